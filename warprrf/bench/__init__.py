@@ -1,0 +1,1 @@
+"""Experiments and benchmarks: every table and figure of the README from one command each."""

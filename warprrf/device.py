@@ -1,0 +1,144 @@
+"""Where work runs and how arrays cross the border: devices, split CPU launches, argument checks, optional packages.
+
+Warp runs a CPU launch on one thread. :func:`launch` splits the index range over a thread pool (Warp releases the
+interpreter lock), so every kernel of ours takes ``offset`` first and works on index ``offset + wp.tid()``; an index
+owns what it writes, and the result does not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+Progress = Callable[[str, int, int], None]
+"""``progress(stage, done, total)``: called by long work; the library itself never prints."""
+
+# Below this many indices a launch is cheaper on one thread than split (a launch costs about 15 us).
+MIN_SPLIT = 256
+# More pieces than threads, so that an expensive stretch of the range does not leave the other threads idle.
+PIECES_PER_THREAD = 4
+
+
+def resolve(device: Any = None) -> wp.Device:
+    """The Warp device that ``device`` names (``None``: Warp's preferred one, CUDA where there is a GPU).
+
+    Raises:
+        ValueError: if Warp has no such device.
+    """
+    _quiet()
+    try:
+        return wp.get_device(device)
+    except (ValueError, RuntimeError, TypeError) as error:
+        known = ", ".join(str(d) for d in wp.get_devices())
+        raise ValueError(f"device: got {device!r}, expected one of {known}") from error
+
+
+@cache
+def _quiet() -> None:
+    wp.config.quiet = True
+    wp.init()
+
+
+@cache
+def threads() -> int:
+    """CPU threads that one launch is split over: ``WARPRRF_THREADS`` if set, else the cores this process may use."""
+    wanted = os.environ.get("WARPRRF_THREADS")
+    if wanted is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not wanted.isdigit() or int(wanted) < 1:
+        raise ValueError(f"WARPRRF_THREADS: got {wanted!r}, expected a whole number of at least 1")
+    return int(wanted)
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=threads(), thread_name_prefix="warprrf")
+
+
+def launch(kernel: Any, dim: int, inputs: Sequence[Any], device: Any = None, pieces: int | None = None) -> None:
+    """Launch ``kernel`` over ``dim`` indices; on a CPU the range is split over all cores.
+
+    The kernel's first argument is ``offset: int`` and is supplied here; ``inputs`` are the others, in order.
+    ``pieces`` fixes into how many parts a CPU launch is cut (default: 4 a thread).
+    """
+    if dim <= 0:
+        return
+    device = resolve(device)
+    count = 1 if device.is_cuda else min(pieces or PIECES_PER_THREAD * threads(), max(1, dim // MIN_SPLIT))
+    if pieces is not None and not device.is_cuda:
+        count = min(pieces, dim)
+    if count == 1 or (not device.is_cuda and threads() == 1):
+        wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=device, record_tape=False)
+        return
+    kernel.module.load(device)
+    bounds = [dim * k // count for k in range(count + 1)]
+
+    def piece(k: int) -> None:
+        wp.launch(
+            kernel, dim=bounds[k + 1] - bounds[k], inputs=[bounds[k], *inputs], device=device, record_tape=False
+        )
+
+    for done in [_pool().submit(piece, k) for k in range(count)]:
+        done.result()
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import an optional package, or say which extra brings it.
+
+    Raises:
+        ImportError: naming the package and the ``pip install`` line.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] != module.split(".")[0]:
+            raise
+        raise ImportError(f'{module} is not installed: pip install "warprrf[{extra}]"') from error
+
+
+def check_array(
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...] | None = None,
+    dtype: Any = np.float64,
+    finite: bool = True,
+) -> np.ndarray:
+    """``value`` (NumPy, Warp, torch or nested lists) as a contiguous NumPy array of ``shape`` and ``dtype``.
+
+    Args:
+        shape: expected shape, ``None`` for a free length; ``None`` altogether skips the check.
+        finite: refuse NaN and infinities.
+
+    Raises:
+        TypeError: if it cannot be read as numbers.
+        ValueError: naming the argument, what came and what was expected.
+    """
+    if isinstance(value, wp.array):
+        value = value.numpy()
+    elif hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    try:
+        array = np.ascontiguousarray(value, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name}: got {type(value).__name__} that does not read as an array of {np.dtype(dtype)}"
+        ) from error
+    if np.ndim(value) == 0:
+        array = array.reshape(())
+    if shape is not None and (
+        array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True))
+    ):
+        wanted = ", ".join("any" if s is None else str(s) for s in shape)
+        raise ValueError(f"{name}: got shape {array.shape}, expected ({wanted})")
+    if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+        bad = int(np.count_nonzero(~np.isfinite(array)))
+        raise ValueError(f"{name}: got {bad} values that are NaN or infinite, expected finite numbers")
+    return array

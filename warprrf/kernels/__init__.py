@@ -1,0 +1,1 @@
+"""Warp functions and kernels: no files, no torch, no state of the host."""

@@ -1,0 +1,1 @@
+"""Stage 2: spectra, propagation, materials, radio fields, paths and the lookups they are measured against."""
