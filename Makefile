@@ -1,0 +1,85 @@
+# warprrf: `make lobby` reconstructs the lobby from photos, fits its radio field and reports every error.
+#
+#   make lobby      install what is missing, then photos -> geometry -> radio -> evaluation into runs/lobby/ (resumable)
+#   make test       lint, types, import rules, tests: what CI runs
+#   make lint       the first three alone
+#   make data       regenerate data/lobby/ from nothing: scene, photos, spectra (hours; resumable)
+#   make notebooks  run the notebooks and store their outputs
+#   make clean      remove caches and build output (not .venv, data or runs)
+#
+#   PYTHON=...  which interpreter makes the environment     VENV=...  where it goes (default .venv)
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-builtin-rules
+
+VENV ?= .venv
+BIN := $(abspath $(VENV))/bin
+RUN := $(BIN)/python
+ARGS ?=
+
+# Compiled kernels are kept in the checkout, so that they survive from one command to the next.
+export WARP_CACHE_PATH ?= $(CURDIR)/.cache/warp
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PYTHONHASHSEED ?= 0
+export MPLBACKEND ?= Agg
+export PYTHON
+
+# Dr.Jit picks the first LLVM it finds, and aborts on 15 and 16: name the newest where several are installed.
+LLVM := $(shell PATH="$$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | awk '/libLLVM/ && /(-|so\.)(1[7-9]|2[0-9])/ {print $$NF}' | sort -V | tail -1)
+ifneq ($(LLVM),)
+export DRJIT_LIBLLVM_PATH ?= $(LLVM)
+endif
+
+.PHONY: help lobby test lint data notebooks clean setup setup-test
+
+help:
+	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
+
+$(VENV)/.made:
+	python=$$(bash tools/find_python.sh)
+	"$$python" -m venv $(VENV)
+	touch $@
+
+# One stamp for what the main job needs, one for everything (torch is only in the second).
+$(VENV)/.lobby: $(VENV)/.made pyproject.toml constraints.txt
+	bash tools/system_packages.sh
+	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots]'
+	touch $@
+
+$(VENV)/.sionna: $(VENV)/.lobby
+	bash tools/system_packages.sh llvm
+	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,sionna,exr]'
+	touch $@
+
+$(VENV)/.test: $(VENV)/.made pyproject.toml constraints.txt
+	bash tools/system_packages.sh llvm
+	$(RUN) -m pip install -q -c constraints.txt -e '.[all,test]'
+	touch $(VENV)/.lobby $(VENV)/.sionna $@
+
+setup: $(VENV)/.lobby
+setup-test: $(VENV)/.test
+
+lobby: $(VENV)/.lobby
+	@$(BIN)/warprrf lobby $(ARGS)
+
+data: $(VENV)/.sionna
+	@$(BIN)/warprrf data $(ARGS)
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	PYTHONPATH=. $(BIN)/lint-imports --no-cache
+
+test: lint
+	$(RUN) -m pytest $(ARGS)
+
+notebooks: $(VENV)/.test
+	cd notebooks && for notebook in *.py; do $(BIN)/jupytext --to ipynb --update --execute "$$notebook"; done
+
+clean:
+	rm -rf .cache build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +
