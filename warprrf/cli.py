@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
+from warprrf.bench.stages import write_atomically, write_json
+from warprrf.device import require
 
 EPILOG = """\
 a walk through, in a checkout:
@@ -187,7 +189,7 @@ def _render(args: argparse.Namespace, bars: Bars) -> None:
     from PIL import Image
 
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
-    _atomic(Path(args.out), lambda path: Image.fromarray(pixels).save(path))
+    write_atomically(Path(args.out), lambda path: Image.fromarray(pixels).save(path))
     print(f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians")
 
 
@@ -208,8 +210,7 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
     bars._close()
     print(table(figures))
     if args.out:
-        text = json.dumps(figures, indent=2, default=float)
-        _atomic(Path(args.out), lambda path: Path(path).write_text(text + "\n"))
+        write_json(args.out, figures)
 
 
 def table(methods: dict[str, dict[str, Any]]) -> str:
@@ -249,17 +250,6 @@ def _existing(path: str | os.PathLike[str]) -> Path:
     if not path.exists():
         raise ValueError(f"{path}: no such file or folder")
     return path
-
-
-def _atomic(path: Path, write: Callable[[str], Any]) -> None:
-    """Write through a temporary name of the same suffix, so that a kill leaves the old file or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(str(partial))
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float, float]]:
@@ -322,13 +312,11 @@ def _load_geometry(path: str, mesh: str | None) -> Any:
 def _write_spectrum(spectrum: Any, path: Path) -> None:
     if path.suffix == ".npz":
         arrays = {"path_gain": spectrum.path_gain, "delay_s": spectrum.delay_s, "aod": spectrum.aod}
-        _atomic(path, lambda name: np.savez_compressed(name, **arrays))
+        write_atomically(path, lambda name: np.savez_compressed(name, **arrays))
     elif path.suffix == ".png":
-        figure = wr.device.require("matplotlib.figure", extra="plots").Figure(
-            figsize=(8.0, 4.2), layout="constrained"
-        )
+        figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
         spectrum.plot(ax=figure.add_subplot())
-        _atomic(path, lambda name: figure.savefig(name, dpi=130))
+        write_atomically(path, lambda name: figure.savefig(name, dpi=130))
     else:
         raise ValueError(f"{path}: expected .png (a picture) or .npz (path_gain, delay_s, aod)")
 
