@@ -78,7 +78,7 @@ def launch(kernel: Any, dim: int, inputs: Sequence[Any], device: Any = None, pie
     if count == 1 or (not device.is_cuda and threads() == 1):
         wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=device, record_tape=False)
         return
-    kernel.module.load(device)
+    kernel.module.load(device, block_dim=1)  # as a CPU launch does; its default would compile a second build
     bounds = [dim * k // count for k in range(count + 1)]
 
     def piece(k: int) -> None:
