@@ -241,7 +241,7 @@ class Mesh:
         return free
 
     def closest(self, points: Any, *, device: Any = None) -> Closest:
-        """The nearest point of the surface to each of ``points`` [m], shape ``(N, 3)``; in float64 once the face is known."""
+        """The nearest point of the surface to each of ``points`` (N, 3) [m], in float64 once the face is known."""
         p = _device.check_array("points", points, (None, 3))
         where = _device.resolve(device)
         face = wp.zeros(len(p), dtype=wp.int32, device=where)
@@ -308,7 +308,7 @@ def _ray_arrays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Nearest point of triangle ``k`` to point ``k``: the foot on the plane if inside, else the nearest of three edges."""
+    """Nearest point of triangle k to point k: the foot on the plane if inside, else the nearest on its edges."""
     corners = [triangles[:, k] for k in range(3)]
     ab, ac, ap = corners[1] - corners[0], corners[2] - corners[0], p - corners[0]
     gram = [np.einsum("ni,ni->n", x, y) for x, y in ((ab, ab), (ab, ac), (ac, ac), (ap, ab), (ap, ac))]

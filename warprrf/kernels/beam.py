@@ -1,0 +1,114 @@
+"""Spreading of point-like paths over an equirectangular grid by a von Mises-Fisher beam, in float64.
+
+``exp(kappa (cos a - 1))`` is evaluated as ``exp(-kappa c^2 / 2)`` with c the chord between unit vectors, which does not
+cancel near the beam's centre, as it is at the poles and across the azimuth seam. Paths come sorted by the pixel that
+they fall in, so that every pixel gathers its own sum: no atomics, the same result on any number of threads.
+"""
+
+import warp as wp
+
+
+@wp.func
+def column_start(column: int, half: int, columns: int):
+    """First column of a window about ``column``; 0 if the window spans the whole row."""
+    if 2 * half + 1 >= columns:
+        return 0
+    return (column - half + columns) % columns
+
+
+@wp.func
+def window_width(half: int, columns: int):
+    """Number of columns of the window."""
+    return wp.min(2 * half + 1, columns)
+
+
+@wp.kernel
+def beam_normaliser(
+    offset: int,
+    directions: wp.array(dtype=wp.vec3d),
+    cells: wp.array(dtype=wp.int32),
+    pixels: wp.array2d(dtype=wp.vec3d),
+    solid_angles: wp.array(dtype=wp.float64),
+    half_widths: wp.array2d(dtype=wp.int32),
+    kappa: wp.float64,
+    chord_limit: wp.float64,
+    nearest: wp.array(dtype=wp.float64),
+    total: wp.array(dtype=wp.float64),
+):
+    """For each path: squared chord to its nearest pixel centre, and the beam's sum over pixels relative to there."""
+    k = offset + wp.tid()
+    rows = pixels.shape[0]
+    columns = pixels.shape[1]
+    d = directions[k]
+    cell_row = cells[k] / columns
+    cell_column = cells[k] - cell_row * columns
+    c0 = wp.length_sq(d - pixels[cell_row, cell_column])
+    # The pixel whose cell holds the path is the nearest, or near enough to keep the exponentials from underflowing.
+    shift = c0
+    weight = wp.float64(0.0)
+    for row in range(rows):
+        half = half_widths[row, cell_row]
+        if half >= 0:
+            start = column_start(cell_column, half, columns)
+            row_weight = wp.float64(0.0)
+            for step in range(window_width(half, columns)):
+                column = start + step
+                if column >= columns:
+                    column = column - columns
+                c = wp.length_sq(d - pixels[row, column])
+                if c <= chord_limit:
+                    row_weight = row_weight + wp.exp(wp.float64(0.5) * kappa * (shift - c))
+            weight = weight + row_weight * solid_angles[row]
+    nearest[k] = shift
+    total[k] = weight
+
+
+@wp.kernel
+def gather_beams(
+    offset: int,
+    directions: wp.array(dtype=wp.vec3d),
+    powers: wp.array(dtype=wp.float64),
+    nearest: wp.array(dtype=wp.float64),
+    starts: wp.array(dtype=wp.int32),
+    pixels: wp.array2d(dtype=wp.vec3d),
+    solid_angles: wp.array(dtype=wp.float64),
+    half_widths: wp.array2d(dtype=wp.int32),
+    kappa: wp.float64,
+    chord_limit: wp.float64,
+    image: wp.array2d(dtype=wp.float64),
+    strongest: wp.array2d(dtype=wp.int32),
+):
+    """Sum of the beams at each pixel, and which path gives the most there (-1: none)."""
+    k = offset + wp.tid()
+    rows = pixels.shape[0]
+    columns = pixels.shape[1]
+    row = k / columns
+    column = k - row * columns
+    p = pixels[row, column]
+    value = wp.float64(0.0)
+    best_value = wp.float64(0.0)
+    best = int(-1)
+    for cell_row in range(rows):
+        half = half_widths[row, cell_row]
+        if half >= 0:
+            first = column_start(column, half, columns)
+            width = window_width(half, columns)
+            # The window's cells are contiguous but for the seam: one stretch of paths, or two.
+            for part in range(2):
+                low = first
+                high = wp.min(first + width, columns)
+                if part == 1:
+                    low = 0
+                    high = wp.max(first + width - columns, 0)
+                if high > low:
+                    base = cell_row * columns
+                    for m in range(starts[base + low], starts[base + high]):
+                        c = wp.length_sq(directions[m] - p)
+                        if c <= chord_limit:
+                            w = powers[m] * wp.exp(wp.float64(0.5) * kappa * (nearest[m] - c))
+                            value = value + w
+                            if w > best_value:
+                                best_value = w
+                                best = m
+    image[row, column] = value * solid_angles[row]
+    strongest[row, column] = best
