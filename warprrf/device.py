@@ -63,29 +63,44 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=threads(), thread_name_prefix="warprrf")
 
 
-def launch(kernel: Any, dim: int, inputs: Sequence[Any], device: Any = None, pieces: int | None = None) -> None:
+def launch(
+    kernel: Any,
+    dim: int,
+    inputs: Sequence[Any],
+    device: Any = None,
+    *,
+    pieces: int | None = None,
+    adjoint: bool = False,
+) -> None:
     """Launch ``kernel`` over ``dim`` indices; on a CPU the range is split over all cores.
 
     The kernel's first argument is ``offset: int`` and is supplied here; ``inputs`` are the others, in order.
-    ``pieces`` fixes into how many parts a CPU launch is cut (default: 4 a thread).
+    ``pieces`` fixes into how many parts a CPU launch is cut (default: 4 a thread), for kernels that own one buffer a
+    piece. ``adjoint`` runs the kernel's adjoint on the arrays' ``.grad``.
     """
     if dim <= 0:
         return
     device = resolve(device)
-    count = 1 if device.is_cuda else min(pieces or PIECES_PER_THREAD * threads(), max(1, dim // MIN_SPLIT))
-    if pieces is not None and not device.is_cuda:
+    if device.is_cuda:
+        count = 1
+    elif pieces is not None:
         count = min(pieces, dim)
-    if count == 1 or (not device.is_cuda and threads() == 1):
-        wp.launch(kernel, dim=dim, inputs=[0, *inputs], device=device, record_tape=False)
-        return
-    kernel.module.load(device, block_dim=1)  # as a CPU launch does; its default would compile a second build
+    else:
+        count = min(PIECES_PER_THREAD * threads(), max(1, dim // MIN_SPLIT))
+    kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
     bounds = [dim * k // count for k in range(count + 1)]
 
     def piece(k: int) -> None:
+        arguments = [bounds[k], *inputs]
+        extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
         wp.launch(
-            kernel, dim=bounds[k + 1] - bounds[k], inputs=[bounds[k], *inputs], device=device, record_tape=False
+            kernel, dim=bounds[k + 1] - bounds[k], inputs=arguments, device=device, record_tape=False, **extra
         )
 
+    if count == 1 or threads() == 1:
+        for k in range(count):
+            piece(k)
+        return
     for done in [_pool().submit(piece, k) for k in range(count)]:
         done.result()
 

@@ -1,0 +1,76 @@
+"""warprrf: radio radiance fields from photos and a few radio measurements.
+
+Stage 1 reconstructs a room's geometry from photos (:func:`reconstruct`); stage 2 fits a radio field to sparse spatial
+spectra (:meth:`RadioField.fit`), which then answers for any receiver (:meth:`RadioField.spectrum`,
+:meth:`RadioField.paths`).
+
+Conventions: metres, seconds, hertz, radians; world right-handed with z up; zenith in [0, pi], azimuth in (-pi, pi];
+``world_to_camera`` 4x4 with OpenCV axes; quaternions wxyz. A spectrum is an equirectangular grid of *path gain*, row i
+at zenith ``(i + 0.5) pi / H``, column j at azimuth ``-pi + (j + 0.5) 2 pi / W``.
+
+Names are imported when first used: ``import warprrf`` alone loads no heavy package.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Blending": "geometry.render",
+    "BlendWeights": "geometry.render",
+    "Camera": "geometry.camera",
+    "Gaussians": "geometry.gaussians",
+    "Material": "rf.materials",
+    "Mesh": "geometry.mesh",
+    "Paths": "rf.paths",
+    "RadioField": "rf.field",
+    "Rasterizer": "geometry.render",
+    "Reconstruction": "geometry.reconstruction",
+    "Scene": "rf.scene",
+    "Spectrum": "rf.spectrum",
+    "SpectrumDataset": "rf.dataset",
+    "blend_weights": "geometry.render",
+    "evaluate": "rf.metrics",
+    "reconstruct": "geometry.reconstruction",
+    "render": "geometry.render",
+    "simulate": "rf.simulate",
+    "trace_paths": "rf.paths",
+}
+
+__all__ = ["__version__", *_HOMES]
+
+if TYPE_CHECKING:
+    from warprrf.geometry.camera import Camera as Camera
+    from warprrf.geometry.gaussians import Gaussians as Gaussians
+    from warprrf.geometry.mesh import Mesh as Mesh
+    from warprrf.geometry.reconstruction import Reconstruction as Reconstruction
+    from warprrf.geometry.reconstruction import reconstruct as reconstruct
+    from warprrf.geometry.render import Blending as Blending
+    from warprrf.geometry.render import BlendWeights as BlendWeights
+    from warprrf.geometry.render import Rasterizer as Rasterizer
+    from warprrf.geometry.render import blend_weights as blend_weights
+    from warprrf.geometry.render import render as render
+    from warprrf.rf.dataset import SpectrumDataset as SpectrumDataset
+    from warprrf.rf.field import RadioField as RadioField
+    from warprrf.rf.materials import Material as Material
+    from warprrf.rf.metrics import evaluate as evaluate
+    from warprrf.rf.paths import Paths as Paths
+    from warprrf.rf.paths import trace_paths as trace_paths
+    from warprrf.rf.scene import Scene as Scene
+    from warprrf.rf.simulate import simulate as simulate
+    from warprrf.rf.spectrum import Spectrum as Spectrum
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'warprrf' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"warprrf.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

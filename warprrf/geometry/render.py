@@ -1,0 +1,390 @@
+"""Splat Gaussians into photos and panoramas: one rasteriser, exact on every ray, differentiable through Warp's tape.
+
+:func:`render` is the NumPy face. :class:`Rasterizer` works on Warp arrays, in float32 or float64, records its
+hand-written adjoint on an active ``wp.Tape``, and is what :mod:`warprrf.geometry.refine` trains with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf.device import check_array, launch, resolve
+from warprrf.geometry.camera import Camera
+from warprrf.geometry.gaussians import Gaussians
+from warprrf.kernels import sh as sh_kernels
+from warprrf.kernels import splat as kernels
+
+# Gradient sums are kept in this many parts on a CPU, one writer each: the result does not depend on the thread count.
+CPU_PIECES = 4
+RULES = {"product": kernels.PRODUCT, "exp": kernels.EXPONENTIAL}
+
+
+@dataclass(frozen=True)
+class Blending:
+    """How responses become an image; the defaults suit 8-bit photos.
+
+    Attributes:
+        alpha_min: a Gaussian contributes where ``opacity * response`` reaches this.
+        alpha_max: clamp of alpha, so that no layer is fully opaque.
+        transmittance_min: a pixel is finished when less light than this is left.
+        rule: ``"product"`` of (1 - alpha), or ``"exp"`` of minus the sum of alphas (the paper's equation for T_k, which
+            can blend to more than one).
+    """
+
+    alpha_min: float = 1 / 255  # below this a Gaussian cannot change an 8-bit pixel
+    alpha_max: float = 0.99
+    transmittance_min: float = 1e-4
+    rule: str = "product"
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("alpha_min", 0, 1), ("alpha_max", 0, 1), ("transmittance_min", -1, 1)):
+            value = getattr(self, name)
+            if not low < value <= high:
+                raise ValueError(f"{name}: got {value!r}, expected a number in ({low}, {high}]")
+        if self.rule not in RULES:
+            raise ValueError(f"rule: got {self.rule!r}, expected one of {sorted(RULES)}")
+
+
+# An image 60 dB deep: a layer clamped at 0.99 would leak -20 dB, so alpha may come within 1e-6 of one.
+RADIO = Blending(alpha_min=1e-4, alpha_max=1 - 1e-6, transmittance_min=1e-6)
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What :func:`render` returns.
+
+    Attributes:
+        features: blended features, shape ``(H, W, C)`` float32.
+        alpha: sum of blending weights, shape ``(H, W)``.
+        depth: Euclidean range [m], the blended mean of each Gaussian's peak on the ray; inf where alpha is 0.
+        dominant: Gaussian of largest weight, int32, -1 where none.
+        peak: range of the dominant Gaussian's peak [m]; inf where none.
+    """
+
+    features: np.ndarray = field(repr=False)
+    alpha: np.ndarray = field(repr=False)
+    depth: np.ndarray = field(repr=False)
+    dominant: np.ndarray = field(repr=False)
+    peak: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class BlendWeights:
+    """The ``K`` largest blending weights of every pixel, front to back.
+
+    Attributes:
+        index: Gaussian, shape ``(H, W, K)`` int32, -1 where fewer than K.
+        weight: alpha times transmittance, same shape, float32.
+        range: distance of the Gaussian's peak on the ray [m], same shape.
+        dominant: Gaussian of largest weight, shape ``(H, W)`` int32, -1 where none.
+        alpha: sum of all weights, shape ``(H, W)``.
+        dropped: sum of the weights left out by the limit K, shape ``(H, W)``.
+    """
+
+    index: np.ndarray = field(repr=False)
+    weight: np.ndarray = field(repr=False)
+    range: np.ndarray = field(repr=False)
+    dominant: np.ndarray = field(repr=False)
+    alpha: np.ndarray = field(repr=False)
+    dropped: np.ndarray = field(repr=False)
+
+
+def render(
+    g: Gaussians,
+    cam: Camera,
+    features: Any = None,
+    background: Any = 0.0,
+    device: Any = None,
+    *,
+    blending: Blending | None = None,
+) -> Rendering:
+    """Blend Gaussians front to back along every pixel's ray.
+
+    Args:
+        features: per Gaussian, shape ``(N, C)``; default: the colour that ``g.sh`` shows towards the camera.
+        background: scalar or shape ``(C,)``, seen through what transmittance is left.
+        blending: cutoffs and transmittance rule; default: those of photos.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    _check(g, cam)
+    device = resolve(device)
+    raster = Rasterizer(device=device, blending=blending)
+    scene = raster.upload(g)
+    if features is None:
+        feature_array = raster.colors(scene[0], wp.array(g.sh, dtype=wp.float32, device=device), cam)
+    else:
+        feature_array = wp.array(
+            check_array("features", features, (len(g), None), np.float32), dtype=wp.float32, device=device
+        )
+    back = check_array("background", background, None, np.float32)
+    if back.ndim > 1 or (back.ndim == 1 and len(back) != feature_array.shape[1]):
+        raise ValueError(f"background: got shape {back.shape}, expected a scalar or ({feature_array.shape[1]},)")
+    view = raster.prepare(*scene, cam)
+    image = raster.blend(view, feature_array, np.broadcast_to(back, (feature_array.shape[1],)))
+    alpha = image.alpha.numpy()
+    dominant = image.dominant.numpy()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(alpha > 0, image.depth_sum.numpy() / alpha, np.inf).astype(np.float32)
+    peak = np.where(dominant >= 0, image.peak.numpy(), np.inf).astype(np.float32)
+    return Rendering(image.features.numpy(), alpha, depth, dominant, peak)
+
+
+def blend_weights(
+    g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: Any = None
+) -> BlendWeights:
+    """Blending weights of every pixel as a sparse matrix; geometry that is frozen needs them only once.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    _check(g, cam)
+    if not isinstance(top_k, int | np.integer) or top_k < 1:
+        raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    raster = Rasterizer(device=device, blending=blending)
+    view = raster.prepare(*raster.upload(g), cam)
+    shape = (cam.height, cam.width, int(top_k))
+    index = wp.full(shape, -1, dtype=int, device=raster.device)
+    weight = wp.zeros(shape, dtype=wp.float32, device=raster.device)
+    range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
+    total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
+    launch(
+        raster.kernels.strongest,
+        cam.width * cam.height,
+        [view.rows, view.ids, view.starts, view.view, raster.rules, index, weight, range_, total],
+        device=raster.device,
+    )
+    weights, indices, alpha = weight.numpy(), index.numpy(), total.numpy()
+    best = np.argmax(weights, axis=2)
+    dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]
+    dropped = np.maximum(alpha - weights.sum(axis=2), 0)
+    return BlendWeights(indices, weights, range_.numpy(), dominant, alpha, dropped)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Gaussians projected for one camera: coefficients and depth-sorted tile lists on the device."""
+
+    camera: Camera
+    view: Any
+    inputs: tuple[wp.array, ...]
+    rows: wp.array
+    count: wp.array
+    ids: wp.array
+    starts: wp.array
+    entries: int
+
+
+@dataclass(frozen=True)
+class Image:
+    """A blended image on the device; ``depth_sum`` is the sum of weight times range."""
+
+    features: wp.array
+    alpha: wp.array
+    depth: wp.array
+    depth_sum: wp.array
+    dominant: wp.array
+    peak: wp.array
+
+
+class Rasterizer:
+    """Projects, bins and blends on one device in one precision.
+
+    Under an active ``wp.Tape`` :meth:`rasterize` and :meth:`colors` record their adjoints for the means, quaternions,
+    scales, opacities, features, background and harmonics; losses may use ``features``, ``alpha`` and ``depth``.
+    """
+
+    def __init__(self, *, device: Any = None, blending: Blending | None = None, real: Any = wp.float32) -> None:
+        self.device = resolve(device)
+        self.blending = blending or Blending()
+        self.real = real
+        self.kernels = kernels.build(real)
+        self.rules = kernels.Rules()
+        self.rules.alpha_min = self.blending.alpha_min
+        self.rules.alpha_max = self.blending.alpha_max
+        self.rules.transmittance_min = self.blending.transmittance_min
+        self.rules.rule = RULES[self.blending.rule]
+
+    def vector(self, size: int) -> Any:
+        return wp.types.vector(size, self.real)
+
+    def upload(self, g: Gaussians) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+        """Means, quaternions, scales and opacities as arrays of this precision."""
+        return (
+            wp.array(g.means, dtype=self.vector(3), device=self.device),
+            wp.array(g.quaternions, dtype=self.vector(4), device=self.device),
+            wp.array(g.scales, dtype=self.vector(3), device=self.device),
+            wp.array(g.opacities, dtype=self.real, device=self.device),
+        )
+
+    def rasterize(
+        self,
+        means: wp.array,
+        quaternions: wp.array,
+        scales: wp.array,
+        opacities: wp.array,
+        features: wp.array,
+        cam: Camera,
+        background: Any = None,
+    ) -> Image:
+        """Project and blend; differentiable on an active tape."""
+        return self.blend(self.prepare(means, quaternions, scales, opacities, cam), features, background)
+
+    def colors(self, means: wp.array, sh: wp.array, cam: Camera) -> wp.array:
+        """Colours ``max(0, SH + 0.5)`` towards the camera, shape ``(N, C)``; differentiable on an active tape."""
+        kernel = sh_kernels.build(self.real).colors
+        tape = wp._src.context.runtime.tape
+        origin = wp.array([cam.position], dtype=self.vector(3), device=self.device)
+        out = wp.zeros((len(means), sh.shape[2]), dtype=self.real, device=self.device, requires_grad=tape is not None)
+        launch(kernel, len(means), [means, sh, origin, out], device=self.device)
+        if tape is not None:
+            tape.record_func(lambda: self.colors_adjoint(means, sh, origin, out), [means, sh, out])
+        return out
+
+    def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
+        """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
+        launch(
+            sh_kernels.build(self.real).colors, len(means), [means, sh, origin, out], device=self.device, adjoint=True
+        )
+
+    def prepare(
+        self, means: wp.array, quaternions: wp.array, scales: wp.array, opacities: wp.array, cam: Camera
+    ) -> Prepared:
+        """Project every Gaussian and list those that each 16 x 16 tile sees, near to far."""
+        n, device = len(means), self.device
+        view = _view(cam)
+        rows = wp.empty((max(n, 1), kernels.ROW), dtype=self.real, device=device)
+        span = wp.empty(n, dtype=wp.vec4i, device=device)
+        count = wp.empty(n, dtype=int, device=device)
+        distance = wp.empty(n, dtype=float, device=device)
+        inputs = (means, quaternions, scales, opacities)
+        launch(self.kernels.project, n, [*inputs, view, self.rules, rows, span, count, distance], device=device)
+        order, ends, entries = _sorted_visible(count, distance)
+        tiles = view.tiles_x * view.tiles_y
+        keys = wp.empty(2 * max(entries, 1), dtype=int, device=device)
+        ids = wp.empty(2 * max(entries, 1), dtype=int, device=device)
+        starts = wp.zeros(tiles + 1, dtype=int, device=device)
+        if entries:
+            launch(kernels.emit_tiles, len(order), [order, span, ends, view.tiles_x, keys, ids], device=device)
+            wp.utils.radix_sort_pairs(keys, ids, entries)
+            launch(kernels.tile_starts, tiles + 1, [keys, entries, starts], device=device)
+        return Prepared(cam, view, inputs, rows, count, ids, starts, entries)
+
+    def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
+        """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
+        device, real = self.device, self.real
+        tape = wp._src.context.runtime.tape
+        shape = (prepared.camera.height, prepared.camera.width)
+        channels = features.shape[1]
+        if background is None:
+            background = wp.zeros(channels, dtype=real, device=device)
+        elif not isinstance(background, wp.array):
+            background = wp.array(np.asarray(background), dtype=real, device=device)
+        grad = tape is not None
+        image = wp.zeros((*shape, channels), dtype=real, device=device, requires_grad=grad)
+        alpha = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
+        depth_sum, left, peak = (wp.zeros(shape, dtype=real, device=device) for _ in range(3))
+        dominant = wp.full(shape, -1, dtype=int, device=device)
+        strips = prepared.view.tiles_x * prepared.view.tiles_y * kernels.TILE
+        for first in range(0, channels, kernels.CHANNELS):
+            launch(
+                self.kernels.blend,
+                strips,
+                [prepared.rows, features, first, background, prepared.ids, prepared.starts, prepared.view, self.rules,
+                 image, alpha, depth_sum, left, dominant, peak],
+                device=device,
+            )  # fmt: skip
+        depth = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
+        launch(self.kernels.mean_depth, shape[0] * shape[1], [depth_sum, alpha, depth], device=device)
+        out = Image(image, alpha, depth, depth_sum, dominant, peak)
+        if tape is not None:
+            tape.record_func(
+                lambda: self.blend_adjoint(prepared, features, background, out, left),
+                [*prepared.inputs, features, background, image, alpha, depth],
+            )
+        return out
+
+    def blend_adjoint(
+        self, prepared: Prepared, features: wp.array, background: wp.array, out: Image, left: wp.array
+    ) -> wp.array:
+        """Add the gradients of every input for those of ``out``; returns each Gaussian's summed blending weight."""
+        device, real = self.device, self.real
+        n = len(features)
+        strips = prepared.view.tiles_x * prepared.view.tiles_y * kernels.TILE
+        pieces = 1 if device.is_cuda else min(CPU_PIECES, strips)
+        means, quaternions, scales, opacities = prepared.inputs
+        seen = wp.zeros(n, dtype=real, device=device)
+        feature_grad = _gradient(features)
+        for first in range(0, features.shape[1], kernels.CHANNELS):
+            sums = wp.zeros((pieces, n, kernels.GRADIENTS), dtype=real, device=device)
+            launch(
+                self.kernels.blend_adjoint,
+                strips,
+                [strips, pieces, prepared.rows, features, first, prepared.ids, prepared.starts, prepared.view,
+                 self.rules, out.features, out.alpha, out.depth_sum, out.features.grad, out.alpha.grad, out.depth.grad,
+                 sums],
+                device=device,
+                pieces=pieces,
+            )  # fmt: skip
+            launch(
+                self.kernels.chain,
+                n,
+                [quaternions, scales, prepared.count, first, sums, _gradient(means), _gradient(quaternions),
+                 _gradient(scales), _gradient(opacities), feature_grad, seen],
+                device=device,
+            )  # fmt: skip
+        if background.requires_grad:
+            launch(
+                self.kernels.background_adjoint, len(background), [left, out.features.grad, background.grad],
+                device=device,
+            )  # fmt: skip
+        return seen
+
+
+def _gradient(array: wp.array) -> wp.array:
+    """Where an input's gradient goes; a scratch array if nobody asked for it."""
+    return array.grad if array.requires_grad else wp.zeros_like(array)
+
+
+def _sorted_visible(count: wp.array, distance: wp.array) -> tuple[wp.array, wp.array, int]:
+    """Visible Gaussians by range (as float32; ties by index), running ends of their tile entries, and the total."""
+    device = count.device
+    counts = count.numpy()
+    visible = np.flatnonzero(counts).astype(np.int32)
+    if len(visible) == 0:
+        return wp.empty(0, dtype=int, device=device), wp.empty(0, dtype=int, device=device), 0
+    order = visible[np.argsort(distance.numpy()[visible], kind="stable")]
+    ends = np.cumsum(counts[order], dtype=np.int64)
+    if ends[-1] > 2**30:
+        raise ValueError(
+            f"gaussians: they cover {ends[-1]} tiles in all, more than 2^30; prune large Gaussians or render smaller"
+        )
+    return (
+        wp.array(order, dtype=int, device=device),
+        wp.array(ends.astype(np.int32), dtype=int, device=device),
+        int(ends[-1]),
+    )
+
+
+def _view(cam: Camera) -> Any:
+    view = kernels.View()
+    view.kind = kernels.SPHERICAL if cam.kind == "spherical" else kernels.PINHOLE
+    view.width, view.height = cam.width, cam.height
+    view.tiles_x = -(-cam.width // kernels.TILE)
+    view.tiles_y = -(-cam.height // kernels.TILE)
+    view.fx, view.fy, view.cx, view.cy = cam.fx, cam.fy, cam.cx, cam.cy
+    view.rotation = wp.mat33d(cam.rotation)
+    view.origin = wp.vec3d(cam.position)
+    return view
+
+
+def _check(g: Any, cam: Any) -> None:
+    if not isinstance(g, Gaussians):
+        raise TypeError(f"g: got {type(g).__name__}, expected warprrf.Gaussians")
+    if not isinstance(cam, Camera):
+        raise TypeError(f"cam: got {type(cam).__name__}, expected warprrf.Camera (Camera.pinhole or Camera.spherical)")
