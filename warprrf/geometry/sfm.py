@@ -1,0 +1,536 @@
+"""Structure from motion: camera poses and a sparse point cloud from photo files, and their scale in metres.
+
+Wraps pycolmap (COLMAP: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT on the image
+files, matching, incremental mapping with one shared pinhole camera whose focal length is estimated. Photos must be
+free of lens distortion. The model comes out in units and axes of its own; :func:`align_to_known` brings it to metres
+with a similarity fitted to surveyed camera positions. Everything runs on the CPU and repeats itself for a given seed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import Progress, check_array, require
+from warprrf.geometry.camera import Camera
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+MIN_PHOTOS = 3
+# Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
+MAX_EXHAUSTIVE_PAIRS = 2000
+COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
+COARSE_NEIGHBOURS = 36  # pairs kept for each photo
+EXTRACT_BATCH = 12
+MATCH_BATCH = 400
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Posed cameras and a sparse point cloud.
+
+    Attributes:
+        cameras: photo name to :class:`Camera`, for the photos that were posed.
+        points: 3D points, shape ``(P, 3)`` float64; metres once aligned, arbitrary units before.
+        colors: colour of each point in [0, 1], shape ``(P, 3)``.
+        reprojection_error: mean reprojection error of each point [pixels], shape ``(P,)``.
+        track_length: number of photos that see each point, shape ``(P,)`` int64.
+        track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
+        track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
+        unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
+        other_models: number of photos in each smaller model that was left out.
+        metric: True once :func:`align_to_known` has brought the model to metres.
+        scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
+    """
+
+    cameras: dict[str, Camera]
+    points: np.ndarray
+    colors: np.ndarray
+    reprojection_error: np.ndarray
+    track_length: np.ndarray
+    track_start: np.ndarray
+    track_camera: np.ndarray
+    unposed: tuple[str, ...] = ()
+    other_models: tuple[int, ...] = ()
+    metric: bool = False
+    scale_rms_m: float = float("nan")
+
+    def viewpoints(self) -> np.ndarray:
+        """Mean position of the cameras that see each point, shape ``(P, 3)``: normals are turned towards it."""
+        positions = np.array([camera.position for camera in self.cameras.values()])
+        total = np.add.reduceat(positions[self.track_camera], self.track_start[:-1], axis=0)
+        return total / self.track_length[:, None]
+
+    def subset(self, keep: np.ndarray) -> SparseModel:
+        """The model with only the points where ``keep`` (boolean, shape ``(P,)``) is True."""
+        seen = np.repeat(keep, self.track_length)
+        length = self.track_length[keep]
+        return replace(
+            self,
+            points=self.points[keep],
+            colors=self.colors[keep],
+            reprojection_error=self.reprojection_error[keep],
+            track_length=length,
+            track_start=np.concatenate([[0], np.cumsum(length)]),
+            track_camera=self.track_camera[seen],
+        )
+
+
+def find_photos(photos: Any) -> dict[str, Path]:
+    """Photo name to file, sorted by name, for a folder or a sequence of image files.
+
+    A name is the path below the folder (or below the files' common folder), with forward slashes.
+
+    Raises:
+        ValueError: if the folder or files do not exist, or too few photos are there.
+    """
+    if isinstance(photos, str | os.PathLike):
+        root = Path(photos)
+        if not root.is_dir():
+            raise ValueError(f"photos: {root} is not a folder; expected a folder of photos or a list of image files")
+        files = sorted(p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
+    else:
+        files = [Path(p) for p in photos]
+        missing = [str(p) for p in files if not p.is_file()]
+        if missing:
+            raise ValueError(f"photos: {len(missing)} of {len(files)} files do not exist: {_some(missing)}")
+        parents = {str(p.resolve().parent) for p in files}
+        root = Path(os.path.commonpath(parents)) if parents else Path()
+        files = [p.resolve() for p in files]
+    named = {p.relative_to(root).as_posix(): p.resolve() for p in files}
+    if len(named) < MIN_PHOTOS:
+        raise ValueError(
+            f"photos: got {len(named)} photos in {root}, expected at least {MIN_PHOTOS} "
+            f"({', '.join(PHOTO_SUFFIXES)}); a room wants 60 or more that overlap"
+        )
+    return dict(sorted(named.items()))
+
+
+def structure_from_motion(
+    photos: Any,
+    *,
+    workspace: str | os.PathLike[str],
+    max_features: int = 2000,
+    camera_model: str = "SIMPLE_PINHOLE",
+    pairs: str = "auto",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> SparseModel:
+    """Camera poses and sparse points of ``photos``, in the model's own units (see :func:`align_to_known`).
+
+    Finished steps are kept in ``workspace`` and reused as long as photos and options stay the same, so that a stopped
+    run goes on where it was.
+
+    Args:
+        photos: a folder, or a sequence of image files, all of one size and from one undistorted camera.
+        workspace: folder for the feature database and the model; made if it is not there.
+        max_features: SIFT features kept per photo (the largest ones).
+        camera_model: COLMAP camera model, ``"SIMPLE_PINHOLE"`` (one focal length) or ``"PINHOLE"`` (two).
+        pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
+            largest features finds promising, once there are more than 2000 pairs.
+        seed: seed of every random draw.
+        progress: called as ``progress("features" | "matching" | "mapping", done, total)``.
+
+    Raises:
+        ValueError: for photos that are missing, unreadable, of different sizes or too few, an unknown camera model,
+            or when the photos overlap too little to be posed; the message names the files.
+        ImportError: if pycolmap is not installed.
+    """
+    if camera_model not in CAMERA_MODELS:
+        raise ValueError(
+            f"camera_model: got {camera_model!r}, expected one of {CAMERA_MODELS}; photos with lens distortion have "
+            "to be undistorted first (for instance with COLMAP's image_undistorter)"
+        )
+    if pairs not in ("auto", "exhaustive"):
+        raise ValueError(f'pairs: got {pairs!r}, expected "auto" or "exhaustive"')
+    if max_features < 100:
+        raise ValueError(f"max_features: got {max_features}, expected at least 100")
+    named = find_photos(photos)
+    _check_photos(named)
+    colmap = require("pycolmap", extra="photos")
+    folder = Path(workspace) / "sfm"
+    options = {"max_features": max_features, "camera_model": camera_model, "pairs": pairs, "seed": seed}
+    _open_workspace(folder, named, options)
+    report = progress or (lambda stage, done, total: None)
+    with _quiet(colmap):
+        colmap.set_random_seed(seed)
+        if not (folder / "model" / "points3D.bin").is_file():
+            _extract(colmap, folder, list(named), max_features, camera_model, report)
+            _match(colmap, folder, list(named), pairs, seed, report)
+            _map(colmap, folder, named, seed, report)
+        model = colmap.Reconstruction(str(folder / "model"))
+        others = json.loads((folder / "model" / "others.json").read_text())
+        return replace(_sparse_model(model, list(named)), other_models=tuple(others))
+
+
+def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
+    """A COLMAP model folder (``cameras``, ``images``, ``points3D``; ``.bin`` or ``.txt``) as a :class:`SparseModel`.
+
+    Lengths are taken as metres.
+
+    Raises:
+        ValueError: if the folder holds no readable model, or a camera is not a pinhole.
+        ImportError: if pycolmap is not installed.
+    """
+    colmap = require("pycolmap", extra="photos")
+    root = Path(folder)
+    if not any(all((root / f"{n}{ext}").is_file() for n in ("cameras", "images")) for ext in (".bin", ".txt")):
+        raise ValueError(f"colmap: {root} holds no COLMAP model; expected cameras, images and points3D (.bin or .txt)")
+    with _quiet(colmap):
+        try:
+            model = colmap.Reconstruction(str(root))
+        except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
+            raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
+        return replace(_sparse_model(model, sorted(i.name for i in model.images.values())), metric=True)
+
+
+def fit_similarity(source: Any, target: Any) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale ``s``, rotation ``R`` (3, 3) and shift ``t`` (3,) that minimise ``sum |s R source + t - target|^2``.
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
+    1991, eqs. (40) to (43). Float64 throughout.
+
+    Raises:
+        ValueError: for fewer than three points, or points on one line.
+    """
+    source = check_array("source", source, (None, 3))
+    target = check_array("target", target, (len(source), 3))
+    if len(source) < 3:
+        raise ValueError(f"source: got {len(source)} points, expected at least 3")
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    for name, centred in (("source", a), ("target", b)):
+        spread = np.linalg.svd(centred, compute_uv=False)
+        if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:
+            raise ValueError(f"{name}: the points lie on one line (or coincide), so that the rotation is not fixed")
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / (a**2).sum())
+    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+
+
+def align_to_known(sparse: SparseModel, known_positions: Mapping[str, Any]) -> SparseModel:
+    """``sparse`` in metres and world axes, by the similarity that best meets surveyed camera positions.
+
+    Args:
+        known_positions: photo name (or its file name, where that is unique) to camera position (3,) [m].
+
+    Returns:
+        The transformed model; its ``scale_rms_m`` is the rms distance left at the surveyed cameras [m].
+
+    Raises:
+        ValueError: for fewer than three positions, positions on one line, a name that is no photo, or a surveyed
+            photo that could not be posed.
+    """
+    if len(known_positions) < 3:
+        raise ValueError(
+            f"known_positions: got {len(known_positions)}, expected at least 3 camera positions that are not on a line"
+        )
+    names = match_names("known_positions", known_positions, (*sparse.cameras, *sparse.unposed))
+    lost = [n for n in names if n not in sparse.cameras]
+    usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in sparse.cameras}
+    if len(usable) < 3:
+        raise ValueError(
+            f"known_positions: only {len(usable)} of the surveyed photos were posed, expected at least 3; "
+            f"without pose: {_some(lost)}"
+        )
+    source = np.array([sparse.cameras[n].position for n in usable])
+    target = np.array([check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in usable.items()])
+    try:
+        scale, rotation, shift = fit_similarity(source, target)
+    except ValueError as error:
+        raise ValueError(f"known_positions: {error}") from error
+    rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
+    return replace(_transformed(sparse, scale, rotation, shift), metric=True, scale_rms_m=rms)
+
+
+def match_names(argument: str, wanted: Any, names: Sequence[str]) -> list[str]:
+    """Full photo names of ``wanted``: each is a name, or a file name that only one of ``names`` has.
+
+    Raises:
+        ValueError: naming the entries that are no photo, or that several photos share.
+    """
+    by_file: dict[str, list[str]] = {}
+    for name in names:
+        by_file.setdefault(name.rsplit("/", 1)[-1], []).append(name)
+    found, unknown, shared = [], [], []
+    for key in wanted:
+        key = str(key)
+        if key in names:
+            found.append(key)
+        elif len(by_file.get(Path(key).name, ())) == 1:
+            found.append(by_file[Path(key).name][0])
+        else:
+            (shared if Path(key).name in by_file else unknown).append(key)
+    if unknown:
+        raise ValueError(f"{argument}: no such photo: {_some(unknown)}; photos are named like {_some(list(names), 2)}")
+    if shared:
+        raise ValueError(f"{argument}: several photos have the file name of {_some(shared)}; give the longer name")
+    return found
+
+
+def _transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
+    cameras = {}
+    for name, camera in sparse.cameras.items():
+        pose = np.eye(4)
+        pose[:3, :3] = camera.rotation @ rotation.T
+        pose[:3, 3] = -pose[:3, :3] @ (scale * rotation @ camera.position + shift)
+        cameras[name] = replace(camera, world_to_camera=pose)
+    return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)
+
+
+def _some(items: Sequence[str], limit: int = 5) -> str:
+    more = f" and {len(items) - limit} more" if len(items) > limit else ""
+    return ", ".join(str(i) for i in items[:limit]) + more
+
+
+def _check_photos(named: Mapping[str, Path]) -> None:
+    image = require("PIL.Image", extra="photos")
+    bad, sizes = [], {}
+    for name, path in named.items():
+        try:
+            with image.open(path) as photo:
+                photo.load()
+                sizes[name] = photo.size
+        except (OSError, SyntaxError, ValueError) as error:
+            bad.append(f"{name} ({error})")
+    if bad:
+        raise ValueError(f"photos: {len(bad)} of {len(named)} files do not read as images: {_some(bad)}")
+    common = max(set(sizes.values()), key=list(sizes.values()).count)
+    odd = [f"{n} ({s[0]} x {s[1]})" for n, s in sizes.items() if s != common]
+    if odd:
+        raise ValueError(
+            f"photos: {len(odd)} photos are not {common[0]} x {common[1]} as the others are; one camera with one "
+            f"image size is expected: {_some(odd)}"
+        )
+
+
+@contextmanager
+def _quiet(colmap: ModuleType) -> Iterator[None]:
+    """COLMAP logs to stderr; keep only its fatal messages, and put the level back afterwards."""
+    before = colmap.logging.minloglevel
+    colmap.logging.minloglevel = int(colmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        colmap.logging.minloglevel = before
+
+
+def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any]) -> None:
+    """Make ``folder`` hold the work for these photos and options: what other photos or options left there goes."""
+    state = {"options": options, "photos": {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in named.items()}}
+    stamp = folder / "photos.json"
+    if stamp.is_file() and json.loads(stamp.read_text()) == state:
+        return
+    if folder.is_dir():
+        for part in ("photos.json", "features.db", "matches.db", "working.db", "pairs.txt"):
+            (folder / part).unlink(missing_ok=True)
+        for part in ("model", "mapping", "images"):
+            shutil.rmtree(folder / part, ignore_errors=True)
+    images = folder / "images"
+    for name, path in named.items():
+        link = images / name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            link.symlink_to(path)
+        except OSError:  # a file system without links
+            shutil.copyfile(path, link)
+    temporary = stamp.with_suffix(".tmp")
+    temporary.write_text(json.dumps(state))
+    os.replace(temporary, stamp)
+
+
+def _fresh_copy(source: Path | None, target: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        Path(f"{target}{suffix}").unlink(missing_ok=True)
+    if source is not None:
+        shutil.copyfile(source, target)
+
+
+def _settle(working: Path, final: Path) -> None:
+    """Move a finished database into place, with nothing left in SQLite's write-ahead log."""
+    with closing(sqlite3.connect(working)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        connection.execute("PRAGMA journal_mode=DELETE")
+    os.replace(working, final)
+
+
+def _extract(
+    colmap: ModuleType, folder: Path, names: list[str], max_features: int, camera_model: str, report: Progress
+) -> None:
+    if (folder / "features.db").is_file():
+        return
+    working, images = folder / "working.db", folder / "images"
+    _fresh_copy(None, working)
+    colmap.Database.open(str(working)).close()
+    reader = colmap.ImageReaderOptions(camera_model=camera_model)
+    # Importing first numbers the images by name; extraction alone numbers them as threads finish.
+    colmap.import_images(working, images, colmap.CameraMode.SINGLE, image_names=names, options=reader)
+    reader.existing_camera_id = 1
+    extraction = colmap.FeatureExtractionOptions(use_gpu=False)
+    extraction.sift.max_num_features = max_features
+    for start in range(0, len(names), EXTRACT_BATCH):
+        report("features", start, len(names))
+        colmap.extract_features(
+            working,
+            images,
+            image_names=names[start : start + EXTRACT_BATCH],
+            camera_mode=colmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=colmap.Device.cpu,
+        )
+    report("features", len(names), len(names))
+    _settle(working, folder / "features.db")
+
+
+def _match(colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, report: Progress) -> None:
+    if (folder / "matches.db").is_file():
+        return
+    working, listing = folder / "working.db", folder / "pairs.txt"
+    _fresh_copy(folder / "features.db", working)
+    with colmap.Database.open(str(working)) as database:
+        counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
+        blank = [n for n in names if counts[n] < 8]
+        if len(names) - len(blank) < MIN_PHOTOS:
+            raise ValueError(
+                f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), too "
+                f"few remain to work with: {_some(blank)}"
+            )
+        chosen = list(itertools.combinations(names, 2))
+        if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
+            chosen = _promising_pairs(colmap, database, names)
+    matching = colmap.FeatureMatchingOptions(use_gpu=False)
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    for start in range(0, len(chosen), MATCH_BATCH):
+        report("matching", start, len(chosen))
+        listing.write_text("".join(f"{a} {b}\n" for a, b in chosen[start : start + MATCH_BATCH]))
+        colmap.match_image_pairs(
+            working,
+            matching_options=matching,
+            pairing_options=colmap.ImportedPairingOptions(match_list_path=listing),
+            verification_options=verification,
+            device=colmap.Device.cpu,
+        )
+    listing.unlink(missing_ok=True)
+    report("matching", len(chosen), len(chosen))
+    _settle(working, folder / "matches.db")
+
+
+def _promising_pairs(colmap: ModuleType, database: Any, names: list[str]) -> list[tuple[str, str]]:
+    """Pairs worth matching: each photo with those that share the most of its largest features.
+
+    The largest features of two photos are compared by brute force, one matrix product a pair; a mutual nearest
+    neighbour that passes the ratio test is a vote. Consecutive photos are always kept.
+    """
+    ids = {i.name: i.image_id for i in database.read_all_images()}
+    descriptors = []
+    for name in names:
+        d = np.asarray(database.read_descriptors(ids[name]).data, dtype=np.float32)
+        k = database.read_keypoints(ids[name])  # x, y and the 2x2 shape
+        area = np.abs(k[:, 2] * k[:, 5] - k[:, 3] * k[:, 4])
+        d = d[np.argsort(-area, kind="stable")[:COARSE_FEATURES]]
+        descriptors.append(d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9))
+    votes = np.zeros((len(names), len(names)))
+    for i, j in itertools.combinations(range(len(names)), 2):
+        if min(len(descriptors[i]), len(descriptors[j])) < 8:
+            continue
+        cosine = descriptors[i] @ descriptors[j].T
+        best_j, best_i = cosine.argmax(axis=1), cosine.argmax(axis=0)
+        two = np.partition(cosine, -2, axis=1)[:, -2:]
+        distinct = (1 - two[:, 1]) < 0.64 * (1 - two[:, 0])  # Lowe's ratio 0.8, on squared distances
+        votes[i, j] = votes[j, i] = np.count_nonzero(distinct & (best_i[best_j] == np.arange(len(best_j))))
+    keep = np.zeros(votes.shape, dtype=bool)
+    order = np.argsort(-votes, axis=1, kind="stable")[:, :COARSE_NEIGHBOURS]
+    np.put_along_axis(keep, order, True, axis=1)
+    keep &= votes >= 4
+    step = np.arange(len(names) - 1)
+    keep[step, step + 1] = True
+    keep |= keep.T
+    return [(names[i], names[j]) for i, j in itertools.combinations(range(len(names)), 2) if keep[i, j]]
+
+
+def _map(colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int, report: Progress) -> None:
+    working, output = folder / "working.db", folder / "mapping"
+    _fresh_copy(folder / "matches.db", working)
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    options = colmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.num_threads = 1  # sums in a fixed order: the same poses every time
+    options.min_model_size = MIN_PHOTOS
+    posed = itertools.count(2)
+    report("mapping", 0, len(named))
+    models = colmap.incremental_mapping(
+        working,
+        folder / "images",
+        output,
+        options,
+        next_image_callback=lambda: report("mapping", min(next(posed), len(named)), len(named)),
+    )
+    if not models:
+        with colmap.Database.open(str(working)) as database:
+            linked = database.num_verified_image_pairs()
+        raise ValueError(
+            f"photos: too few matches between the {len(named)} photos to pose any ({linked} pairs of photos match); "
+            f"expected photos of one textured place that overlap by half or more: {_some(list(named))}"
+        )
+    largest, *others = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    partial = folder / "model.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    largest.write_binary(str(partial))
+    (partial / "others.json").write_text(json.dumps([m.num_reg_images() for m in others]))
+    os.replace(partial, folder / "model")
+    shutil.rmtree(output, ignore_errors=True)
+    _fresh_copy(None, working)
+    report("mapping", len(named), len(named))
+
+
+def _sparse_model(model: Any, names: Sequence[str]) -> SparseModel:
+    images = {i.name: i for i in model.images.values() if i.has_pose}
+    cameras = {}
+    for name in sorted(images):
+        image = images[name]
+        lens = model.cameras[image.camera_id]
+        kind = lens.model.name
+        if kind not in CAMERA_MODELS:
+            raise ValueError(
+                f"colmap: camera {image.camera_id} is a {kind}, expected one of {CAMERA_MODELS}; undistort the photos "
+                "first (COLMAP's image_undistorter writes a pinhole model)"
+            )
+        k = lens.calibration_matrix()
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        u, _, vt = np.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = u @ vt
+        cameras[name] = Camera.pinhole(
+            lens.width, lens.height, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2], world_to_camera=pose
+        )
+    position = {images[n].image_id: i for i, n in enumerate(cameras)}
+    points = [model.points3D[i] for i in sorted(model.points3D)]
+    tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
+    length = np.array([len(t) for t in tracks], dtype=np.int64)
+    return SparseModel(
+        cameras=cameras,
+        points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+        colors=np.array([p.color for p in points], dtype=np.float64).reshape(-1, 3) / 255,
+        reprojection_error=np.array([p.error for p in points], dtype=np.float64),
+        track_length=length,
+        track_start=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+        track_camera=np.array([c for t in tracks for c in t], dtype=np.int64),
+        unposed=tuple(n for n in names if n not in cameras),
+    )
