@@ -281,7 +281,7 @@ def mesh_error_map(pictures: dict[str, np.ndarray]) -> Any:
         axes[2].annotate(
             f"asked: {share} % within {limit:g} cm", (limit, share), (limit + 0.4, share - 6), fontsize=9
         )
-    axes[2].set_xlim(0, 12)
+    axes[2].set_xlim(0, 16)
     axes[2].set_ylim(0, 100)
     axes[2].grid(alpha=0.3)
     axes[2].set_xlabel("distance [cm]")
@@ -311,7 +311,7 @@ def floor_plan(pictures: dict[str, np.ndarray]) -> Any:
     ax.autoscale_view()
     ax.set_xlabel("x [m]")
     ax.set_ylabel("y [m]")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=4, fontsize=9, frameon=False)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure
 
 
@@ -361,8 +361,8 @@ def spectrum_rows(
         right.set_title(
             f"{name} - truth, rms {np.sqrt(np.mean((image - truth_db) ** 2)):.1f} dB", fontsize=10
         )
-    figure.colorbar(shown, ax=axes[:, 0], label="path gain [dB]", shrink=0.7)
-    figure.colorbar(wrong, ax=axes[1:, 1], label="difference [dB]", extend="both", shrink=0.7)
+    figure.colorbar(shown, ax=axes[:, 0], label="path gain [dB]", fraction=0.04, pad=0.01)
+    figure.colorbar(wrong, ax=axes[1:, 1], label="difference [dB]", extend="both", fraction=0.04, pad=0.01)
     figure.supxlabel("azimuth [degrees]", fontsize=10)
     figure.supylabel("zenith [degrees]", fontsize=10)
     return figure
