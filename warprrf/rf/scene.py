@@ -1,0 +1,172 @@
+"""A scene for radio propagation: one mesh, a material for each face, and the XML it came from.
+
+The XML is the subset of Mitsuba's scene format that Sionna RT reads: ``bsdf`` elements whose identifiers name radio
+materials (``mat-itu_concrete``, ``itu_concrete`` or ``concrete``), and ``shape`` elements that load a PLY or OBJ file
+each. Neither Mitsuba nor Sionna is needed to read it. The values of the materials stand in a table beside the XML.
+"""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import check_array
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.meshio import read_mesh
+from warprrf.rf.materials import Material, load_materials
+
+
+class Scene:
+    """Surfaces and what they are made of.
+
+    Attributes:
+        mesh: all surfaces, closed solids with outward normals where the scene is a room's furniture.
+        materials: the materials in use.
+        face_material: index into ``materials`` of each face, shape ``(F,)``, int32.
+        face_object: index into ``object_names`` of each face, shape ``(F,)``, int32.
+        object_names: names of the objects.
+        xml_path: the file it was loaded from, or None.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        materials: Sequence[Material],
+        face_material: Any,
+        *,
+        face_object: Any = None,
+        object_names: Sequence[str] = ("object",),
+        xml_path: str | os.PathLike[str] | None = None,
+    ) -> None:
+        if not isinstance(mesh, Mesh):
+            raise TypeError(f"mesh: got {type(mesh).__name__}, expected a warprrf Mesh")
+        faces = len(mesh.faces)
+        if face_object is None:
+            face_object = np.zeros(faces, dtype=np.int32)
+        self.mesh = mesh
+        self.materials = list(materials)
+        self.face_material = check_array("face_material", face_material, (faces,), dtype=np.int32)
+        self.face_object = check_array("face_object", face_object, (faces,), dtype=np.int32)
+        self.object_names = list(object_names)
+        self.xml_path = None if xml_path is None else Path(xml_path)
+        for name, index, table in (
+            ("face_material", self.face_material, self.materials),
+            ("face_object", self.face_object, self.object_names),
+        ):
+            if faces and (index.min() < 0 or index.max() >= len(table)):
+                raise ValueError(
+                    f"{name}: got indices {index.min()} to {index.max()}, expected 0 to {len(table) - 1}"
+                )
+
+    @classmethod
+    def load(cls, xml: str | os.PathLike[str], *, materials: str | os.PathLike[str] | None = None) -> Scene:
+        """Read a scene.
+
+        Args:
+            xml: the scene file.
+            materials: table of materials; ``materials.json`` beside ``xml`` by default.
+
+        Raises:
+            FileNotFoundError: if the XML, a mesh or the table is missing.
+            ValueError: if the XML cannot be parsed, uses what we don't read, or names a material without an entry.
+        """
+        xml = Path(xml)
+        if not xml.is_file():
+            raise FileNotFoundError(f"xml: there is no scene file {xml}")
+        table = load_materials(xml.parent / "materials.json" if materials is None else materials)
+        try:
+            root = ElementTree.parse(xml).getroot()
+        except ElementTree.ParseError as error:
+            raise ValueError(f"xml: {xml} is not well-formed: {error}") from error
+        shapes = root.findall("shape")
+        if not shapes:
+            raise ValueError(f"xml: {xml} holds no shapes")
+        vertices, faces, names, used = [], [], [], []
+        start = 0
+        for shape in shapes:
+            name = shape.get("id") or f"shape_{len(names)}"
+            material = _material_name(shape, name, xml)
+            if material not in table:
+                raise ValueError(
+                    f"xml: object {name!r} of {xml} is made of {material!r}, which the table of materials lacks; "
+                    f"it has {', '.join(sorted(table))}"
+                )
+            part = read_mesh(_mesh_path(shape, name, xml))
+            vertices.append(part.vertices)
+            faces.append(part.faces + start)
+            start += len(part.vertices)
+            names.append(name)
+            used.append(material)
+        order = list(dict.fromkeys(used))
+        counts = [len(f) for f in faces]
+        return cls(
+            Mesh(np.concatenate(vertices), np.concatenate(faces)),
+            [table[name] for name in order],
+            np.repeat([order.index(name) for name in used], counts),
+            face_object=np.repeat(np.arange(len(names)), counts),
+            object_names=names,
+            xml_path=xml,
+        )
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lower and upper corner of the mesh [m], shape ``(2, 3)``."""
+        return np.stack([self.mesh.vertices.min(axis=0), self.mesh.vertices.max(axis=0)])
+
+    def object_faces(self, name: str) -> np.ndarray:
+        """Indices of the faces of one object; ValueError for an unknown name."""
+        if name not in self.object_names:
+            raise ValueError(f"name: got {name!r}, expected one of {', '.join(self.object_names)}")
+        return np.flatnonzero(self.face_object == self.object_names.index(name))
+
+    def is_free(self, points: Any, *, clearance_m: float = 0.0, device: Any = None) -> np.ndarray:
+        """Whether points lie in the air of a room of closed solids, shape ``(N,)``, bool.
+
+        A point is in the air if rays from it in three directions all first meet a surface from its outer side;
+        ``clearance_m`` asks for that distance [m] from every surface besides.
+        """
+        points = check_array("points", points, (None, 3))
+        free = np.ones(len(points), dtype=bool)
+        for direction in ((0.021, 0.013, 1.0), (0.017, -0.011, -1.0), (1.0, 0.37, 0.113)):
+            unit = np.asarray(direction) / np.linalg.norm(direction)
+            hit = self.mesh.cast(points, np.tile(unit, (len(points), 1)), device=device)
+            outer = np.where(hit.face >= 0, self.mesh.face_normals[hit.face] @ unit < 0, False)
+            free &= outer
+        if clearance_m > 0 and free.any():
+            near = free.copy()
+            near[free] = self.mesh.distance(points[free], device=device) >= clearance_m
+            free = near
+        return free
+
+
+def _material_name(shape: ElementTree.Element, name: str, xml: Path) -> str:
+    """The radio material of a shape: its bsdf's identifier without ``mat-`` and ``itu_``."""
+    element = next((r for r in shape.findall("ref")), None)
+    if element is None:
+        element = shape.find("bsdf")
+    identifier = None if element is None else element.get("id")
+    if identifier is None:
+        raise ValueError(f"xml: object {name!r} of {xml} names no material (a <ref id=...> to a bsdf)")
+    identifier = identifier.removeprefix("mat-")
+    return identifier[4:] if identifier.startswith(("itu_", "itu-")) else identifier
+
+
+def _mesh_path(shape: ElementTree.Element, name: str, xml: Path) -> Path:
+    if shape.get("type") not in ("ply", "obj"):
+        raise ValueError(
+            f"xml: object {name!r} of {xml} is a {shape.get('type')!r}, expected 'ply' or 'obj'; export it as a mesh"
+        )
+    if shape.find("transform") is not None:
+        raise ValueError(f"xml: object {name!r} of {xml} has a transform; apply it to the mesh before")
+    filename = next((s.get("value") for s in shape.findall("string") if s.get("name") == "filename"), None)
+    if filename is None:
+        raise ValueError(f"xml: object {name!r} of {xml} names no mesh file")
+    path = xml.parent / filename
+    if not path.is_file():
+        raise FileNotFoundError(f"xml: object {name!r} of {xml} needs the mesh {path}, which is missing")
+    return path
