@@ -1,0 +1,259 @@
+"""What a stranger meets first: a light import, the public names, a wheel that stands alone, extras that are named."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+
+# Each of these lives inside one module of ours, which imports it when called.
+WRAPPED = ("open3d", "pycolmap", "trimesh", "sionna", "mitsuba")
+HEAVY = (
+    *WRAPPED,
+    "torch",
+    "drjit",
+    "matplotlib",
+    "xarray",
+    "h5py",
+    "scipy",
+    "pandas",
+    "PIL",
+    "skimage",
+    "tqdm",
+)
+
+# The public names that notebooks and outside checks rely on, and the members that they use.
+PUBLIC = {
+    "Camera": ("pinhole", "spherical"),
+    "Gaussians": ("save_ply", "load_ply"),
+    "Mesh": ("cast", "visible"),
+    "RadioField": ("fit", "save", "load", "spectrum", "paths"),
+    "Reconstruction": ("from_files", "save", "load"),
+    "Scene": ("load",),
+    "SpectrumDataset": ("load", "save", "split", "export_exr", "import_exr"),
+    "reconstruct": (),
+    "render": (),
+    "simulate": (),
+    "trace_paths": (),
+}
+
+IMPORT_NAMES = {
+    "sionna": "sionna-rt",
+    "skimage": "scikit-image",
+    "PIL": "pillow",
+    "drjit": "sionna-rt",
+    "mitsuba": "sionna-rt",
+}
+
+
+def python(
+    code: str, interpreter: str = sys.executable, **options: object
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([interpreter, "-c", code], capture_output=True, text=True, timeout=300, **options)  # type: ignore[call-overload]
+
+
+def test_import_loads_no_heavy_package() -> None:
+    done = python(f"import sys, warprrf; print([m for m in {HEAVY!r} if m in sys.modules])", cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_public_name_exists_with_its_members(name: str) -> None:
+    import warprrf
+
+    value = getattr(warprrf, name)
+    assert name in dir(warprrf)
+    assert [member for member in PUBLIC[name] if not hasattr(value, member)] == []
+
+
+def test_unknown_name_is_an_attribute_error() -> None:
+    import warprrf
+
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        warprrf.no_such_thing  # noqa: B018
+
+
+def test_version_is_stated_once() -> None:
+    import warprrf
+
+    assert warprrf.__version__ == PROJECT["version"]
+
+
+def _imports(file: Path) -> set[str]:
+    """Top-level packages that a file imports anywhere, `require("package", ...)` included."""
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            found.add(node.module.split(".")[0])
+        elif (
+            isinstance(node, ast.Call)
+            and getattr(node.func, "id", getattr(node.func, "attr", "")) == "require"
+        ):
+            if node.args and isinstance(node.args[0], ast.Constant):
+                found.add(str(node.args[0].value).split(".")[0])
+    return found
+
+
+def _sources() -> list[Path]:
+    return sorted((ROOT / "warprrf").rglob("*.py"))
+
+
+@pytest.mark.parametrize("package", WRAPPED)
+def test_heavy_package_is_wrapped_by_few_modules(package: str) -> None:
+    """One module of the library wraps each; `bench` may build its scene and photos with a second one."""
+    users = [f.relative_to(ROOT / "warprrf").as_posix() for f in _sources() if package in _imports(f)]
+    library = [user for user in users if not user.startswith("bench/")]
+    assert len(library) <= 1, users
+
+
+def test_required_extras_exist_and_bring_the_package() -> None:
+    """Every `require(package, extra=...)` names an extra that lists the distribution of that package."""
+    wrong = []
+    for file in _sources():
+        for node in ast.walk(ast.parse(file.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            if getattr(node.func, "id", getattr(node.func, "attr", "")) != "require" or not node.args:
+                continue
+            extra = next(
+                (k.value for k in node.keywords if k.arg == "extra"),
+                node.args[1] if len(node.args) > 1 else None,
+            )
+            if not isinstance(node.args[0], ast.Constant) or not isinstance(extra, ast.Constant):
+                continue
+            package = str(node.args[0].value).split(".")[0]
+            listed = {canonicalize_name(Requirement(r).name) for r in EXTRAS.get(str(extra.value), ())}
+            if canonicalize_name(IMPORT_NAMES.get(package, package)) not in listed:
+                wrong.append(f"{file.name}:{node.lineno}: {package} is not in the extra {extra.value}")
+    assert wrong == []
+
+
+def test_constraints_pin_every_requirement_exactly() -> None:
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and line[0] != "#"]
+    pinned = {}
+    for line in lines:
+        requirement = Requirement(line)
+        assert re.fullmatch(r"==[\w.+!]+", str(requirement.specifier)), line
+        pinned[canonicalize_name(requirement.name)] = str(requirement.specifier)[2:]
+    wanted = [Requirement(r) for group in (PROJECT["dependencies"], *EXTRAS.values()) for r in group]
+    direct = {canonicalize_name(r.name): r.specifier for r in wanted if r.name != "warprrf"}
+    assert sorted(set(direct) - set(pinned)) == []
+    assert [name for name, allowed in direct.items() if not allowed.contains(pinned[name])] == []
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("hatchling")
+    folder = tmp_path_factory.mktemp("wheel")
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "wheel",
+            "-q",
+            "--no-deps",
+            "--no-build-isolation",
+            "-w",
+            str(folder),
+            str(ROOT),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return next(folder.glob("warprrf-*.whl"))
+
+
+def test_wheel_is_typed_licensed_and_holds_only_the_package(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "warprrf/py.typed" in names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"warprrf"}
+    assert wheel.stat().st_size < 2e6
+
+
+def _core_files() -> list[Path]:
+    """Top-level files and folders of the core dependencies, theirs included, in this environment."""
+    todo, seen = [Requirement(r) for r in PROJECT["dependencies"]], set()
+    found: set[Path] = set()
+    while todo:
+        name = canonicalize_name(todo.pop().name)
+        if name in seen:
+            continue
+        seen.add(name)
+        distribution = metadata.distribution(name)
+        root = Path(str(distribution.locate_file("")))
+        found |= {
+            root / f.parts[0] for f in distribution.files or () if f.parts[0] not in ("..", "__pycache__")
+        }
+        for line in distribution.requires or ():
+            requirement = Requirement(line)
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                todo.append(requirement)
+    return sorted(found)
+
+
+def test_wheel_works_in_a_fresh_environment_without_extras(wheel: Path, tmp_path: Path) -> None:
+    """A new environment gets the wheel and the core dependencies (linked, not downloaded), and no extra."""
+    fresh, core = tmp_path / "venv", tmp_path / "core"
+    subprocess.run([sys.executable, "-m", "venv", str(fresh)], check=True, timeout=300)
+    interpreter = str(fresh / "bin" / "python")
+    subprocess.run(
+        [interpreter, "-m", "pip", "install", "-q", "--no-deps", "--no-index", str(wheel)],
+        check=True,
+        timeout=300,
+    )
+    core.mkdir()
+    for source in _core_files():
+        (core / source.name).symlink_to(source)
+    purelib = python(
+        "import sysconfig; print(sysconfig.get_path('purelib'))", interpreter, cwd=tmp_path
+    ).stdout.strip()
+    (Path(purelib) / "core.pth").write_text(f"{core}\n")
+
+    hidden = python(
+        f"import importlib.util as u; print([m for m in {WRAPPED!r} if u.find_spec(m)])",
+        interpreter,
+        cwd=tmp_path,
+    )
+    assert hidden.stdout.strip() == "[]", hidden.stderr
+    done = python(
+        f"import warprrf as wr; [getattr(wr, name) for name in {sorted(PUBLIC)!r}]; print(wr.__file__)",
+        interpreter,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    assert str(fresh) in done.stdout
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for index in range(4):
+        (photos / f"{index}.jpg").write_bytes(b"")
+    done = python(
+        f"import warprrf as wr; wr.reconstruct({str(photos)!r}, workspace={str(tmp_path / 'w')!r})",
+        interpreter,
+        cwd=tmp_path,
+    )
+    assert done.returncode != 0
+    assert 'ImportError: pycolmap is not installed: pip install "warprrf[photos]"' in done.stderr
+    done = subprocess.run(
+        [str(fresh / "bin" / "warprrf"), "--version"], capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.strip() == f"warprrf {PROJECT['version']}", done.stderr
