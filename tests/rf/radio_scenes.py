@@ -1,0 +1,67 @@
+"""Small radio scenes for tests: what propagation asks of a scene and of a material, and nothing else."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh
+
+EPSILON_0 = 8.8541878128e-12
+
+
+@dataclass(frozen=True)
+class SlabMaterial:
+    name: str = "slab"
+    relative_permittivity: float = 5.0
+    conductivity: float = 0.5
+    thickness_m: float = 0.1
+    scattering: float = 0.0
+    pattern: str = "lambertian"
+    alpha_r: int = 1
+
+    def permittivity(self, frequency_hz):
+        return self.relative_permittivity - 1j * self.conductivity / (2 * np.pi * frequency_hz * EPSILON_0)
+
+    def scattering_coefficient(self, frequency_hz):
+        return self.scattering
+
+
+METAL = SlabMaterial("metal", 1.0, 1e7, 0.1)
+
+
+@dataclass(frozen=True)
+class RadioScene:
+    mesh: Mesh
+    face_material: np.ndarray
+    materials: list
+    face_object: np.ndarray | None = None
+    object_names: tuple = ()
+    xml_path: object = None
+
+    @property
+    def bounds(self):
+        return self.mesh.bounds
+
+
+def box_mesh(low, high, inward=False):
+    """Vertices and faces of a closed box, 6 sides of 2 faces."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    return low + corners * (high - low), faces[:, ::-1] if inward else faces
+
+
+def joined(*parts):
+    """One mesh of several (vertices, faces), and the part each face came from."""
+    shift = np.cumsum([0] + [len(v) for v, _ in parts])
+    mesh = Mesh(
+        np.concatenate([v for v, _ in parts]), np.concatenate([f + s for (_, f), s in zip(parts, shift)])
+    )
+    return mesh, np.repeat(np.arange(len(parts)), [len(f) for _, f in parts])
+
+
+def square(half, z=0.0):
+    """A horizontal square sheet, normal up."""
+    v = [[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]
+    return np.array(v, float), np.array([[0, 1, 2], [0, 2, 3]])

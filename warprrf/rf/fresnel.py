@@ -1,0 +1,140 @@
+"""Reflection from a slab and diffuse scattering lobes, as facts of the surface alone (no geometry, no distances).
+
+Reflection: ITU-R P.2040-4, section 2.2.2, the single-layer slab in vacuum, in float64. Scattering lobes: Degli-Esposti
+et al., "Measurement and modelling of scattering from buildings", IEEE Trans. AP 55 (2007), normalised so that a lobe
+integrates to one over the hemisphere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh
+
+SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
+LAMBERTIAN = 0
+"""Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""
+
+
+class RadioMaterial(Protocol):
+    """What propagation needs to know of a material."""
+
+    name: str
+    thickness_m: float
+    pattern: str
+    alpha_r: Any
+
+    def permittivity(self, frequency_hz: float) -> complex:
+        """Relative permittivity, with a negative imaginary part for losses."""
+        ...
+
+    def scattering_coefficient(self, frequency_hz: float) -> float:
+        """Scattering coefficient S in [0, 1]."""
+        ...
+
+
+@dataclass(frozen=True)
+class SurfaceTable:
+    """Radio properties per material at one frequency, as arrays.
+
+    Attributes:
+        permittivity: Complex relative permittivity, shape ``(M,)``.
+        thickness_m: Slab thickness [m], shape ``(M,)``.
+        scattering: Scattering coefficient S, shape ``(M,)``.
+        alpha_r: Exponent of the directive lobe, shape ``(M,)``, int32; 0 for a Lambertian one.
+    """
+
+    permittivity: np.ndarray
+    thickness_m: np.ndarray
+    scattering: np.ndarray
+    alpha_r: np.ndarray
+
+
+def surface_table(materials: list[Any], frequency_hz: float) -> SurfaceTable:
+    """The table of ``materials`` at ``frequency_hz``.
+
+    Raises:
+        ValueError: if the frequency lies outside a material's band, or a lobe is not known.
+    """
+    alpha = []
+    for m in materials:
+        if m.pattern not in ("lambertian", "directive"):
+            raise ValueError(
+                f"material {m.name!r}: got pattern {m.pattern!r}, expected 'lambertian' or 'directive'"
+            )
+        alpha.append(LAMBERTIAN if m.pattern == "lambertian" else int(m.alpha_r))
+        if m.pattern == "directive" and alpha[-1] < 1:
+            raise ValueError(
+                f"material {m.name!r}: got alpha_r {m.alpha_r!r}, expected a whole number of at least 1"
+            )
+    return SurfaceTable(
+        permittivity=np.array([complex(m.permittivity(frequency_hz)) for m in materials]),
+        thickness_m=np.array([float(m.thickness_m) for m in materials]),
+        scattering=np.array([float(m.scattering_coefficient(frequency_hz)) for m in materials]),
+        alpha_r=np.array(alpha, dtype=np.int32),
+    )
+
+
+def slab_reflection(
+    cos_incidence: Any, permittivity: Any, thickness_m: Any, wavelength_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reflection coefficients of a slab: field across (TE) and in (TM) the plane of incidence, complex.
+
+    Source: ITU-R P.2040-4, eqs. (37a), (37b), (43a), (44). A perfect conductor gives -1 and +1.
+    """
+    cos = np.asarray(cos_incidence, dtype=np.float64)
+    eta = np.asarray(permittivity, dtype=np.complex128)
+    root = np.sqrt(eta - (1.0 - cos**2))
+    te = (cos - root) / (cos + root)
+    tm = (eta * cos - root) / (eta * cos + root)
+    q = 2.0 * np.pi * np.asarray(thickness_m) / wavelength_m * root  # eq. (44)
+    echo = np.exp(-2j * q)
+    return te * (1.0 - echo) / (1.0 - te**2 * echo), tm * (1.0 - echo) / (1.0 - tm**2 * echo)  # eq. (43a)
+
+
+def lobe(alpha_r: int, cos_incidence: Any, cos_scatter: Any, cos_to_mirror: Any) -> np.ndarray:
+    """Scattering lobe f_s [1/sr]: Lambertian for ``alpha_r`` 0, else ((1 + cos psi) / 2)^alpha_r, normalised.
+
+    Args:
+        cos_incidence: Cosine of the incidence angle.
+        cos_scatter: Cosine of the scattering angle.
+        cos_to_mirror: Cosine of the angle psi between the scattered and the mirror direction.
+    """
+    if alpha_r == LAMBERTIAN:
+        return np.asarray(cos_scatter) / np.pi
+    return (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r / lobe_norm(alpha_r, cos_incidence)
+
+
+def lobe_norm(alpha_r: int, cos_incidence: Any) -> np.ndarray:
+    """Integral of ((1 + cos psi) / 2)^alpha_r over the hemisphere [sr]. Degli-Esposti et al. (2007), eqs. (11)-(14)."""
+    cos = np.asarray(cos_incidence, dtype=np.float64)
+    sin_sq = 1.0 - cos**2
+    binomial, term, series, total = 1.0, np.ones_like(cos), np.zeros_like(cos), np.zeros_like(cos)
+    for j in range(alpha_r + 1):
+        if j % 2 == 0:
+            total = total + binomial * 2.0 * np.pi / (j + 1)
+        else:
+            # One more term of sum_w C(2w, w) (sin theta_i)^(2w) / 4^w.
+            series = series + term
+            w = (j - 1) // 2
+            term = term * sin_sq * (2 * w + 1) / (2 * w + 2)
+            total = total + binomial * 2.0 * np.pi / (j + 1) * cos * series
+        binomial = binomial * (alpha_r - j) / (j + 1)
+    return total / 2.0**alpha_r
+
+
+def as_mesh(mesh_or_scene: Any) -> Mesh:
+    """The mesh of a scene, or the mesh itself.
+
+    Raises:
+        TypeError: if it is neither.
+    """
+    if isinstance(mesh_or_scene, Mesh):
+        return mesh_or_scene
+    mesh = getattr(mesh_or_scene, "mesh", None)
+    if isinstance(mesh, Mesh):
+        return mesh
+    raise TypeError(f"mesh_or_scene: got {type(mesh_or_scene).__name__}, expected a Mesh or a Scene")
