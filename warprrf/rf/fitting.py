@@ -1,0 +1,360 @@
+"""Fitting per-Gaussian harmonics to spectra on cached blending weights, with Adam and the adjoint of ``kernels.field``.
+
+A :class:`Problem` holds the weights of the training receivers, sorted once into fixed batches; :func:`fit_layer` fits
+one set of 16 coefficients per Gaussian (a *layer*): the gain against dB images, or a plainly blended channel (delay,
+angle of departure) against its own images. No rasteriser runs here. Each sum has one owner, so the result depends on
+the seed and not on the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.device import Progress
+from warprrf.kernels import field as _kernels
+from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
+from warprrf.rf.transport import Transport
+
+KINDS = {"exp": _kernels.EXPONENTIAL, "linear": _kernels.CLAMPED, "signed": _kernels.SIGNED}
+ADAM = (0.9, 0.999, 1e-15)  # decays and epsilon as RF-3DGS publishes them
+FINAL_RATE = 0.05  # the learning rate falls exponentially to this share of its first value
+
+
+@dataclass(frozen=True)
+class Rates:
+    """How fast coefficients learn and how firmly they stay where the data says little.
+
+    Attributes:
+        constant: Adam rate of the degree-0 coefficient [nepers of gain, or units of the channel].
+        directional: rate of the others. (RF-3DGS' 2.5e-3 and 1.25e-4 are for 8-bit colours over 10 000 steps; a gain
+            spans 14 nepers and is fitted in a few hundred.)
+        ridge: pull towards the initial value, in pixels: how many pixels' L1 pull it balances at a deviation of one.
+            A Gaussian that many pixels see hardly feels it, a rarely seen one stays near its initial value.
+        ridge_directional: the same for the other coefficients.
+    """
+
+    constant: float = 0.2
+    directional: float = 0.1
+    ridge: float = 0.02
+    ridge_directional: float = 0.1
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a layer is fitted to, for all receivers of a problem.
+
+    Attributes:
+        image: values in units of the loss, shape ``(R, H, W)``: the dB image mapped by the range, or a channel.
+        factor: what multiplies a pixel's blended gain (solid angle and spreading loss), shape ``(R, H, W)``; None for
+            a channel.
+        extra: power added to a pixel [linear], shape ``(R, H, W)``; None for zero.
+        mask: one where a channel's pixel counts, shape ``(R, H, W)``; None for a gain.
+        floor, low, high: N0 [linear, in the units of ``factor``] and the range of the dB image [dB].
+        ssim_share: weight of 1 - SSIM in the loss, the rest is L1; gains only.
+    """
+
+    image: np.ndarray
+    factor: np.ndarray | None = None
+    extra: np.ndarray | None = None
+    mask: np.ndarray | None = None
+    floor: float = 1.0
+    low: float = 0.0
+    high: float = 1.0
+    ssim_share: float = 0.2
+
+
+@dataclass
+class State:
+    """Where an optimisation stands: enough to go on and end with the same bits.
+
+    Attributes:
+        step: steps done.
+        coefficients, first, second: coefficients and Adam's moments, shape ``(G, 16)``.
+        losses: loss of each step.
+    """
+
+    step: int
+    coefficients: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    losses: list[float] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """One batch's pairs on the device, Gaussian by Gaussian; see ``kernels.field``."""
+
+    receivers: np.ndarray
+    rows: int
+    row_gaussian: wp.array
+    row_start: wp.array
+    pair_pixel: wp.array
+    pair_direction: wp.array
+    pair_weight: wp.array
+    pixel_start: wp.array
+    pair_of_pixel: wp.array
+
+
+class Problem:
+    """Blending weights of the training receivers, in batches on the device.
+
+    Args:
+        transport: weights of the training receivers.
+        batch: receivers per optimiser step.
+        seed: deals receivers into batches and orders them.
+        device: where to fit.
+        precision: ``np.float32``, or ``np.float64`` for gradient checks.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        *,
+        batch: int = 10,
+        seed: int = 0,
+        device: Any = None,
+        precision: Any = np.float32,
+    ) -> None:
+        if not isinstance(batch, int | np.integer) or batch < 1:
+            raise ValueError(f"batch: got {batch!r}, expected a whole number of receivers of at least 1")
+        self.transport = transport
+        self.seed = int(seed)
+        self.device = _device.resolve(device)
+        self.precision = np.dtype(precision)
+        self.real = wp.float64 if self.precision == np.float64 else wp.float32
+        self.kernels = _kernels.build(self.real)
+        self.seen = np.unique(transport.gaussian)
+        self.pixels = transport.shape[0] * transport.shape[1]
+        count = len(transport.receivers)
+        order = np.random.default_rng([self.seed, 0]).permutation(count)
+        parts = np.array_split(order, max(1, round(count / batch)))
+        self.batches = [self._batch(np.sort(part)) for part in parts]
+        self.basis = harmonics(transport.shape, self.real, self.device)
+        self.window = self.upload(_kernels.WINDOW)
+
+    def upload(self, values: np.ndarray, dtype: Any = None) -> wp.array:
+        """``values`` on the device, in the problem's precision unless ``dtype`` says otherwise."""
+        return wp.array(
+            np.ascontiguousarray(values, dtype=self.precision), dtype=dtype or self.real, device=self.device
+        )
+
+    def launch(self, kernel: Any, dim: int, *inputs: Any) -> None:
+        """Launch one of the problem's kernels on its device."""
+        _device.launch(kernel, dim, inputs, device=self.device)
+
+    def batch_at(self, step: int) -> int:
+        """Which batch a step uses: all of them once an epoch, in an order that seed and epoch fix."""
+        epoch, place = divmod(step, len(self.batches))
+        return int(np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.batches))[place])
+
+    def _batch(self, receivers: np.ndarray) -> Batch:
+        part = self.transport.subset(receivers)
+        pixel = np.repeat(np.arange(len(part.start) - 1, dtype=np.int32), np.diff(part.start))
+        order = np.argsort(part.gaussian, kind="stable")
+        gaussian = part.gaussian[order]
+        first = (
+            np.flatnonzero(np.concatenate([[True], gaussian[1:] != gaussian[:-1]])) if len(gaussian) else [0]
+        )
+        place = np.empty(len(order), dtype=np.int32)
+        place[order] = np.arange(len(order), dtype=np.int32)
+
+        def integers(values: Any) -> wp.array:
+            return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=self.device)
+
+        return Batch(
+            receivers=receivers,
+            rows=len(first) if len(gaussian) else 0,
+            row_gaussian=integers(np.searchsorted(self.seen, gaussian[first]) if len(gaussian) else []),
+            row_start=integers([*first, len(gaussian)]),
+            pair_pixel=integers(pixel[order]),
+            pair_direction=integers(pixel[order] % self.pixels),
+            pair_weight=self.upload(part.weight[order]),
+            pixel_start=integers(part.start),
+            pair_of_pixel=integers(place),
+        )
+
+
+def harmonics(shape: tuple[int, int], real: Any, device: Any) -> wp.array:
+    """The 16 real harmonics at every pixel's direction, shape ``(H * W,)`` of 16-vectors, on the device."""
+    from warprrf.rf.spectrum import pixel_directions
+
+    kernels = _kernels.build(real)
+    kind = np.float64 if real is wp.float64 else np.float32
+    toward = wp.array(pixel_directions(shape).reshape(-1, 3).astype(kind), dtype=kernels.vec3, device=device)
+    out = wp.zeros(len(toward), dtype=kernels.vec16, device=device)
+    _device.launch(kernels.evaluate_basis, len(toward), [toward, out], device=device)
+    return out
+
+
+class Layer:
+    """Loss and gradient of one layer's coefficients on a :class:`Problem`'s batches."""
+
+    def __init__(self, problem: Problem, target: Target, kind: str) -> None:
+        self.problem, self.target, self.kind = problem, target, KINDS[kind]
+        p, k = problem, problem.kernels
+        shape = (len(p.transport.receivers), p.pixels)
+        self.images = np.asarray(target.image, p.precision).reshape(shape)
+        ones, zeros = np.ones(shape, p.precision), np.zeros(shape, p.precision)
+        factor = ones if target.factor is None else np.asarray(target.factor, p.precision).reshape(shape)
+        extra = zeros if target.extra is None else np.asarray(target.extra, p.precision).reshape(shape)
+        mask = None if target.mask is None else np.asarray(target.mask, p.precision).reshape(shape)
+        self.data = []
+        for batch in p.batches:
+            pick = batch.receivers
+            image = p.upload(self.images[pick].ravel())
+            moments = wp.zeros(len(image), dtype=k.vec3, device=p.device)
+            if mask is None:
+                u = self.images[pick].reshape(-1)
+                wp.copy(moments, p.upload(np.stack([u, u * u, u * u], axis=-1), k.vec3))
+                moments = self._filtered(moments, wp.zeros_like(moments), wp.zeros_like(moments))
+            self.data.append(
+                {
+                    "target": image,
+                    "moments": moments,
+                    "factor": p.upload(factor[pick].ravel()),
+                    "extra": p.upload(extra[pick].ravel()),
+                    "mask": None if mask is None else p.upload(mask[pick].ravel()),
+                    "count": float(len(image)) if mask is None else max(float(mask[pick].sum()), 1.0),
+                }
+            )
+        largest = max(len(d["target"]) for d in self.data)
+        pairs = max(len(b.pair_pixel) for b in p.batches)
+        self.contribution = wp.zeros(pairs, dtype=p.real, device=p.device)
+        self.scalars = [wp.zeros(largest, dtype=p.real, device=p.device) for _ in range(5)]
+        self.vectors = [wp.zeros(largest, dtype=k.vec3, device=p.device) for _ in range(3)]
+        self.gradient = wp.zeros(len(p.seen), dtype=k.vec16, device=p.device)
+
+    def _filtered(
+        self, source: wp.array, between: wp.array, out: wp.array, count: int | None = None
+    ) -> wp.array:
+        p, (height, width) = self.problem, self.problem.transport.shape
+        size = len(source) if count is None else count
+        p.launch(p.kernels.filter_azimuth, size, width, p.window, source, between)
+        p.launch(p.kernels.filter_zenith, size, height, width, p.window, between, out)
+        return out
+
+    def step(self, index: int, coefficients: wp.array, *, need_loss: bool = True) -> float:
+        """Loss of batch ``index``; leaves its gradient in ``self.gradient`` (zero for Gaussians it does not see)."""
+        p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
+        target, size = self.target, len(data["target"])
+        total, image, absolute, score, adjoint = self.scalars
+        p.launch(
+            k.contributions, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_direction,
+            batch.pair_weight, p.basis, coefficients, self.contribution,
+        )  # fmt: skip
+        p.launch(k.pixel_sums, size, batch.pixel_start, batch.pair_of_pixel, self.contribution, total)
+        if data["mask"] is not None:
+            share = p.real(1.0 / data["count"])
+            p.launch(k.absolute_adjoint, size, share, data["mask"], data["target"], total, absolute, adjoint)
+        else:
+            scale = (p.real(target.floor), p.real(target.low), p.real(target.high))
+            moments, between, slopes = self.vectors
+            p.launch(
+                k.to_image, size, data["factor"], data["extra"], *scale, data["target"], total, image, moments
+            )
+            self._filtered(moments, between, slopes, size)
+            p.launch(k.ssim_slopes, size, data["moments"], slopes, score, moments)
+            self._filtered(moments, between, slopes, size)
+            shares = p.real((1 - target.ssim_share) / size), p.real(target.ssim_share / size)
+            p.launch(
+                k.loss_adjoint, size, data["factor"], data["extra"], *scale, *shares, data["target"], total, image,
+                slopes, absolute, adjoint,
+            )  # fmt: skip
+        p.launch(
+            k.coefficient_adjoint, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_pixel,
+            batch.pair_direction, batch.pair_weight, p.basis, self.contribution, adjoint, self.gradient,
+        )  # fmt: skip
+        if not need_loss:
+            return float("nan")
+        error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data["count"]
+        if data["mask"] is not None:
+            return error
+        similarity = float(np.mean(score.numpy()[:size], dtype=np.float64))
+        return (1 - target.ssim_share) * error + target.ssim_share * (1 - similarity)
+
+    def power(self, index: int, coefficients: wp.array) -> np.ndarray:
+        """What the layer predicts for the receivers of batch ``index``: factor times blend plus extra."""
+        self.step(index, coefficients, need_loss=False)
+        data = self.data[index]
+        total = self.scalars[0].numpy()[: len(data["target"])]
+        return data["factor"].numpy() * total + data["extra"].numpy()
+
+
+def fit_layer(
+    problem: Problem,
+    target: Target,
+    kind: str,
+    *,
+    initial: float,
+    steps: int,
+    degree: int = 3,
+    rates: Rates | None = None,
+    state: State | None = None,
+    each: Callable[[State], None] | None = None,
+    stage: str = "fit",
+    progress: Progress | None = None,
+) -> State:
+    """Fit one layer.
+
+    Args:
+        problem: weights and batches.
+        target: what to fit.
+        kind: ``"exp"``, ``"linear"`` (clamped at zero) or ``"signed"``.
+        initial: degree-0 coefficient that every Gaussian starts with.
+        steps: optimiser steps, one batch each.
+        degree: of the harmonics, 0 to 3; coefficients above it stay zero.
+        rates: learning rates and ridge.
+        state: go on from here instead of starting.
+        each: called with the state every 50 steps and after the last.
+        stage, progress: for the progress callback.
+
+    Returns:
+        Final state; coefficients of the Gaussians ``problem.seen``, shape ``(G, 16)``.
+    """
+    rates = rates or Rates()
+    p, k = problem, problem.kernels
+    count = DEGREE_TO_COUNT[degree]
+    active = np.arange(_kernels.COEFFICIENTS) < count
+    start = np.zeros(_kernels.COEFFICIENTS)
+    start[0] = initial
+    rate = np.where(active, rates.directional, 0.0)
+    rate[0] = rates.constant
+    layer = Layer(problem, target, kind)
+    if state is None:
+        table = np.tile(start, (len(p.seen), 1))
+        state = State(0, table, np.zeros_like(table), np.zeros_like(table))
+    coefficients, first, second = (
+        p.upload(a, k.vec16) for a in (state.coefficients, state.first, state.second)
+    )
+    initial_vector = k.vec16(*start.tolist())
+    losses = list(state.losses)
+    decay1, decay2, epsilon = ADAM
+
+    def snapshot(step: int) -> State:
+        return State(step, coefficients.numpy(), first.numpy(), second.numpy(), losses)
+
+    for step in range(state.step, steps):
+        index = p.batch_at(step)
+        losses.append(layer.step(index, coefficients))
+        # one pixel's L1 pull on a neper of gain, so that the ridge counts in pixels
+        pull = np.log10(np.e) * 10 / (target.high - target.low) if target.mask is None else 1.0
+        pull /= layer.data[index]["count"]
+        ridge = np.where(active, rates.ridge_directional, 0.0) * pull
+        ridge[0] = rates.ridge * pull
+        now = rate * FINAL_RATE ** (step / max(steps - 1, 1))
+        p.launch(
+            k.adam, len(p.seen), k.vec16(*now.tolist()), k.vec16(*ridge.tolist()), p.real(decay1), p.real(decay2),
+            p.real(1 / (1 - decay1 ** (step + 1))), p.real(1 / (1 - decay2 ** (step + 1))), p.real(epsilon),
+            initial_vector, layer.gradient, first, second, coefficients,
+        )  # fmt: skip
+        if progress is not None:
+            progress(stage, step + 1, steps)
+        if each is not None and ((step + 1) % 50 == 0 or step + 1 == steps):
+            each(snapshot(step + 1))
+    return snapshot(max(steps, state.step))

@@ -1,0 +1,303 @@
+"""What a receiver sees of the frozen geometry: blending weights, interaction points, path lengths.
+
+Geometry does not change while the radio part is learned, so the weights of a view are computed once, as a sparse
+pixels-by-Gaussians matrix, and every fit and every model reuses them. Radio needs other cutoffs than photos: an image
+60 dB deep shows what an opacity clamp of 0.99 leaks through a wall (-20 dB), so :func:`cutoffs` derives them from the
+data set's range.
+
+An interaction point stands for the whole ray, as in the paper: the centre of the Gaussian that contributes most
+(``"centre"``), the peak of that Gaussian's response on the ray (``"peak"``), the blended mean of all peaks
+(``"expected"``), or the mesh hit (``"mesh"``). Lengths are float64 metres: at 300 GHz a wavelength is 1 mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf.device import Progress, check_array
+from warprrf.geometry.camera import Camera
+from warprrf.geometry.render import Blending, blend_weights
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.spectrum import check_shape, pixel_directions
+
+if TYPE_CHECKING:
+    from warprrf.geometry.gaussians import Gaussians
+    from warprrf.geometry.mesh import Mesh
+
+INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
+TRANSMITTANCE = ("product", "exp")
+TOP_K = 16  # Gaussians kept per pixel
+ALPHA_MIN = 1e-3  # a fainter layer changes what lies behind it by less than 0.005 dB
+MIN_WEIGHT = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
+ON_A_WALL_M = 1e-4  # a receiver nearer to the mesh than this sits in the wall
+
+
+@dataclass(frozen=True)
+class Transport:
+    """Blending weights of the frozen geometry for some receivers, as sparse rows: one row a pixel.
+
+    Attributes:
+        shape: rows and columns of a spectrum.
+        receivers: positions [m], shape ``(R, 3)``.
+        start: where each pixel's pairs begin, shape ``(R * H * W + 1,)`` int64.
+        gaussian: Gaussian of each pair, front to back within a pixel, shape ``(E,)`` int32.
+        weight: blending weight alpha T of each pair, shape ``(E,)`` float32; what top-K left out is shared among the
+            pairs that stayed, so that a pixel's sum is that of all its Gaussians.
+        dominant: Gaussian with the largest weight, shape ``(R, H, W)`` int32, -1 where there is none.
+        expected_range: blended mean of the peak ranges [m], shape ``(R, H, W)`` float32, NaN where there is none.
+        rule: transmittance rule, ``"product"`` or ``"exp"``.
+        dropped: largest and mean weight per pixel that top-K left out.
+    """
+
+    shape: tuple[int, int]
+    receivers: np.ndarray
+    start: np.ndarray
+    gaussian: np.ndarray
+    weight: np.ndarray
+    dominant: np.ndarray
+    expected_range: np.ndarray
+    rule: str
+    dropped: tuple[float, float]
+
+    def subset(self, indices: Sequence[int] | np.ndarray) -> Transport:
+        """The receivers at ``indices``, in that order."""
+        chosen = np.asarray(indices, dtype=np.int64)
+        pixels = self.shape[0] * self.shape[1]
+        pieces = [slice(self.start[r * pixels], self.start[(r + 1) * pixels]) for r in chosen]
+        counts = np.diff(self.start).reshape(len(self.receivers), pixels)[chosen].ravel()
+        return Transport(
+            shape=self.shape,
+            receivers=self.receivers[chosen],
+            start=np.concatenate([[0], np.cumsum(counts)]),
+            gaussian=np.concatenate([self.gaussian[p] for p in pieces]),
+            weight=np.concatenate([self.weight[p] for p in pieces]),
+            dominant=self.dominant[chosen],
+            expected_range=self.expected_range[chosen],
+            rule=self.rule,
+            dropped=self.dropped,
+        )
+
+    def at(self, receiver: Any) -> Transport:
+        """The part of one receiver (3,) [m].
+
+        Raises:
+            ValueError: if it is none of these receivers.
+        """
+        position = check_array("receiver", receiver, (3,))
+        found = np.flatnonzero((self.receivers == position).all(axis=1))
+        if len(found) == 0:
+            raise ValueError(
+                f"receiver: got {position.tolist()}, which is none of the {len(self.receivers)} here"
+            )
+        return self.subset(found[:1])
+
+    @property
+    def pixel_weight(self) -> np.ndarray:
+        """Sum of the weights per pixel, shape ``(R, H, W)`` float64; with the ``exp`` rule it can exceed one."""
+        cumulated = np.concatenate([[0.0], np.cumsum(self.weight, dtype=np.float64)])
+        return np.diff(cumulated[self.start]).reshape(len(self.receivers), *self.shape)
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Single-bounce path geometry per pixel; NaN where the ray meets nothing.
+
+    Attributes:
+        point: interaction point [m], shape ``(..., H, W, 3)``.
+        total: length transmitter - point - receiver [m], shape ``(..., H, W)``.
+        departure: unit direction from the transmitter to the point, shape ``(..., H, W, 3)``.
+    """
+
+    point: np.ndarray
+    total: np.ndarray
+    departure: np.ndarray
+
+    @property
+    def delay_s(self) -> np.ndarray:
+        """Time of flight [s], shape ``(..., H, W)``."""
+        return self.total / SPEED_OF_LIGHT
+
+
+def cutoffs(range_db: Any, rule: str = "product") -> Blending:
+    """How to blend for images that span ``range_db`` (lowest, highest) [dB].
+
+    A wall may leak no more than the floor of the range, and blending stops when no more than that is left. An alpha
+    below :data:`ALPHA_MIN` is left out.
+    """
+    depth = 10 ** (-(float(range_db[1]) - float(range_db[0])) / 10)
+    leak = min(max(depth, 1e-6), 1e-2)
+    return Blending(alpha_min=ALPHA_MIN, alpha_max=1.0 - leak, transmittance_min=leak, rule=rule)
+
+
+def check_receiver(name: str, position: Any, mesh: Mesh | None) -> np.ndarray:
+    """``position`` (3,) or (R, 3) [m] if spectra can be asked for there.
+
+    Raises:
+        ValueError: if it is not finite, outside the mesh's bounds, or on its surface.
+    """
+    array = check_array(name, position)
+    if array.ndim not in (1, 2) or array.shape[-1] != 3 or array.size == 0:
+        raise ValueError(f"{name}: got shape {array.shape}, expected (3,) or (R, 3) with R at least 1")
+    if mesh is None:
+        return array
+    points = np.atleast_2d(array)
+    low, high = mesh.bounds
+    outside = np.flatnonzero(((points < low) | (points > high)).any(axis=-1))
+    if len(outside):
+        raise ValueError(
+            f"{name}: got {points[outside[0]].tolist()}, which lies outside the scene's bounds {low.tolist()} to "
+            f"{high.tolist()} [m]; expected a position inside"
+        )
+    distance = mesh.distance(points)
+    touching = np.flatnonzero(distance < ON_A_WALL_M)
+    if len(touching):
+        raise ValueError(
+            f"{name}: got {points[touching[0]].tolist()}, which lies on a surface ({distance[touching[0]]:.1e} m); "
+            f"move it off by more than {ON_A_WALL_M} m"
+        )
+    return array
+
+
+def transport(
+    gaussians: Gaussians,
+    receivers: Any,
+    shape: tuple[int, int],
+    *,
+    range_db: Any = (-60.0, 0.0),
+    rule: str = "product",
+    top_k: int = TOP_K,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> Transport:
+    """Blending weights of ``gaussians`` for every pixel of every receiver.
+
+    Args:
+        gaussians: the frozen geometry.
+        receivers: positions [m], shape ``(R, 3)``.
+        shape: rows and columns of a spectrum.
+        range_db: lowest and highest value of the data set's dB images: sets :func:`cutoffs`.
+        rule: transmittance: ``"product"`` of (1 - alpha), or the paper's ``"exp"`` of minus the sum of alphas.
+        top_k: Gaussians kept per pixel.
+        device: where blending runs.
+        progress: called once a receiver with the stage ``"transport"``.
+
+    Raises:
+        ValueError: for positions that are not finite, an unknown rule, or a ``top_k`` below 1.
+    """
+    rows, columns = check_shape(shape)
+    positions = check_array("receivers", receivers, (None, 3))
+    if rule not in TRANSMITTANCE:
+        raise ValueError(f"rule: got {rule!r}, expected one of {', '.join(TRANSMITTANCE)}")
+    if not isinstance(top_k, int | np.integer) or top_k < 1:
+        raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    blending = cutoffs(range_db, rule)
+    pieces: list[tuple[np.ndarray, ...]] = []
+    worst, mean = 0.0, 0.0
+    for i, position in enumerate(positions):
+        view = blend_weights(
+            gaussians,
+            Camera.spherical(columns, rows, position=position),
+            top_k=int(top_k),
+            blending=blending,
+            device=device,
+        )
+        weight = np.asarray(view.weight, dtype=np.float64)
+        index = np.asarray(view.index)
+        listed = (index >= 0) & (weight > 0)
+        total = np.sum(weight, axis=-1, where=listed, initial=0.0)
+        dropped = np.asarray(view.dropped, dtype=np.float64)
+        keep = listed & (weight > MIN_WEIGHT * total[..., None])
+        kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
+        scale = np.divide(total + dropped, kept, out=np.zeros_like(kept), where=kept > 0)
+        expected = np.sum(weight * np.asarray(view.range), axis=-1, where=keep, initial=0.0)
+        pieces.append(
+            (
+                np.count_nonzero(keep, axis=-1).ravel(),
+                index[keep],
+                (weight * scale[..., None])[keep].astype(np.float32),
+                np.where(kept > 0, np.asarray(view.dominant), -1).astype(np.int32),
+                np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0).astype(np.float32),
+            )
+        )
+        worst, mean = max(worst, float(dropped.max())), mean + float(dropped.mean()) / len(positions)
+        if progress is not None:
+            progress("transport", i + 1, len(positions))
+    if not pieces:
+        raise ValueError("receivers: got none, expected at least one position")
+    counts, gaussian, weights, dominant, expected_range = zip(*pieces, strict=True)
+    return Transport(
+        shape=(rows, columns),
+        receivers=positions,
+        start=np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64),
+        gaussian=np.concatenate(gaussian).astype(np.int32),
+        weight=np.concatenate(weights),
+        dominant=np.stack(dominant),
+        expected_range=np.stack(expected_range),
+        rule=rule,
+        dropped=(worst, mean),
+    )
+
+
+def interaction_points(
+    seen: Transport, gaussians: Gaussians, kind: str, *, mesh: Mesh | None = None, device: Any = None
+) -> np.ndarray:
+    """Where each pixel's ray is taken to interact [m], shape ``(R, H, W, 3)`` float64; NaN where it meets nothing.
+
+    Args:
+        kind: ``"centre"``, ``"peak"``, ``"expected"`` or ``"mesh"`` (see the module); a ray that misses the mesh falls
+            back on ``"peak"``.
+
+    Raises:
+        ValueError: for an unknown kind, or ``"mesh"`` without a mesh.
+    """
+    if kind not in INTERACTION_POINTS:
+        raise ValueError(f"interaction_point: got {kind!r}, expected one of {', '.join(INTERACTION_POINTS)}")
+    directions = pixel_directions(seen.shape)
+    origins = seen.receivers[:, None, None, :]
+    empty = seen.dominant < 0
+    means = np.asarray(gaussians.means, dtype=np.float64)
+    if kind == "centre":
+        points = means[seen.dominant]
+    elif kind == "expected":
+        points = origins + seen.expected_range.astype(np.float64)[..., None] * directions
+    else:
+        distance = _peak_range(gaussians, seen.dominant, origins, directions)
+        if kind == "mesh":
+            if mesh is None:
+                raise ValueError('interaction_point: got "mesh", but the geometry has no mesh; use "peak"')
+            shape = (len(seen.receivers), *seen.shape, 3)
+            hit = mesh.cast(
+                np.broadcast_to(origins, shape).reshape(-1, 3),
+                np.broadcast_to(directions, shape).reshape(-1, 3),
+                device=device,
+            )
+            met = np.isfinite(hit.t).reshape(shape[:3])
+            distance = np.where(met, hit.t.reshape(shape[:3]), distance)
+            empty = empty & ~met
+        points = origins + distance[..., None] * directions
+    return np.where(empty[..., None], np.nan, points)
+
+
+def path_lengths(points: np.ndarray, transmitter: np.ndarray, receivers: np.ndarray) -> Lengths:
+    """Lengths and directions of departure of single bounces at ``points`` (R, H, W, 3) [m], in float64."""
+    outward = points - transmitter
+    previous = np.linalg.norm(outward, axis=-1)
+    view = np.linalg.norm(points - receivers[:, None, None, :], axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return Lengths(point=points, total=previous + view, departure=outward / previous[..., None])
+
+
+def _peak_range(
+    gaussians: Gaussians, dominant: np.ndarray, origins: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """Range [m] at which the dominant Gaussian's response peaks on the ray: t* = -(o.g) / (g.g), in float64."""
+    scales = np.asarray(gaussians.scales, dtype=np.float64)[dominant]
+    rotations = gaussians.rotations[dominant]
+    means = np.asarray(gaussians.means, dtype=np.float64)[dominant]
+    g = np.einsum("...ji,...j->...i", rotations, np.broadcast_to(directions, means.shape)) / scales
+    o = np.einsum("...ji,...j->...i", rotations, np.broadcast_to(origins, means.shape) - means) / scales
+    return -np.einsum("...i,...i->...", o, g) / np.einsum("...i,...i->...", g, g)
