@@ -18,6 +18,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+if wp.config.log_level == wp.LOG_INFO:  # Warp's default: it would announce devices and every compiled module
+    wp.config.log_level = wp.LOG_ERROR
+
 Progress = Callable[[str, int, int], None]
 """``progress(stage, done, total)``: called by long work; the library itself never prints."""
 
@@ -33,18 +36,11 @@ def resolve(device: Any = None) -> wp.Device:
     Raises:
         ValueError: if Warp has no such device.
     """
-    _quiet()
     try:
         return wp.get_device(device)
     except (ValueError, RuntimeError, TypeError) as error:
         known = ", ".join(str(d) for d in wp.get_devices())
         raise ValueError(f"device: got {device!r}, expected one of {known}") from error
-
-
-@cache
-def _quiet() -> None:
-    wp.config.quiet = True
-    wp.init()
 
 
 @cache

@@ -6,6 +6,7 @@ hand-written adjoint on an active ``wp.Tape``, and is what :mod:`warprrf.geometr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -237,14 +238,18 @@ class Rasterizer:
 
     def colors(self, means: wp.array, sh: wp.array, cam: Camera) -> wp.array:
         """Colours ``max(0, SH + 0.5)`` towards the camera, shape ``(N, C)``; differentiable on an active tape."""
-        kernel = sh_kernels.build(self.real).colors
-        tape = wp._src.context.runtime.tape
-        origin = wp.array([cam.position], dtype=self.vector(3), device=self.device)
+        tape = _active_tape()
         out = wp.zeros((len(means), sh.shape[2]), dtype=self.real, device=self.device, requires_grad=tape is not None)
-        launch(kernel, len(means), [means, sh, origin, out], device=self.device)
+        origin = self.colors_into(means, sh, cam, out)
         if tape is not None:
             tape.record_func(lambda: self.colors_adjoint(means, sh, origin, out), [means, sh, out])
         return out
+
+    def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
+        """Write the colours to ``out``; returns the ray origin that :meth:`colors_adjoint` wants. Records nothing."""
+        origin = wp.array([cam.position], dtype=self.vector(3), device=self.device)
+        launch(sh_kernels.build(self.real).colors, len(means), [means, sh, origin, out], device=self.device)
+        return origin
 
     def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
         """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
@@ -277,15 +282,32 @@ class Rasterizer:
 
     def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
-        device, real = self.device, self.real
-        tape = wp._src.context.runtime.tape
+        tape = _active_tape()
+        image, left, back = self._blend(prepared, features, background, requires_grad=tape is not None)
+        if tape is not None:
+            tape.record_func(
+                lambda: self.blend_adjoint(prepared, features, back, image, left),
+                [*prepared.inputs, features, back, image.features, image.alpha, image.depth],
+            )
+        return image
+
+    def blend_with_adjoint(
+        self, prepared: Prepared, features: wp.array, background: Any = None
+    ) -> tuple[Image, Callable[[], wp.array]]:
+        """Blend without a tape: the image, and the function that adds the inputs' gradients for the image's."""
+        image, left, back = self._blend(prepared, features, background, requires_grad=True)
+        return image, lambda: self.blend_adjoint(prepared, features, back, image, left)
+
+    def _blend(
+        self, prepared: Prepared, features: wp.array, background: Any, *, requires_grad: bool
+    ) -> tuple[Image, wp.array, wp.array]:
+        device, real, grad = self.device, self.real, requires_grad
         shape = (prepared.camera.height, prepared.camera.width)
         channels = features.shape[1]
         if background is None:
             background = wp.zeros(channels, dtype=real, device=device)
         elif not isinstance(background, wp.array):
             background = wp.array(np.asarray(background), dtype=real, device=device)
-        grad = tape is not None
         image = wp.zeros((*shape, channels), dtype=real, device=device, requires_grad=grad)
         alpha = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
         depth_sum, left, peak = (wp.zeros(shape, dtype=real, device=device) for _ in range(3))
@@ -301,13 +323,7 @@ class Rasterizer:
             )  # fmt: skip
         depth = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
         launch(self.kernels.mean_depth, shape[0] * shape[1], [depth_sum, alpha, depth], device=device)
-        out = Image(image, alpha, depth, depth_sum, dominant, peak)
-        if tape is not None:
-            tape.record_func(
-                lambda: self.blend_adjoint(prepared, features, background, out, left),
-                [*prepared.inputs, features, background, image, alpha, depth],
-            )
-        return out
+        return Image(image, alpha, depth, depth_sum, dominant, peak), left, background
 
     def blend_adjoint(
         self, prepared: Prepared, features: wp.array, background: wp.array, out: Image, left: wp.array
@@ -344,6 +360,10 @@ class Rasterizer:
                 device=device,
             )  # fmt: skip
         return seen
+
+
+def _active_tape() -> wp.Tape | None:
+    return wp._src.context.runtime.tape
 
 
 def _gradient(array: wp.array) -> wp.array:

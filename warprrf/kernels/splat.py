@@ -26,7 +26,7 @@ import warp as wp
 TILE = 16  # pixels: tiles are TILE x TILE, strips 1 x TILE
 STRIP = 16
 CHANNELS = 4  # feature channels blended by one launch
-ROW = 32  # numbers per Gaussian and view: see `project`
+ROW = 34  # numbers per Gaussian and view: see `project`
 GRADIENTS = 16  # numbers per Gaussian that `blend_adjoint` sums: Y1 3, Y2 6, opacity 1, features 4, image-plane 1, spare 1
 PINHOLE, SPHERICAL = 0, 1
 PRODUCT, EXPONENTIAL = 0, 1  # transmittance rules: prod(1 - alpha), or the paper's exp(-sum alpha)
@@ -112,7 +112,8 @@ def tile_span(lo: wp.float64, hi: wp.float64, pixels: int):
 
 @wp.func
 def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radius: wp.float64, inside: bool):
-    """Tiles that the ellipsoid ``radius`` can touch: first column, columns, first row, rows. Columns wrap on a sphere.
+    """Tiles that the ellipsoid ``radius`` can touch (first column, columns, first row, rows; columns wrap on a sphere),
+    and the lowest and highest row of pixels, in pixel coordinates.
 
     A plane through the ray origin with normal l touches the ellipsoid where l^T (r^2 cov - m m^T) l = 0.
     """
@@ -121,9 +122,10 @@ def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radiu
     distance = wp.length(m)
     everything = wp.vec4i(0, view.tiles_x, 0, view.tiles_y)
     nothing = wp.vec4i(0, 0, 0, 0)
+    rows = wp.vec2d(wp.float64(-1.0), wp.float64(view.height + 1))
     if inside:
-        return everything
-    cap = wp.float64(1.5707963267948966)
+        return everything, rows
+    cap = wp.float64(3.141592653589793)  # a long ellipsoid close by reaches more than 90 degrees from its mean
     if extent < distance:
         cap = wp.asin(extent / distance)
     if view.kind == wp.static(PINHOLE):
@@ -131,24 +133,26 @@ def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radiu
         c = r2 * (view.rotation * cov * wp.transpose(view.rotation)) - wp.outer(local, local)
         if c[2, 2] < wp.float64(0.0):  # the ellipsoid lies on one side of the camera plane
             if local[2] <= wp.float64(0.0):
-                return nothing
+                return nothing, rows
             x = tangent_interval(c[0, 0], c[0, 2], c[2, 2])
             y = tangent_interval(c[1, 1], c[1, 2], c[2, 2])
             tx = tile_span(view.fx * x[0] + view.cx, view.fx * x[1] + view.cx, view.width)
             ty = tile_span(view.fy * y[0] + view.cy, view.fy * y[1] + view.cy, view.height)
-            return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], ty[1] - ty[0] + 1)
+            rows = wp.vec2d(view.fy * y[0] + view.cy, view.fy * y[1] + view.cy)
+            return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], ty[1] - ty[0] + 1), rows
         corner = wp.vec2d(
             wp.max(view.cx, wp.float64(view.width) - view.cx) / view.fx,
             wp.max(view.cy, wp.float64(view.height) - view.cy) / view.fy,
         )
         if wp.acos(wp.clamp(local[2] / distance, wp.float64(-1.0), wp.float64(1.0))) > cap + wp.atan(wp.length(corner)):
-            return nothing
-        return everything
+            return nothing, rows
+        return everything, rows
     pi = wp.float64(3.141592653589793)
-    rows = wp.float64(view.height) / pi
+    per_radian = wp.float64(view.height) / pi
     columns = wp.float64(view.width) / (wp.float64(2.0) * pi)
     zenith = wp.acos(wp.clamp(m[2] / distance, wp.float64(-1.0), wp.float64(1.0)))
-    ty = tile_span((zenith - cap) * rows, (zenith + cap) * rows, view.height)
+    rows = wp.vec2d((zenith - cap) * per_radian, (zenith + cap) * per_radian)
+    ty = tile_span(rows[0], rows[1], view.height)
     count_y = ty[1] - ty[0] + 1
     # Silhouette seen along the pole axis: the same dual conic in the horizontal plane.
     c11 = r2 * cov[0, 0] - m[0] * m[0]
@@ -156,7 +160,7 @@ def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radiu
     c22 = r2 * cov[1, 1] - m[1] * m[1]
     determinant = c11 * c22 - c12 * c12
     if determinant >= wp.float64(0.0):  # the pole axis meets the ellipse: every azimuth
-        return wp.vec4i(0, view.tiles_x, ty[0], count_y)
+        return wp.vec4i(0, view.tiles_x, ty[0], count_y), rows
     # In the frame whose first axis points at the mean: l = (-sin p, cos p), and tan p solves a quadratic.
     rho = wp.sqrt(m[0] * m[0] + m[1] * m[1])
     cp = m[0] / rho
@@ -171,7 +175,7 @@ def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radiu
         half_lo = wp.atan(t[0])
         half_hi = wp.atan(t[1])
     else:  # the ellipse reaches behind the pole axis sideways
-        return wp.vec4i(0, view.tiles_x, ty[0], count_y)
+        return wp.vec4i(0, view.tiles_x, ty[0], count_y), rows
     azimuth = wp.atan2(m[1], m[0])
     lo = (azimuth + half_lo + pi) * columns
     hi = (azimuth + half_hi + pi) * columns
@@ -181,13 +185,13 @@ def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radiu
         hi += w
     tx = tile_span(lo, wp.min(hi, w), view.width)
     if hi <= w:
-        return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], count_y)
+        return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], count_y), rows
     rest = tile_span(wp.float64(0.0), hi - w, view.width)
     if tx[1] < tx[0]:
-        return wp.vec4i(rest[0], rest[1] - rest[0] + 1, ty[0], count_y)
+        return wp.vec4i(rest[0], rest[1] - rest[0] + 1, ty[0], count_y), rows
     if rest[1] < rest[0]:
-        return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], count_y)
-    return wp.vec4i(tx[0], wp.min(view.tiles_x - tx[0] + rest[1] + 1, view.tiles_x), ty[0], count_y)
+        return wp.vec4i(tx[0], tx[1] - tx[0] + 1, ty[0], count_y), rows
+    return wp.vec4i(tx[0], wp.min(view.tiles_x - tx[0] + rest[1] + 1, view.tiles_x), ty[0], count_y), rows
 
 
 @wp.kernel(enable_backward=False)
@@ -288,7 +292,7 @@ def build(real: Any) -> SimpleNamespace:
         """Per Gaussian and view: the row of coefficients, the covered tiles, the range that orders blending.
 
         Row: e1 3, e2 3, mh 3, A 3 (times |m|^2), a.a, a.b1, a.b2, b1.b1, b1.b2, b2.b2, |m|, opacity, q at the cutoff,
-        a 3, b1 3, b2 3 (scaled by the smallest scale), 1/s_min, s_min.
+        a 3, b1 3, b2 3 (scaled by the smallest scale), 1/s_min, s_min, first and last row of pixels.
         """
         i = offset + wp.tid()
         zero = wp.float64(0.0)
@@ -328,7 +332,7 @@ def build(real: Any) -> SimpleNamespace:
         for k in range(3):
             axis = wp.vec3d(r[0, k], r[1, k], r[2, k]) * s[k]
             cov += wp.outer(axis, axis)
-        tiles = covered_tiles(view, mean, m, cov, wp.sqrt(cut), inside)
+        tiles, pixel_rows = covered_tiles(view, mean, m, cov, wp.sqrt(cut), inside)
         span[i] = tiles
         count[i] = tiles[1] * tiles[3]
         for k in range(3):
@@ -352,6 +356,8 @@ def build(real: Any) -> SimpleNamespace:
         rows[i, 20] = real(cut)
         rows[i, 30] = real(wp.float64(1.0) / smin)
         rows[i, 31] = real(smin)
+        rows[i, 32] = real(pixel_rows[0] - wp.float64(0.51))
+        rows[i, 33] = real(pixel_rows[1] - wp.float64(0.49))
 
     @wp.func
     def local_ray(rows: wp.array(dtype=real, ndim=2), k: int, dx: strip, dy: strip, dz: strip):
@@ -416,6 +422,7 @@ def build(real: Any) -> SimpleNamespace:
         y = (tile / view.tiles_x) * wp.static(TILE) + i % wp.static(TILE)
         if y >= view.height:
             return
+        row = real(y)
         dx, dy, dz = strip_directions(view, x0, y)
         channels = wp.min(features.shape[1] - first, wp.static(CHANNELS))
         one = strip(real(1.0))
@@ -433,32 +440,33 @@ def build(real: Any) -> SimpleNamespace:
         peak = strip()
         for j in range(starts[tile], starts[tile + 1]):
             k = ids[j]
-            w, u1, u2 = local_ray(rows, k, dx, dy, dz)
-            n, ag, gg, side = quadratics(rows, k, w, u1, u2)
-            q = wp.cw_div(n, gg)
-            room = strip(rows[k, 20]) - q
-            if wp.max(room) > real(0.0):
-                keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
-                alpha = wp.min(rows[k, 19] * negative_exponential(real(0.5) * q), amax)
-                alpha = wp.cw_mul(alpha, keep)
-                weight = wp.cw_mul(alpha, transmittance)
-                transmittance = thinned(transmittance, alpha, rules.rule)
-                t = rows[k, 18] * wp.cw_div(ag, gg)
-                depth += wp.cw_mul(weight, t)
-                total += weight
-                better = step(weight - best)
-                best = wp.max(best, weight)
-                owner += wp.cw_mul(better, strip(real(k)) - owner)
-                peak += wp.cw_mul(better, t - peak)
-                c0 += features[k, first] * weight
-                if channels > 1:
-                    c1 += features[k, first + 1] * weight
-                if channels > 2:
-                    c2 += features[k, first + 2] * weight
-                if channels > 3:
-                    c3 += features[k, first + 3] * weight
-                if wp.max(transmittance) <= real(rules.transmittance_min):
-                    break
+            if row >= rows[k, 32] and row <= rows[k, 33]:
+                w, u1, u2 = local_ray(rows, k, dx, dy, dz)
+                n, ag, gg, side = quadratics(rows, k, w, u1, u2)
+                q = wp.cw_div(n, gg)
+                room = strip(rows[k, 20]) - q
+                if wp.max(room) > real(0.0):
+                    keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
+                    alpha = wp.min(rows[k, 19] * negative_exponential(real(0.5) * q), amax)
+                    alpha = wp.cw_mul(alpha, keep)
+                    weight = wp.cw_mul(alpha, transmittance)
+                    transmittance = thinned(transmittance, alpha, rules.rule)
+                    t = rows[k, 18] * wp.cw_div(ag, gg)
+                    depth += wp.cw_mul(weight, t)
+                    total += weight
+                    better = step(weight - best)
+                    best = wp.max(best, weight)
+                    owner += wp.cw_mul(better, strip(real(k)) - owner)
+                    peak += wp.cw_mul(better, t - peak)
+                    c0 += features[k, first] * weight
+                    if channels > 1:
+                        c1 += features[k, first + 1] * weight
+                    if channels > 2:
+                        c2 += features[k, first + 2] * weight
+                    if channels > 3:
+                        c3 += features[k, first + 3] * weight
+                    if wp.max(transmittance) <= real(rules.transmittance_min):
+                        break
         c0 += background[first] * transmittance
         if channels > 1:
             c1 += background[first + 1] * transmittance
@@ -545,6 +553,7 @@ def build(real: Any) -> SimpleNamespace:
                         r += vt[lane] * depth_sum[y, x] + va[lane] * a
                 goal[lane] = r
         with_depth = wp.dot(vt, vt) > real(0.0)
+        row = real(y)
         dx, dy, dz = strip_directions(view, x0, y)
         one = strip(real(1.0))
         amax = strip(real(rules.alpha_max))
@@ -552,86 +561,87 @@ def build(real: Any) -> SimpleNamespace:
         transmittance = strip(real(1.0))
         for j in range(starts[tile], starts[tile + 1]):
             k = ids[j]
-            w, u1, u2 = local_ray(rows, k, dx, dy, dz)
-            n, ag, gg, side = quadratics(rows, k, w, u1, u2)
-            q = wp.cw_div(n, gg)
-            room = strip(rows[k, 20]) - q
-            if wp.max(room) > real(0.0):
-                keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
-                response = wp.cw_mul(negative_exponential(real(0.5) * q), keep)
-                raw = rows[k, 19] * response
-                alpha = wp.min(raw, amax)
-                free = one - step(raw - amax)
-                weight = wp.cw_mul(alpha, transmittance)
-                t = rows[k, 18] * wp.cw_div(ag, gg)
-                value = features[k, first] * v0
-                if channels > 1:
-                    value += features[k, first + 1] * v1
-                if channels > 2:
-                    value += features[k, first + 2] * v2
-                if channels > 3:
-                    value += features[k, first + 3] * v3
-                if first == 0:
-                    value += wp.cw_mul(vt, t) + va
-                goal -= wp.cw_mul(weight, value)
-                behind = goal
-                if rules.rule == wp.static(PRODUCT):
-                    behind = wp.cw_div(goal, wp.max(one - alpha, strip(real(wp.static(tiny)))))
-                slope = wp.cw_mul(wp.cw_mul(wp.cw_mul(transmittance, value) - behind, keep), free)
-                transmittance = thinned(transmittance, alpha, rules.rule)
-                v = real(-0.5) * wp.cw_mul(slope, raw)  # dL/dq
-                # y = M (t d - m) without cancellation: t w - |m| = -|m| side / gg
-                off = rows[k, 30] * wp.cw_div(strip(-rows[k, 18]), gg)
-                lift = wp.cw_mul(off, side)
-                s1 = rows[k, 30] * wp.cw_mul(t, u1)
-                s2 = rows[k, 30] * wp.cw_mul(t, u2)
-                y0 = rows[k, 21] * lift + rows[k, 24] * s1 + rows[k, 27] * s2
-                y1 = rows[k, 22] * lift + rows[k, 25] * s1 + rows[k, 28] * s2
-                y2 = rows[k, 23] * lift + rows[k, 26] * s1 + rows[k, 29] * s2
-                p0 = wp.cw_mul(v, y0)
-                p1 = wp.cw_mul(v, y1)
-                p2 = wp.cw_mul(v, y2)
-                s00 = wp.dot(p0, y0)
-                s01 = wp.dot(p0, y1)
-                s02 = wp.dot(p0, y2)
-                s11 = wp.dot(p1, y1)
-                s12 = wp.dot(p1, y2)
-                s22 = wp.dot(p2, y2)
-                if with_depth:
-                    half = (real(0.5) * rows[k, 31]) * wp.cw_div(wp.cw_mul(weight, vt), gg)
-                    h0 = wp.cw_mul(half, rows[k, 21] * w + rows[k, 24] * u1 + rows[k, 27] * u2)
-                    h1 = wp.cw_mul(half, rows[k, 22] * w + rows[k, 25] * u1 + rows[k, 28] * u2)
-                    h2 = wp.cw_mul(half, rows[k, 23] * w + rows[k, 26] * u1 + rows[k, 29] * u2)
-                    p0 -= h0
-                    p1 -= h1
-                    p2 -= h2
-                    s00 -= real(2.0) * wp.dot(h0, y0)
-                    s01 -= wp.dot(h0, y1) + wp.dot(h1, y0)
-                    s02 -= wp.dot(h0, y2) + wp.dot(h2, y0)
-                    s11 -= real(2.0) * wp.dot(h1, y1)
-                    s12 -= wp.dot(h1, y2) + wp.dot(h2, y1)
-                    s22 -= real(2.0) * wp.dot(h2, y2)
-                wp.atomic_add(sums, piece, k, 0, wp.dot(p0, one))
-                wp.atomic_add(sums, piece, k, 1, wp.dot(p1, one))
-                wp.atomic_add(sums, piece, k, 2, wp.dot(p2, one))
-                wp.atomic_add(sums, piece, k, 3, s00)
-                wp.atomic_add(sums, piece, k, 4, s01)
-                wp.atomic_add(sums, piece, k, 5, s02)
-                wp.atomic_add(sums, piece, k, 6, s11)
-                wp.atomic_add(sums, piece, k, 7, s12)
-                wp.atomic_add(sums, piece, k, 8, s22)
-                wp.atomic_add(sums, piece, k, 9, wp.dot(slope, response))
-                wp.atomic_add(sums, piece, k, 10, wp.dot(weight, v0))
-                if channels > 1:
-                    wp.atomic_add(sums, piece, k, 11, wp.dot(weight, v1))
-                if channels > 2:
-                    wp.atomic_add(sums, piece, k, 12, wp.dot(weight, v2))
-                if channels > 3:
-                    wp.atomic_add(sums, piece, k, 13, wp.dot(weight, v3))
-                if first == 0:
-                    wp.atomic_add(sums, piece, k, 14, wp.dot(weight, one))
-                if wp.max(transmittance) <= real(rules.transmittance_min):
-                    break
+            if row >= rows[k, 32] and row <= rows[k, 33]:
+                w, u1, u2 = local_ray(rows, k, dx, dy, dz)
+                n, ag, gg, side = quadratics(rows, k, w, u1, u2)
+                q = wp.cw_div(n, gg)
+                room = strip(rows[k, 20]) - q
+                if wp.max(room) > real(0.0):
+                    keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
+                    response = wp.cw_mul(negative_exponential(real(0.5) * q), keep)
+                    raw = rows[k, 19] * response
+                    alpha = wp.min(raw, amax)
+                    free = one - step(raw - amax)
+                    weight = wp.cw_mul(alpha, transmittance)
+                    t = rows[k, 18] * wp.cw_div(ag, gg)
+                    value = features[k, first] * v0
+                    if channels > 1:
+                        value += features[k, first + 1] * v1
+                    if channels > 2:
+                        value += features[k, first + 2] * v2
+                    if channels > 3:
+                        value += features[k, first + 3] * v3
+                    if first == 0:
+                        value += wp.cw_mul(vt, t) + va
+                    goal -= wp.cw_mul(weight, value)
+                    behind = goal
+                    if rules.rule == wp.static(PRODUCT):
+                        behind = wp.cw_div(goal, wp.max(one - alpha, strip(real(wp.static(tiny)))))
+                    slope = wp.cw_mul(wp.cw_mul(wp.cw_mul(transmittance, value) - behind, keep), free)
+                    transmittance = thinned(transmittance, alpha, rules.rule)
+                    v = real(-0.5) * wp.cw_mul(slope, raw)  # dL/dq
+                    # y = M (t d - m) without cancellation: t w - |m| = -|m| side / gg
+                    off = rows[k, 30] * wp.cw_div(strip(-rows[k, 18]), gg)
+                    lift = wp.cw_mul(off, side)
+                    s1 = rows[k, 30] * wp.cw_mul(t, u1)
+                    s2 = rows[k, 30] * wp.cw_mul(t, u2)
+                    y0 = rows[k, 21] * lift + rows[k, 24] * s1 + rows[k, 27] * s2
+                    y1 = rows[k, 22] * lift + rows[k, 25] * s1 + rows[k, 28] * s2
+                    y2 = rows[k, 23] * lift + rows[k, 26] * s1 + rows[k, 29] * s2
+                    p0 = wp.cw_mul(v, y0)
+                    p1 = wp.cw_mul(v, y1)
+                    p2 = wp.cw_mul(v, y2)
+                    s00 = wp.dot(p0, y0)
+                    s01 = wp.dot(p0, y1)
+                    s02 = wp.dot(p0, y2)
+                    s11 = wp.dot(p1, y1)
+                    s12 = wp.dot(p1, y2)
+                    s22 = wp.dot(p2, y2)
+                    if with_depth:
+                        half = (real(0.5) * rows[k, 31]) * wp.cw_div(wp.cw_mul(weight, vt), gg)
+                        h0 = wp.cw_mul(half, rows[k, 21] * w + rows[k, 24] * u1 + rows[k, 27] * u2)
+                        h1 = wp.cw_mul(half, rows[k, 22] * w + rows[k, 25] * u1 + rows[k, 28] * u2)
+                        h2 = wp.cw_mul(half, rows[k, 23] * w + rows[k, 26] * u1 + rows[k, 29] * u2)
+                        p0 -= h0
+                        p1 -= h1
+                        p2 -= h2
+                        s00 -= real(2.0) * wp.dot(h0, y0)
+                        s01 -= wp.dot(h0, y1) + wp.dot(h1, y0)
+                        s02 -= wp.dot(h0, y2) + wp.dot(h2, y0)
+                        s11 -= real(2.0) * wp.dot(h1, y1)
+                        s12 -= wp.dot(h1, y2) + wp.dot(h2, y1)
+                        s22 -= real(2.0) * wp.dot(h2, y2)
+                    wp.atomic_add(sums, piece, k, 0, wp.dot(p0, one))
+                    wp.atomic_add(sums, piece, k, 1, wp.dot(p1, one))
+                    wp.atomic_add(sums, piece, k, 2, wp.dot(p2, one))
+                    wp.atomic_add(sums, piece, k, 3, s00)
+                    wp.atomic_add(sums, piece, k, 4, s01)
+                    wp.atomic_add(sums, piece, k, 5, s02)
+                    wp.atomic_add(sums, piece, k, 6, s11)
+                    wp.atomic_add(sums, piece, k, 7, s12)
+                    wp.atomic_add(sums, piece, k, 8, s22)
+                    wp.atomic_add(sums, piece, k, 9, wp.dot(slope, response))
+                    wp.atomic_add(sums, piece, k, 10, wp.dot(weight, v0))
+                    if channels > 1:
+                        wp.atomic_add(sums, piece, k, 11, wp.dot(weight, v1))
+                    if channels > 2:
+                        wp.atomic_add(sums, piece, k, 12, wp.dot(weight, v2))
+                    if channels > 3:
+                        wp.atomic_add(sums, piece, k, 13, wp.dot(weight, v3))
+                    if first == 0:
+                        wp.atomic_add(sums, piece, k, 14, wp.dot(weight, one))
+                    if wp.max(transmittance) <= real(rules.transmittance_min):
+                        break
 
     @wp.kernel(module="unique", enable_backward=False)
     def chain(

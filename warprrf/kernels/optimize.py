@@ -1,0 +1,122 @@
+"""Adam on flat float32 arrays, and the bounded parameters of Gaussians: logarithms of scales, logits of opacities."""
+
+import warp as wp
+
+
+@wp.kernel(enable_backward=False)
+def activate(
+    offset: int,
+    log_scales: wp.array(dtype=wp.vec3),
+    logits: wp.array(dtype=float),
+    scales: wp.array(dtype=wp.vec3),
+    opacities: wp.array(dtype=float),
+):
+    """Scales and opacities from what Adam moves."""
+    i = offset + wp.tid()
+    s = log_scales[i]
+    scales[i] = wp.vec3(wp.exp(s[0]), wp.exp(s[1]), wp.exp(s[2]))
+    opacities[i] = 1.0 / (1.0 + wp.exp(-logits[i]))
+
+
+@wp.kernel(enable_backward=False)
+def activate_adjoint(
+    offset: int,
+    scales: wp.array(dtype=wp.vec3),
+    opacities: wp.array(dtype=float),
+    scales_grad: wp.array(dtype=wp.vec3),
+    opacities_grad: wp.array(dtype=float),
+    log_scales_grad: wp.array(dtype=wp.vec3),
+    logits_grad: wp.array(dtype=float),
+):
+    """Chain rule through :func:`activate`."""
+    i = offset + wp.tid()
+    log_scales_grad[i] = wp.cw_mul(scales_grad[i], scales[i])
+    logits_grad[i] = opacities_grad[i] * opacities[i] * (1.0 - opacities[i])
+
+
+@wp.kernel(enable_backward=False)
+def accumulate(
+    offset: int,
+    origin: wp.vec3,
+    means: wp.array(dtype=wp.vec3),
+    means_grad: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=float),
+    pull: wp.array(dtype=float),
+    hits: wp.array(dtype=float),
+    seen: wp.array(dtype=float),
+):
+    """Densification statistics: gradient of the projected position (times the focal length), views, blending weight."""
+    i = offset + wp.tid()
+    if weight[i] > 0.0:
+        pull[i] = pull[i] + wp.length(means_grad[i]) * wp.length(means[i] - origin)
+        seen[i] = seen[i] + weight[i]
+    hits[i] = hits[i] + 1.0
+
+
+@wp.kernel(enable_backward=False)
+def adam(
+    offset: int,
+    width: int,
+    rates: wp.array(dtype=float),
+    first_correction: float,
+    second_correction: float,
+    gradient: wp.array(dtype=float),
+    first: wp.array(dtype=float),
+    second: wp.array(dtype=float),
+    values: wp.array(dtype=float),
+):
+    """One step (Kingma and Ba 2015; 0.9, 0.999, 1e-15) on rows of ``width`` numbers; clears the gradient."""
+    row = offset + wp.tid()
+    for k in range(width):
+        e = row * width + k
+        g = gradient[e]
+        m = 0.9 * first[e] + 0.1 * g
+        v = 0.999 * second[e] + 0.001 * g * g
+        first[e] = m
+        second[e] = v
+        values[e] = values[e] - rates[k] * first_correction * m / (wp.sqrt(second_correction * v) + 1.0e-15)
+        gradient[e] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def pull_to_planes(
+    offset: int,
+    plane_of: wp.array(dtype=int),
+    planes: wp.array(dtype=wp.vec4),
+    strength: float,
+    thickness: float,
+    means: wp.array(dtype=wp.vec3),
+    quaternions: wp.array(dtype=wp.vec4),
+    log_scales: wp.array(dtype=wp.vec3),
+):
+    """Move a Gaussian towards its plane, turn its thin axis (the third) to the normal, keep it thin.
+
+    The proximal step of a quadratic penalty: ``strength`` is the share of the deviation removed.
+    """
+    i = offset + wp.tid()
+    s = log_scales[i]
+    log_scales[i] = wp.vec3(s[0], s[1], wp.min(s[2], wp.log(thickness)))
+    p = plane_of[i]
+    if p < 0:
+        return
+    normal = wp.vec3(planes[p][0], planes[p][1], planes[p][2])
+    x = means[i]
+    means[i] = x - strength * (wp.dot(normal, x) - planes[p][3]) * normal
+    q = wp.normalize(quaternions[i])
+    axis = wp.vec3(
+        2.0 * (q[1] * q[3] + q[0] * q[2]),
+        2.0 * (q[2] * q[3] - q[0] * q[1]),
+        1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]),
+    )
+    if wp.dot(axis, normal) < 0.0:
+        normal = -normal
+    turn = 0.5 * strength * wp.cross(axis, normal)  # half the rotation vector, small angle
+    w = 1.0
+    quaternions[i] = wp.normalize(
+        wp.vec4(
+            w * q[0] - turn[0] * q[1] - turn[1] * q[2] - turn[2] * q[3],
+            w * q[1] + turn[0] * q[0] + turn[1] * q[3] - turn[2] * q[2],
+            w * q[2] - turn[0] * q[3] + turn[1] * q[0] + turn[2] * q[1],
+            w * q[3] + turn[0] * q[2] - turn[1] * q[1] + turn[2] * q[0],
+        )
+    )
