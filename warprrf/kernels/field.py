@@ -1,8 +1,8 @@
 """Fitting spherical harmonics to spectra on cached blending weights: forward, loss, hand-written adjoint, Adam.
 
 A pair is one Gaussian seen in one pixel of one receiver, with its blending weight ``w``. Pairs are stored Gaussian by
-Gaussian; a row is one Gaussian's stretch of them. The kernels keep every sum with one owner, so that a launch split over
-threads gives the same bits as one thread: rows own their contributions and gradients, pixels own their power and loss.
+Gaussian; a row is one Gaussian's stretch of them. Every sum has one owner, so that a launch split over threads gives
+the same bits as one thread: rows own their contributions and gradients, pixels own their power and loss.
 
     row:    c_e = w_e A(b_p . a_g)               A = exp, max(0, .), or the identity (delay and angle channels)
     pixel:  P_p = F_p sum_e c_e + X_p            F: solid angle and spreading loss, X: explicit line of sight

@@ -1,4 +1,4 @@
-"""Radio fields and half-done fits on disk: safetensors (no pickle), options as JSON in the header, written in one go."""
+"""Radio fields and half-done fits on disk: safetensors (no pickle), options as JSON in the header."""
 
 from __future__ import annotations
 
@@ -90,7 +90,11 @@ class Checkpoint:
                 f"checkpoint: {self.path} belongs to a fit with other data or options; delete it or name another file"
             )
         for name, info in header["layers"].items():
-            self.states[name] = State(**info, **{k: tensors[f"{name}/{k}"] for k in _ARRAYS})
+            self.states[name] = State(
+                step=int(info["step"]),
+                losses=list(info["losses"]),
+                **{k: tensors[f"{name}/{k}"] for k in _ARRAYS},  # type: ignore[arg-type]
+            )
 
     def state(self, name: str) -> State | None:
         """Where layer ``name`` stood, or None."""

@@ -186,10 +186,30 @@ def harmonics(shape: tuple[int, int], real: Any, device: Any) -> wp.array:
 
     kernels = _kernels.build(real)
     kind = np.float64 if real is wp.float64 else np.float32
-    toward = wp.array(pixel_directions(shape).reshape(-1, 3).astype(kind), dtype=kernels.vec3, device=device)
+    toward: wp.array = wp.array(
+        pixel_directions(shape).reshape(-1, 3).astype(kind), dtype=kernels.vec3, device=device
+    )
     out = wp.zeros(len(toward), dtype=kernels.vec16, device=device)
     _device.launch(kernels.evaluate_basis, len(toward), [toward, out], device=device)
     return out
+
+
+@dataclass(frozen=True)
+class BatchTarget:
+    """One batch's part of a :class:`Target` on the device.
+
+    Attributes:
+        image, factor, extra, mask: flattened, as in :class:`Target`; ``mask`` is None for a gain.
+        moments: window averages of (t, t^2, t^2), which SSIM needs.
+        count: pixels that the loss is averaged over.
+    """
+
+    image: wp.array
+    factor: wp.array
+    extra: wp.array
+    mask: wp.array | None
+    moments: wp.array
+    count: float
 
 
 class Layer:
@@ -204,7 +224,7 @@ class Layer:
         factor = ones if target.factor is None else np.asarray(target.factor, p.precision).reshape(shape)
         extra = zeros if target.extra is None else np.asarray(target.extra, p.precision).reshape(shape)
         mask = None if target.mask is None else np.asarray(target.mask, p.precision).reshape(shape)
-        self.data = []
+        self.data: list[BatchTarget] = []
         for batch in p.batches:
             pick = batch.receivers
             image = p.upload(self.images[pick].ravel())
@@ -214,16 +234,16 @@ class Layer:
                 wp.copy(moments, p.upload(np.stack([u, u * u, u * u], axis=-1), k.vec3))
                 moments = self._filtered(moments, wp.zeros_like(moments), wp.zeros_like(moments))
             self.data.append(
-                {
-                    "target": image,
-                    "moments": moments,
-                    "factor": p.upload(factor[pick].ravel()),
-                    "extra": p.upload(extra[pick].ravel()),
-                    "mask": None if mask is None else p.upload(mask[pick].ravel()),
-                    "count": float(len(image)) if mask is None else max(float(mask[pick].sum()), 1.0),
-                }
+                BatchTarget(
+                    image=image,
+                    factor=p.upload(factor[pick].ravel()),
+                    extra=p.upload(extra[pick].ravel()),
+                    mask=None if mask is None else p.upload(mask[pick].ravel()),
+                    moments=moments,
+                    count=float(len(image)) if mask is None else max(float(mask[pick].sum()), 1.0),
+                )
             )
-        largest = max(len(d["target"]) for d in self.data)
+        largest = max(len(d.image) for d in self.data)
         pairs = max(len(b.pair_pixel) for b in p.batches)
         self.contribution = wp.zeros(pairs, dtype=p.real, device=p.device)
         self.scalars = [wp.zeros(largest, dtype=p.real, device=p.device) for _ in range(5)]
@@ -242,28 +262,26 @@ class Layer:
     def step(self, index: int, coefficients: wp.array, *, need_loss: bool = True) -> float:
         """Loss of batch ``index``; leaves its gradient in ``self.gradient`` (zero for Gaussians it does not see)."""
         p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
-        target, size = self.target, len(data["target"])
+        target, size = self.target, len(data.image)
         total, image, absolute, score, adjoint = self.scalars
         p.launch(
             k.contributions, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_direction,
             batch.pair_weight, p.basis, coefficients, self.contribution,
         )  # fmt: skip
         p.launch(k.pixel_sums, size, batch.pixel_start, batch.pair_of_pixel, self.contribution, total)
-        if data["mask"] is not None:
-            share = p.real(1.0 / data["count"])
-            p.launch(k.absolute_adjoint, size, share, data["mask"], data["target"], total, absolute, adjoint)
+        if data.mask is not None:
+            share = p.real(1.0 / data.count)
+            p.launch(k.absolute_adjoint, size, share, data.mask, data.image, total, absolute, adjoint)
         else:
             scale = (p.real(target.floor), p.real(target.low), p.real(target.high))
             moments, between, slopes = self.vectors
-            p.launch(
-                k.to_image, size, data["factor"], data["extra"], *scale, data["target"], total, image, moments
-            )
+            p.launch(k.to_image, size, data.factor, data.extra, *scale, data.image, total, image, moments)
             self._filtered(moments, between, slopes, size)
-            p.launch(k.ssim_slopes, size, data["moments"], slopes, score, moments)
+            p.launch(k.ssim_slopes, size, data.moments, slopes, score, moments)
             self._filtered(moments, between, slopes, size)
             shares = p.real((1 - target.ssim_share) / size), p.real(target.ssim_share / size)
             p.launch(
-                k.loss_adjoint, size, data["factor"], data["extra"], *scale, *shares, data["target"], total, image,
+                k.loss_adjoint, size, data.factor, data.extra, *scale, *shares, data.image, total, image,
                 slopes, absolute, adjoint,
             )  # fmt: skip
         p.launch(
@@ -272,8 +290,8 @@ class Layer:
         )  # fmt: skip
         if not need_loss:
             return float("nan")
-        error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data["count"]
-        if data["mask"] is not None:
+        error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data.count
+        if data.mask is not None:
             return error
         similarity = float(np.mean(score.numpy()[:size], dtype=np.float64))
         return (1 - target.ssim_share) * error + target.ssim_share * (1 - similarity)
@@ -282,8 +300,8 @@ class Layer:
         """What the layer predicts for the receivers of batch ``index``: factor times blend plus extra."""
         self.step(index, coefficients, need_loss=False)
         data = self.data[index]
-        total = self.scalars[0].numpy()[: len(data["target"])]
-        return data["factor"].numpy() * total + data["extra"].numpy()
+        total = self.scalars[0].numpy()[: len(data.image)]
+        return data.factor.numpy() * total + data.extra.numpy()
 
 
 def fit_layer(
@@ -344,7 +362,7 @@ def fit_layer(
         losses.append(layer.step(index, coefficients))
         # one pixel's L1 pull on a neper of gain, so that the ridge counts in pixels
         pull = np.log10(np.e) * 10 / (target.high - target.low) if target.mask is None else 1.0
-        pull /= layer.data[index]["count"]
+        pull /= layer.data[index].count
         ridge = np.where(active, rates.ridge_directional, 0.0) * pull
         ridge[0] = rates.ridge * pull
         now = rate * FINAL_RATE ** (step / max(steps - 1, 1))

@@ -167,9 +167,9 @@ def evaluate(
         the shares ``direction_within_1deg``, ``direction_within_3deg``; medians over receivers of each one's
         power-weighted median over the pixels whose truth is above the floor: ``tof_error_median_ns``,
         ``aod_error_median_deg`` (None if nothing was predicted, or for most of the power; a pixel without a
-        prediction counts as infinitely wrong); all of them again as ``..._blocked`` for receivers without line of sight (None if there are none);
-        ``lpips`` with ``lpips_reason``; ``seconds_per_spectrum`` (median), ``receivers``, ``receivers_blocked``,
-        ``beam_width_deg``, and ``per_receiver``: the arrays ``(R,)`` behind them.
+        prediction counts as infinitely wrong); all of them again as ``..._blocked`` for receivers without line of
+        sight (None if there are none); ``lpips`` with ``lpips_reason``; ``seconds_per_spectrum`` (median),
+        ``receivers``, ``receivers_blocked``, ``beam_width_deg``, and ``per_receiver``: the arrays ``(R,)`` behind them.
 
     Raises:
         ValueError: if a prediction has another shape than the truth, or holds NaN, infinite or negative path gain.

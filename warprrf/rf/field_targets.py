@@ -1,0 +1,84 @@
+"""What a field's layers are fitted to: dB images for the gain, delay and AoD spectra for ``rf3dgs``' channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warprrf.rf.fitting import Target
+from warprrf.rf.single_bounce import SingleBounce
+from warprrf.rf.spectrum import directions_from_angles, to_db
+from warprrf.rf.transport import Transport
+
+if TYPE_CHECKING:
+    from warprrf.rf.dataset import SpectrumDataset
+
+Y00 = 0.28209479177387814  # harmonic of degree 0
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Layers to fit, in order.
+
+    Attributes:
+        layers: target of each layer: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``.
+        initial: degree-0 coefficient that each layer's Gaussians start with.
+        gain_unit: linear factor of the gain: its median over the lit pixels.
+        delay_unit: seconds per unit of the delay layer: the longest delay.
+    """
+
+    layers: dict[str, Target]
+    initial: dict[str, float]
+    gain_unit: float
+    delay_unit: float
+
+
+def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Transport) -> Targets:
+    """What to fit the spectra ``images`` (R, H, W) of ``ds`` with.
+
+    Raises:
+        ValueError: if no pixel above the floor meets a Gaussian.
+    """
+    transmitter, floor = np.asarray(ds.transmitter, np.float64), float(ds.floor)
+    lengths = law.lengths(seen, transmitter)
+    factor = law.factor(lengths)
+    extra = np.zeros_like(images)
+    for i, receiver in enumerate(seen.receivers):
+        beam = law.beam(receiver, transmitter)
+        extra[i] = 0.0 if beam is None else beam
+    blended = factor * seen.pixel_weight
+    lit = (images - extra > floor) & (blended > 0)
+    if not lit.any():
+        raise ValueError(
+            "ds: got no pixel above the floor where a ray meets a Gaussian; expected spectra with power and "
+            "geometry around the receivers"
+        )
+    gain_unit = float(np.median((images - extra)[lit] / blended[lit]))
+    low, high = (float(v) for v in ds.range_db)
+    layers = {
+        "gain": Target(
+            image=np.clip((to_db(images, floor) - low) / (high - low), 0.0, 1.0),
+            # in units of the floor, so that float32 works near one
+            factor=factor * (gain_unit / floor),
+            extra=extra / floor,
+            floor=1.0,
+            low=low - 10 * np.log10(floor),
+            high=high - 10 * np.log10(floor),
+        )
+    }
+    initial = {"gain": 0.0 if law.options.gain == "exp" else 1.0 / Y00}
+    delay_unit = 1.0
+    delays = None if ds.delay_s is None else np.asarray(ds.delay_s, np.float64)
+    if law.options.model == "rf3dgs" and delays is not None:
+        mask = (images > floor) & np.isfinite(delays) & (seen.dominant >= 0)
+        if mask.any():
+            delay_unit = float(delays[mask].max())
+            departure = directions_from_angles(*np.moveaxis(np.asarray(ds.aod, np.float64), -1, 0))
+            channels = {"delay": delays / delay_unit}
+            channels.update({f"aod_{axis}": departure[..., k] for k, axis in enumerate("xyz")})
+            for name, image in channels.items():
+                layers[name] = Target(image=np.where(mask, image, 0.0), mask=mask)
+                initial[name] = float(np.median(image[mask])) / Y00
+    return Targets(layers, initial, gain_unit, delay_unit)
