@@ -163,7 +163,13 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
     if args.train is not None:
         dataset = dataset.split(args.train, seed=args.seed)[0]
     field = wr.RadioField.fit(
-        geometry, dataset, model=args.model, seed=args.seed, progress=bars, device=args.device, **_steps(args)
+        geometry,
+        dataset,
+        model=args.model,
+        seed=args.seed,
+        progress=bars,
+        device=args.device,
+        **_iterations(args),
     )
     field.save(args.out)
     print(f"{args.out}: {args.model} fitted on {len(dataset.receivers)} receivers")
@@ -199,9 +205,10 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
     field = wr.RadioField.load(_existing(args.field))
     dataset = wr.SpectrumDataset.load(_existing(args.spectra))
     train, test = dataset.split(args.train, seed=args.seed)
-    methods: dict[str, Any] = {field.model: field}
+    methods: dict[str, Any] = {field.options.model: field.spectrum}
     if args.lookups:
-        methods |= lookups.all_of(train)
+        known = (lookups.nearest, lookups.idw, lookups.constant, lookups.mean)
+        methods |= {lookup.name: lookup for lookup in (build(train) for build in known)}
     figures: dict[str, dict[str, Any]] = {}
     for count, (name, predictor) in enumerate(methods.items()):
         bars("evaluate", count, len(methods))
@@ -340,8 +347,8 @@ def _look_at(
     )
 
 
-def _steps(args: argparse.Namespace) -> dict[str, int]:
-    return {} if args.steps is None else {"steps": args.steps}
+def _iterations(args: argparse.Namespace) -> dict[str, int]:
+    return {} if args.iterations is None else {"iterations": args.iterations}
 
 
 # ------------------------------------------------------------------------------------------------------ arguments
@@ -358,7 +365,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="warprrf",
         description="Radio radiance fields from photos and a few radio measurements.",
         epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=30),
     )
     parser.add_argument("--version", action="version", version=f"warprrf {wr.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -425,7 +432,7 @@ def _parser() -> argparse.ArgumentParser:
         "--train", type=int, metavar="N", help="receivers of the nested training subset (default: all)"
     )
     fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is a .ply")
-    fit.add_argument("--steps", type=int, help="optimisation steps (default: the model's)")
+    fit.add_argument("--iterations", type=int, help="optimiser steps (default: the model's)")
 
     ren = add("render", _render, "a picture from Gaussians, or a spectrum from a radio field", HELP_RENDER)
     ren.add_argument("source", help="Gaussians (.ply) or a radio field (.safetensors)")

@@ -168,7 +168,8 @@ class StagedRun:
             return known["figures"]
         spent = known["seconds"] if same and not known.get("finished") else 0.0
         attempts = known["attempts"] + 1 if same and not known.get("finished") else 1
-        start = last = time.monotonic()
+        steps: dict[str, float] = dict(known.get("steps", {})) if spent else {}
+        start = last = step_start = time.monotonic()
 
         def record(finished: bool, figures: dict[str, Any]) -> None:
             seconds = spent + time.monotonic() - start
@@ -177,13 +178,19 @@ class StagedRun:
                 "finished": finished,
                 "seconds": seconds,
                 "attempts": attempts,
+                "steps": steps,
                 "outputs": outputs,
                 "figures": plain(figures),
             }
             write_json(self.folder / STATE_FILE, {"stages": self._stages})
 
         def progress(step: str, done: int, total: int) -> None:
-            nonlocal last
+            nonlocal last, step_start
+            now = time.monotonic()
+            steps[step] = (
+                steps.get(step, 0.0) + now - step_start
+            )  # the time since the last call went into this step
+            step_start = now
             if self._progress is not None:
                 self._progress(step, done, total)
             if time.monotonic() - last > HEARTBEAT_S:
@@ -205,6 +212,10 @@ class StagedRun:
     def seconds(self, *names: str) -> float:
         """Wall time of the named stages (default: all of this run), killed attempts included."""
         return float(sum(self._stages[name]["seconds"] for name in names or self.order))
+
+    def steps(self, name: str) -> dict[str, float]:
+        """Wall time [s] of the steps that stage `name` reported to its progress callback."""
+        return {step: float(seconds) for step, seconds in self._stages[name].get("steps", {}).items()}
 
     def attempts(self, name: str) -> int:
         """How many times stage `name` was started until it was finished."""

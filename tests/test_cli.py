@@ -1,0 +1,192 @@
+"""The command line teaches, refuses bad input in one line, and carries spectra from a scene to a scored field."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warprrf import cli
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENE = ROOT / "data" / "lobby" / "scene.xml"
+COMMANDS = ("lobby", "reconstruct", "simulate", "fit", "render", "evaluate", "data")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_an_example_that_the_parser_takes(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main([command, "--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    examples = [
+        line.split("   ")[0].split()[1:]
+        for line in map(str.strip, text.splitlines())
+        if line.startswith("warprrf ")
+    ]
+    assert examples
+    for words in examples:
+        cli._parser().parse_args(words)  # exits where an example is wrong
+
+
+def test_top_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    text = capsys.readouterr().out
+    assert [command for command in COMMANDS if f"\n    {command} " not in text] == []
+
+
+SIMULATE = ["simulate", "{scene}", "-o", "{tmp}/x.nc", "--transmitter", "2", "3", "3", "--receivers"]
+RENDER = ["render", "-o", "{tmp}/x.png"]
+BAD = {
+    "no photos": (["reconstruct", "{tmp}/none", "-o", "{tmp}/out"], "none"),
+    "no scene": ([word.replace("{scene}", "none.xml") for word in SIMULATE] + ["2,2,1"], "none.xml"),
+    "receiver of two numbers": ([*SIMULATE, "2,2"], "x,y,z"),
+    "receiver that is no number": ([*SIMULATE, "2,2,up"], "numbers"),
+    "NaN receiver": ([*SIMULATE, "2,2,nan"], "receivers"),
+    "receiver outside": ([*SIMULATE, "2,2,40"], "receivers"),
+    "frequency outside the materials": ([*SIMULATE, "2,2,1", "--frequency", "5e12"], "frequency"),
+    "geometry of unknown kind": (
+        ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
+        ".ply",
+    ),
+    "corrupt spectra": (["fit", "{scene}", "{tmp}/bad.nc", "-o", "{tmp}/f.safetensors"], "bad.nc"),
+    "corrupt field": ([*RENDER, "{tmp}/bad.safetensors", "--receiver", "1", "1", "1"], "bad.safetensors"),
+    "corrupt splats": (
+        [*RENDER, "{tmp}/bad.ply", "--position", "0", "0", "1", "--look-at", "1", "0", "1"],
+        "bad.ply",
+    ),
+    "camera looks straight up": (
+        [*RENDER, "{tmp}/one.ply", "--position", "0", "0", "1", "--look-at", "0", "0", "2"],
+        "--look-at",
+    ),
+    "field without receiver": ([*RENDER, "{tmp}/bad.safetensors"], "--receiver"),
+    "no lobby": (["lobby", "--data", "{tmp}", "--out", "{tmp}/run"], "photos"),
+    "positions that are no positions": (
+        ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/words.txt"],
+        "words.txt",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", sorted(BAD))
+def test_bad_input_is_one_line_and_status_2(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import warprrf as wr
+
+    (tmp_path / "words.txt").write_text("these are, words\n")
+    (tmp_path / "bad.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0notjson!")
+    (tmp_path / "bad.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    (tmp_path / "bad.ply").write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nend_header\n"
+    )
+    wr.Gaussians(np.zeros((1, 3)), [[1.0, 0, 0, 0]], np.ones((1, 3)), [0.5], np.zeros((1, 1, 3))).save_ply(
+        tmp_path / "one.ply"
+    )
+    words, expected = BAD[case]
+    before = sorted(path.name for path in tmp_path.iterdir())
+    status = cli.main([word.format(tmp=tmp_path, scene=SCENE) for word in words] + ["--quiet"])
+    said = capsys.readouterr().err.strip()
+    assert status == 2
+    assert said.startswith("warprrf: error: ")
+    assert said.count("\n") == 0
+    assert expected in said
+    assert sorted(path.name for path in tmp_path.iterdir() if path.name != "run") == before
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no such file"):
+        cli.main(
+            [
+                "simulate",
+                str(tmp_path / "none.xml"),
+                "-o",
+                "x.nc",
+                "--transmitter",
+                "1",
+                "1",
+                "1",
+                "--receivers",
+                "1,1,1",
+                "--debug",
+            ]
+        )
+
+
+@pytest.mark.parametrize("suffix", ["json", "csv"])
+def test_known_positions_from_json_and_csv_agree(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"surveyed.{suffix}"
+    path.write_text(
+        '{"a.jpg": [1, 2.5, 3], "b.jpg": [4, 5, 6]}'
+        if suffix == "json"
+        else "file,x,y,z\na.jpg,1,2.5,3\nb.jpg,4,5,6\n"
+    )
+    assert cli._read_positions(path) == {"a.jpg": (1.0, 2.5, 3.0), "b.jpg": (4.0, 5.0, 6.0)}
+
+
+def test_receivers_from_file_and_words_agree(tmp_path: Path) -> None:
+    expected = np.array([[1.0, 2.0, 1.5], [3.0, 4.0, 1.5]])
+    (tmp_path / "r.csv").write_text("x,y,z\n1,2,1.5\n3,4,1.5\n")
+    np.save(tmp_path / "r.npy", expected)
+    for words in (["1,2,1.5", "3,4,1.5"], [str(tmp_path / "r.csv")], [str(tmp_path / "r.npy")]):
+        np.testing.assert_array_equal(cli._read_receivers(words), expected)
+
+
+def test_look_at_puts_the_target_in_the_middle_with_z_up() -> None:
+    camera = cli._look_at((1.0, 2.0, 1.5), (4.0, 6.0, 1.0), (640, 480), 90.0)
+    pose = camera.world_to_camera
+    target, above = (pose @ (*point, 1.0) for point in ((4.0, 6.0, 1.0), (4.0, 6.0, 1.2)))
+    np.testing.assert_allclose(target[:3], [0.0, 0.0, np.sqrt(3**2 + 4**2 + 0.5**2)], atol=1e-12)
+    assert above[1] < 0  # y points down, so higher is negative
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    assert camera.fx == pytest.approx(320.0)  # half the width over tan(45 degrees)
+
+
+def test_simulate_fit_evaluate_and_render_round_trip(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On the true mesh; the field must beat the constant, or the commands lost something on the way."""
+    import warprrf as wr
+
+    rng = np.random.default_rng(3)
+    scene = wr.Scene.load(SCENE)
+    places = rng.uniform([1.0, 1.0, 1.0], [14.0, 11.0, 2.0], (400, 3))
+    places = places[scene.is_free(places, clearance_m=0.3)][:16]
+    np.savetxt(tmp_path / "receivers.csv", places, delimiter=",")
+    spectra, field = tmp_path / "spectra.nc", tmp_path / "field.safetensors"
+    common = ["--quiet", "--device", "cpu"]
+    simulate = [
+        "simulate",
+        SCENE,
+        "-o",
+        spectra,
+        "--transmitter",
+        3.2,
+        2.6,
+        3.2,
+        "--receivers",
+        tmp_path / "receivers.csv",
+    ]
+    assert cli.main([str(word) for word in [*simulate, "--shape", 16, 32, *common]]) == 0
+    fit = ["fit", SCENE, spectra, "-o", field, "--train", 10, "--iterations", 60]
+    assert cli.main([str(word) for word in [*fit, *common]]) == 0
+    evaluate = ["evaluate", field, spectra, "--train", 10, "-o", tmp_path / "figures.json"]
+    assert cli.main([str(word) for word in [*evaluate, *common]]) == 0
+    assert "rf3dgs+" in capsys.readouterr().out
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert set(figures) == {"rf3dgs+", "nearest", "idw", "constant", "mean"}
+    assert figures["rf3dgs+"]["psnr_db"] > figures["constant"]["psnr_db"] + 1.0
+    position = [f"{x:.3f}" for x in places[0]]
+    for name in ("s.png", "s.npz"):
+        assert (
+            cli.main(["render", str(field), "-o", str(tmp_path / name), "--receiver", *position, *common])
+            == 0
+        )
+    stored = np.load(tmp_path / "s.npz")
+    assert stored["path_gain"].shape == (16, 32)
+    assert (tmp_path / "s.png").read_bytes()[:4] == b"\x89PNG"
