@@ -16,8 +16,9 @@ import warp as wp
 from warprrf.device import check_array, launch, resolve
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
+from warprrf.kernels import blend as blend_kernels
+from warprrf.kernels import project as kernels
 from warprrf.kernels import sh as sh_kernels
-from warprrf.kernels import splat as kernels
 
 # Gradient sums are kept in this many parts on a CPU, one writer each: the result does not depend on the thread count.
 CPU_PIECES = 4
@@ -204,7 +205,8 @@ class Rasterizer:
         self.device = resolve(device)
         self.blending = blending or Blending()
         self.real = real
-        self.kernels = kernels.build(real)
+        self.project_kernels = kernels.build(real)
+        self.kernels = blend_kernels.build(real)
         self.rules = kernels.Rules()
         self.rules.alpha_min = self.blending.alpha_min
         self.rules.alpha_max = self.blending.alpha_max
@@ -212,6 +214,7 @@ class Rasterizer:
         self.rules.rule = RULES[self.blending.rule]
 
     def vector(self, size: int) -> Any:
+        """Warp's vector type of this precision."""
         return wp.types.vector(size, self.real)
 
     def upload(self, g: Gaussians) -> tuple[wp.array, wp.array, wp.array, wp.array]:
@@ -268,7 +271,7 @@ class Rasterizer:
         count = wp.empty(n, dtype=int, device=device)
         distance = wp.empty(n, dtype=float, device=device)
         inputs = (means, quaternions, scales, opacities)
-        launch(self.kernels.project, n, [*inputs, view, self.rules, rows, span, count, distance], device=device)
+        launch(self.project_kernels.project, n, [*inputs, view, self.rules, rows, span, count, distance], device=device)
         order, ends, entries = _sorted_visible(count, distance)
         tiles = view.tiles_x * view.tiles_y
         keys = wp.empty(2 * max(entries, 1), dtype=int, device=device)
@@ -348,7 +351,7 @@ class Rasterizer:
                 pieces=pieces,
             )  # fmt: skip
             launch(
-                self.kernels.chain,
+                self.project_kernels.chain,
                 n,
                 [quaternions, scales, prepared.count, first, sums, _gradient(means), _gradient(quaternions),
                  _gradient(scales), _gradient(opacities), feature_grad, seen],
