@@ -2,12 +2,14 @@
 
 All rays of a view start at one point. For a Gaussian with whitening matrix ``M = diag(1/s) R^T`` and mean ``m`` seen
 from the ray origin, let ``mh = m/|m|``, ``e1, e2`` perpendicular to it, ``a = M mh``, ``b1 = M e1``,
-``b2 = M e2``. A ray ``d = w mh + u1 e1 + u2 e2`` has ``g = M d = w a + u1 b1 + u2 b2``; its squared Mahalanobis distance is
+``b2 = M e2``. A ray ``d = w mh + u1 e1 + u2 e2`` has ``g = M d = w a + u1 b1 + u2 b2``; its squared Mahalanobis
+distance is
 
     q = |m|^2 u^T A u / |g|^2,   A the Gram matrix of (b1 x a, b2 x a),
 
 the response ``exp(-q/2)``, the peak at range ``t = |m| (a.g)/|g|^2``, visible where ``a.g > 0``. This is exact for
-every direction, with no projection to differentiate; projection serves binning only. Coefficients are computed in float64.
+every direction, with no projection to differentiate; projection serves binning only. Coefficients are computed in
+float64.
 """
 
 from functools import cache
