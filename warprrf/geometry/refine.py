@@ -337,10 +337,11 @@ class _Refinement:
                 [width, rate, *corrections, self.gradients[name], *moments, self.state[name]],
                 device=self.device,
             )
+        strength = c.plane_strength if t < c.iterations else 1.0  # in the end exactly flat
         launch(
             optimize.pull_to_planes,
             self.count,
-            [self.state["plane_of"], self.plane_table, c.plane_strength, c.thickness_m, self.means, self.quaternions,
+            [self.state["plane_of"], self.plane_table, strength, c.thickness_m, self.means, self.quaternions,
              self.log_scales],
             device=self.device,
         )  # fmt: skip
