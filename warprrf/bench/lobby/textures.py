@@ -14,6 +14,8 @@ import numpy as np
 from warprrf.device import require
 
 LIFT = 0.75  # exponent that brightens all but the ceiling, so that the walls are not dark beside the light
+FINE = 0.05  # m: detail below this deviation of a Gaussian window is damped
+FINE_CONTRAST = 0.35
 Paint = Callable[[int, int, float, np.random.Generator], np.ndarray]
 
 
@@ -273,6 +275,18 @@ STYLES: dict[str, Paint] = {
 }
 
 
+def soften(image: np.ndarray, texel: float) -> np.ndarray:
+    """``image`` with its contrast below `FINE` damped to `FINE_CONTRAST`: surfaces of a room are smooth up close."""
+    pad = [min(n - 1, round(3 * FINE / texel)) for n in image.shape[:2]]
+    padded = np.pad(image, [(pad[0], pad[0]), (pad[1], pad[1]), (0, 0)], mode="reflect")
+    height, width = padded.shape[:2]
+    f2 = np.fft.fftfreq(height, texel)[:, None] ** 2 + np.fft.rfftfreq(width, texel)[None, :] ** 2
+    gain = FINE_CONTRAST + (1 - FINE_CONTRAST) * np.exp(-2 * (np.pi * FINE) ** 2 * f2)
+    spectrum = np.fft.rfft2(padded, axes=(0, 1)) * gain[..., None]
+    out = np.fft.irfft2(spectrum, s=(height, width), axes=(0, 1))
+    return out[pad[0] : pad[0] + image.shape[0], pad[1] : pad[1] + image.shape[1]]
+
+
 def paint(style: str, width_m: float, height_m: float, texel: float, rng: np.random.Generator) -> np.ndarray:
     """One face's texture in ``style``, shape ``(rows, columns, 3)``, sRGB in (0, 1).
 
@@ -282,5 +296,5 @@ def paint(style: str, width_m: float, height_m: float, texel: float, rng: np.ran
     if style not in STYLES:
         raise ValueError(f"style: got {style!r}, expected one of {', '.join(sorted(STYLES))}")
     rows, columns = max(4, round(height_m / texel)), max(4, round(width_m / texel))
-    image = np.clip(STYLES[style](rows, columns, texel, rng), 0.02, 0.97)
+    image = np.clip(soften(STYLES[style](rows, columns, texel, rng), texel), 0.02, 0.97)
     return image if style == "ceiling" else image**LIFT
