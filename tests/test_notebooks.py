@@ -1,0 +1,34 @@
+"""The notebooks run from beginning to end, and what is committed was made from the text beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
+MAX_BYTES = 1_500_000
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
+def test_committed_notebook_is_its_text(source: Path) -> None:
+    jupytext = pytest.importorskip("jupytext")
+    text, paired = jupytext.read(source), jupytext.read(source.with_suffix(".ipynb"))
+    kept = [(cell.cell_type, cell.source) for cell in paired.cells]
+    assert kept == [(cell.cell_type, cell.source) for cell in text.cells]
+    assert all(cell.get("execution_count") for cell in paired.cells if cell.cell_type == "code"), "not executed"
+    assert source.with_suffix(".ipynb").stat().st_size < MAX_BYTES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(source: Path) -> None:
+    jupytext = pytest.importorskip("jupytext")
+    nbclient = pytest.importorskip("nbclient")
+    notebook = jupytext.read(source)
+    nbclient.NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(source.parent)}}
+    ).execute()
+    printed = [o.get("text", "") for c in notebook.cells if c.cell_type == "code" for o in c.outputs]
+    assert any("all of it" in text for text in printed)
