@@ -39,8 +39,7 @@ help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
 
 $(VENV)/.made:
-	python=$$(bash tools/find_python.sh)
-	"$$python" -m venv $(VENV)
+	python=$$(bash tools/find_python.sh) && "$$python" -m venv $(VENV)
 	touch $@
 
 # One stamp for what the main job needs, one for everything (torch is only in the second).
