@@ -347,7 +347,7 @@ def _look_at(
     )
 
 
-def _iterations(args: argparse.Namespace) -> dict[str, int]:
+def _iterations(args: argparse.Namespace) -> dict[str, Any]:
     return {} if args.iterations is None else {"iterations": args.iterations}
 
 
