@@ -81,7 +81,7 @@ def surface_table(materials: list[Any], frequency_hz: float) -> SurfaceTable:
 def slab_reflection(
     cos_incidence: Any, permittivity: Any, thickness_m: Any, wavelength_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Reflection coefficients of a slab: field across (TE) and in (TM) the plane of incidence, complex.
+    """Reflection of a slab (``inf`` thick: a half-space): field across (TE) and in (TM) the plane of incidence.
 
     Source: ITU-R P.2040-4, eqs. (37a), (37b), (43a), (44). A perfect conductor gives -1 and +1.
     """
@@ -90,8 +90,10 @@ def slab_reflection(
     root = np.sqrt(eta - (1.0 - cos**2))
     te = (cos - root) / (cos + root)
     tm = (eta * cos - root) / (eta * cos + root)
-    q = 2.0 * np.pi * np.asarray(thickness_m) / wavelength_m * root  # eq. (44)
-    echo = np.exp(-2j * q)
+    thickness = np.asarray(thickness_m, dtype=np.float64)
+    endless = np.isinf(thickness)
+    q = 2.0 * np.pi * np.where(endless, 0.0, thickness) / wavelength_m * root  # eq. (44)
+    echo = np.where(endless, 0.0, np.exp(-2j * q))
     return te * (1.0 - echo) / (1.0 - te**2 * echo), tm * (1.0 - echo) / (1.0 - tm**2 * echo)  # eq. (43a)
 
 

@@ -1,0 +1,446 @@
+"""A set of spectra of one transmitter: in memory, as NetCDF, split for training, one spectrum to and from OpenEXR.
+
+Files are NetCDF-4 (xarray over h5netcdf) in SI units with everything needed to read them as attributes. A compact file
+holds the same variables with mantissas rounded to what matters, so that zlib finds something to compress.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.paths import check_frequency
+from warprrf.rf.spectrum import Spectrum, check_shape, default_floor, pixel_angles, to_db
+
+POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
+
+# What a compact file keeps. A relative step of 2^-9 is 0.008 dB; below N0 / 256 a pixel moves the dB image by less.
+COMPACT_GAIN_BITS = 8  # explicit mantissa bits
+COMPACT_GAIN_OF_FLOOR = 2.0**-8  # absolute step, times N0
+COMPACT_DELAY_STEP_S = 2.0**-40  # 0.9 ps, 0.27 mm
+COMPACT_AOD_STEP_RAD = 2.0**-10  # 9.8e-4 rad between values: errors below 4.9e-4 rad
+
+_ROLES = ("train", "test")
+
+
+@dataclass(frozen=True)
+class SpectrumDataset:
+    """Spectra at R receivers.
+
+    Attributes:
+        receivers: Positions [m], shape ``(R, 3)``, float64.
+        transmitter: Position [m], shape ``(3,)``, float64.
+        frequency_hz: Carrier frequency [Hz].
+        path_gain: Path gain per pixel [linear], shape ``(R, H, W)``, float32.
+        delay_s: Delay of the pixel's strongest path [s], shape ``(R, H, W)``, float64; NaN where empty.
+        aod: Its zenith and azimuth of departure [rad], shape ``(R, H, W, 2)``, float32; NaN where empty.
+        floor: Noise floor N0 that dB images add [linear].
+        range_db: 10 log10 N0 and the highest value of the dB images [dB].
+        beam_sigma_rad: Width of the receiver beam, kappa = 1 / sigma^2 [rad].
+        engine: "exact" or "sionna".
+        polarisation: What is averaged and summed.
+        seed: Seed of the engine.
+        role: "train" or "test" for each receiver, shape ``(R,)``.
+        line_of_sight: Whether the receiver sees the transmitter, shape ``(R,)``, bool.
+        attributes: Anything else worth keeping: depth, samples, versions.
+    """
+
+    receivers: np.ndarray
+    transmitter: np.ndarray
+    frequency_hz: float
+    path_gain: np.ndarray
+    delay_s: np.ndarray
+    aod: np.ndarray
+    floor: float
+    range_db: tuple[float, float]
+    beam_sigma_rad: float
+    engine: str
+    polarisation: str
+    seed: int
+    role: np.ndarray
+    line_of_sight: np.ndarray
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes and values; ValueError or TypeError names the field."""
+        check = _device.check_array
+        receivers = check("receivers", self.receivers, (None, 3))
+        count = len(receivers)
+        gain = check("path_gain", self.path_gain, (count, None, None), dtype=np.float32)
+        if (gain < 0).any():
+            raise ValueError(
+                f"path_gain: got {int((gain < 0).sum())} negative values, expected linear path gain"
+            )
+        shape = check_shape(gain.shape[1:])
+        role = np.asarray(self.role, dtype="<U5")
+        if role.shape != (count,) or not np.isin(role, _ROLES).all():
+            raise ValueError(f"role: got shape {role.shape}, expected ({count},) of 'train' and 'test'")
+        fields: dict[str, Any] = {
+            "receivers": receivers,
+            "transmitter": check("transmitter", self.transmitter, (3,)),
+            "frequency_hz": check_frequency(self.frequency_hz),
+            "path_gain": gain,
+            "delay_s": check("delay_s", self.delay_s, (count, *shape), finite=False),
+            "aod": check("aod", self.aod, (count, *shape, 2), dtype=np.float32, finite=False),
+            "floor": float(check("floor", self.floor, ())),
+            "range_db": (float(self.range_db[0]), float(self.range_db[1])),
+            "beam_sigma_rad": float(check("beam_sigma_rad", self.beam_sigma_rad, ())),
+            "seed": int(self.seed),
+            "role": role,
+            "line_of_sight": check("line_of_sight", self.line_of_sight, (count,), dtype=bool),
+        }
+        if not fields["floor"] > 0:
+            raise ValueError(f"floor: got {self.floor!r}, expected a positive linear noise floor")
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_spectra(
+        cls,
+        *,
+        receivers: Any,
+        transmitter: Any,
+        frequency_hz: float,
+        path_gain: Any,
+        delay_s: Any,
+        aod: Any,
+        line_of_sight: Any,
+        beam_sigma_rad: float,
+        engine: str,
+        seed: int = 0,
+        role: Any = None,
+        floor: float | None = None,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> SpectrumDataset:
+        """A data set with N0, its dB range and, if none are given, roles chosen for it."""
+        gain = np.asarray(path_gain, dtype=np.float32)
+        noise = default_floor(gain) if floor is None else float(floor)
+        return cls(
+            receivers=receivers,
+            transmitter=transmitter,
+            frequency_hz=frequency_hz,
+            path_gain=gain,
+            delay_s=delay_s,
+            aod=aod,
+            floor=noise,
+            range_db=(10.0 * float(np.log10(noise)), float(to_db(gain.max(), noise))),
+            beam_sigma_rad=beam_sigma_rad,
+            engine=engine,
+            polarisation=POLARISATION,
+            seed=seed,
+            role=assign_roles(len(gain), seed=seed) if role is None else role,
+            line_of_sight=line_of_sight,
+            attributes=dict(attributes or {}),
+        )
+
+    def __len__(self) -> int:
+        return len(self.receivers)
+
+    def __getitem__(self, index: int) -> Spectrum:
+        """The spectrum of one receiver."""
+        return Spectrum(
+            path_gain=self.path_gain[index],
+            delay_s=self.delay_s[index],
+            aod=self.aod[index],
+            floor=self.floor,
+            range_db=self.range_db,
+            attributes={
+                "receiver": self.receivers[index],
+                "transmitter": self.transmitter,
+                "frequency_hz": self.frequency_hz,
+                "beam_sigma_rad": self.beam_sigma_rad,
+                "engine": self.engine,
+            },
+        )
+
+    def __iter__(self) -> Any:
+        return (self[k] for k in range(len(self)))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a spectrum."""
+        return self.path_gain.shape[1], self.path_gain.shape[2]
+
+    @property
+    def path_gain_db(self) -> np.ndarray:
+        """10 log10(P + N0) [dB], shape ``(R, H, W)``, float64."""
+        return to_db(self.path_gain, self.floor)
+
+    def subset(self, indices: Any) -> SpectrumDataset:
+        """The receivers named by ``indices`` (whole numbers or a mask); floor and range stay those of the whole set."""
+        chosen = np.asarray(indices)
+        if chosen.dtype == bool:
+            chosen = np.flatnonzero(chosen)
+        chosen = chosen.astype(np.int64)
+        if chosen.ndim != 1 or (len(chosen) and (chosen.min() < -len(self) or chosen.max() >= len(self))):
+            raise ValueError(
+                f"indices: got {indices!r}, expected a list of receivers from 0 to {len(self) - 1}"
+            )
+        per_receiver = ("receivers", "path_gain", "delay_s", "aod", "role", "line_of_sight")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in per_receiver})
+
+    def split(self, n_train: int, seed: int = 0) -> tuple[SpectrumDataset, SpectrumDataset]:
+        """``n_train`` training receivers and all test receivers.
+
+        Subsets are nested: a larger ``n_train`` holds the smaller one. Seed 0 takes training receivers in the order of
+        the file, which for the lobby is that of the full data set; other seeds take them in another order. The test
+        receivers are always the same.
+
+        Raises:
+            ValueError: if the set has fewer training receivers, or no test receivers.
+        """
+        train, test = np.flatnonzero(self.role == "train"), np.flatnonzero(self.role == "test")
+        if not 1 <= n_train <= len(train):
+            raise ValueError(
+                f"n_train: got {n_train}, expected 1 to {len(train)}, the training receivers there are"
+            )
+        if len(test) == 0:
+            raise ValueError(
+                "role: there are no test receivers; give simulate(..., roles=) or assign_roles some"
+            )
+        if seed != 0:
+            train = np.random.default_rng(seed).permutation(train)
+        return self.subset(train[:n_train]), self.subset(test)
+
+    def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
+        """Write NetCDF-4, whole or not at all.
+
+        Args:
+            path: File to write or replace.
+            compact: Round mantissas first: path gain to 0.2 % (and N0 / 512), delay to 0.5 ps, AoD to 4.9e-4 rad;
+                the file says so.
+        """
+        xarray = _device.require("xarray", extra="all")
+        _device.require("h5netcdf", extra="all")
+        gain, delay, aod = self.path_gain, self.delay_s, self.aod
+        attributes: dict[str, Any] = {
+            "title": "Spatial radio spectra",
+            "frequency_hz": self.frequency_hz,
+            "beam": "von Mises-Fisher, kappa = 1 / beam_sigma_rad^2, sums to one over the pixels for each path",
+            "beam_sigma_rad": self.beam_sigma_rad,
+            "floor": self.floor,
+            "floor_meaning": "N0 [linear]: dB images are 10 log10(path_gain + N0)",
+            "range_low_db": self.range_db[0],
+            "range_high_db": self.range_db[1],
+            "engine": self.engine,
+            "polarisation": self.polarisation,
+            "seed": self.seed,
+            "axes": "metres, z up; zenith 0 to pi, azimuth -pi to pi; arrival points from the receiver",
+            "compact": int(compact),
+            **self.attributes,
+        }
+        if compact:
+            gain = _round_mantissa(gain, COMPACT_GAIN_BITS, COMPACT_GAIN_OF_FLOOR * self.floor)
+            delay = np.round(delay / COMPACT_DELAY_STEP_S) * COMPACT_DELAY_STEP_S
+            aod = (np.round(aod / COMPACT_AOD_STEP_RAD) * COMPACT_AOD_STEP_RAD).astype(np.float32)
+            attributes["compact_rounding"] = (
+                f"path_gain: {COMPACT_GAIN_BITS} mantissa bits and steps of floor * {COMPACT_GAIN_OF_FLOOR:g}; "
+                f"delay: {COMPACT_DELAY_STEP_S:g} s; aod: {COMPACT_AOD_STEP_RAD:g} rad"
+            )
+        zenith, azimuth = pixel_angles(self.shape)
+        pixel = ("receiver", "zenith", "azimuth")
+        data = xarray.Dataset(
+            {
+                "receiver_position": (("receiver", "xyz"), self.receivers, {"units": "m"}),
+                "transmitter_position": (("xyz",), self.transmitter, {"units": "m"}),
+                "path_gain": (pixel, gain, {"units": "1", "long_name": "path gain per pixel, linear"}),
+                "delay": (pixel, delay, {"units": "s", "long_name": "delay of the pixel's strongest path"}),
+                "aod": (
+                    (*pixel, "angle"),
+                    aod,
+                    {
+                        "units": "rad",
+                        "long_name": "zenith and azimuth of departure of the pixel's strongest path",
+                    },
+                ),
+                "role": (
+                    ("receiver",),
+                    (self.role == "test").astype(np.int8),
+                    {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "train test"},
+                ),
+                "line_of_sight": (("receiver",), self.line_of_sight.astype(np.int8), {"units": "1"}),
+            },
+            coords={
+                "zenith": (("zenith",), zenith, {"units": "rad"}),
+                "azimuth": (("azimuth",), azimuth, {"units": "rad"}),
+                "xyz": ["x", "y", "z"],
+                "angle": ["zenith", "azimuth"],
+            },
+            attrs=attributes,
+        )
+        packing: dict[str, Any] = {"zlib": True, "shuffle": True, "complevel": 9 if compact else 4}
+        encoding = {name: {**packing, "_FillValue": None} for name in ("path_gain", "delay", "aod")}
+        write_whole(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=encoding))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SpectrumDataset:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not a readable NetCDF file of spectra.
+        """
+        file = Path(path)
+        if not file.is_file():
+            raise FileNotFoundError(f"path: there is no data set {file}; warprrf simulate makes one")
+        xarray = _device.require("xarray", extra="all")
+        _device.require("h5netcdf", extra="all")
+        try:
+            with xarray.open_dataset(file, engine="h5netcdf", decode_cf=False) as opened:
+                data = opened.load()
+        except (OSError, ValueError, RuntimeError, KeyError) as error:
+            raise ValueError(f"path: {file} does not read as NetCDF-4 ({error}); is it whole?") from error
+        known = {"frequency_hz", "beam_sigma_rad", "floor", "range_low_db", "range_high_db"}
+        known |= {"engine", "polarisation", "seed"}
+        variables = {
+            "receiver_position",
+            "transmitter_position",
+            "path_gain",
+            "delay",
+            "aod",
+            "role",
+            "line_of_sight",
+        }
+        missing = sorted((known - set(data.attrs)) | (variables - set(data.variables)))
+        if missing:
+            raise ValueError(f"path: {file} lacks {', '.join(missing)}, expected a data set saved by warprrf")
+        a = {name: _plain(value) for name, value in data.attrs.items()}
+        spare = {"title", "beam", "floor_meaning", "axes", "compact", "compact_rounding"}
+        return cls(
+            receivers=data["receiver_position"].values,
+            transmitter=data["transmitter_position"].values,
+            frequency_hz=a["frequency_hz"],
+            path_gain=data["path_gain"].values,
+            delay_s=data["delay"].values,
+            aod=data["aod"].values,
+            floor=a["floor"],
+            range_db=(a["range_low_db"], a["range_high_db"]),
+            beam_sigma_rad=a["beam_sigma_rad"],
+            engine=str(a["engine"]),
+            polarisation=str(a["polarisation"]),
+            seed=int(a["seed"]),
+            role=np.where(data["role"].values == 1, "test", "train"),
+            line_of_sight=data["line_of_sight"].values.astype(bool),
+            attributes={name: value for name, value in a.items() if name not in known | spare},
+        )
+
+    def export_exr(self, path: str | os.PathLike[str], index: int) -> None:
+        """Write one spectrum as OpenEXR: channels path_gain, delay, aod_zenith, aod_azimuth, 32-bit.
+
+        Numbers in the header are text, because EXR headers hold 32-bit floats only.
+        """
+        exr = _device.require("OpenEXR", extra="exr")
+        if not -len(self) <= index < len(self):
+            raise ValueError(f"index: got {index}, expected a receiver from 0 to {len(self) - 1}")
+        channels = {
+            "path_gain": self.path_gain[index].astype(np.float32),
+            "delay": self.delay_s[index].astype(np.float32),
+            "aod_zenith": np.ascontiguousarray(self.aod[index, ..., 0]),
+            "aod_azimuth": np.ascontiguousarray(self.aod[index, ..., 1]),
+        }
+        header: dict[str, Any] = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+        numbers = {
+            "frequency_hz": [self.frequency_hz],
+            "beam_sigma_rad": [self.beam_sigma_rad],
+            "floor": [self.floor],
+            "range_db": self.range_db,
+            "receiver": self.receivers[index],
+            "transmitter": self.transmitter,
+        }
+        header.update(
+            {f"warprrf_{name}": " ".join(repr(float(v)) for v in row) for name, row in numbers.items()}
+        )
+        header.update({"warprrf_engine": self.engine, "warprrf_polarisation": self.polarisation})
+        write_whole(path, lambda part: exr.File(header, dict(channels)).write(str(part)), suffix=".exr")
+
+
+def import_exr(path: str | os.PathLike[str]) -> Spectrum:
+    """Read one spectrum from OpenEXR; position, frequency, beam and engine are in its ``attributes``.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it does not read as one of ours.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"path: there is no file {file}")
+    exr = _device.require("OpenEXR", extra="exr")
+    try:
+        with exr.File(str(file), separate_channels=True) as opened:
+            header = dict(opened.header())
+            channels = {name: np.array(channel.pixels) for name, channel in opened.channels().items()}
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ValueError(f"path: {file} does not read as OpenEXR ({error})") from error
+    names = ("path_gain", "delay", "aod_zenith", "aod_azimuth")
+    lacking = [n for n in names if n not in channels] + [
+        n for n in ("floor", "range_db") if f"warprrf_{n}" not in header
+    ]
+    if lacking:
+        raise ValueError(f"path: {file} lacks {', '.join(lacking)}, expected a spectrum exported by warprrf")
+    numbers = {}
+    for name in ("frequency_hz", "beam_sigma_rad", "floor", "range_db", "receiver", "transmitter"):
+        row = np.array([float(v) for v in str(header.get(f"warprrf_{name}", "nan")).split()])
+        numbers[name] = row if len(row) > 1 else float(row[0])
+    low, high = np.reshape(numbers.pop("range_db"), 2)
+    return Spectrum(
+        path_gain=channels["path_gain"],
+        delay_s=channels["delay"].astype(np.float64),
+        aod=np.stack([channels["aod_zenith"], channels["aod_azimuth"]], axis=-1),
+        floor=float(numbers.pop("floor")),
+        range_db=(float(low), float(high)),
+        attributes={
+            **numbers,
+            "engine": str(header.get("warprrf_engine", "")),
+            "polarisation": str(header.get("warprrf_polarisation", "")),
+        },
+    )
+
+
+def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.ndarray:
+    """ "train" or "test" for each of ``count`` receivers, ``test`` of them (an eighth by default) drawn at random."""
+    wanted = count // 8 if test is None else test
+    if not 0 <= wanted <= count:
+        raise ValueError(f"test: got {wanted}, expected 0 to {count}, the receivers there are")
+    role = np.full(count, "train", dtype="<U5")
+    role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
+    return role
+
+
+def write_whole(path: str | os.PathLike[str], write: Any, suffix: str = "") -> None:
+    """Call ``write(temporary path)`` in the target's folder, then move the file into place."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=suffix)
+    os.close(handle)
+    try:
+        write(Path(name))
+        os.chmod(name, 0o644)
+        os.replace(name, target)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def _round_mantissa(values: np.ndarray, bits: int, step: float) -> np.ndarray:
+    """float32 values with ``bits`` explicit mantissa bits, and no finer than multiples of ``step``."""
+    coarse = np.round(values / np.float32(step)) * np.float32(step)
+    rounded = np.where(values < step * 2.0**bits, coarse, values).astype(np.float32)
+    drop = 23 - bits
+    whole = rounded.view(np.uint32)
+    half = np.uint32((1 << (drop - 1)) - 1) + ((whole >> np.uint32(drop)) & np.uint32(1))  # ties to even
+    return ((whole + half) & np.uint32(0xFFFFFFFF ^ ((1 << drop) - 1))).view(np.float32)
+
+
+def _plain(value: Any) -> Any:
+    """A NetCDF attribute as a Python value."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value.decode() if isinstance(value, bytes) else value

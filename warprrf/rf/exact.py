@@ -1,0 +1,235 @@
+"""Spectra of a single bounce without sampling noise: line of sight, mirror reflections and diffuse scattering.
+
+Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths`). Diffuse scattering is evaluated along 64
+directions per pixel, each with one receiver ray and one shadow ray on the mesh, as a path of its own: path gain
+(lambda / 4 pi)^2 S^2 |Gamma|^2 f_s cos(theta_i) / (cos(theta_s) d1^2) times its share of the pixel's solid angle, with
+|Gamma|^2 the mean over transmit polarisations. All paths are spread by one receiver beam.
+
+The directions form a rank-1 lattice of equal solid angles, shifted from row to row and column to column: a regular grid
+would meet upright edges in whole columns, and errs 3 to 5 times more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
+from warprrf.kernels.scatter import scatter_to_receiver
+from warprrf.rf.fresnel import SPEED_OF_LIGHT, SurfaceTable
+from warprrf.rf.paths import MirrorTracer, Paths
+from warprrf.rf.spectrum import (
+    BEAM_SIGMA_RAD,
+    angles_from_directions,
+    check_shape,
+    directions_from_angles,
+    pixel_solid_angles,
+    spread_paths,
+)
+
+SUB_PIXELS = 8
+"""Default square root of the directions per pixel.
+
+Error of the total diffuse power at 60 x 120 over 17 places in a furnished room, rms (largest): 4: 0.3 % (0.8 %),
+8: 0.05 % (0.13 %), 16: 0.02 % (0.04 %).
+"""
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True)
+class ReceivedPaths:
+    """What one receiver gets, as pixels, and as totals before the beam.
+
+    Attributes:
+        path_gain: Path gain per pixel [linear], shape ``(H, W)``, float64.
+        delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
+        aod: Its zenith and azimuth of departure [rad], shape ``(H, W, 2)``; NaN where empty.
+        line_of_sight: Whether the transmitter is seen.
+        totals: Path gain by kind: "los", "mirror", "diffuse" [linear].
+    """
+
+    path_gain: np.ndarray
+    delay_s: np.ndarray
+    aod: np.ndarray
+    line_of_sight: bool
+    totals: dict[str, float]
+
+
+@dataclass(frozen=True)
+class DiffusePaths:
+    """Diffuse paths of one receiver, one per direction that meets a lit surface.
+
+    Attributes:
+        direction: Direction of arrival, shape ``(L, 3)``.
+        power: Path gain [linear], shape ``(L,)``.
+        range_m: Distance to the scattering point [m], shape ``(L,)``.
+        index: Which of the engine's directions, shape ``(L,)``.
+    """
+
+    direction: np.ndarray
+    power: np.ndarray
+    range_m: np.ndarray
+    index: np.ndarray
+
+
+class ExactEngine:
+    """Deterministic single-bounce propagation from one transmitter.
+
+    Args:
+        scene: Scene with ``mesh``, ``face_material`` and ``materials``.
+        transmitter: Position [m], shape ``(3,)``.
+        frequency_hz: Carrier frequency [Hz].
+        shape: Rows and columns of the spectrum.
+        beam_sigma_rad: Receiver beam width [rad].
+        sub_pixels: Square root of the number of directions per pixel.
+        device: Where rays are cast and beams spread.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        *,
+        transmitter: Any,
+        frequency_hz: float,
+        shape: tuple[int, int],
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        sub_pixels: int = SUB_PIXELS,
+        device: Any = None,
+    ) -> None:
+        if sub_pixels < 1:
+            raise ValueError(f"sub_pixels: got {sub_pixels!r}, expected at least 1")
+        self.shape = check_shape(shape)
+        self.beam_sigma_rad = beam_sigma_rad
+        self.sub_pixels = sub_pixels
+        self.tracer = MirrorTracer(scene, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
+        if self.tracer.table is None:
+            raise TypeError(
+                "scene: got a bare Mesh, expected a Scene with materials, because scattering needs them"
+            )
+        self.device = _device.resolve(device)
+        self._surface = self._upload(self.tracer.table, np.asarray(scene.face_material, dtype=np.int32))
+
+    def _upload(self, table: SurfaceTable, face_material: np.ndarray) -> list[wp.array]:
+        where, mesh = self.device, self.tracer.mesh
+        eta = np.column_stack([table.permittivity.real, table.permittivity.imag])
+        return [
+            wp.array(mesh.triangles[:, 0], dtype=wp.vec3d, device=where),
+            wp.array(mesh.face_normals, dtype=wp.vec3d, device=where),
+            wp.array(face_material, dtype=wp.int32, device=where),
+            wp.array(eta, dtype=wp.vec2d, device=where),
+            wp.array(table.thickness_m, dtype=wp.float64, device=where),
+            wp.array(table.scattering, dtype=wp.float64, device=where),
+            wp.array(table.alpha_r, dtype=wp.int32, device=where),
+        ]
+
+    def diffuse(self, receiver: np.ndarray) -> DiffusePaths:
+        """Diffuse paths of one receiver (3,), one per direction that meets a lit surface."""
+        grid = _sub_pixel_grid(self.shape, self.sub_pixels, str(self.device))
+        mesh, count = self.tracer.mesh, len(grid.solid_angles)
+        radiance = wp.zeros(count, dtype=wp.float64, device=self.device)
+        range_m = wp.zeros(count, dtype=wp.float64, device=self.device)
+        inputs = [
+            mesh.on_device(self.device).id,
+            wp.vec3d(*mesh.center),
+            *self._surface,
+            wp.vec3d(*self.tracer.transmitter),
+            wp.vec3d(*receiver),
+            wp.float64(self.tracer.wavelength_m),
+            wp.float64(0.5 * np.pi / (self.shape[0] * self.sub_pixels)),
+            wp.float64(ENDPOINT_CLEARANCE),
+            4 if mesh.is_closed else 0,
+            grid.on_device,
+            radiance,
+            range_m,
+        ]
+        _device.launch(scatter_to_receiver, count, inputs, device=self.device)
+        power = radiance.numpy() * grid.solid_angles
+        lit = np.flatnonzero(power > 0)
+        return DiffusePaths(grid.directions[lit], power[lit], range_m.numpy()[lit], lit)
+
+    def receive(self, receiver: Any) -> ReceivedPaths:
+        """The spectrum of one receiver (3,)."""
+        point = _device.check_array("receiver", receiver, (3,))
+        specular = self.tracer.trace(point, 1)
+        scattered = self.diffuse(point)
+        directions = np.concatenate([specular.arrival, scattered.direction])
+        power = np.concatenate([specular.power, scattered.power])
+        first = np.where(
+            specular.kind[:, None] == "los", point, np.nan_to_num(specular.vertices[:, 0])
+        )  # the first point after the transmitter
+        first = np.concatenate([first, point + scattered.range_m[:, None] * scattered.direction])
+        rest = specular.length_m - np.linalg.norm(
+            first[: len(specular.tau)] - self.tracer.transmitter, axis=1
+        )
+        spread = spread_paths(directions, power, self.shape, self.beam_sigma_rad, device=self.device)
+        delay_s, aod = strongest_delay_and_departure(
+            spread.strongest, self.tracer.transmitter, first, np.concatenate([rest, scattered.range_m])
+        )
+        return ReceivedPaths(
+            path_gain=spread.path_gain,
+            delay_s=delay_s,
+            aod=aod,
+            line_of_sight=bool((specular.kind == "los").any()),
+            totals=power_by_kind(specular, scattered.power),
+        )
+
+
+def power_by_kind(specular: Paths, diffuse: np.ndarray) -> dict[str, float]:
+    """Total path gain of each kind of path [linear]."""
+    return {
+        "los": float(specular.power[specular.kind == "los"].sum()),
+        "mirror": float(specular.power[specular.kind == "mirror"].sum()),
+        "diffuse": float(diffuse.sum()),
+    }
+
+
+def strongest_delay_and_departure(
+    strongest: np.ndarray, transmitter: np.ndarray, first: np.ndarray, rest_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Delay [s] and departure angles [rad] of each pixel's strongest path, NaN where it has none.
+
+    Args:
+        strongest: Index of the path, shape ``(H, W)``; -1 where empty.
+        first: First point after the transmitter of each path [m], shape ``(L, 3)``.
+        rest_m: Length from there to the receiver [m], shape ``(L,)``.
+    """
+    delay_s, aod = np.full(strongest.shape, np.nan), np.full((*strongest.shape, 2), np.nan)
+    filled = strongest >= 0
+    index = strongest[filled]
+    leg = first[index] - transmitter
+    delay_s[filled] = (np.linalg.norm(leg, axis=1) + rest_m[index]) / SPEED_OF_LIGHT
+    aod[filled] = np.stack(angles_from_directions(leg), axis=-1)
+    return delay_s, aod
+
+
+@dataclass(frozen=True)
+class _SubPixels:
+    directions: np.ndarray
+    solid_angles: np.ndarray
+    on_device: wp.array
+
+
+@lru_cache(maxsize=4)
+def _sub_pixel_grid(shape: tuple[int, int], sub_pixels: int, device: str) -> _SubPixels:
+    """``sub_pixels``^2 directions per pixel, pixel by pixel, of equal solid angle within one."""
+    rows, columns = shape
+    count = sub_pixels**2
+    step = min(
+        (a for a in range(1, count + 1) if np.gcd(a, count) == 1), key=lambda a: abs(a - count * _GOLDEN)
+    )
+    k, i, j = np.arange(count), np.arange(rows)[:, None, None], np.arange(columns)[None, :, None]
+    across = (k + np.mod(i * _GOLDEN, 1.0)) / count  # one value a row and direction: no two alike in a column
+    down = (k * step % count + np.mod(j * _GOLDEN, 1.0)) / count
+    top, bottom = np.cos(i * np.pi / rows), np.cos((i + 1) * np.pi / rows)
+    azimuth = -np.pi + (j + across) * 2.0 * np.pi / columns
+    directions = directions_from_angles(np.arccos(top + (bottom - top) * down), azimuth).reshape(-1, 3)
+    return _SubPixels(
+        directions=directions,
+        solid_angles=np.repeat(pixel_solid_angles(shape) / count, columns * count),
+        on_device=wp.array(directions, dtype=wp.vec3d, device=device),
+    )

@@ -1,0 +1,290 @@
+"""Spectra of a scene for many receivers, by either engine, resumable receiver by receiver."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.device import Progress
+from warprrf.rf.dataset import SpectrumDataset, write_whole
+from warprrf.rf.exact import SUB_PIXELS, ExactEngine, ReceivedPaths
+from warprrf.rf.fresnel import as_mesh, surface_table
+from warprrf.rf.paths import check_frequency
+from warprrf.rf.sionna_engine import SionnaEngine
+from warprrf.rf.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
+
+ENGINES = ("exact", "sionna")
+WALL_CLEARANCE_M = 1e-4
+"""Positions nearer to a surface than this count as on it [m]."""
+
+# Receivers drawn at a time before those without clearance are dropped; a scene with less than one free place in
+# _TRIES * _BATCH has none worth the name.
+_BATCH = 1000
+_TRIES = 200
+
+
+def simulate(
+    scene: Any,
+    *,
+    transmitter: Any,
+    receivers: Any,
+    frequency_hz: float,
+    shape: tuple[int, int] = DEFAULT_SHAPE,
+    engine: str = "exact",
+    depth: int = 3,
+    samples: int = 1_000_000,
+    beam_sigma_rad: float = BEAM_SIGMA_RAD,
+    refraction: bool = False,
+    seed: int = 0,
+    roles: Any = None,
+    floor: float | None = None,
+    workspace: str | os.PathLike[str] | None = None,
+    progress: Progress | None = None,
+    device: Any = None,
+) -> SpectrumDataset:
+    """Spectra of one transmitter at many receivers.
+
+    Args:
+        scene: The :class:`Scene`.
+        transmitter: Position [m], shape ``(3,)``.
+        receivers: Positions [m], shape ``(R, 3)``.
+        frequency_hz: Carrier frequency [Hz].
+        shape: Rows and columns of a spectrum.
+        engine: "exact": line of sight, one mirror reflection and single-bounce scattering, without noise; ``depth``,
+            ``samples``, ``refraction`` and ``seed`` play no part. "sionna": Sionna RT's PathSolver.
+        depth: Most bounces on a path of Sionna's.
+        samples: Rays per transmitter of Sionna's.
+        beam_sigma_rad: Receiver beam width, kappa = 1 / sigma^2 [rad].
+        refraction: Whether Sionna's paths go through slabs.
+        seed: Seed of Sionna's rays, and of the roles if none are given.
+        roles: "train" or "test" for each receiver, shape ``(R,)``; an eighth is for test by default.
+        floor: N0 [linear]; median over views of the view's maximum, less 60 dB, by default.
+        workspace: Folder that keeps each finished receiver, so that a killed run goes on where it stopped.
+        progress: Called as ``progress("simulate", done, total)``.
+        device: Where our own kernels run.
+
+    Raises:
+        ValueError: on a position that is NaN, outside the scene, inside a solid or on a surface; on a frequency outside
+            a material's band; on an unknown engine.
+        ImportError: if ``engine="sionna"`` and Sionna RT is missing.
+    """
+    if engine not in ENGINES:
+        raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
+    grid = check_shape(shape)
+    for name, value, least in (("depth", depth, 0), ("samples", samples, 1)):
+        if isinstance(value, bool) or int(value) != value or value < least:
+            raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+    points = _device.check_array("receivers", receivers, (None, 3))
+    if len(points) == 0:
+        raise ValueError("receivers: got none, expected at least one position")
+    source = _device.check_array("transmitter", transmitter, (3,))
+    frequency = check_frequency(frequency_hz)
+    table = surface_table(scene.materials, frequency)
+    check_positions(scene, source, points, device=device)
+
+    common = {
+        "transmitter": source,
+        "frequency_hz": frequency,
+        "shape": grid,
+        "beam_sigma_rad": beam_sigma_rad,
+    }
+    settings: dict[str, Any] = {"sub_pixels": SUB_PIXELS} if engine == "exact" else {}
+    if engine == "sionna":
+        settings = {"depth": depth, "samples": samples, "refraction": refraction, "seed": seed}
+    versions = _versions(engine)
+    surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
+    cache = (
+        None if workspace is None else _Cache(Path(workspace), engine, settings, common, versions, surfaces)
+    )
+    running: ExactEngine | SionnaEngine | None = None
+    results = []
+    for k, point in enumerate(points):
+        if progress is not None:
+            progress("simulate", k, len(points))
+        found = None if cache is None else cache.load(point)
+        if found is None:
+            if running is None:
+                running = _start(engine, scene, common, settings, device)
+            found = running.receive(point)
+            if cache is not None:
+                cache.save(point, found)
+        results.append(found)
+    if progress is not None:
+        progress("simulate", len(points), len(points))
+    single = {"depth": 1} if engine == "exact" else {"refraction": int(refraction)}
+    kept = {name: value for name, value in settings.items() if name not in ("seed", "refraction")}
+    return SpectrumDataset.from_spectra(
+        receivers=points,
+        transmitter=source,
+        frequency_hz=frequency,
+        path_gain=np.stack([r.path_gain.astype(np.float32) for r in results]),
+        delay_s=np.stack([r.delay_s for r in results]),
+        aod=np.stack([r.aod.astype(np.float32) for r in results]),
+        line_of_sight=[r.line_of_sight for r in results],
+        beam_sigma_rad=beam_sigma_rad,
+        engine=engine,
+        seed=seed,
+        role=roles,
+        floor=floor,
+        attributes={**single, **kept, **{f"version_{name}": value for name, value in versions.items()}},
+    )
+
+
+def check_positions(
+    scene: Any, transmitter: np.ndarray, receivers: np.ndarray, *, device: Any = None
+) -> None:
+    """Refuse positions outside the scene, on a surface, or in another solid than the transmitter's air.
+
+    Raises:
+        ValueError: naming the first such position.
+    """
+    mesh = as_mesh(scene)
+    points = np.concatenate([transmitter[None], receivers])
+    low, high = mesh.bounds
+    solid = mesh.is_closed
+    outside = ((points < low) | (points > high)).any(axis=1) if solid else np.zeros(len(points), dtype=bool)
+    near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
+    inside = np.zeros(len(points), dtype=bool)
+    if solid:
+        winding = mesh.winding_number(points)
+        inside = np.abs(winding - winding[0]) > 0.5
+        # Of solids wound outward the air has winding number 0; of one hollow room, its inside is the air.
+        inside[0] = winding[0] > 1.5
+    for bad, what in ((outside, "outside the scene"), (near, "on a surface"), (inside, "inside a solid")):
+        if bad.any():
+            k = int(np.flatnonzero(bad)[0])
+            name = "transmitter" if k == 0 else f"receivers[{k - 1}]"
+            box = f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()}"
+            raise ValueError(
+                f"{name}: {points[k].tolist()} is {what} ({int(bad.sum())} such in all), expected a place in the air "
+                f"of the scene ({box}); sample_receivers finds some"
+            )
+
+
+def sample_receivers(
+    scene: Any,
+    n: int,
+    *,
+    z: tuple[float, float] = (0.8, 2.2),
+    clearance: float = 0.3,
+    seed: int,
+    device: Any = None,
+) -> np.ndarray:
+    """``n`` places drawn uniformly from the scene's air, shape ``(n, 3)`` [m]; a longer draw starts with a shorter one.
+
+    Args:
+        scene: Scene of closed solids or one closed room.
+        z: Lowest and highest place [m].
+        clearance: Least distance to any surface [m].
+        seed: Seed of the draw.
+
+    Raises:
+        ValueError: if there is no such place, or the range is empty.
+    """
+    if n < 1 or not z[0] <= z[1]:
+        raise ValueError(f"n, z: got {n!r}, {z!r}, expected at least 1 and (lowest, highest)")
+    mesh = as_mesh(scene)
+    low, high = mesh.bounds.copy()
+    low[2], high[2] = max(low[2], z[0]), min(high[2], z[1])
+    if low[2] > high[2]:
+        raise ValueError(
+            f"z: got {z!r}, but the scene lies between {mesh.bounds[0, 2]:g} and {mesh.bounds[1, 2]:g} m"
+        )
+    rng = np.random.default_rng(seed)
+    found: list[np.ndarray] = []
+    count = 0
+    for _ in range(_TRIES):
+        points = rng.uniform(low, high, (_BATCH, 3))
+        points = points[scene.is_free(points, clearance_m=clearance, device=device)]
+        found.append(points)
+        count += len(points)
+        if count >= n:
+            return np.concatenate(found)[:n]
+    raise ValueError(
+        f"clearance: found {count} of {n} places {clearance:g} m from everything in {_TRIES * _BATCH} draws"
+    )
+
+
+def _start(engine: str, scene: Any, common: Any, settings: Any, device: Any) -> ExactEngine | SionnaEngine:
+    if engine == "exact":
+        return ExactEngine(scene, **common, **settings, device=device)
+    return SionnaEngine(scene, **common, **settings, device=device)
+
+
+def _versions(engine: str) -> dict[str, str]:
+    packages = {"warprrf": "warprrf", "warp": "warp-lang", "numpy": "numpy"}
+    if engine == "sionna":
+        packages |= {"sionna_rt": "sionna-rt", "mitsuba": "mitsuba", "drjit": "drjit"}
+    found = {}
+    for name, package in packages.items():
+        try:
+            found[name] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "unknown"
+    return found
+
+
+class _Cache:
+    """One file a receiver, named by everything that its spectrum depends on."""
+
+    def __init__(
+        self,
+        folder: Path,
+        engine: str,
+        settings: dict[str, Any],
+        common: dict[str, Any],
+        versions: dict[str, str],
+        surfaces: tuple[np.ndarray, ...],
+    ) -> None:
+        self.folder = folder
+        # Our own version is left out: a run goes on after an update; a new solver starts afresh.
+        solver = {k: v for k, v in versions.items() if k in ("sionna_rt", "mitsuba", "drjit")}
+        digest = hashlib.sha256(repr((engine, sorted(settings.items()), sorted(solver.items()))).encode())
+        for name in sorted(common):
+            digest.update(np.asarray(common[name], dtype=np.float64).tobytes())
+        for array in surfaces:
+            digest.update(np.ascontiguousarray(array).tobytes())
+        self._base = digest
+
+    def _path(self, point: np.ndarray) -> Path:
+        digest = self._base.copy()
+        digest.update(point.tobytes())
+        return self.folder / f"{digest.hexdigest()[:24]}.npz"
+
+    def load(self, point: np.ndarray) -> ReceivedPaths | None:
+        """A finished receiver, or None; a file cut short is as good as none."""
+        path = self._path(point)
+        if not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                kinds = data["kinds"].tolist()
+                return ReceivedPaths(
+                    path_gain=data["path_gain"],
+                    delay_s=data["delay_s"],
+                    aod=data["aod"],
+                    line_of_sight=bool(data["line_of_sight"]),
+                    totals=dict(zip(kinds, data["totals"].tolist(), strict=True)),
+                )
+        except (zipfile.BadZipFile, EOFError, KeyError, ValueError):
+            path.unlink()
+            return None
+
+    def save(self, point: np.ndarray, found: ReceivedPaths) -> None:
+        """Keep a finished receiver."""
+        arrays: dict[str, Any] = {
+            "path_gain": found.path_gain.astype(np.float32),
+            "delay_s": found.delay_s,
+            "aod": found.aod.astype(np.float32),
+            "line_of_sight": np.array(found.line_of_sight),
+            "kinds": np.array(list(found.totals)),
+            "totals": np.array(list(found.totals.values())),
+        }
+        write_whole(self._path(point), lambda part: np.savez(part, **arrays), suffix=".npz")

@@ -1,0 +1,217 @@
+"""Spectra from Sionna RT's PathSolver: line of sight, specular and diffuse paths of any depth, by ray sampling.
+
+The scene's own material table is set in Python (an XML can't carry scattering patterns, and Sionna has no metal at
+300 GHz). Both transmit and both receive polarisations are solved at once: path gain is the mean over the former and
+the sum over the latter. One solve per receiver, because Sionna shares its cap on paths between all of them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.exact import ReceivedPaths
+from warprrf.rf.llvm import select_llvm
+from warprrf.rf.paths import check_frequency
+from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
+
+# Sionna's default cap of 1e6 paths truncates silently; each sample can give one path a bounce.
+_PATHS_PER_SAMPLE_AND_BOUNCE = 1
+# Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
+_RECEIVERS_PER_FLUSH = 20
+_DIFFUSE = 2  # sionna.rt.InteractionType.DIFFUSE
+
+
+class SionnaEngine:
+    """Sionna RT for one transmitter.
+
+    Args:
+        scene: Scene loaded from an XML file.
+        transmitter: Position [m], shape ``(3,)``.
+        frequency_hz: Carrier frequency [Hz].
+        shape: Rows and columns of the spectrum.
+        beam_sigma_rad: Receiver beam width [rad].
+        depth: Most bounces on a path.
+        samples: Rays from the transmitter.
+        refraction: Whether paths go through slabs.
+        seed: Seed of the ray directions.
+        device: Where beams are spread (Sionna takes its own: CUDA where there is a GPU).
+
+    Raises:
+        ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
+        ValueError: if the scene was not loaded from a file.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        *,
+        transmitter: Any,
+        frequency_hz: float,
+        shape: tuple[int, int],
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        depth: int = 3,
+        samples: int = 1_000_000,
+        refraction: bool = False,
+        seed: int = 0,
+        device: Any = None,
+    ) -> None:
+        select_llvm()
+        self._rt = _device.require("sionna.rt", extra="sionna")
+        self.shape = check_shape(shape)
+        self.beam_sigma_rad = beam_sigma_rad
+        self.transmitter = _device.check_array("transmitter", transmitter, (3,))
+        self.frequency_hz = check_frequency(frequency_hz)
+        self.depth, self.samples, self.refraction, self.seed = depth, samples, refraction, seed
+        self.device = device
+        self._select_variant()
+        self._scene = self._load(scene)
+        self._solver = self._rt.PathSolver(deterministic=True)
+        self._solved = 0
+
+    @property
+    def version(self) -> str:
+        """Sionna RT's version."""
+        return str(self._rt.__version__)
+
+    def _select_variant(self) -> None:
+        """Mitsuba may be on another variant in this process, for photos."""
+        mitsuba = _device.require("mitsuba", extra="sionna")
+        if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
+            mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
+
+    def _load(self, scene: Any) -> Any:
+        if getattr(scene, "xml_path", None) is None:
+            raise ValueError(
+                "scene: got one without an XML file, which Sionna needs; use Scene.load or engine='exact'"
+            )
+        rt = self._rt
+        loaded = rt.load_scene(str(scene.xml_path), merge_shapes=False)
+        before = list(loaded.radio_materials)
+        materials = []
+        for k, material in enumerate(scene.materials):
+            if not np.isfinite(material.thickness_m):
+                raise ValueError(
+                    f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
+                )
+            eta = complex(material.permittivity(self.frequency_hz))
+            radio = rt.RadioMaterial(
+                f"warprrf-{k}-{material.name}",
+                thickness=material.thickness_m,
+                relative_permittivity=eta.real,
+                conductivity=-eta.imag * 2.0 * np.pi * self.frequency_hz * _VACUUM_PERMITTIVITY,
+                scattering_coefficient=material.scattering_coefficient(self.frequency_hz),
+                xpd_coefficient=0.0,
+            )
+            directive = material.pattern == "directive"
+            radio.scattering_pattern = (
+                rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
+            )
+            loaded.add(radio)
+            materials.append(radio)
+        objects = dict(loaded.objects)
+        for index, name in enumerate(scene.object_names):
+            if name not in objects:
+                raise ValueError(f"scene: object {name!r} is not in {scene.xml_path} as Sionna reads it")
+            used = np.unique(np.asarray(scene.face_material)[np.asarray(scene.face_object) == index])
+            if len(used) != 1:
+                raise ValueError(
+                    f"scene: object {name!r} has {len(used)} materials, Sionna allows one an object"
+                )
+            objects[name].radio_material = materials[int(used[0])]
+        for name in before:
+            if not loaded.radio_materials[name].is_used:
+                loaded.remove(name)
+        loaded.frequency = self.frequency_hz
+        both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
+        loaded.tx_array, loaded.rx_array = rt.PlanarArray(**both), rt.PlanarArray(**both)
+        loaded.add(rt.Transmitter("tx", position=self.transmitter.tolist()))
+        return loaded
+
+    def solve(self, receiver: Any, *, specular: bool = True) -> dict[str, np.ndarray]:
+        """Paths of one receiver (3,): ``power``, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.
+
+        Without ``specular`` reflections every ray scatters, and at depth 1 Sionna's result hardly depends on chance.
+        """
+        point = _device.check_array("receiver", receiver, (3,))
+        self._select_variant()
+        self._scene.add(self._rt.Receiver("rx", position=point.tolist()))
+        try:
+            paths = self._solver(
+                self._scene,
+                max_depth=self.depth,
+                max_num_paths_per_src=self._path_cap,
+                samples_per_src=self.samples,
+                synthetic_array=True,
+                los=True,
+                specular_reflection=specular,
+                diffuse_reflection=True,
+                refraction=self.refraction,
+                seed=self.seed,
+            )
+            found = self._read(paths)
+        finally:
+            self._scene.remove("rx")
+        self._solved += 1
+        if self._solved % _RECEIVERS_PER_FLUSH == 0:
+            self._flush()
+        return found
+
+    @property
+    def _path_cap(self) -> int:
+        return self.samples * max(self.depth, 1) * _PATHS_PER_SAMPLE_AND_BOUNCE + 100_000
+
+    def _read(self, paths: Any) -> dict[str, np.ndarray]:
+        """Sionna's arrays of one receiver and transmitter; both antennas are two polarisations at one place."""
+        real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
+        per_path = (real**2 + imag**2).reshape(-1, real.shape[-1])  # 2 receive x 2 transmit polarisations
+        valid = paths.valid.numpy().reshape(-1)
+        if len(valid) >= self._path_cap:
+            raise RuntimeError(f"Sionna filled its cap of {self._path_cap} paths: power would be missing")
+        kinds = paths.interactions.numpy().reshape(-1, len(valid)) if len(valid) else np.zeros((1, 0), int)
+
+        def field(values: Any) -> np.ndarray:
+            return np.asarray(values.numpy(), dtype=np.float64).reshape(-1)[valid]
+
+        return {
+            "power": per_path.sum(axis=0)[valid] / 2.0,
+            "tau": field(paths.tau),
+            "arrival": directions_from_angles(field(paths.theta_r), field(paths.phi_r)),
+            "aod": np.column_stack([field(paths.theta_t), field(paths.phi_t)]),
+            "diffuse": (kinds == _DIFFUSE).any(axis=0)[valid],
+            "bounces": (kinds != 0).sum(axis=0)[valid],
+        }
+
+    def _flush(self) -> None:
+        drjit = _device.require("drjit", extra="sionna")
+        drjit.flush_malloc_cache()
+        drjit.flush_kernel_cache()
+
+    def receive(self, receiver: Any) -> ReceivedPaths:
+        """The spectrum of one receiver (3,)."""
+        found = self.solve(receiver)
+        spread = spread_paths(
+            found["arrival"], found["power"], self.shape, self.beam_sigma_rad, device=self.device
+        )
+        filled = spread.strongest >= 0
+        index = spread.strongest[filled]
+        delay_s, aod = np.full(self.shape, np.nan), np.full((*self.shape, 2), np.nan)
+        delay_s[filled], aod[filled] = found["tau"][index], found["aod"][index]
+        direct, diffuse = found["bounces"] == 0, found["diffuse"]
+        power = found["power"]
+        return ReceivedPaths(
+            path_gain=spread.path_gain,
+            delay_s=delay_s,
+            aod=aod,
+            line_of_sight=bool(direct.any()),
+            totals={
+                "los": float(power[direct].sum()),
+                "mirror": float(power[~direct & ~diffuse].sum()),
+                "diffuse": float(power[diffuse].sum()),
+            },
+        )
+
+
+_VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
