@@ -201,7 +201,7 @@ blocked = int(np.flatnonzero(~test.line_of_sight)[0])
 open_view = int(np.flatnonzero(test.line_of_sight)[0])
 figure, axes = plt.subplots(1, 2, figsize=(14, 3.6))
 for ax, index, title in ((axes[0], open_view, "line of sight"), (axes[1], blocked, "blocked")):
-    truth = test.spectrum(index)
+    truth = test[index]
     truth.plot(ax=ax)
     ax.set_title(f"{title}: {10 * np.log10(truth.total_path_gain):.1f} dB in all")
 
@@ -236,7 +236,7 @@ ax.set_xlabel("step"), ax.set_ylabel("0.8 L1 + 0.2 (1 - SSIM)"), ax.grid(alpha=0
 
 # %%
 for index in (open_view, blocked):
-    truth, guess = test.spectrum(index), field.spectrum(test.receivers[index])
+    truth, guess = test[index], field.spectrum(test.receivers[index])
     low, high = test.range_db
     figure = report.spectrum_rows(truth.path_gain_db, {"RF-3DGS+": guess.path_gain_db}, low, high)
     display(figure)  # noqa: F821

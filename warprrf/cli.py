@@ -10,6 +10,7 @@ import argparse
 import csv
 import json
 import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -136,6 +137,7 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
 
 
 def _simulate(args: argparse.Namespace, bars: Bars) -> None:
+    unfinished = Path(f"{args.out}.receivers")
     dataset = wr.simulate(
         wr.Scene.load(_existing(args.scene)),
         transmitter=np.array(args.transmitter, dtype=np.float64),
@@ -148,13 +150,13 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
         beam_sigma_rad=np.deg2rad(args.beam_sigma_deg),
         refraction=args.refraction,
         seed=args.seed,
+        workspace=unfinished,
         progress=bars,
-        **({"device": args.device} if args.engine == "exact" else {}),
+        device=args.device,
     )
     dataset.save(args.out)
-    print(
-        f"{args.out}: {len(dataset.receivers)} spectra of {args.shape[0]} x {args.shape[1]} pixels, {args.engine}"
-    )
+    shutil.rmtree(unfinished)  # the finished receivers of a killed run are not needed any more
+    print(f"{args.out}: {len(dataset)} spectra of {args.shape[0]} x {args.shape[1]} pixels, {args.engine}")
 
 
 def _fit(args: argparse.Namespace, bars: Bars) -> None:
@@ -365,7 +367,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="warprrf",
         description="Radio radiance fields from photos and a few radio measurements.",
         epilog=EPILOG,
-        formatter_class=lambda prog: argparse.RawDescriptionHelpFormatter(prog, max_help_position=30),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"warprrf {wr.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
@@ -487,6 +489,7 @@ Overlap matters most: every surface in five photos or more, loops that look acro
 HELP_SIMULATE = """\
 `exact` evaluates line of sight, mirror reflections and one diffuse bounce without sampling noise, on Warp's mesh rays.
 `sionna` asks Sionna RT's PathSolver (extra: sionna) for line of sight, mirror and diffuse paths up to --depth.
+A killed run continues: finished receivers wait in OUT.receivers/. An eighth of the receivers is marked for test.
 A spectrum is path gain per pixel over the full sphere, spread by the receiver beam; its sum is the total path gain.
 
 examples:
