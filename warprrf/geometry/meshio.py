@@ -93,7 +93,7 @@ def write_mesh(
         mesh.vertex_attributes["t"] = coordinates[:, 1]
     path.parent.mkdir(parents=True, exist_ok=True)
     data = mesh.export(file_type=path.suffix.lstrip("."))
-    temporary = path.with_name(path.name + ".part")
+    temporary = path.with_name(path.name + ".partial")
     temporary.write_bytes(data.encode() if isinstance(data, str) else data)
     os.replace(temporary, path)
 

@@ -186,9 +186,12 @@ def _material(entry: Mapping[str, Any], path: Path) -> Material:
             raise ValueError(f"{where} has no {key!r}")
     bands = tuple(
         Band(
-            _number(row, "low_ghz", where) * 1e9,
-            _number(row, "high_ghz", where) * 1e9,
-            *(_number(row, key, where) for key in "abcd"),
+            low_hz=_number(row, "low_ghz", where) * 1e9,
+            high_hz=_number(row, "high_ghz", where) * 1e9,
+            a=_number(row, "a", where),
+            b=_number(row, "b", where),
+            c=_number(row, "c", where),
+            d=_number(row, "d", where),
             source=str(row.get("source", "assumed")),
         )
         for row in entry["permittivity"]

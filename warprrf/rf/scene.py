@@ -86,7 +86,10 @@ class Scene:
         shapes = root.findall("shape")
         if not shapes:
             raise ValueError(f"xml: {xml} holds no shapes")
-        vertices, faces, names, used = [], [], [], []
+        vertices: list[np.ndarray] = []
+        faces: list[np.ndarray] = []
+        names: list[str] = []
+        used: list[str] = []
         start = 0
         for shape in shapes:
             name = shape.get("id") or f"shape_{len(names)}"

@@ -11,6 +11,7 @@ The ceiling is backlit: its texture is its radiance too, which gives even light 
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,9 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
+from warprrf.bench.lobby.radio import material_table
+from warprrf.bench.lobby.textures import paint
 from warprrf.device import Progress, require
 from warprrf.geometry.meshio import write_mesh
-from warprrf.bench.lobby.textures import paint
 
 ROOM = np.array([[0.0, 0.0, 0.0], [15.0, 12.0, 4.0]])
 """Lower and upper corner of the room's air [m]."""
@@ -275,7 +277,7 @@ def scene_xml(solids: Sequence[Solid]) -> str:
 
 
 def build(directory: str | os.PathLike[str], *, seed: int = 0, progress: Progress | None = None) -> Path:
-    """Write meshes, textures and ``scene.xml`` of the lobby under ``directory``; returns the XML's path."""
+    """Write ``scene.xml``, ``materials.json``, meshes and textures under ``directory``; returns the XML's path."""
     directory = Path(directory)
     (directory / "meshes").mkdir(parents=True, exist_ok=True)
     (directory / "textures").mkdir(exist_ok=True)
@@ -287,7 +289,7 @@ def build(directory: str | os.PathLike[str], *, seed: int = 0, progress: Progres
         faces = [f for _, f in members]
         atlas = _Atlas(faces, np.random.default_rng([seed, *material.encode()]))
         target = directory / "textures" / f"{material}.jpg"
-        temporary = target.with_name(target.name + ".part")
+        temporary = target.with_name(target.name + ".partial")
         picture = image_module.fromarray(np.round(255 * atlas.image).astype(np.uint8))
         picture.save(temporary, format="JPEG", quality=JPEG_QUALITY, optimize=True)
         os.replace(temporary, target)
@@ -305,8 +307,12 @@ def build(directory: str | os.PathLike[str], *, seed: int = 0, progress: Progres
             write_mesh(path, np.concatenate(vertices), np.array(triangles), uv=np.concatenate(uv))
         if progress is not None:
             progress("scene", done + 1, len(materials))
-    xml = directory / "scene.xml"
-    temporary = xml.with_name(xml.name + ".part")
-    temporary.write_text(scene_xml(solids), encoding="utf-8")
-    os.replace(temporary, xml)
-    return xml
+    _write_text(directory / "materials.json", json.dumps(material_table(), indent=1) + "\n")
+    _write_text(directory / "scene.xml", scene_xml(solids))
+    return directory / "scene.xml"
+
+
+def _write_text(path: Path, text: str) -> None:
+    temporary = path.with_name(path.name + ".partial")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
