@@ -119,7 +119,7 @@ def _lobby(args: argparse.Namespace, bars: Bars) -> None:
 def _data(args: argparse.Namespace, bars: Bars) -> None:
     from warprrf.bench.lobby import make_data
 
-    make_data.run(args.data, steps=args.only, progress=bars, device=args.device)
+    make_data.run(args.data, steps=args.only, full=args.full, progress=bars, device=args.device)
 
 
 def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
@@ -463,6 +463,11 @@ def _parser() -> argparse.ArgumentParser:
     data = add("data", _data, "regenerate data/lobby/ from nothing (hours; resumable)", HELP_DATA)
     data.add_argument("--data", default="data/lobby", help="folder to write (default data/lobby)")
     data.add_argument("--only", nargs="+", choices=("scene", "photos", "spectra"), help="these steps alone")
+    data.add_argument(
+        "--full",
+        action="store_true",
+        help="all 800 receivers too (spectra_full.nc and spectra_sionna_full.nc)",
+    )
     return parser
 
 
