@@ -19,6 +19,7 @@ from warprrf.device import check_array
 HYPOTHESES = 192  # points tried as plane centres in each round
 REFINED = 12  # best hypotheses of a round that are refined before one is chosen
 REFITS = 8
+ECHO_M, ECHO_CELL_M = 0.1, 0.3  # noise of a plane passes for a second one this close; compared by cells of this size
 DRAW = 6000  # points a hypothesis is scored on
 
 
@@ -76,13 +77,16 @@ class Plane:
         return inside & self.occupied[index[:, 0], index[:, 1]]
 
 
-def fit_plane(points: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Unit normal and offset of the plane with the least (weighted) sum of squared distances to ``points``."""
-    w = np.ones(len(points)) if weights is None else weights
-    centre = w @ points / w.sum()
+def fit_plane(points: np.ndarray, weights: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, float]:
+    """Unit normal and offset of the plane with the least weighted sum of squared distances to ``points``.
+
+    The result faces the way of ``normal``; points on one line fix no plane, ``normal`` is then kept.
+    """
+    centre = weights @ points / weights.sum()
     local = points - centre
-    _, vectors = np.linalg.eigh((local * w[:, None]).T @ local)
-    normal = vectors[:, 0]
+    values, vectors = np.linalg.eigh((local * weights[:, None]).T @ local)
+    if values[1] > 1e-6 * values[2]:
+        normal = vectors[:, 0] if vectors[:, 0] @ normal >= 0 else -vectors[:, 0]
     return normal, float(normal @ centre)
 
 
@@ -159,13 +163,9 @@ def _best_plane(
             on = (np.abs(residual) < band) & (normals @ normal > cosine)
             if step < 4:
                 on &= reach < 0.75 * 2**step
-            if on.sum() < 3:
+            if not on.any():
                 break
-            fitted, offset = fit_plane(points[on], weight[on] / (1 + (residual[on] / distance_m) ** 2))
-            sign = 1.0 if fitted @ normal >= 0 else -1.0
-            normal, offset = sign * fitted, sign * offset
-        if on.sum() < 3:
-            continue
+            normal, offset = fit_plane(points[on], weight[on] / (1 + (residual[on] / distance_m) ** 2), normal)
         residual = points @ normal - offset
         on = (np.abs(residual) < distance_m) & (normals @ normal > cosine)
         if weight[on].sum() > best_weight:
@@ -201,18 +201,32 @@ def _merged(
             kept.append(plane)
         else:
             kept[twin] = replace(kept[twin], inliers=np.union1d(kept[twin].inliers, plane.inliers))
+    kept = [plane for i, plane in enumerate(kept) if not any(_echo(points, plane, strong) for strong in kept[:i])]
     refitted = []
     for plane in kept:
         normal, offset = plane.normal, plane.offset
         for _ in range(3):
             own = points[plane.inliers]
             w = weight[plane.inliers] / (1 + ((own @ normal - offset) / (0.5 * distance_m)) ** 2)
-            fitted, offset = fit_plane(own, w)
-            sign = 1.0 if fitted @ normal >= 0 else -1.0
-            normal, offset = sign * fitted, sign * offset
+            normal, offset = fit_plane(own, w, normal)
         residual = points[plane.inliers] @ normal - offset
         refitted.append(replace(plane, normal=normal, offset=offset, rms_m=float(np.sqrt(np.mean(residual**2)))))
     return sorted(refitted, key=lambda p: -weight[p.inliers].sum())
+
+
+def _echo(points: np.ndarray, plane: Plane, strong: Plane) -> bool:
+    """Whether ``plane`` is only noise of a better supported parallel one: then points of both share the same places.
+
+    A poster in front of a wall is no echo: behind it, the wall has no points.
+    """
+    own = points[plane.inliers]
+    if strong.normal @ plane.normal < np.cos(np.radians(10.0)) or np.median(np.abs(strong.distance(own))) > ECHO_M:
+        return False
+    axes = plane_axes(strong.normal)
+    here = np.floor(own @ axes.T / ECHO_CELL_M).astype(np.int64)
+    there = np.floor(points[strong.inliers] @ axes.T / ECHO_CELL_M).astype(np.int64)
+    cells = {tuple(c) for c in here}
+    return sum(tuple(c) in cells for c in there) > len(here)
 
 
 def plane_axes(normal: np.ndarray) -> np.ndarray:

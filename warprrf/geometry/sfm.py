@@ -253,7 +253,7 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, Any]) -> S
     except ValueError as error:
         raise ValueError(f"known_positions: {error}") from error
     rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
-    return replace(_transformed(sparse, scale, rotation, shift), metric=True, scale_rms_m=rms)
+    return replace(transformed(sparse, scale, rotation, shift), metric=True, scale_rms_m=rms)
 
 
 def match_names(argument: str, wanted: Any, names: Sequence[str]) -> list[str]:
@@ -281,7 +281,8 @@ def match_names(argument: str, wanted: Any, names: Sequence[str]) -> list[str]:
     return found
 
 
-def _transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
+def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
+    """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
     cameras = {}
     for name, camera in sparse.cameras.items():
         pose = np.eye(4)
@@ -406,8 +407,8 @@ def _match(colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed:
         blank = [n for n in names if counts[n] < 8]
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
-                f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), too "
-                f"few remain to work with: {_some(blank)}"
+                f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), "
+                f"too few remain to work with: {_some(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
         if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:

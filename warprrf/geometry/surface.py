@@ -1,7 +1,7 @@
 """Surfaces: cleaned points, their normals, depth maps fused into a mesh, and the planar patches of that mesh.
 
-Wraps Open3D for neighbour queries, ray casting, TSDF fusion (Curless and Levoy, "A volumetric method for building
-complex models from range images", 1996) and quadric simplification. Lengths in metres. Rooms are mostly planar, and a
+Wraps Open3D for neighbour queries, ray casting and TSDF fusion (Curless and Levoy, "A volumetric method for building
+complex models from range images", 1996). Lengths in metres. Rooms are mostly planar, and a
 plane fitted to thousands of points is far better than any depth map: the mesh is therefore snapped to its planes, with
 sharp edges where two of them meet.
 """
@@ -9,7 +9,7 @@ sharp edges where two of them meet.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,9 @@ __all__ = [
     "simplify",
     "visible_from",
 ]
+
+# Voxels along a block's side, and blocks to set aside for at first (the grid grows when it needs more).
+BLOCK_VOXELS, BLOCKS = 16, 20_000
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,7 @@ def fuse_depth(
     truncation_m: float | None = None,
     max_range_m: float = 12.0,
     edge_tolerance: float = 0.03,
+    min_views: int = 2,
     min_component_faces: int = 200,
 ) -> Mesh:
     """One mesh from depth maps of pinhole cameras, by a truncated signed distance field.
@@ -185,6 +189,7 @@ def fuse_depth(
         max_range_m: depths beyond this are left out.
         edge_tolerance: a pixel is left out where inverse depth bends by more than this part of itself from one
             neighbour to the next: on a plane it is linear in the image, across an occluding edge it jumps.
+        min_views: a surface is kept where at least this many depth maps saw it.
         min_component_faces: connected pieces with fewer faces are dropped as floating debris.
 
     Raises:
@@ -196,31 +201,31 @@ def fuse_depth(
         raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
     if voxel_m <= 0:
         raise ValueError(f"voxel_m: got {voxel_m}, expected a positive length in metres")
-    volume = o3d.pipelines.integration.ScalableTSDFVolume(
-        voxel_length=voxel_m,
-        sdf_trunc=truncation_m or 4 * voxel_m,
-        color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
+    core = o3d.core
+    truncation = (truncation_m or 4 * voxel_m) / voxel_m
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)), voxel_m, BLOCK_VOXELS, BLOCKS
     )
+    filled = False
     for k, (given, camera) in enumerate(zip(depths, cameras, strict=True)):
         if camera.kind != "pinhole":
             raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
         depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
         z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
         z[(depth > max_range_m) | ~_smooth(z, edge_tolerance)] = 0.0
-        image = o3d.geometry.RGBDImage.create_from_color_and_depth(
-            o3d.geometry.Image(np.zeros((*z.shape, 3), dtype=np.uint8)),
-            o3d.geometry.Image(z.astype(np.float32)),
-            depth_scale=1.0,
-            depth_trunc=max_range_m,
-            convert_rgb_to_intensity=False,
+        image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
+        # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.
+        lens = core.Tensor(
+            np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=np.float64)
         )
-        # Open3D puts pixel centres at whole numbers, we at +0.5.
-        lens = o3d.camera.PinholeCameraIntrinsic(
-            camera.width, camera.height, camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5
-        )
-        volume.integrate(image, lens, camera.world_to_camera)
-    raw = volume.extract_triangle_mesh()
-    if len(raw.triangles) == 0:
+        pose = core.Tensor(np.array(camera.world_to_camera, dtype=np.float64))
+        if not (z > 0).any():
+            continue
+        blocks = grid.compute_unique_block_coordinates(image, lens, pose, 1.0, max_range_m, truncation)
+        grid.integrate(blocks, image, lens, pose, 1.0, max_range_m, truncation)
+        filled = True
+    raw = grid.extract_triangle_mesh(float(min_views)).to_legacy() if filled else None
+    if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
     raw.merge_close_vertices(1e-4 * voxel_m)
     raw.remove_degenerate_triangles()
@@ -311,7 +316,10 @@ def flatten(mesh: Mesh, patches: Sequence[PlanarPatch], *, limit_m: float = 0.15
     vertices = mesh.vertices.copy()
     pairs = np.unique(
         np.concatenate(
-            [np.stack([mesh.faces[p.faces].ravel(), np.full(3 * len(p.faces), k)], axis=1) for k, p in enumerate(patches)]
+            [
+                np.stack([mesh.faces[p.faces].ravel(), np.full(3 * len(p.faces), k)], axis=1)
+                for k, p in enumerate(patches)
+            ]
             or [np.zeros((0, 2), dtype=np.int64)]
         ),
         axis=0,
@@ -338,24 +346,80 @@ def flatten(mesh: Mesh, patches: Sequence[PlanarPatch], *, limit_m: float = 0.15
     return Mesh(vertices, mesh.faces)
 
 
-def simplify(mesh: Mesh, faces: int) -> Mesh:
-    """``mesh`` reduced to about ``faces`` faces by quadric error (Garland and Heckbert, 1997); flat parts cost none."""
-    o3d = require("open3d", extra="photos")
-    raw = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))
-    )
-    raw = _tidy(raw)
-    if len(raw.triangles) > faces:
-        raw = _tidy(raw.simplify_quadric_decimation(faces))
-    return Mesh(np.asarray(raw.vertices), np.asarray(raw.triangles))
+def simplify(
+    mesh: Mesh, patches: Sequence[PlanarPatch], *, cell_m: float = 0.25
+) -> tuple[Mesh, list[PlanarPatch]]:
+    """``mesh`` with the insides of its planar patches, and the straight edges between two of them, made coarse.
 
+    Vertices inside a flattened patch are gathered by cells of ``cell_m`` into one of their number, those on an edge of
+    two patches by stretches of that length. A continuous map of a plane piece onto itself that keeps its border leaves
+    no hole, and no vertex leaves its plane: the surface stays the same. Elsewhere nothing changes.
 
-def _tidy(raw: Any) -> Any:
-    raw.remove_duplicated_vertices()
-    raw.remove_duplicated_triangles()
-    raw.remove_degenerate_triangles()
-    raw.remove_unreferenced_vertices()
-    return raw
+    Returns:
+        The coarser mesh, and the same patches with the indices of its faces.
+    """
+    label = np.full(len(mesh.faces), -1, dtype=np.int64)
+    for k, patch in enumerate(patches):
+        label[patch.faces] = k
+    low, high = np.full(len(mesh.vertices), len(patches)), np.full(len(mesh.vertices), -2)
+    third = np.zeros(len(mesh.vertices), dtype=bool)
+    for corner in range(3):
+        np.minimum.at(low, mesh.faces[:, corner], label)
+        np.maximum.at(high, mesh.faces[:, corner], label)
+    for corner in range(3):
+        vertex = mesh.faces[:, corner]
+        np.logical_or.at(third, vertex, (label != low[vertex]) & (label != high[vertex]))
+    border = np.zeros(len(mesh.vertices), dtype=bool)
+    ring = face_neighbours(mesh.faces)
+    for side in range(3):
+        rim = ring[:, side] < 0
+        border[mesh.faces[rim][:, [side, (side + 1) % 3]]] = True
+    movable = (low >= 0) & ~third & ~border & (high >= 0)
+    origin = mesh.bounds[0]
+    key = np.concatenate([np.stack([low, high], axis=1), np.zeros((len(low), 3), dtype=np.int64)], axis=1)
+    cells = np.floor((mesh.vertices - origin) / cell_m).astype(np.int64)
+    for k, patch in enumerate(patches):
+        # Cells within the plane: the world axis nearest to the normal takes no part.
+        inside = movable & (low == k) & (high == k)
+        flat = np.arange(3) != np.abs(patch.normal).argmax()
+        key[inside, 2:] = cells[inside] * flat
+    edge = np.flatnonzero(movable & (low != high))
+    if len(edge):
+        normal = np.array([p.normal for p in patches])
+        along = np.cross(normal[low[edge]], normal[high[edge]])
+        size = np.linalg.norm(along, axis=1)
+        straight = size > 0.2
+        movable[edge[~straight]] = False
+        edge, along = edge[straight], along[straight] / size[straight, None]
+        key[edge, 2] = np.floor((mesh.vertices[edge] * along).sum(axis=1) / cell_m).astype(np.int64)
+    target = np.arange(len(mesh.vertices))
+    chosen = np.flatnonzero(movable)
+    if len(chosen):
+        _, group, size = np.unique(key[chosen], axis=0, return_inverse=True, return_counts=True)
+        group = group.ravel()
+        centre = np.stack([np.bincount(group, mesh.vertices[chosen, a]) for a in range(3)], axis=1) / size[:, None]
+        gap = np.linalg.norm(mesh.vertices[chosen] - centre[group], axis=1)
+        order = np.lexsort((gap, group))
+        first = order[np.concatenate([[0], np.cumsum(size)[:-1]])]
+        target[chosen] = chosen[first][group]
+    faces = target[mesh.faces]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces, label = faces[whole], label[whole]
+    used, faces = np.unique(faces, return_inverse=True)
+    coarse = Mesh(mesh.vertices[used], faces.reshape(-1, 3))
+    faces, areas = coarse.faces.copy(), coarse.areas
+    solid = areas > 1e-10
+    result = []
+    for k, patch in enumerate(patches):
+        own = np.flatnonzero((label == k) & solid)
+        turned = own[coarse.face_normals[own] @ patch.normal < 0]
+        faces[turned] = faces[turned][:, ::-1]  # folded over within the plane
+    kept = np.cumsum(solid) - 1
+    for k, patch in enumerate(patches):
+        own = np.flatnonzero((label == k) & solid)
+        if len(own):
+            result.append(replace(patch, faces=kept[own]))
+    return Mesh(coarse.vertices, faces[solid]), result
 
 
 def face_neighbours(faces: np.ndarray) -> np.ndarray:
@@ -372,11 +436,15 @@ def face_neighbours(faces: np.ndarray) -> np.ndarray:
 
 
 def smoothed_normals(mesh: Mesh, rounds: int) -> np.ndarray:
-    """Face normals averaged, by area, with those of the faces across the edges, ``rounds`` times, shape ``(F, 3)``."""
+    """Face normals averaged, by area, with those of the faces across the edges, ``rounds`` times, shape ``(F, 3)``.
+
+    A face across a sharp edge (more than 45 degrees) takes no part.
+    """
     ring = face_neighbours(mesh.faces)
     normals = np.nan_to_num(mesh.face_normals)
-    weight = np.where(ring >= 0, mesh.areas[ring], 0.0)[..., None]
+    area = np.where(ring >= 0, mesh.areas[ring], 0.0)
     for _ in range(rounds):
+        weight = np.where(np.einsum("fi,fki->fk", normals, normals[ring]) > np.sqrt(0.5), area, 0.0)[..., None]
         total = mesh.areas[:, None] * normals + (weight * normals[ring]).sum(axis=1)
         normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
     return normals
