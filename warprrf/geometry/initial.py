@@ -86,11 +86,16 @@ def initial_gaussians(
     if not parts:
         raise ValueError("points: got none, and no plane that a photo sees; nothing to start from")
     return Gaussians(
-        *(np.concatenate([getattr(g, k) for g in parts]) for k in ("means", "quaternions", "scales", "opacities", "sh"))
+        *(
+            np.concatenate([getattr(g, k) for g in parts])
+            for k in ("means", "quaternions", "scales", "opacities", "sh")
+        )
     )
 
 
-def _discs_on_points(points: np.ndarray, colors: np.ndarray, normals: np.ndarray, chosen: np.ndarray) -> Gaussians:
+def _discs_on_points(
+    points: np.ndarray, colors: np.ndarray, normals: np.ndarray, chosen: np.ndarray
+) -> Gaussians:
     if len(points) > 3:
         _, gap = neighbours(points, 4, points[chosen])
         radius = np.clip(gap[:, 1:].mean(axis=1), MIN_SCALE, MAX_SCALE)
@@ -150,19 +155,25 @@ def _plane_blocks(
         if not len(index):
             continue
         centres = plane.to_world(plane.corner + (index + 0.5) * plane.cell_m)
-        seen = visible_from(surface, centres, np.broadcast_to(plane.normal, centres.shape), cameras, clearance_m=0.05)
+        seen = visible_from(
+            surface, centres, np.broadcast_to(plane.normal, centres.shape), cameras, clearance_m=0.05
+        )
         some = seen.any(axis=1)
         index, centres, seen = index[some], centres[some], seen[some]
         if not len(index):
             continue
         quarter = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]) * plane.cell_m
         fine = (centres[:, None, :] + (quarter @ plane.axes)[None]).reshape(-1, 3)
-        color = sample_colors(fine, np.repeat(seen, 4, axis=0), plane.normal, cameras, images).reshape(-1, 4, 3)
+        color = sample_colors(fine, np.repeat(seen, 4, axis=0), plane.normal, cameras, images).reshape(
+            -1, 4, 3
+        )
         coarse_key, parent = np.unique(index // 2, axis=0, return_inverse=True)
         parent = parent.ravel()
         members = np.bincount(parent)
 
-        def pooled(values: np.ndarray, parent: np.ndarray = parent, members: np.ndarray = members) -> np.ndarray:
+        def pooled(
+            values: np.ndarray, parent: np.ndarray = parent, members: np.ndarray = members
+        ) -> np.ndarray:
             return np.stack([np.bincount(parent, v) for v in values.T], axis=1) / members[:, None]
 
         middle = color.mean(axis=1)
@@ -182,7 +193,9 @@ def _plane_blocks(
             )
         )  # fmt: skip
         levels[2].append(
-            _Blocks(fine, np.full(n_fine, k), np.full(n_fine, cell / 2), color.reshape(-1, 3), np.zeros(n_fine))
+            _Blocks(
+                fine, np.full(n_fine, k), np.full(n_fine, cell / 2), color.reshape(-1, 3), np.zeros(n_fine)
+            )
         )
         parents[0].append(parent + offset[0])
         parents[1].append(np.repeat(np.arange(n_middle), 4) + offset[1])
@@ -215,11 +228,17 @@ def _joined(blocks: Sequence[_Blocks]) -> _Blocks:
 
 
 def _picked(blocks: _Blocks, use: np.ndarray) -> _Blocks:
-    return _Blocks(blocks.centre[use], blocks.plane[use], blocks.side[use], blocks.color[use], blocks.variance[use])
+    return _Blocks(
+        blocks.centre[use], blocks.plane[use], blocks.side[use], blocks.color[use], blocks.variance[use]
+    )
 
 
 def sample_colors(
-    points: np.ndarray, seen: np.ndarray, normal: np.ndarray, cameras: Sequence[Camera], images: Sequence[np.ndarray]
+    points: np.ndarray,
+    seen: np.ndarray,
+    normal: np.ndarray,
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
 ) -> np.ndarray:
     """Median colour of each point over the photos that see it best (near and frontal), shape ``(N, 3)``.
 

@@ -19,7 +19,10 @@ from warprrf.device import check_array
 HYPOTHESES = 192  # points tried as plane centres in each round
 REFINED = 12  # best hypotheses of a round that are refined before one is chosen
 REFITS = 8
-ECHO_M, ECHO_CELL_M = 0.1, 0.3  # noise of a plane passes for a second one this close; compared by cells of this size
+ECHO_M, ECHO_CELL_M = (
+    0.1,
+    0.3,
+)  # noise of a plane passes for a second one this close; compared by cells of this size
 DRAW = 6000  # points a hypothesis is scored on
 
 
@@ -131,7 +134,9 @@ def detect_planes(
         misses = 0
         found.append(replace(plane, inliers=free[plane.inliers]))
         # A wider band goes with it, so that the plane's own fringe is not found again as a second plane.
-        fringe = (np.abs(plane.distance(points[free])) < 2.5 * distance_m) & (normals[free] @ plane.normal > cosine)
+        fringe = (np.abs(plane.distance(points[free])) < 2.5 * distance_m) & (
+            normals[free] @ plane.normal > cosine
+        )
         free = free[~fringe]
     return _merged(points, normals, weight, found, distance_m, cosine)
 
@@ -165,7 +170,9 @@ def _best_plane(
                 on &= reach < 0.75 * 2**step
             if not on.any():
                 break
-            normal, offset = fit_plane(points[on], weight[on] / (1 + (residual[on] / distance_m) ** 2), normal)
+            normal, offset = fit_plane(
+                points[on], weight[on] / (1 + (residual[on] / distance_m) ** 2), normal
+            )
         residual = points @ normal - offset
         on = (np.abs(residual) < distance_m) & (normals @ normal > cosine)
         if weight[on].sum() > best_weight:
@@ -201,7 +208,9 @@ def _merged(
             kept.append(plane)
         else:
             kept[twin] = replace(kept[twin], inliers=np.union1d(kept[twin].inliers, plane.inliers))
-    kept = [plane for i, plane in enumerate(kept) if not any(_echo(points, plane, strong) for strong in kept[:i])]
+    kept = [
+        plane for i, plane in enumerate(kept) if not any(_echo(points, plane, strong) for strong in kept[:i])
+    ]
     refitted = []
     for plane in kept:
         normal, offset = plane.normal, plane.offset
@@ -210,7 +219,9 @@ def _merged(
             w = weight[plane.inliers] / (1 + ((own @ normal - offset) / (0.5 * distance_m)) ** 2)
             normal, offset = fit_plane(own, w, normal)
         residual = points[plane.inliers] @ normal - offset
-        refitted.append(replace(plane, normal=normal, offset=offset, rms_m=float(np.sqrt(np.mean(residual**2)))))
+        refitted.append(
+            replace(plane, normal=normal, offset=offset, rms_m=float(np.sqrt(np.mean(residual**2))))
+        )
     return sorted(refitted, key=lambda p: -weight[p.inliers].sum())
 
 
@@ -220,7 +231,10 @@ def _echo(points: np.ndarray, plane: Plane, strong: Plane) -> bool:
     A poster in front of a wall is no echo: behind it, the wall has no points.
     """
     own = points[plane.inliers]
-    if strong.normal @ plane.normal < np.cos(np.radians(10.0)) or np.median(np.abs(strong.distance(own))) > ECHO_M:
+    if (
+        strong.normal @ plane.normal < np.cos(np.radians(10.0))
+        or np.median(np.abs(strong.distance(own))) > ECHO_M
+    ):
         return False
     axes = plane_axes(strong.normal)
     here = np.floor(own @ axes.T / ECHO_CELL_M).astype(np.int64)
@@ -316,5 +330,7 @@ def _in_hull(queries: np.ndarray, points: np.ndarray, margin: float) -> np.ndarr
 
     hull = np.array(chain(ordered) + chain(ordered[::-1]))
     edge = np.roll(hull, -1, axis=0) - hull
-    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.maximum(np.linalg.norm(edge, axis=1), 1e-12)[:, None]
+    outward = (
+        np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.maximum(np.linalg.norm(edge, axis=1), 1e-12)[:, None]
+    )
     return ((queries @ outward.T) <= (hull * outward).sum(axis=1) + margin).all(axis=1)

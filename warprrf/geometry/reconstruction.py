@@ -164,14 +164,19 @@ class Reconstruction:
         """
         path = Path(folder) / FILE
         if not path.is_file():
-            raise ValueError(f"folder: {folder} holds no {FILE}; expected a folder that Reconstruction.save wrote")
+            raise ValueError(
+                f"folder: {folder} holds no {FILE}; expected a folder that Reconstruction.save wrote"
+            )
         header, arrays = _read(path)
         if header.get("format") != FORMAT:
             raise ValueError(f"folder: {path} has format {header.get('format')}, this version reads {FORMAT}")
         try:
             cameras = {
                 name: Camera(
-                    c["kind"], c["size"][0], c["size"][1], np.array(c["world_to_camera"]),
+                    c["kind"],
+                    c["size"][0],
+                    c["size"][1],
+                    np.array(c["world_to_camera"]),
                     **dict(zip(("fx", "fy", "cx", "cy"), c["lens"], strict=True)),
                 )  # fmt: skip
                 for name, c in header["cameras"].items()
@@ -273,12 +278,21 @@ def reconstruct(
     steps = _Steps(Path(workspace))
 
     sparse = sfm.structure_from_motion(
-        photos, workspace=workspace, max_features=config.max_features, pairs=config.pairs, seed=seed, progress=progress
+        photos,
+        workspace=workspace,
+        max_features=config.max_features,
+        pairs=config.pairs,
+        seed=seed,
+        progress=progress,
     )
-    sparse = sfm.align_to_known(sparse, known_positions) if known_positions is not None else _assumed_scale(sparse)
+    sparse = (
+        sfm.align_to_known(sparse, known_positions) if known_positions is not None else _assumed_scale(sparse)
+    )
     cameras = {n: c for n, c in sparse.cameras.items() if n not in skipped}
     if not cameras:
-        raise ValueError(f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to")
+        raise ValueError(
+            f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to"
+        )
 
     before = [
         (Path(workspace) / "sfm" / "photos.json").read_text(),
@@ -326,9 +340,16 @@ def reconstruct(
     stored = steps.load("surface", start_key)
     if stored is None:
         mesh, patches = fuse_gaussians(
-            gaussians, list(sparse.cameras.values()), planes=planes, config=config, progress=progress, device=device
+            gaussians,
+            list(sparse.cameras.values()),
+            planes=planes,
+            config=config,
+            progress=progress,
+            device=device,
         )
-        header = {"patches": [{"normal": p.normal.tolist(), "offset": p.offset, "area": p.area} for p in patches]}
+        header = {
+            "patches": [{"normal": p.normal.tolist(), "offset": p.offset, "area": p.area} for p in patches]
+        }
         arrays = {f"patch_{k}": p.faces for k, p in enumerate(patches)}
         steps.save("surface", start_key, header, arrays | {"vertices": mesh.vertices, "faces": mesh.faces})
     else:
@@ -375,7 +396,9 @@ def fuse_gaussians(
         )
         out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
         with np.errstate(invalid="ignore"):
-            solid = (out.alpha >= config.alpha) & (np.abs(out.depth - out.peak) <= config.depth_spread * out.peak)
+            solid = (out.alpha >= config.alpha) & (
+                np.abs(out.depth - out.peak) <= config.depth_spread * out.peak
+            )
         depths.append(np.where(solid, out.depth, 0.0))
         small.append(view)
     report("depth", len(chosen), len(chosen))
@@ -416,7 +439,9 @@ def _start(
 ) -> tuple[list[Plane], Gaussians]:
     """Planes of the sparse points and the Gaussians that refinement starts from."""
     if len(sparse.points) < 3:
-        raise ValueError(f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed")
+        raise ValueError(
+            f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
+        )
     keep = surface.clean_points(
         sparse.points,
         reprojection_error=sparse.reprojection_error,
@@ -432,7 +457,11 @@ def _start(
     )
     eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
     planes = occupancy(
-        planes, sparse.points, eyes, np.repeat(sparse.points, sparse.track_length, axis=0), cell_m=config.cell_m
+        planes,
+        sparse.points,
+        eyes,
+        np.repeat(sparse.points, sparse.track_length, axis=0),
+        cell_m=config.cell_m,
     )
     planes = seen_cells(planes, list(sparse.cameras.values()))
     report("planes", 1, 2)
@@ -452,7 +481,9 @@ def _assumed_scale(sparse: sfm.SparseModel) -> sfm.SparseModel:
     ahead /= np.linalg.norm(ahead)
     rotation = np.stack([ahead, np.cross(up, ahead), up])
     positions = np.array([c.position for c in poses])
-    gap = np.linalg.norm(np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1)
+    gap = np.linalg.norm(
+        np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1
+    )
     scale = ASSUMED_DISTANCE_M / float(np.median(gap)) if len(gap) else 1.0
     return sfm.transformed(sparse, scale, rotation, -scale * rotation @ positions.mean(axis=0))
 
@@ -501,7 +532,9 @@ def _write(path: Path, header: dict[str, Any], arrays: dict[str, np.ndarray]) ->
 
     with replacing(path) as temporary:
         save_file(
-            {k: np.ascontiguousarray(v) for k, v in arrays.items()}, temporary, metadata={"header": json.dumps(header)}
+            {k: np.ascontiguousarray(v) for k, v in arrays.items()},
+            temporary,
+            metadata={"header": json.dumps(header)},
         )
 
 

@@ -99,7 +99,9 @@ def find_photos(photos: Any) -> dict[str, Path]:
     if isinstance(photos, str | os.PathLike):
         root = Path(photos)
         if not root.is_dir():
-            raise ValueError(f"photos: {root} is not a folder; expected a folder of photos or a list of image files")
+            raise ValueError(
+                f"photos: {root} is not a folder; expected a folder of photos or a list of image files"
+            )
         files = sorted(p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
     else:
         files = [Path(p) for p in photos]
@@ -186,8 +188,12 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
     """
     colmap = require("pycolmap", extra="photos")
     root = Path(folder)
-    if not any(all((root / f"{n}{ext}").is_file() for n in ("cameras", "images")) for ext in (".bin", ".txt")):
-        raise ValueError(f"colmap: {root} holds no COLMAP model; expected cameras, images and points3D (.bin or .txt)")
+    if not any(
+        all((root / f"{n}{ext}").is_file() for n in ("cameras", "images")) for ext in (".bin", ".txt")
+    ):
+        raise ValueError(
+            f"colmap: {root} holds no COLMAP model; expected cameras, images and points3D (.bin or .txt)"
+        )
     with _quiet(colmap):
         try:
             model = colmap.Reconstruction(str(root))
@@ -213,7 +219,9 @@ def fit_similarity(source: Any, target: Any) -> tuple[float, np.ndarray, np.ndar
     for name, centred in (("source", a), ("target", b)):
         spread = np.linalg.svd(centred, compute_uv=False)
         if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:
-            raise ValueError(f"{name}: the points lie on one line (or coincide), so that the rotation is not fixed")
+            raise ValueError(
+                f"{name}: the points lie on one line (or coincide), so that the rotation is not fixed"
+            )
     u, d, vt = np.linalg.svd(b.T @ a)
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
@@ -275,9 +283,13 @@ def match_names(argument: str, wanted: Any, names: Sequence[str]) -> list[str]:
         else:
             (shared if Path(key).name in by_file else unknown).append(key)
     if unknown:
-        raise ValueError(f"{argument}: no such photo: {_some(unknown)}; photos are named like {_some(list(names), 2)}")
+        raise ValueError(
+            f"{argument}: no such photo: {_some(unknown)}; photos are named like {_some(list(names), 2)}"
+        )
     if shared:
-        raise ValueError(f"{argument}: several photos have the file name of {_some(shared)}; give the longer name")
+        raise ValueError(
+            f"{argument}: several photos have the file name of {_some(shared)}; give the longer name"
+        )
     return found
 
 
@@ -331,7 +343,10 @@ def _quiet(colmap: ModuleType) -> Iterator[None]:
 
 def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any]) -> None:
     """Make ``folder`` hold the work for these photos and options: what other photos or options left there goes."""
-    state = {"options": options, "photos": {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in named.items()}}
+    state = {
+        "options": options,
+        "photos": {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in named.items()},
+    }
     stamp = folder / "photos.json"
     if stamp.is_file() and json.loads(stamp.read_text()) == state:
         return
@@ -397,7 +412,9 @@ def _extract(
     _settle(working, folder / "features.db")
 
 
-def _match(colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, report: Progress) -> None:
+def _match(
+    colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, report: Progress
+) -> None:
     if (folder / "matches.db").is_file():
         return
     working, listing = folder / "working.db", folder / "pairs.txt"

@@ -55,7 +55,9 @@ class PlanarPatch:
     area: float
 
 
-def neighbours(points: np.ndarray, count: int, queries: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def neighbours(
+    points: np.ndarray, count: int, queries: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Indices and distances [m] of the ``count`` nearest ``points`` to each query, nearest first, shape ``(Q, count)``.
 
     Without ``queries``, of every point among the others (itself left out).
@@ -98,7 +100,9 @@ def clean_points(
     points = check_array("points", points, (None, 3))
     keep = np.ones(len(points), dtype=bool)
     if reprojection_error is not None:
-        keep &= check_array("reprojection_error", reprojection_error, (len(points),)) <= max_reprojection_error
+        keep &= (
+            check_array("reprojection_error", reprojection_error, (len(points),)) <= max_reprojection_error
+        )
     if track_length is not None:
         keep &= check_array("track_length", track_length, (len(points),)) >= min_track_length
     chosen = np.flatnonzero(keep)
@@ -136,7 +140,12 @@ def estimate_normals(points: Any, viewpoints: Any, *, neighbour_count: int = 16)
 
 
 def visible_from(
-    surface: Mesh | None, points: np.ndarray, normals: np.ndarray, cameras: Sequence[Camera], *, clearance_m: float
+    surface: Mesh | None,
+    points: np.ndarray,
+    normals: np.ndarray,
+    cameras: Sequence[Camera],
+    *,
+    clearance_m: float,
 ) -> np.ndarray:
     """Which cameras see which points, shape ``(P, cameras)`` bool: in the frame, from the front, nothing between.
 
@@ -147,7 +156,8 @@ def visible_from(
     if surface is not None:
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(
-            o3d.core.Tensor(surface.vertices.astype(np.float32)), o3d.core.Tensor(surface.faces.astype(np.uint32))
+            o3d.core.Tensor(surface.vertices.astype(np.float32)),
+            o3d.core.Tensor(surface.faces.astype(np.uint32)),
         )
     seen = np.zeros((len(points), len(cameras)), dtype=bool)
     start = points + clearance_m * normals
@@ -397,7 +407,9 @@ def simplify(
     if len(chosen):
         _, group, size = np.unique(key[chosen], axis=0, return_inverse=True, return_counts=True)
         group = group.ravel()
-        centre = np.stack([np.bincount(group, mesh.vertices[chosen, a]) for a in range(3)], axis=1) / size[:, None]
+        centre = (
+            np.stack([np.bincount(group, mesh.vertices[chosen, a]) for a in range(3)], axis=1) / size[:, None]
+        )
         gap = np.linalg.norm(mesh.vertices[chosen] - centre[group], axis=1)
         order = np.lexsort((gap, group))
         first = order[np.concatenate([[0], np.cumsum(size)[:-1]])]
@@ -444,7 +456,9 @@ def smoothed_normals(mesh: Mesh, rounds: int) -> np.ndarray:
     normals = np.nan_to_num(mesh.face_normals)
     area = np.where(ring >= 0, mesh.areas[ring], 0.0)
     for _ in range(rounds):
-        weight = np.where(np.einsum("fi,fki->fk", normals, normals[ring]) > np.sqrt(0.5), area, 0.0)[..., None]
+        weight = np.where(np.einsum("fi,fki->fk", normals, normals[ring]) > np.sqrt(0.5), area, 0.0)[
+            ..., None
+        ]
         total = mesh.areas[:, None] * normals + (weight * normals[ring]).sum(axis=1)
         normals = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
     return normals
@@ -469,14 +483,20 @@ def _without_islands(label: np.ndarray, ring: np.ndarray, areas: np.ndarray, min
     face = np.repeat(np.arange(len(label)), 3)
     other = ring.ravel()
     same = (other >= 0) & (label[face] == label[other]) & (label[face] >= 0)
-    links = sparse.coo_matrix((np.ones(same.sum()), (face[same], other[same])), shape=(len(label), len(label)))
+    links = sparse.coo_matrix(
+        (np.ones(same.sum()), (face[same], other[same])), shape=(len(label), len(label))
+    )
     _, piece = graph.connected_components(links, directed=False)
     total = np.bincount(piece, weights=areas)
     return np.where(total[piece] >= min_area, label, -1)
 
 
 def _grown(
-    label: np.ndarray, ring: np.ndarray, mesh: Mesh, planes: Sequence[tuple[np.ndarray, float]], distance_m: float
+    label: np.ndarray,
+    ring: np.ndarray,
+    mesh: Mesh,
+    planes: Sequence[tuple[np.ndarray, float]],
+    distance_m: float,
 ) -> np.ndarray:
     """Seam faces join the neighbouring patch whose plane all their corners are nearest to, round by round."""
     if not planes:
