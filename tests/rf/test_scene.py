@@ -1,0 +1,115 @@
+"""Scenes: the XML's objects and materials face by face, errors that name what is missing, points in free air."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.meshio import enclosed_volume, is_closed, read_mesh, write_mesh
+from warprrf.rf.materials import Material
+from warprrf.rf.scene import Scene
+
+LOBBY = Path(__file__).parents[2] / "data" / "lobby"
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    for name in ("scene.xml", "materials.json"):
+        shutil.copy(LOBBY / name, tmp_path)
+    shutil.copytree(LOBBY / "meshes", tmp_path / "meshes")
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def lobby() -> Scene:
+    return Scene.load(LOBBY / "scene.xml")
+
+
+def test_each_face_has_the_material_of_its_object(lobby: Scene) -> None:
+    expected = {"floor": "marble", "wall_west": "glass", "gallery": "concrete", "elevator": "metal"}
+    for name, material in expected.items():
+        used = {lobby.materials[k].name for k in lobby.face_material[lobby.object_faces(name)]}
+        assert used == {material}
+    assert len(lobby.face_object) == len(lobby.mesh.faces) == len(lobby.face_material)
+    part = read_mesh(LOBBY / "meshes" / "kiosk.ply")
+    corners = lobby.mesh.vertices[lobby.mesh.faces[lobby.object_faces("kiosk")]]
+    np.testing.assert_array_equal(corners, part.vertices[part.faces])
+
+
+def test_sionna_opens_the_scene_with_the_same_objects_and_materials(lobby: Scene) -> None:
+    from warprrf.rf.llvm import select_llvm
+
+    select_llvm()
+    rt = pytest.importorskip("sionna.rt", reason="sionna-rt is not installed")
+    theirs = rt.load_scene(str(LOBBY / "scene.xml"), merge_shapes=False)
+    assert set(theirs.objects) == set(lobby.object_names)
+    for name, thing in theirs.objects.items():
+        ours = lobby.materials[lobby.face_material[lobby.object_faces(name)[0]]]
+        assert thing.radio_material.name == f"itu_{ours.name}"
+
+
+def test_air_is_free_and_solids_are_not(lobby: Scene) -> None:
+    points = np.array([[7.3, 5.0, 1.5], [9.2, 3.0, 1.5], [3.6, 3.3, 1.0], [7.5, 6.0, -0.1], [7.5, 6.0, 6.0]])
+    np.testing.assert_array_equal(lobby.is_free(points, device="cpu"), [True, False, False, False, False])
+    near = np.array([[6.3 + 0.29, 2.0, 1.5], [6.3 + 0.31, 2.0, 1.5]])  # 0.29 and 0.31 m east of the partition
+    np.testing.assert_array_equal(lobby.is_free(near, clearance_m=0.3, device="cpu"), [False, True])
+
+
+def test_missing_files_and_materials_are_named(copy: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no scene file"):
+        Scene.load(copy / "other.xml")
+    (copy / "meshes" / "desk.ply").rename(copy / "desk.ply")
+    with pytest.raises(FileNotFoundError, match=r"'desk'.*desk\.ply"):
+        Scene.load(copy / "scene.xml")
+    (copy / "desk.ply").rename(copy / "meshes" / "desk.ply")
+    text = (copy / "scene.xml").read_text()
+    (copy / "scene.xml").write_text(text.replace("mat-itu_brick", "mat-itu_cheese"))
+    with pytest.raises(ValueError, match=r"'wall_north'.*'cheese'.*brick"):
+        Scene.load(copy / "scene.xml")
+    (copy / "scene.xml").write_text(text[:500])
+    with pytest.raises(ValueError, match="not well-formed"):
+        Scene.load(copy / "scene.xml")
+    (copy / "scene.xml").write_text(text)
+    (copy / "materials.json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"materials\.json"):
+        Scene.load(copy / "scene.xml")
+
+
+def test_a_corrupt_mesh_is_named(copy: Path) -> None:
+    path = copy / "meshes" / "desk.ply"
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(ValueError, match=r"desk\.ply"):
+        Scene.load(copy / "scene.xml")
+
+
+def test_a_scene_from_arrays_checks_its_indices() -> None:
+    wall = Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]])
+    scene = Scene(wall, [Material.conductor(scattering=0.5)], [0])
+    assert scene.materials[0].permittivity(300e9).imag < -1e5
+    assert scene.materials[0].scattering_coefficient(300e9) == 0.5
+    with pytest.raises(ValueError, match="face_material"):
+        Scene(wall, [Material.conductor()], [1])
+    with pytest.raises(ValueError, match="face_material"):
+        Scene(wall, [Material.conductor()], [0, 0])
+    with pytest.raises(TypeError, match="mesh"):
+        Scene([[0, 0, 0]], [Material.conductor()], [0])  # type: ignore[arg-type]
+
+
+def test_meshes_survive_a_file(tmp_path: Path) -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    uv = np.array([[0, 0], [1, 0], [0, 1], [0.25, 0.5]])
+    write_mesh(tmp_path / "tetrahedron.ply", vertices, faces, uv=uv)
+    back = read_mesh(tmp_path / "tetrahedron.ply")
+    np.testing.assert_allclose(back.vertices, vertices)
+    np.testing.assert_array_equal(back.faces, faces)
+    assert back.uv is not None
+    np.testing.assert_allclose(back.uv, uv)
+    assert is_closed(back.vertices, back.faces)
+    assert not is_closed(back.vertices, back.faces[1:])
+    assert enclosed_volume(back.vertices, back.faces) == pytest.approx(1.5 / 6)  # base times height over six
+    assert enclosed_volume(back.vertices, back.faces[:, ::-1]) == pytest.approx(-1.5 / 6)
