@@ -273,7 +273,9 @@ def match_names(argument: str, wanted: Any, names: Sequence[str]) -> list[str]:
     by_file: dict[str, list[str]] = {}
     for name in names:
         by_file.setdefault(name.rsplit("/", 1)[-1], []).append(name)
-    found, unknown, shared = [], [], []
+    found: list[str] = []
+    unknown: list[str] = []
+    shared: list[str] = []
     for key in wanted:
         key = str(key)
         if key in names:
