@@ -90,7 +90,7 @@ def score_mesh(
 ) -> MeshScore:
     """Errors of ``mesh`` where the photos of the (true) ``cameras`` see it.
 
-    Figures: ``mesh_distance_median_m``, ``mesh_distance_p90_m`` (from what photo rays meet to the nearest true surface),
+    Figures: ``mesh_distance_median_m``, ``mesh_distance_p90_m`` (from what photo rays meet to the nearest surface),
     ``mesh_normal_median_deg``, ``mesh_range_median_m`` and ``_p90_m`` (difference of ranges along the same rays),
     ``mesh_missed`` (share of photo rays that meet the truth but not the mesh), ``mesh_complete`` (share of what the
     photos see of the true surface with the mesh within 5 cm), ``mesh_surface_median_m`` and ``_p90_m`` (points drawn
