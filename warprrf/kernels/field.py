@@ -269,16 +269,18 @@ def build(real: Any) -> SimpleNamespace:
         first_correction: real,
         second_correction: real,
         epsilon: real,
-        initial: vec16,
+        initial: wp.array(dtype=real),
         gradient: wp.array(dtype=vec16),
         first: wp.array(dtype=vec16),
         second: wp.array(dtype=vec16),
         coefficients: wp.array(dtype=vec16),
     ):
-        """One step of Adam (Kingma and Ba 2015) on a Gaussian, with a pull ``ridge`` towards the initial value."""
+        """One step of Adam (Kingma and Ba 2015) on a Gaussian, with a pull ``ridge`` towards the initial constant."""
         i = offset + wp.tid()
         a = coefficients[i]
-        g = gradient[i] + wp.cw_mul(ridge, a - initial)
+        away = a
+        away[0] -= initial[i]
+        g = gradient[i] + wp.cw_mul(ridge, away)
         m = first_decay * first[i] + (real(1.0) - first_decay) * g
         v = second_decay * second[i] + (real(1.0) - second_decay) * wp.cw_mul(g, g)
         first[i] = m

@@ -182,15 +182,16 @@ class RadioField:
         layers, losses, done = {}, {}, 0
         for name, target in plan.layers.items():
             state = fit_layer(
-                problem, target, options.gain if name == "gain" else "signed", initial=plan.initial[name],
-                steps=steps[name], degree=options.sh_degree, rates=learned if name == "gain" else CHANNEL_RATES,
+                problem, target, options.gain if name == "gain" else "signed", steps=steps[name],
+                degree=options.sh_degree, rates=learned if name == "gain" else CHANNEL_RATES,
                 state=saver.state(name), each=saver.saving(name),
                 progress=_shifted(progress, done, sum(steps.values())),
             )  # fmt: skip
             done += steps[name]
             everyone = np.zeros((len(gaussians), _kernels.COEFFICIENTS), np.float32)
-            everyone[:, 0] = plan.initial[name]
-            everyone[problem.seen] = state.coefficients
+            everyone[:, 0] = plan.unseen[name]
+            unit = 1.0 if target.unit is None else target.unit[:, None]
+            everyone[problem.seen] = state.coefficients * unit
             layers[name], losses[name] = everyone, [float(loss) for loss in state.losses]
         saver.remove()
         return replace(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warprrf.rf.fitting import Target
+from warprrf.rf.fitting import Target, weighted_means
 from warprrf.rf.single_bounce import SingleBounce
 from warprrf.rf.spectrum import directions_from_angles, to_db
 from warprrf.rf.transport import Transport
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
 
 Y00 = 0.28209479177387814  # harmonic of degree 0
+DARK = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,13 @@ class Targets:
 
     Attributes:
         layers: target of each layer: ``gain`` first, then ``delay``, ``aod_x``, ``aod_y``, ``aod_z`` for ``rf3dgs``.
-        initial: degree-0 coefficient that each layer's Gaussians start with.
+        unseen: degree-0 coefficient of each layer for Gaussians that no training receiver sees: the median.
         gain_unit: linear factor of the gain: its median over the lit pixels.
         delay_unit: seconds per unit of the delay layer: the longest delay.
     """
 
     layers: dict[str, Target]
-    initial: dict[str, float]
+    unseen: dict[str, float]
     gain_unit: float
     delay_unit: float
 
@@ -56,10 +57,18 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
             "geometry around the receivers"
         )
     gain_unit = float(np.median((images - extra)[lit] / blended[lit]))
+    # Each Gaussian starts from the mean gain, in dB, of the pixels that see it: shadows lie 14 nepers below the median.
+    met = blended > 0
+    floored = np.maximum(images - extra, DARK * floor)
+    relative = np.log(floored / np.where(met, blended * gain_unit, 1.0))
+    start = np.nan_to_num(weighted_means(seen, relative, met)[1])
+    exponential = law.options.gain == "exp"
     low, high = (float(v) for v in ds.range_db)
     layers = {
         "gain": Target(
             image=np.clip((to_db(images, floor) - low) / (high - low), 0.0, 1.0),
+            initial=start / Y00 if exponential else np.full(len(start), 1.0 / Y00),
+            unit=None if exponential else np.exp(start),
             # in units of the floor, so that float32 works near one
             factor=factor * (gain_unit / floor),
             extra=extra / floor,
@@ -68,7 +77,7 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
             high=high - 10 * np.log10(floor),
         )
     }
-    initial = {"gain": 0.0 if law.options.gain == "exp" else 1.0 / Y00}
+    unseen = {"gain": 0.0 if exponential else 1.0 / Y00}
     delay_unit = 1.0
     delays = None if ds.delay_s is None else np.asarray(ds.delay_s, np.float64)
     if law.options.model == "rf3dgs" and delays is not None:
@@ -79,6 +88,12 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
             channels = {"delay": delays / delay_unit}
             channels.update({f"aod_{axis}": departure[..., k] for k, axis in enumerate("xyz")})
             for name, image in channels.items():
-                layers[name] = Target(image=np.where(mask, image, 0.0), mask=mask)
-                initial[name] = float(np.median(image[mask])) / Y00
-    return Targets(layers, initial, gain_unit, delay_unit)
+                middle = float(np.median(image[mask]))
+                mean = weighted_means(seen, image, mask)[1]
+                layers[name] = Target(
+                    image=np.where(mask, image, 0.0),
+                    initial=np.where(np.isnan(mean), middle, mean) / Y00,
+                    mask=mask,
+                )
+                unseen[name] = middle / Y00
+    return Targets(layers, unseen, gain_unit, delay_unit)

@@ -55,11 +55,15 @@ class Target:
             a channel.
         extra: power added to a pixel [linear], shape ``(R, H, W)``; None for zero.
         mask: one where a channel's pixel counts, shape ``(R, H, W)``; None for a gain.
+        initial: degree-0 coefficient that each of the Gaussians seen starts with and is pulled to, shape ``(G,)``.
+        unit: what each Gaussian's blended value is multiplied by, shape ``(G,)``; None for one.
         floor, low, high: N0 [linear, in the units of ``factor``] and the range of the dB image [dB].
         ssim_share: weight of 1 - SSIM in the loss, the rest is L1; gains only.
     """
 
     image: np.ndarray
+    initial: np.ndarray
+    unit: np.ndarray | None = None
     factor: np.ndarray | None = None
     extra: np.ndarray | None = None
     mask: np.ndarray | None = None
@@ -99,6 +103,10 @@ class Batch:
     pair_weight: wp.array
     pixel_start: wp.array
     pair_of_pixel: wp.array
+
+    def pair_owner(self) -> np.ndarray:
+        """Which of the Gaussians seen each pair belongs to, shape ``(E,)``."""
+        return np.repeat(self.row_gaussian.numpy(), np.diff(self.row_start.numpy()))
 
 
 class Problem:
@@ -180,6 +188,23 @@ class Problem:
         )
 
 
+def weighted_means(
+    transport: Transport, values: np.ndarray, where: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Per Gaussian seen by ``transport``: its index, and the mean of ``values`` over the pixels ``where`` that see it.
+
+    Both images have shape ``(R, H, W)``; the mean is weighted by blending weight, NaN if it is seen in none of them.
+    """
+    seen, local = np.unique(transport.gaussian, return_inverse=True)
+    pixel = np.repeat(np.arange(where.size), np.diff(transport.start))
+    weight = transport.weight * where.ravel()[pixel]
+    total = np.bincount(local, weights=weight, minlength=len(seen))
+    summed = np.bincount(
+        local, weights=weight * np.where(where, values, 0.0).ravel()[pixel], minlength=len(seen)
+    )
+    return seen, np.divide(summed, total, out=np.full(len(seen), np.nan), where=total > 0)
+
+
 def harmonics(shape: tuple[int, int], real: Any, device: Any) -> wp.array:
     """The 16 real harmonics at every pixel's direction, shape ``(H * W,)`` of 16-vectors, on the device."""
     from warprrf.rf.spectrum import pixel_directions
@@ -219,6 +244,11 @@ class Layer:
         self.problem, self.target, self.kind = problem, target, KINDS[kind]
         p, k = problem, problem.kernels
         shape = (len(p.transport.receivers), p.pixels)
+        self.weights = [batch.pair_weight for batch in p.batches]
+        if target.unit is not None:
+            self.weights = [
+                p.upload(batch.pair_weight.numpy() * target.unit[batch.pair_owner()]) for batch in p.batches
+            ]
         self.images = np.asarray(target.image, p.precision).reshape(shape)
         ones, zeros = np.ones(shape, p.precision), np.zeros(shape, p.precision)
         factor = ones if target.factor is None else np.asarray(target.factor, p.precision).reshape(shape)
@@ -266,7 +296,7 @@ class Layer:
         total, image, absolute, score, adjoint = self.scalars
         p.launch(
             k.contributions, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_direction,
-            batch.pair_weight, p.basis, coefficients, self.contribution,
+            self.weights[index], p.basis, coefficients, self.contribution,
         )  # fmt: skip
         p.launch(k.pixel_sums, size, batch.pixel_start, batch.pair_of_pixel, self.contribution, total)
         if data.mask is not None:
@@ -286,7 +316,7 @@ class Layer:
             )  # fmt: skip
         p.launch(
             k.coefficient_adjoint, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_pixel,
-            batch.pair_direction, batch.pair_weight, p.basis, self.contribution, adjoint, self.gradient,
+            batch.pair_direction, self.weights[index], p.basis, self.contribution, adjoint, self.gradient,
         )  # fmt: skip
         if not need_loss:
             return float("nan")
@@ -309,7 +339,6 @@ def fit_layer(
     target: Target,
     kind: str,
     *,
-    initial: float,
     steps: int,
     degree: int = 3,
     rates: Rates | None = None,
@@ -324,7 +353,6 @@ def fit_layer(
         problem: weights and batches.
         target: what to fit.
         kind: ``"exp"``, ``"linear"`` (clamped at zero) or ``"signed"``.
-        initial: degree-0 coefficient that every Gaussian starts with.
         steps: optimiser steps, one batch each.
         degree: of the harmonics, 0 to 3; coefficients above it stay zero.
         rates: learning rates and ridge.
@@ -339,18 +367,17 @@ def fit_layer(
     p, k = problem, problem.kernels
     count = DEGREE_TO_COUNT[degree]
     active = np.arange(_kernels.COEFFICIENTS) < count
-    start = np.zeros(_kernels.COEFFICIENTS)
-    start[0] = initial
     rate = np.where(active, rates.directional, 0.0)
     rate[0] = rates.constant
     layer = Layer(problem, target, kind)
     if state is None:
-        table = np.tile(start, (len(p.seen), 1))
+        table = np.zeros((len(p.seen), _kernels.COEFFICIENTS))
+        table[:, 0] = target.initial
         state = State(0, table, np.zeros_like(table), np.zeros_like(table))
     coefficients, first, second = (
         p.upload(a, k.vec16) for a in (state.coefficients, state.first, state.second)
     )
-    initial_vector = k.vec16(*start.tolist())
+    initial = p.upload(target.initial)
     losses = list(state.losses)
     decay1, decay2, epsilon = ADAM
 
@@ -369,7 +396,7 @@ def fit_layer(
         p.launch(
             k.adam, len(p.seen), k.vec16(*now.tolist()), k.vec16(*ridge.tolist()), p.real(decay1), p.real(decay2),
             p.real(1 / (1 - decay1 ** (step + 1))), p.real(1 / (1 - decay2 ** (step + 1))), p.real(epsilon),
-            initial_vector, layer.gradient, first, second, coefficients,
+            initial, layer.gradient, first, second, coefficients,
         )  # fmt: skip
         if progress is not None:
             progress(stage, step + 1, steps)
