@@ -111,7 +111,7 @@ def test_a_hundred_thousand_paths_are_quick():
     spread(d[:10], powers[:10], (60, 120), SIGMA)
     start = time.perf_counter()
     image = spread(d, powers, (60, 120), SIGMA)
-    assert time.perf_counter() - start < 3.0  # 0.2 s on two free cores
+    assert time.perf_counter() - start < 5.0  # 0.15 s on two free cores
     assert image.sum() == pytest.approx(1e5, rel=1e-10)
 
 

@@ -80,10 +80,10 @@ def lobe_norm(alpha: int, cos_i: wp.float64):
 def lobe_over_cosine(
     alpha: int, cos_i: wp.float64, cos_s: wp.float64, cos_psi: wp.float64, half_width: wp.float64
 ):
-    """f_s / cos(theta_s) [1/sr], the cosine averaged over a sub-pixel in which it varies by +-``half_width``.
+    """f_s / cos(theta_s) [1/sr], averaged over the stretch of +-``half_width`` in cosine that a direction stands for.
 
     A Lambertian lobe's cosine cancels. Else 1 / cos is replaced by its mean, ln(b / a) / (b - a), which stays finite
-    at grazing; the part of the sub-pixel below the horizon shows another surface, so the mean is over what is above.
+    at grazing; what lies below the horizon shows another surface, so the mean is over what is above.
     """
     if alpha == 0:
         return wp.float64(1.0) / PI

@@ -14,7 +14,7 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.device import Progress
 from warprrf.rf.dataset import SpectrumDataset, write_whole
-from warprrf.rf.exact import SUB_PIXELS, ExactEngine, ReceivedPaths
+from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.fresnel import as_mesh, surface_table
 from warprrf.rf.paths import check_frequency
 from warprrf.rf.sionna_engine import SionnaEngine
@@ -246,7 +246,10 @@ class _Cache:
         self.folder = folder
         # Our own version is left out: a run goes on after an update; a new solver starts afresh.
         solver = {k: v for k, v in versions.items() if k in ("sionna_rt", "mitsuba", "drjit")}
-        digest = hashlib.sha256(repr((engine, sorted(settings.items()), sorted(solver.items()))).encode())
+        revision = REVISION if engine == "exact" else 0
+        digest = hashlib.sha256(
+            repr((engine, revision, sorted(settings.items()), sorted(solver.items()))).encode()
+        )
         for name in sorted(common):
             digest.update(np.asarray(common[name], dtype=np.float64).tobytes())
         for array in surfaces:

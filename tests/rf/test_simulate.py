@@ -1,0 +1,138 @@
+"""simulate: bad places are refused, a killed run goes on, receivers are drawn from the air."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from radio_scenes import box_mesh, joined  # noqa: E402
+
+import warprrf.rf.simulate as module
+from warprrf.rf.materials import Band, Material
+from warprrf.rf.scene import Scene
+from warprrf.rf.simulate import sample_receivers, simulate
+
+F = 300e9
+TX = np.array([-5.0, 3.5, 2.7])
+LOW, HIGH = np.array([-7.0, -6, 0]), np.array([8.0, 6, 4])
+BOX = np.array([-1.0, -1, 0]), np.array([0.5, 1.5, 2.2])
+
+
+def scene(material=None, solid_walls=False):
+    if solid_walls:
+        walls = []
+        for axis in range(3):
+            for side in (0, 1):
+                low, high = LOW - 0.2, HIGH + 0.2
+                low[axis], high[axis] = (
+                    (HIGH[axis], HIGH[axis] + 0.2) if side else (LOW[axis] - 0.2, LOW[axis])
+                )
+                walls.append(box_mesh(low, high))
+        mesh, part = joined(box_mesh(BOX[0] - [0, 0, 0.05], BOX[1]), *walls)
+    else:
+        mesh, part = joined(box_mesh(LOW, HIGH, inward=True), box_mesh(*BOX))
+    stuff = material or Material.custom("stone", relative_permittivity=5.0, conductivity=0.5, scattering=0.5)
+    return Scene(
+        mesh,
+        [stuff],
+        np.zeros(len(mesh.faces), int),
+        face_object=part,
+        object_names=[str(k) for k in range(7)],
+    )
+
+
+def run(receivers, s=None, **options):
+    return simulate(
+        s or scene(), transmitter=TX, receivers=receivers, frequency_hz=F, **{"shape": (20, 40), **options}
+    )
+
+
+@pytest.mark.parametrize("solid_walls", [False, True])
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ([9.0, 0, 1], r"receivers\[1\].*outside"),
+        ([3.0, 0, -1], r"receivers\[1\].*outside"),
+        ([0.0, 0, 1], r"receivers\[1\].*inside a solid"),
+        ([0.50005, 0, 1], r"receivers\[1\].*on a surface"),
+        ([3.0, 0, 0], r"receivers\[1\].*on a surface"),
+        ([np.nan, 0, 1], "receivers.*NaN"),
+    ],
+)
+def test_places_that_cannot_receive_are_refused(place, words, solid_walls):
+    with pytest.raises(ValueError, match=words):
+        run([[3.0, 0, 1], place], scene(solid_walls=solid_walls))
+
+
+def test_a_transmitter_in_a_solid_is_refused():
+    with pytest.raises(ValueError, match="transmitter.*inside a solid|receivers.*inside a solid"):
+        simulate(scene(), transmitter=[0, 0, 1.0], receivers=[[3.0, 0, 1]], frequency_hz=F, shape=(20, 40))
+
+
+def test_a_frequency_outside_the_band_names_material_and_band():
+    stuff = Material("stone", (Band(1e9, 100e9, 5.0, 0.0, 0.1, 0.8),))
+    with pytest.raises(ValueError, match=r"300 GHz.*'stone'.*1 to 100 GHz"):
+        run([[3.0, 0, 1]], scene(stuff))
+
+
+@pytest.mark.parametrize("options", [{"engine": "best"}, {"shape": (1, 4)}, {"depth": -1}, {"samples": 0.5}])
+def test_bad_options_are_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        run([[3.0, 0, 1]], **options)
+
+
+def test_a_killed_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    places = np.array([[3.0, 0, 1], [4, 1, 1.5], [-3, -3, 2]])
+    whole = run(places)
+    real, calls = module.ExactEngine.receive, []
+
+    def stop_at_third(self, point):
+        calls.append(point)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(self, point)
+
+    monkeypatch.setattr(module.ExactEngine, "receive", stop_at_third)
+    with pytest.raises(KeyboardInterrupt):
+        run(places, workspace=tmp_path)
+    seen = []
+    again = run(places, workspace=tmp_path, progress=lambda *state: seen.append(state))
+    assert len(calls) == 4
+    np.testing.assert_array_equal(again.path_gain, whole.path_gain)
+    np.testing.assert_array_equal(again.delay_s, whole.delay_s)
+    assert seen[-1] == ("simulate", 3, 3)
+    run(places[::-1], workspace=tmp_path)  # order plays no part
+    assert len(calls) == 4
+    next(tmp_path.glob("*.npz")).write_bytes(b"cut short")
+    run(places, workspace=tmp_path)
+    assert len(calls) == 5
+    run(places[:1], workspace=tmp_path, beam_sigma_rad=0.1)  # another beam is another spectrum
+    assert len(calls) == 6
+
+
+def test_the_number_of_threads_does_not_change_a_spectrum(monkeypatch):
+    places = [[3.0, 0, 1]]
+    several = run(places)
+    import warprrf.device
+
+    monkeypatch.setattr(warprrf.device, "threads", lambda: 1)
+    np.testing.assert_array_equal(run(places).path_gain, several.path_gain)
+
+
+def test_receivers_are_drawn_from_the_air():
+    s = scene(solid_walls=True)
+    places = sample_receivers(s, 500, seed=4, clearance=0.3)
+    assert (
+        (places >= LOW + [0.3, 0.3, 0.8]).all() and (places <= HIGH - 0.3).all() and places[:, 2].max() <= 2.2
+    )
+    outside = np.linalg.norm(np.maximum(np.maximum(BOX[0] - places, places - BOX[1]), 0), axis=1)
+    assert outside.min() >= 0.3 - 1e-6
+    np.testing.assert_array_equal(sample_receivers(s, 50, seed=4), places[:50])
+    # Uniform: the share in the western half of the room is the share of its free volume.
+    west = places[:, 0] < -1.3
+    free = (5.4 * 11.4) / (14.4 * 11.4 - 2.1 * 3.1)
+    assert west.mean() == pytest.approx(free, abs=0.07)
+    with pytest.raises(ValueError, match="clearance"):
+        sample_receivers(s, 5, seed=0, clearance=3.0)
