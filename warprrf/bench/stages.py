@@ -8,6 +8,7 @@ in one step.
 
 from __future__ import annotations
 
+import copy
 import fcntl
 import hashlib
 import json
@@ -165,7 +166,7 @@ class StagedRun:
         known = self._stages.get(name, {})
         same = known.get("fingerprint") == mark
         if same and known.get("finished") and all((self.folder / file).exists() for file in outputs):
-            return known["figures"]
+            return copy.deepcopy(known["figures"])
         spent = known["seconds"] if same and not known.get("finished") else 0.0
         attempts = known["attempts"] + 1 if same and not known.get("finished") else 1
         steps: dict[str, float] = dict(known.get("steps", {})) if spent else {}
@@ -207,7 +208,7 @@ class StagedRun:
         if missing:
             raise RuntimeError(f"stage {name} ended without writing {', '.join(missing)}")
         record(True, figures)
-        return self._stages[name]["figures"]
+        return copy.deepcopy(self._stages[name]["figures"])
 
     def seconds(self, *names: str) -> float:
         """Wall time of the named stages (default: all of this run), killed attempts included."""

@@ -134,7 +134,7 @@ def _page(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> str:
         _method_table("Truth: exact (deterministic single bounce)", figures["methods"]),
     ]
     if figures.get("methods_sionna"):
-        title = f"Truth: Sionna RT ({figures.get('sionna_settings', 'path solver')})"
+        title = f"Truth: Sionna RT ({_sionna(figures['data']['sionna']['settings'])})"
         parts.append(_method_table(title, figures["methods_sionna"]))
     parts.append(
         "<p class='note'>Blocked: receivers without line of sight to the transmitter alone. Lookups know no geometry; "
@@ -179,14 +179,20 @@ def _page(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> str:
 
 
 def _one_line(figures: dict[str, Any], machine: dict[str, Any]) -> str:
-    sizes = figures["sizes"]
+    geometry, data = figures["geometry"], figures["data"]["exact"]
     reduced = " Reduced sizes: these figures only show that it runs." if figures.get("reduced") else ""
     return (
-        f"{sizes['photos']} photos, {sizes['gaussians']} Gaussians, {sizes['triangles']} triangles, "
-        f"{sizes['train']} training and {sizes['test']} test receivers ({sizes['blocked']} blocked) at "
-        f"{sizes['shape'][0]} x {sizes['shape'][1]} pixels, {figures['frequency_hz'] / 1e9:g} GHz. "
-        f"{machine['cores']} cores, {machine['processor']}, seed {figures['seed']}.{reduced}"
+        f"{geometry['photos']} photos ({geometry['held_out']} held out), {geometry['gaussians']} Gaussians, "
+        f"{geometry['triangles']} triangles, {data['train']} training and {data['test']} test receivers "
+        f"({data['blocked']} blocked) at {data['shape'][0]} x {data['shape'][1]} pixels, "
+        f"{data['frequency_hz'] / 1e9:g} GHz. {machine['cores']} cores, {machine['processor']}, seed "
+        f"{figures['seed']}.{reduced}"
     )
+
+
+def _sionna(settings: dict[str, Any]) -> str:
+    known = {"depth": "depth {}", "samples": "{:.0e} rays", "refraction": "refraction {}"}
+    return ", ".join(form.format(settings[name]) for name, form in known.items() if name in settings)
 
 
 # ----------------------------------------------------------------------------------------------------- tables
@@ -361,8 +367,12 @@ def spectrum_rows(
         right.set_title(
             f"{name} - truth, rms {np.sqrt(np.mean((image - truth_db) ** 2)):.1f} dB", fontsize=10
         )
-    figure.colorbar(shown, ax=axes[:, 0], label="path gain [dB]", fraction=0.04, pad=0.01)
-    figure.colorbar(wrong, ax=axes[1:, 1], label="difference [dB]", extend="both", fraction=0.04, pad=0.01)
+    for place, image, name, extend in (
+        (0.72, shown, "path gain [dB]", "neither"),
+        (0.28, wrong, "difference [dB]", "both"),
+    ):
+        bar = axes[0, 1].inset_axes((0.1, place, 0.8, 0.09))
+        figure.colorbar(image, cax=bar, label=name, extend=extend, orientation="horizontal")
     figure.supxlabel("azimuth [degrees]", fontsize=10)
     figure.supylabel("zenith [degrees]", fontsize=10)
     return figure

@@ -1,0 +1,478 @@
+"""The main job: the lobby's photos and a few of its spectra become geometry, a radio field, and their errors.
+
+Stages, each kept once finished (see :mod:`warprrf.bench.stages`): ``geometry`` (photos to cameras, Gaussians, mesh),
+``geometry error``, then for each truth a ``fit`` of every model and an ``evaluation``, and ``pictures``. The true
+poses and the true scene are read by the scoring stages alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warprrf as wr
+from warprrf.bench.lobby import report as page
+from warprrf.bench.lobby import score as truth_scores
+from warprrf.bench.lobby.photos import noise_psnr_db
+from warprrf.bench.lobby.spectra import FILES as TRUTHS
+from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
+from warprrf.device import Progress, resolve, threads
+from warprrf.geometry.meshio import write_mesh
+from warprrf.geometry.reconstruction import ReconstructionConfig, read_photo
+from warprrf.rf import lookups, metrics
+from warprrf.rf.spectrum import to_db
+from warprrf.rf.transport import Transport, transport
+
+MODELS = ("rf3dgs+", "rf3dgs")
+LOOKUPS = {"nearest": lookups.nearest, "idw": lookups.idw, "constant": lookups.constant, "mean": lookups.mean}
+TRAIN_RECEIVERS = 50  # the training subset that the asked fit time is stated for
+PACKAGES = ("warprrf", "warp-lang", "numpy", "pycolmap", "open3d", "xarray", "h5netcdf", "safetensors")
+MAP_POINTS = 40_000  # of the mesh, drawn in the report
+SECTION_HEIGHT_M = 1.2
+SOURCE_OF_GEOMETRY = ("device.py", "kernels", "geometry")
+SOURCE_OF_RADIO = (*SOURCE_OF_GEOMETRY, "rf")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much the run does."""
+
+    every_photo: int  # of the photos in the order of the walk, one in so many is used
+    iterations: int | None  # of the photometric refinement; None: its default
+    gaussians: int | None  # that the refinement starts from; None: the default
+    steps: int | None  # of the radio fit; None: the model's default
+    train: int  # receivers that the field is fitted on
+    test: int | None  # receivers that it is scored on; None: all that are held out
+
+
+FULL = Sizes(every_photo=1, iterations=None, gaussians=None, steps=None, train=TRAIN_RECEIVERS, test=None)
+REDUCED = Sizes(every_photo=3, iterations=100, gaussians=8000, steps=60, train=12, test=12)
+
+
+def run(
+    out: str | os.PathLike[str] = "runs/lobby",
+    data: str | os.PathLike[str] = "data/lobby",
+    *,
+    seed: int = 0,
+    device: Any = None,
+    progress: Progress | None = None,
+    reduced: bool = False,
+    fresh: bool = False,
+) -> dict[str, Any]:
+    """Run every stage that is not finished yet and return the content of ``report.json``.
+
+    Args:
+        out: folder of the results: ``report.json``, ``report.html``, ``geometry.ply`` (Gaussians), ``mesh.ply``,
+            ``cameras.json``, ``field.safetensors`` (RF-3DGS+ on the exact truth).
+        data: folder of the lobby's photos, scene and spectra.
+        seed: every random choice follows from it.
+        device: Warp device.
+        progress: ``progress(stage, done, total)``.
+        reduced: few photos and steps: shows that it runs, its figures mean little.
+        fresh: start over instead of continuing.
+
+    Raises:
+        ValueError: if data are missing or broken, or another run is at work in ``out``.
+        ImportError: if the extra ``photos`` or ``plots`` is not installed.
+    """
+    out, data = Path(out), Path(data)
+    sizes = REDUCED if reduced else FULL
+    _check_data(data)
+    with StagedRun(out, fresh=fresh, progress=progress) as stages:
+        geometry_source = source(*SOURCE_OF_GEOMETRY)
+        inputs = [
+            data / "photos",
+            data / "photos.json",
+            data / "surveyed.json",
+            seed,
+            asdict(sizes),
+            geometry_source,
+        ]
+        geometry = stages.stage(
+            "geometry",
+            partial(_geometry, out, data, sizes, seed, device),
+            inputs=inputs,
+            outputs=("reconstruction", "geometry.ply", "mesh.ply", "cameras.json"),
+        )
+        errors = stages.stage(
+            "geometry error",
+            partial(_geometry_error, out, data, sizes, seed, device),
+            inputs=[*inputs, data / "poses_true.json", data / "scene.xml", source("bench")],
+            outputs=("geometry_error.npz",),
+        )
+        view = _View(out / "reconstruction", sizes, device)
+        figures: dict[str, dict[str, Any]] = {}
+        for truth, name in TRUTHS.items():
+            radio = [*inputs, data / name, source(*SOURCE_OF_RADIO)]
+            fits = {
+                model: stages.stage(
+                    f"fit {model}, {truth}",
+                    partial(_fit, out, data / name, view, model, truth, seed),
+                    inputs=[*radio, model],
+                    outputs=(_field_name(model, truth),),
+                )
+                for model in MODELS
+            }
+            figures[truth] = stages.stage(
+                f"evaluation, {truth}",
+                partial(_evaluation, out, data / name, view, truth, seed),
+                inputs=[*radio, MODELS, source("bench/lobby/pipeline.py")],
+            )
+            for model in MODELS:
+                figures[truth]["methods"][model] |= fits[model]
+        stages.stage(
+            "pictures",
+            partial(_pictures, out, data, view, figures["exact"]["methods"], seed),
+            inputs=[*radio, *(data / name for name in TRUTHS.values()), source("bench/lobby/pipeline.py")],
+            outputs=("pictures.npz",),
+        )
+        report: dict[str, Any] = {
+            **{key: errors.get(key) for key, *_ in page.FIGURES},
+            "fit_time_s": figures["exact"]["methods"]["rf3dgs+"]["fit_time_s"],
+            "pipeline_time_s": stages.seconds(),
+            "methods": figures["exact"]["methods"],
+            "methods_sionna": figures["sionna"]["methods"],
+            "data": {truth: figures[truth]["data"] for truth in TRUTHS},
+            "geometry": {**geometry, **errors},
+            "stages": {
+                name: {
+                    "seconds": stages.seconds(name),
+                    "attempts": stages.attempts(name),
+                    "steps": stages.steps(name),
+                }
+                for name in stages.order
+            },
+            "seed": seed,
+            "reduced": reduced,
+            "machine": machine(device),
+        }
+        write_json(out / "report.json", report)
+        page.write(out)
+    return plain(report)
+
+
+def summary(report: dict[str, Any]) -> str:
+    """The report's figures as aligned text."""
+    lines = []
+    for key, name, unit, asked, more in page.FIGURES:
+        value = report.get(key)
+        shown = "-" if value is None else f"{value:.4g} {unit}"
+        wanted = "" if asked is None else f"(asked: at {'least' if more else 'most'} {asked:g})"
+        lines.append(f"{name:<62} {shown:>16}  {wanted}".rstrip())
+    return "\n".join(lines)
+
+
+def machine(device: Any = None) -> dict[str, Any]:
+    """What the figures were measured on: processor, cores, system, versions."""
+    processor = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").is_file():
+        names = [
+            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")
+        ]
+        processor = names[0].split(":", 1)[1].strip() if names else processor
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "processor": processor,
+        "cores": threads(),
+        "device": str(resolve(device)),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "versions": versions,
+    }
+
+
+# ----------------------------------------------------------------------------------------------------- stages
+
+
+class _View:
+    """The reconstruction, and its blending weights for the receivers of a data set, each made once when first used."""
+
+    def __init__(self, folder: Path, sizes: Sizes, device: Any) -> None:
+        self.sizes, self.device = sizes, device
+        self._folder = folder
+        self._seen: dict[str, tuple[Transport, float]] = {}
+
+    @cached_property
+    def reconstruction(self) -> Any:
+        return wr.Reconstruction.load(self._folder)
+
+    def split(self, file: Path, seed: int) -> tuple[Any, Any]:
+        """Training and test set; on reduced sizes the first few test receivers."""
+        train, test = wr.SpectrumDataset.load(file).split(self.sizes.train, seed=seed)
+        return train, test if self.sizes.test is None else test.subset(range(self.sizes.test))
+
+    def transport(self, dataset: Any, progress: Progress | None) -> tuple[Transport, float]:
+        """Blending weights of the receivers of `dataset`, and the seconds that they took."""
+        # Cutoffs follow from the range, so two truths share weights only if receivers and range are the same.
+        shape = dataset.path_gain.shape[1:]
+        key = fingerprint([np.asarray(dataset.receivers), list(dataset.range_db), list(shape)])
+        if key not in self._seen:
+            start = time.perf_counter()
+            weights = transport(
+                self.reconstruction.gaussians,
+                dataset.receivers,
+                shape,
+                range_db=dataset.range_db,
+                device=self.device,
+                progress=progress,
+            )
+            self._seen[key] = weights, time.perf_counter() - start
+        return self._seen[key]
+
+
+def _geometry(
+    out: Path, data: Path, sizes: Sizes, seed: int, device: Any, progress: Progress
+) -> dict[str, Any]:
+    files, held_out, surveyed = photos(data, sizes)
+    reconstruction = wr.reconstruct(
+        files,
+        workspace=out / "workspace",
+        known_positions=surveyed,
+        seed=seed,
+        device=device,
+        progress=progress,
+        **options(sizes, held_out),
+    )
+    reconstruction.save(out / "reconstruction")
+    write_atomically(out / "geometry.ply", reconstruction.gaussians.save_ply)
+    write_atomically(
+        out / "mesh.ply",
+        lambda name: write_mesh(name, reconstruction.mesh.vertices, reconstruction.mesh.faces),
+    )
+    poses = {name: camera.world_to_camera for name, camera in reconstruction.cameras.items()}
+    write_json(out / "cameras.json", {"about": "world_to_camera, OpenCV axes, metres", "cameras": poses})
+    return {
+        "scale_rms_m": reconstruction.scale_rms_m,
+        "photos": len(files),
+        "posed": len(reconstruction.cameras),
+        "held_out": len(held_out),
+        "surveyed": len(surveyed),
+        "gaussians": len(reconstruction.gaussians),
+        "triangles": len(reconstruction.mesh.faces),
+        "patches": len(reconstruction.patches),
+    }
+
+
+def _geometry_error(
+    out: Path, data: Path, sizes: Sizes, seed: int, device: Any, progress: Progress
+) -> dict[str, Any]:
+    files, held_out, _ = photos(data, sizes)
+    used = {file.name for file in files}
+    truth = {
+        name: camera
+        for name, camera in truth_scores.true_cameras(data / "poses_true.json").items()
+        if name in used
+    }
+    reconstruction = wr.Reconstruction.load(out / "reconstruction")
+    figures: dict[str, Any] = truth_scores.score_cameras(reconstruction.cameras, truth)
+    scored = truth_scores.score_mesh(
+        reconstruction.mesh,
+        wr.Scene.load(data / "scene.xml").mesh,
+        list(truth.values()),
+        seed=seed,
+        device=device,
+    )
+    figures |= scored.figures
+    names = [name for name in held_out if name in reconstruction.cameras]
+    if not names:
+        raise ValueError("photos: no held-out photo has a pose, so stage 1 cannot be scored")
+    views, renders, psnr = [], [], []
+    for done, name in enumerate(names):
+        view = read_photo(data / "photos" / name)
+        image = np.clip(
+            wr.render(reconstruction.gaussians, reconstruction.cameras[name], device=device).features, 0, 1
+        )
+        psnr.append(float(-10.0 * np.log10(np.mean((image - view) ** 2, dtype=np.float64))))
+        views.append(np.round(255 * view).astype(np.uint8))
+        renders.append(np.round(255 * image).astype(np.uint8))
+        progress("held-out photos", done + 1, len(names))
+    figures["photo_psnr_db"] = float(np.mean(psnr))
+    figures["photo_psnr_db_by_view"] = dict(zip(names, psnr, strict=True))
+    figures["photo_noise_psnr_db"] = noise_psnr_db(data)
+    order = np.argsort(psnr)
+    shown = sorted({int(order[0]), int(order[len(order) // 2]), int(order[-1])})
+    rng = np.random.default_rng(seed)
+    some = rng.choice(len(scored.points), min(MAP_POINTS, len(scored.points)), replace=False)
+    arrays = {
+        "photo_names": np.array([names[i] for i in shown]),
+        "photo_psnr_db": np.array([psnr[i] for i in shown]),
+        "photo_truth": np.stack([views[i] for i in shown]),
+        "photo_render": np.stack([renders[i] for i in shown]),
+        "mesh_points": scored.points[some].astype(np.float32),
+        "mesh_error_m": scored.distance_m[some].astype(np.float32),
+    }
+    write_atomically(out / "geometry_error.npz", partial(_save_arrays, arrays))
+    return figures
+
+
+def _fit(
+    out: Path, file: Path, view: _View, model: str, truth: str, seed: int, progress: Progress
+) -> dict[str, Any]:
+    train, _ = view.split(file, seed)
+    weights, seconds = view.transport(train, progress)
+    options: dict[str, Any] = {} if view.sizes.steps is None else {"iterations": view.sizes.steps}
+    field = wr.RadioField.fit(
+        view.reconstruction,
+        train,
+        model=model,
+        transport=weights,
+        checkpoint=out / f"{_field_name(model, truth)}.checkpoint",
+        seed=seed,
+        device=view.device,
+        progress=progress,
+        **options,
+    )
+    write_atomically(out / _field_name(model, truth), field.save)
+    return {
+        "transport_time_s": seconds,
+        "fit_time_s": seconds + field.report["fit_time_s"],
+        "loss_first": {name: losses[0] for name, losses in field.report["losses"].items() if losses},
+        "loss_last": {name: losses[-1] for name, losses in field.report["losses"].items() if losses},
+        "gaussians_seen": field.report["gaussians_seen"],
+        "model_bytes": (out / _field_name(model, truth)).stat().st_size,
+    }
+
+
+def _evaluation(
+    out: Path, file: Path, view: _View, truth: str, seed: int, progress: Progress
+) -> dict[str, Any]:
+    train, test = view.split(file, seed)
+    weights, seconds = view.transport(test, progress)
+    order = {
+        tuple(position): index for index, position in enumerate(np.asarray(test.receivers, dtype=np.float64))
+    }
+    methods: dict[str, Any] = {}
+    for model in MODELS:
+        field = wr.RadioField.load(out / _field_name(model, truth), device=view.device)
+
+        def predict(receiver: np.ndarray, field: Any = field) -> Any:
+            return field.spectrum(receiver, transport=weights.subset([order[tuple(receiver)]]))
+
+        methods[model] = metrics.evaluate(test, predict, progress=progress)
+        # Weights were computed beforehand for all methods: the time of a spectrum from nothing includes them.
+        methods[model]["seconds_per_spectrum"] += seconds / len(test.receivers)
+    for name, build in LOOKUPS.items():
+        lookup = build(train)
+        methods[name] = {**metrics.evaluate(test, lookup, progress=progress), "note": lookup.note}
+    gaps = np.linalg.norm(test.receivers[:, None] - np.asarray(train.receivers)[None], axis=-1).min(axis=1)
+    for figures in methods.values():
+        figures["per_receiver"]["distance_to_training_m"] = gaps
+    return {
+        "methods": methods,
+        "data": {
+            "engine": test.engine,
+            "train": len(train.receivers),
+            "test": len(test.receivers),
+            "blocked": int(np.count_nonzero(~np.asarray(test.line_of_sight))),
+            "shape": list(test.path_gain.shape[1:]),
+            "frequency_hz": float(test.frequency_hz),
+            "range_db": list(test.range_db),
+            "beam_sigma_rad": float(test.beam_sigma_rad),
+            "settings": dict(test.attributes),
+        },
+    }
+
+
+def _pictures(
+    out: Path, data: Path, view: _View, methods: dict[str, Any], seed: int, progress: Progress
+) -> dict[str, Any]:
+    train, test = view.split(data / TRUTHS["exact"], seed)
+    score = np.array(methods["rf3dgs+"]["per_receiver"]["psnr_db"], dtype=np.float64)
+    blocked = ~np.asarray(test.line_of_sight, dtype=bool)
+    chosen = _spread_by_score(score, blocked)
+    arrays: dict[str, np.ndarray] = {
+        "train_receivers": np.asarray(train.receivers),
+        "test_receivers": np.asarray(test.receivers),
+        "test_psnr_db": score,
+        "test_blocked": blocked,
+        "transmitter": np.asarray(test.transmitter),
+        "range_db": np.asarray(test.range_db),
+        "section": page.section(*_true_mesh(data), SECTION_HEIGHT_M),
+        "spectrum_receivers": np.asarray(test.receivers)[chosen],
+        "spectrum_blocked": blocked[chosen],
+        "spectrum_truth": to_db(np.asarray(test.path_gain)[chosen], test.floor).astype(np.float32),
+    }
+    predictors: dict[str, Any] = {
+        m: wr.RadioField.load(out / _field_name(m, "exact"), device=view.device).spectrum for m in MODELS
+    }
+    predictors["nearest"] = lookups.nearest(train)
+    for done, (name, predict) in enumerate(predictors.items()):
+        images = [predict(test.receivers[i]).path_gain_db for i in chosen]
+        arrays[f"spectrum_{name}"] = np.stack(images).astype(np.float32)
+        progress("pictures", done + 1, len(predictors))
+    with np.load(out / "geometry_error.npz", allow_pickle=False) as stored:
+        arrays |= {name: stored[name] for name in stored.files}
+    write_atomically(out / "pictures.npz", partial(_save_arrays, arrays))
+    return {}
+
+
+def _save_arrays(arrays: dict[str, Any], path: str) -> None:
+    np.savez_compressed(path, **arrays)
+
+
+def _spread_by_score(score: np.ndarray, blocked: np.ndarray) -> np.ndarray:
+    """Test receivers to show: the 15th, 50th and 85th percentile of PSNR, with and without line of sight."""
+    chosen = []
+    for where in (~blocked, blocked):
+        index = np.flatnonzero(where)
+        index = index[np.argsort(score[index])]
+        chosen += [index[round(share * (len(index) - 1))] for share in (0.85, 0.5, 0.15) if len(index)]
+    return np.array(sorted(set(chosen), key=chosen.index), dtype=np.int64)
+
+
+def _true_mesh(data: Path) -> tuple[np.ndarray, np.ndarray]:
+    mesh = wr.Scene.load(data / "scene.xml").mesh
+    return mesh.vertices, mesh.faces
+
+
+def _field_name(model: str, truth: str) -> str:
+    """The main field is `field.safetensors`; the others carry model and truth in their name."""
+    return (
+        "field.safetensors"
+        if (model, truth) == (MODELS[0], "exact")
+        else f"field-{model}-{truth}.safetensors"
+    )
+
+
+def options(sizes: Sizes, held_out: Sequence[str]) -> dict[str, Any]:
+    """Arguments of :func:`warprrf.reconstruct` for a run of these sizes."""
+    config = {} if sizes.gaussians is None else {"config": ReconstructionConfig(gaussians=sizes.gaussians)}
+    return {"held_out": held_out, "iterations": sizes.iterations, **config}
+
+
+def photos(data: Path, sizes: Sizes = FULL) -> tuple[list[Path], list[str], dict[str, Sequence[float]]]:
+    """Photo files, names of the held-out ones, and surveyed camera positions."""
+    roles = json.loads((data / "photos.json").read_text(encoding="utf-8"))
+    surveyed = json.loads((data / "surveyed.json").read_text(encoding="utf-8"))
+    names = [n for i, n in enumerate(roles["photos"]) if i % sizes.every_photo == 0 or n in surveyed]
+    held_out = [name for name in roles["held_out"] if name in names]
+    return (
+        [data / "photos" / name for name in names],
+        held_out,
+        {n: p for n, p in surveyed.items() if n in names},
+    )
+
+
+def _check_data(data: Path) -> None:
+    needed = ("photos", "photos.json", "surveyed.json", "poses_true.json", "scene.xml", *TRUTHS.values())
+    missing = [name for name in needed if not (data / name).exists()]
+    if missing:
+        raise ValueError(
+            f"data: {data} lacks {', '.join(missing)}; expected the folder data/lobby of a checkout, or make it: "
+            "warprrf data"
+        )
