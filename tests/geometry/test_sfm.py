@@ -276,7 +276,7 @@ def test_promising_pairs_hold_the_true_neighbours(posed, monkeypatch):
 
     monkeypatch.setattr(sfm, "COARSE_NEIGHBOURS", 4)
     with pycolmap.Database.open(str(posed[0] / "sfm" / "matches.db")) as database:
-        chosen = set(sfm._promising_pairs(pycolmap, database, VIEWS))
+        chosen = set(sfm._promising_pairs(database, VIEWS, lambda *a: None))
         ids = {i.name: i.image_id for i in database.read_all_images()}
         inliers = {
             (a, b): len(database.read_two_view_geometry(ids[a], ids[b]).inlier_matches)

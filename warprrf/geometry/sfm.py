@@ -143,7 +143,7 @@ def structure_from_motion(
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
         seed: seed of every random draw.
-        progress: called as ``progress("features" | "matching" | "mapping", done, total)``.
+        progress: called as ``progress("features" | "comparing" | "matching" | "mapping", done, total)``.
 
     Raises:
         ValueError: for photos that are missing, unreadable, of different sizes or too few, an unknown camera model,
@@ -431,7 +431,7 @@ def _match(
             )
         chosen = list(itertools.combinations(names, 2))
         if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
-            chosen = _promising_pairs(colmap, database, names)
+            chosen = _promising_pairs(database, names, report)
     matching = colmap.FeatureMatchingOptions(use_gpu=False)
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
@@ -450,7 +450,7 @@ def _match(
     _settle(working, folder / "matches.db")
 
 
-def _promising_pairs(colmap: ModuleType, database: Any, names: list[str]) -> list[tuple[str, str]]:
+def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[tuple[str, str]]:
     """Pairs worth matching: each photo with those that share the most of its largest features.
 
     The largest features of two photos are compared by brute force, one matrix product a pair; a mutual nearest
@@ -465,14 +465,24 @@ def _promising_pairs(colmap: ModuleType, database: Any, names: list[str]) -> lis
         d = d[np.argsort(-area, kind="stable")[:COARSE_FEATURES]]
         descriptors.append(d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9))
     votes = np.zeros((len(names), len(names)))
-    for i, j in itertools.combinations(range(len(names)), 2):
-        if min(len(descriptors[i]), len(descriptors[j])) < 8:
-            continue
-        cosine = descriptors[i] @ descriptors[j].T
-        best_j, best_i = cosine.argmax(axis=1), cosine.argmax(axis=0)
-        two = np.partition(cosine, -2, axis=1)[:, -2:]
-        distinct = (1 - two[:, 1]) < 0.64 * (1 - two[:, 0])  # Lowe's ratio 0.8, on squared distances
-        votes[i, j] = votes[j, i] = np.count_nonzero(distinct & (best_i[best_j] == np.arange(len(best_j))))
+    fewest = min(len(d) for d in descriptors)
+    if fewest < COARSE_FEATURES:  # pad, so that all photos go through one product; zeros match nothing
+        descriptors = [np.pad(d, ((0, COARSE_FEATURES - len(d)), (0, 0))) for d in descriptors]
+    stack = np.stack(descriptors)
+    for i in range(len(names) - 1):
+        report("comparing", i, len(names))
+        # One product of photo i with all later ones, shape (features of i, photos, features of j).
+        cosine = (stack[i] @ stack[i + 1 :].reshape(-1, stack.shape[2]).T).reshape(COARSE_FEATURES, -1, COARSE_FEATURES)
+        back = cosine.argmax(axis=0)
+        first = cosine.argmax(axis=2)[..., None]
+        top = np.take_along_axis(cosine, first, axis=2)[..., 0]
+        np.put_along_axis(cosine, first, -1.0, axis=2)
+        distinct = (1 - top) < 0.64 * (1 - cosine.max(axis=2))  # Lowe's ratio 0.8, on squared distances
+        first = first[..., 0]
+        mutual = np.take_along_axis(back, first.T, axis=1).T == np.arange(COARSE_FEATURES)[:, None]
+        votes[i, i + 1 :] = (distinct & mutual & (top > 0.5)).sum(axis=0)
+    votes += votes.T
+    report("comparing", len(names), len(names))
     keep = np.zeros(votes.shape, dtype=bool)
     order = np.argsort(-votes, axis=1, kind="stable")[:, :COARSE_NEIGHBOURS]
     np.put_along_axis(keep, order, True, axis=1)

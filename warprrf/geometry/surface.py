@@ -184,7 +184,7 @@ def fuse_depth(
     voxel_m: float = 0.04,
     truncation_m: float | None = None,
     max_range_m: float = 12.0,
-    edge_tolerance: float = 0.03,
+    edge_tolerance: float = 8.0,
     min_views: int = 2,
     min_component_faces: int = 200,
 ) -> Mesh:
@@ -197,8 +197,8 @@ def fuse_depth(
         voxel_m: side of a voxel.
         truncation_m: the field is truncated at this distance (default four voxels).
         max_range_m: depths beyond this are left out.
-        edge_tolerance: a pixel is left out where inverse depth bends by more than this part of itself from one
-            neighbour to the next: on a plane it is linear in the image, across an occluding edge it jumps.
+        edge_tolerance: a pixel is left out where inverse depth bends by more than this part of itself, per focal length
+            in pixels: on a plane it is linear in the image, in a corner it bends, across an occluding edge it jumps.
         min_views: a surface is kept where at least this many depth maps saw it.
         min_component_faces: connected pieces with fewer faces are dropped as floating debris.
 
@@ -222,7 +222,7 @@ def fuse_depth(
             raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
         depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
         z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
-        z[(depth > max_range_m) | ~_smooth(z, edge_tolerance)] = 0.0
+        z[(depth > max_range_m) | ~_smooth(z, edge_tolerance / camera.fx)] = 0.0
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
         # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.
         lens = core.Tensor(
@@ -234,7 +234,7 @@ def fuse_depth(
         blocks = grid.compute_unique_block_coordinates(image, lens, pose, 1.0, max_range_m, truncation)
         grid.integrate(blocks, image, lens, pose, 1.0, max_range_m, truncation)
         filled = True
-    raw = grid.extract_triangle_mesh(float(min_views)).to_legacy() if filled else None
+    raw = grid.extract_triangle_mesh(min_views - 0.5).to_legacy() if filled else None
     if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
     raw.merge_close_vertices(1e-4 * voxel_m)
