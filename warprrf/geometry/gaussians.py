@@ -62,6 +62,7 @@ class Gaussians:
             raise ValueError(
                 f"quaternions: {int((norm < 1e-12).sum())} are zero, expected wxyz rotations; (1, 0, 0, 0) is none"
             )
+        norm = np.where(np.abs(norm - 1) < 1e-6, 1.0, norm)  # unit up to float32: saving and loading changes nothing
         smallest = float(np.finfo(np.float32).tiny)
         if (scales < smallest).any():
             raise ValueError(

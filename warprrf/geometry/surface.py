@@ -237,6 +237,7 @@ def fuse_depth(
     raw = grid.extract_triangle_mesh(min_views - 0.5).to_legacy() if filled else None
     if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
+    raw = _ordered(o3d, np.asarray(raw.vertices), np.asarray(raw.triangles))
     raw.merge_close_vertices(1e-4 * voxel_m)
     raw.remove_degenerate_triangles()
     if min_component_faces > 0:
@@ -247,6 +248,20 @@ def fuse_depth(
     if len(raw.triangles) == 0:
         raise ValueError(f"min_component_faces: no connected piece has {min_component_faces} faces")
     return Mesh(np.asarray(raw.vertices), np.asarray(raw.triangles))
+
+
+def _ordered(o3d: Any, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """The mesh with vertices and faces in an order of their own, not in that in which threads found them."""
+    order = np.lexsort(vertices.T[::-1])
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    faces = rank[faces]
+    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(faces, turn, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    return o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces.astype(np.int32))
+    )
 
 
 def range_to_depth(distance: np.ndarray, camera: Camera) -> np.ndarray:

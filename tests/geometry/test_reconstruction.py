@@ -1,0 +1,325 @@
+"""From photos to geometry: initial Gaussians, resumed runs, files."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warprrf as wr
+from warprrf.geometry import reconstruction, sfm
+from warprrf.geometry.discs import discs_on_mesh
+from warprrf.geometry.initial import initial_gaussians, plane_mesh, seen_cells
+from warprrf.geometry.planes import Plane, occupancy, plane_axes
+from warprrf.geometry.reconstruction import Reconstruction, ReconstructionConfig, reconstruct
+from warprrf.geometry.refine import RefineConfig
+
+pytest.importorskip("open3d")
+pycolmap = pytest.importorskip("pycolmap")
+
+LOBBY = Path(__file__).parents[2] / "data" / "lobby"
+VIEWS = [f"view_{k:03d}.jpg" for k in range(10)]
+SMALL = ReconstructionConfig(
+    max_features=1500,
+    gaussians=2500,
+    refine=RefineConfig(iterations=12, downscale=4, max_gaussians=3000, checkpoint_every=4),
+    depth_downscale=4,
+    voxel_m=0.1,
+)
+
+
+def look(position, target, width=64, height=48, f=40.0):
+    ahead = np.asarray(target, float) - position
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = [right, np.cross(ahead, right), ahead]
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return wr.Camera.pinhole(width, height, fx=f, fy=f, cx=width / 2, cy=height / 2, world_to_camera=pose)
+
+
+def wall_plane(size=2.0):
+    """The wall x = 0, seen from x > 0, cells of 0.1 m over [-size, size] x [0, 2 size]."""
+    y, z = np.meshgrid(np.arange(-size, size, 0.05) + 0.025, np.arange(0, 2 * size, 0.05) + 0.025)
+    points = np.stack([np.zeros(y.size), y.ravel(), z.ravel()], axis=1)
+    none = points[:0]
+    return points, occupancy(
+        [Plane(np.array([1.0, 0, 0]), 0.0, np.arange(len(points)))], points, none, none, margin_m=0.0
+    )
+
+
+def painted(camera):
+    """A photo of the wall: grey for y < 0, black and white stripes of 5 cm for y > 0."""
+    d = camera.directions()
+    point = camera.position + d * (-camera.position[0] / d[..., 0])[..., None]
+    stripes = np.floor(point[..., 2] / 0.05) % 2
+    return np.repeat(np.where(point[..., 1] > 0, stripes, 0.5)[..., None], 3, axis=-1).astype(np.float32)
+
+
+def surveyed(names=VIEWS):
+    views = json.loads((LOBBY / "poses_true.json").read_text())["views"]
+    poses = {n: np.array(views[n]["world_to_camera"]) for n in names}
+    return {n: -p[:3, :3].T @ p[:3, 3] for n, p in poses.items()}
+
+
+# ------------------------------------------------------------------------------------------- where Gaussians start
+
+
+def test_discs_lie_flat_in_the_surface():
+    rng = np.random.default_rng(0)
+    points, normals = rng.uniform(-1, 1, (200, 3)), rng.standard_normal((200, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = rng.random((200, 3))
+    g = initial_gaussians(points, colors, normals)
+    np.testing.assert_allclose(np.abs((g.normals * normals).sum(axis=1)), 1, atol=1e-6)
+    assert (g.scales.min(axis=1) < 0.1 * g.scales.max(axis=1)).all()
+    np.testing.assert_allclose(g.sh[:, 0] * 0.5 / np.sqrt(np.pi) + 0.5, colors, atol=1e-6)
+
+
+def test_planes_take_fine_discs_where_photos_are_busy():
+    points, planes = wall_plane()
+    cameras = [look([3.0, y, 2.0], [0, y, 2.0], 160, 120, 100.0) for y in (-1.0, 0.0, 1.0)]
+    images = [painted(c) for c in cameras]
+    g = initial_gaussians(points[:1], np.zeros((1, 3)), [[1.0, 0, 0]], planes, cameras, images, count=2000)
+    assert 0.7 * 2000 <= len(g) <= 2000
+    np.testing.assert_allclose(g.means[1:, 0], 0, atol=1e-6)
+    busy = g.means[:, 1] > 0.1
+    assert busy.sum() > 2 * (g.means[:, 1] < -0.1).sum()
+    grey = g.sh[g.means[:, 1] < -0.2][:, 0] * 0.5 / np.sqrt(np.pi) + 0.5
+    np.testing.assert_allclose(grey, 0.5, atol=0.02)
+
+
+def test_cells_that_no_photo_sees_get_no_discs():
+    points, planes = wall_plane()
+    camera = look([2.0, 1.5, 2.0], [0, 1.5, 2.0])
+    seen = seen_cells(planes, [camera, camera])
+    uv, depth = camera.project(seen[0].cells())
+    assert 0 < len(uv) < planes[0].occupied.sum()
+    assert ((uv >= 0) & (uv < (64, 48))).all()
+    hidden = seen_cells(planes, [look([-2.0, 1.5, 2.0], [0, 1.5, 2.0])] * 2)  # from behind
+    assert hidden[0].occupied.sum() == 0 and plane_mesh(hidden) is None
+
+
+def test_a_plane_in_front_hides_the_one_behind():
+    _, (wall,) = wall_plane()
+    near = replace(wall, offset=1.0, occupied=wall.occupied.copy())
+    cameras = [look([3.0, 0.0, 2.0], [0, 0, 2.0])] * 2
+    front, back = seen_cells([near, wall], cameras)
+    assert front.occupied.any() and not back.occupied.any()
+
+
+def test_nothing_to_start_from_is_an_error():
+    empty = np.zeros((0, 3))
+    with pytest.raises(ValueError, match="nothing to start from"):
+        initial_gaussians(empty, empty, empty)
+    with pytest.raises(ValueError, match="got 1 for 0 cameras"):
+        initial_gaussians(empty, empty, empty, images=[np.zeros((4, 4, 3))])
+
+
+def test_without_a_survey_z_is_up_and_the_size_is_plausible():
+    cameras = {f"{k}": look([0.1 * k, 0.02 * k**2, 0.0], [1 + k, 2.0, 0.1]) for k in range(4)}
+    rng = np.random.default_rng(0)
+    points = rng.uniform(5, 6, (30, 3))
+    sparse = sfm.SparseModel(
+        cameras, points, points, np.ones(30), np.full(30, 2), np.arange(0, 61, 2), np.tile([0, 3], 30)
+    )
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    out = reconstruction._assumed_scale(sfm.transformed(sparse, 0.2, turn, np.ones(3)))
+    for camera in out.cameras.values():
+        assert camera.rotation[1] @ [0, 0, 1] < -0.9  # the photo's down
+    gap = [np.linalg.norm(p - c.position) for c in list(out.cameras.values())[::3] for p in out.points]
+    assert np.median(gap) == pytest.approx(3.0, rel=0.05)
+
+
+# ------------------------------------------------------------------------------------------- the whole
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    workspace = tmp_path_factory.mktemp("whole")
+    photos = [LOBBY / "photos" / n for n in VIEWS]
+    known = surveyed()
+    rec = reconstruct(
+        photos, workspace=workspace, known_positions=known, held_out=VIEWS[4:5], config=SMALL, device="cpu"
+    )
+    return workspace, photos, known, rec
+
+
+def test_ten_photos_become_gaussians_mesh_and_patches(whole):
+    rec = whole[3]
+    assert len(rec.gaussians) > 1000 and len(rec.cameras) == 10 and rec.held_out == (VIEWS[4],)
+    assert rec.scale_rms_m < 0.03 and rec.metric
+    # Against the true room: the floor is at z = 0, and it is the largest thing that these photos see.
+    level = [p for p in rec.planes if p.normal[2] > 0.99]
+    assert min(abs(p.offset) for p in level) < 0.02
+    truth = wr.Scene.load(LOBBY / "scene.xml").mesh
+    centres = rec.mesh.triangles.mean(axis=1)
+    assert np.median(truth.distance(centres, device="cpu")) < 0.03
+    assert sum(p.area for p in rec.patches) > 0.5 * rec.mesh.areas.sum()
+    for patch in rec.patches[:5]:
+        corners = rec.mesh.vertices[rec.mesh.faces[patch.faces]]
+        assert np.median(np.abs(corners @ patch.normal - patch.offset)) < 1e-6
+
+
+def test_finished_steps_are_not_done_again(whole):
+    workspace, photos, known, rec = whole
+    stages = []
+    again = reconstruct(
+        photos, workspace=workspace, known_positions=known, held_out=VIEWS[4:5], config=SMALL, device="cpu",
+        progress=lambda s, d, n: stages.append(s),
+    )  # fmt: skip
+    assert stages == []
+    for name in ("means", "quaternions", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(again.gaussians, name), getattr(rec.gaussians, name))
+    np.testing.assert_array_equal(again.mesh.vertices, rec.mesh.vertices)
+    assert [p.area for p in again.patches] == [p.area for p in rec.patches]
+
+
+def test_a_killed_run_continues_to_the_same_result(whole):
+    workspace, photos, known, rec = whole
+    for name in ("refined", "surface"):
+        (workspace / f"{name}.safetensors").unlink()
+    for path in workspace.glob("refine-*"):
+        path.unlink()
+    options = {"workspace": workspace, "known_positions": known, "held_out": VIEWS[4:5], "device": "cpu"}
+
+    def render_killed(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reconstruction, "fuse_gaussians", render_killed)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(photos, config=SMALL, **options)
+    (workspace / "surface.safetensors.partial").write_bytes(b"half")
+    stages = set()
+    resumed = reconstruct(photos, config=SMALL, progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == {"depth", "surface"}
+    np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
+    np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
+
+
+def test_a_changed_setting_is_not_served_from_the_old_run(whole):
+    workspace, photos, known, rec = whole
+    stages = set()
+    other = reconstruct(
+        photos, workspace=workspace, known_positions=known, held_out=VIEWS[4:6], config=SMALL, iterations=2,
+        device="cpu", progress=lambda s, d, n: stages.add(s),
+    )  # fmt: skip
+    assert stages == {"planes", "refine", "depth", "surface"}  # the photos' poses stay
+    assert other.held_out == tuple(VIEWS[4:6])
+
+
+def test_bad_names_are_refused_before_any_work(tmp_path):
+    photos = [LOBBY / "photos" / n for n in VIEWS[:4]]
+    with pytest.raises(ValueError, match=r"held_out: no such photo: nobody\.jpg"):
+        reconstruct(photos, workspace=tmp_path, held_out=["nobody.jpg"])
+    with pytest.raises(ValueError, match=r"known_positions: no such photo: nobody\.jpg"):
+        reconstruct(photos, workspace=tmp_path, known_positions={"nobody.jpg": [0, 0, 0]})
+    with pytest.raises(ValueError, match="not a folder"):
+        reconstruct(tmp_path / "nowhere", workspace=tmp_path)
+
+
+# ------------------------------------------------------------------------------------------- files
+
+
+def test_a_saved_reconstruction_is_the_same(whole, tmp_path):
+    rec = whole[3]
+    rec.save(tmp_path)
+    read = Reconstruction.load(tmp_path)
+    for name in ("means", "quaternions", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(read.gaussians, name), getattr(rec.gaussians, name))
+    np.testing.assert_array_equal(read.mesh.vertices, rec.mesh.vertices)
+    np.testing.assert_array_equal(read.mesh.faces, rec.mesh.faces)
+    assert list(read.cameras) == list(rec.cameras) and read.scale_rms_m == rec.scale_rms_m
+    for name, camera in rec.cameras.items():
+        np.testing.assert_array_equal(read.cameras[name].world_to_camera, camera.world_to_camera)
+        assert read.cameras[name].fx == camera.fx
+    for a, b in zip(read.patches, rec.patches, strict=True):
+        np.testing.assert_array_equal(a.faces, b.faces)
+        assert a.offset == b.offset
+    for a, b in zip(read.planes, rec.planes, strict=True):
+        np.testing.assert_array_equal(a.occupied, b.occupied)
+
+
+def test_damaged_files_are_refused_and_survive_a_failed_save(whole, tmp_path):
+    with pytest.raises(ValueError, match="holds no reconstruction.safetensors"):
+        Reconstruction.load(tmp_path)
+    whole[3].save(tmp_path)
+    path = tmp_path / "reconstruction.safetensors"
+    good = path.read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "safetensors.numpy.save_file", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full"))
+        )
+        with pytest.raises(OSError, match="disk full"):
+            whole[3].save(tmp_path)
+    assert path.read_bytes() == good and len(list(tmp_path.iterdir())) == 1
+    path.write_bytes(good[: len(good) // 2])
+    with pytest.raises(ValueError, match="damaged"):
+        Reconstruction.load(tmp_path)
+
+
+LOW, HIGH = np.array([-2.0, -1.5, 0.0]), np.array([2.0, 1.5, 2.5])
+
+
+def room():
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return wr.Mesh(
+        LOW + corners * (HIGH - LOW), [t[::-1] for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    )
+
+
+@pytest.fixture(scope="module")
+def splats(tmp_path_factory):
+    """Splats of a bare room and a COLMAP model of 16 cameras in it."""
+    folder = tmp_path_factory.mktemp("splats")
+    g = discs_on_mesh(room(), 6000)
+    wr.Gaussians(g.means, g.quaternions, g.scales, g.opacities, np.zeros((len(g), 1, 3))).save_ply(
+        folder / "g.ply"
+    )
+    model = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(model="PINHOLE", width=96, height=72, params=[50, 50, 48, 36], camera_id=1)
+    model.add_camera_with_trivial_rig(lens)
+    for k, a in enumerate(np.arange(20) * 2 * np.pi / 10):
+        tilt = (-0.8, 0.8)[k // 10]
+        camera = look([0.3 * np.cos(a), 0.2 * np.sin(a), 1.2], [np.cos(a), np.sin(a), 1.2 + tilt])
+        image = pycolmap.Image(name=f"{k:02d}.jpg", camera_id=1, image_id=k + 1)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.rotation), camera.world_to_camera[:3, 3])
+        model.add_image_with_trivial_frame(image, pose)
+    (folder / "model").mkdir()
+    model.write_binary(str(folder / "model"))
+    return folder
+
+
+def test_splats_with_poses_get_a_mesh_of_their_own(splats):
+    rec = Reconstruction.from_files(splats / "g.ply", colmap=splats / "model", device="cpu",
+                                    config=ReconstructionConfig(depth_downscale=1))  # fmt: skip
+    assert len(rec.cameras) == 20
+    distance = np.minimum(np.abs(rec.mesh.vertices - LOW), np.abs(rec.mesh.vertices - HIGH)).min(axis=1)
+    assert np.median(distance) < 0.01 and np.percentile(distance, 90) < 0.03
+    assert len([p for p in rec.patches if p.area > 4]) == 6
+
+
+def test_splats_with_a_mesh_take_it_as_it_is(splats):
+    rec = Reconstruction.from_files(splats / "g.ply", mesh=room())
+    assert len(rec.mesh.faces) == 12 and len(rec.patches) == 6
+    assert sum(p.area for p in rec.patches) == pytest.approx(2 * (12 + 10 + 7.5))
+
+
+def test_splats_alone_say_what_they_lack_when_it_is_needed(splats):
+    rec = Reconstruction.from_files(splats / "g.ply")
+    assert not rec.has_mesh and rec.patches == []
+    with pytest.raises(ValueError, match="has no mesh.*mesh=, or colmap="):
+        _ = rec.mesh
+    with pytest.raises(FileNotFoundError):
+        Reconstruction.from_files(splats / "none.ply")
+
+
+def test_plane_axes_are_a_right_handed_frame():
+    for normal in np.vstack([np.eye(3), -np.eye(3), [[0.6, 0, 0.8]]]):
+        first, second = plane_axes(normal)
+        np.testing.assert_allclose(np.cross(first, second), normal, atol=1e-12)
