@@ -1,0 +1,164 @@
+"""Sionna RT and our own evaluation check each other on a room with a solid in it."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from radio_scenes import box_mesh, joined  # noqa: E402
+
+from warprrf.rf import llvm
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.materials import Material
+from warprrf.rf.scene import Scene
+from warprrf.rf.simulate import simulate
+from warprrf.rf.spectrum import pixel_of
+
+F, SHAPE = 300e9, (30, 60)
+TX, SEES, BLOCKED = np.array([-5.0, 3.5, 2.7]), np.array([3.0, 4.0, 1.4]), np.array([3.0, -2.0, 1.2])
+
+
+def sionna_or_skip():
+    try:
+        llvm.select_llvm()
+    except ImportError as error:
+        pytest.skip(str(error))
+    pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
+    from warprrf.rf.sionna_engine import SionnaEngine
+
+    return SionnaEngine
+
+
+def write_scene(folder):
+    """A room and a block in it, as PLY files and the XML that Sionna reads."""
+    parts = {
+        "walls": box_mesh([-7, -6, 0], [8, 6, 4], inward=True),
+        "block": box_mesh([-1.5, -2, -0.01], [0.5, 1.5, 2.2]),
+    }
+    shapes = ""
+    for name, (vertices, faces) in parts.items():
+        header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
+        header += "property float x\nproperty float y\nproperty float z\n"
+        header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        rows = [" ".join(f"{x:.9g}" for x in v) for v in vertices] + [f"3 {a} {b} {c}" for a, b, c in faces]
+        (folder / f"{name}.ply").write_text(header + "\n".join(rows) + "\n")
+        shapes += (
+            f'<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>'
+            '<boolean name="face_normals" value="true"/><ref id="mat-itu_concrete" name="bsdf"/></shape>\n'
+        )
+    xml = folder / "scene.xml"
+    bsdf = '<bsdf type="diffuse" id="mat-itu_concrete"/>'
+    xml.write_text(f'<scene version="3.0.0">\n{bsdf}\n{shapes}</scene>\n')
+    mesh, part = joined(*parts.values())
+    stone = Material.custom(
+        "stone",
+        relative_permittivity=5.0,
+        conductivity=5.0,
+        thickness_m=0.05,
+        scattering=0.6,
+        pattern="directive",
+    )
+    board = Material.custom(
+        "board", relative_permittivity=1.6, conductivity=1.0, thickness_m=0.013, scattering=0.9
+    )
+    return Scene(mesh, [stone, board], part, face_object=part, object_names=list(parts), xml_path=xml)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def engines(scene):
+    sionna = sionna_or_skip()
+    common = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
+    return ExactEngine(scene, **common), sionna(scene, depth=1, **common)
+
+
+@pytest.mark.parametrize("rx", [SEES, BLOCKED])
+def test_total_diffuse_power_agrees_within_half_a_percent(engines, rx):
+    ours, theirs = engines
+    found = theirs.solve(rx, specular=False)
+    assert ours.diffuse(rx).power.sum() == pytest.approx(found["power"][found["diffuse"]].sum(), rel=5e-3)
+
+
+@pytest.mark.parametrize("rx", [SEES, BLOCKED])
+def test_line_of_sight_and_mirrors_agree_in_power_delay_and_direction(engines, rx):
+    ours, theirs = engines
+    found = theirs.solve(rx)
+    sharp = ~found["diffuse"]
+    paths = ours.tracer.trace(rx, 1)
+    # Delays agree to float32 and two may be that close: pair by arrival instead.
+    theirs_at = found["arrival"][sharp]
+    assert len(paths.tau) == len(theirs_at)
+    pair = (paths.arrival @ theirs_at.T).argmax(axis=1)
+    np.testing.assert_allclose(paths.tau, found["tau"][sharp][pair], rtol=1e-6)
+    np.testing.assert_allclose(paths.power, found["power"][sharp][pair], rtol=1e-3)
+    np.testing.assert_allclose(paths.arrival, theirs_at[pair], atol=2e-5)
+    np.testing.assert_allclose(
+        np.column_stack([paths.theta_t, paths.phi_t]), found["aod"][sharp][pair], atol=2e-5
+    )
+
+
+def test_two_mirror_reflections_agree_in_power(scene):
+    sionna = sionna_or_skip()
+    common = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
+    found = sionna(scene, depth=2, samples=200_000, **common).solve(SEES)
+    sharp = ~found["diffuse"]
+    paths = ExactEngine(scene, **common).tracer.trace(SEES, 2)
+    a, b = np.argsort(paths.tau), np.argsort(found["tau"][sharp])
+    assert len(a) == len(b) > 10
+    np.testing.assert_allclose(paths.tau[a], found["tau"][sharp][b], rtol=1e-6)
+    # Two of the delays agree to float32, so powers are put in order by themselves.
+    np.testing.assert_allclose(np.sort(paths.power), np.sort(found["power"][sharp]), rtol=1e-3)
+
+
+def test_spectra_have_the_same_shape_and_the_same_strongest_pixel(engines):
+    ours, theirs = (engine.receive(SEES) for engine in engines)
+    pixel = pixel_of(TX - SEES, SHAPE)
+    distance = np.linalg.norm(TX - SEES)
+    for got in (ours, theirs):
+        assert np.unravel_index(got.path_gain.argmax(), SHAPE) == pixel
+        assert got.delay_s[pixel] == pytest.approx(distance / SPEED_OF_LIGHT, rel=1e-6)
+        assert got.path_gain.sum() == pytest.approx(sum(got.totals.values()), rel=1e-9)
+    assert ours.line_of_sight and theirs.line_of_sight
+
+
+def test_more_bounces_bring_more_power_and_simulate_says_how(scene):
+    sionna_or_skip()
+    options = {
+        "transmitter": TX,
+        "receivers": [BLOCKED],
+        "frequency_hz": F,
+        "shape": SHAPE,
+        "engine": "sionna",
+    }
+    one, three = (simulate(scene, depth=n, samples=100_000, **options) for n in (1, 3))
+    assert 1.05 < three.path_gain.sum() / one.path_gain.sum() < 10
+    assert (three.attributes["depth"], three.attributes["samples"]) == (3, 100_000)
+    assert three.attributes["version_sionna_rt"] and not three.line_of_sight[0]
+
+
+def test_a_scene_without_a_file_is_refused(scene):
+    sionna = sionna_or_skip()
+    bare = Scene(scene.mesh, scene.materials, scene.face_material)
+    with pytest.raises(ValueError, match="xml|XML"):
+        sionna(bare, transmitter=TX, frequency_hz=F, shape=SHAPE)
+
+
+def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.setattr(
+        llvm, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
+    )
+    assert llvm.select_llvm() == Path("c")
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH")
+    monkeypatch.setattr(llvm, "installed_llvm", lambda: {15: Path("b")})
+    with pytest.raises(ImportError, match="15.*libllvm19"):
+        llvm.select_llvm()
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/mine.so")
+    assert llvm.select_llvm() == Path("/mine.so")
