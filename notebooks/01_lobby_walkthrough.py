@@ -16,8 +16,8 @@
 #
 # A radio radiance field answers, for any receiver in a room: which paths arrive, from where, sent towards where, how
 # strong, how late. This notebook builds one from two things: **photos** of the room and **a few radio spectra**
-# measured in it. It runs on a CPU, on a third of the photos and with few optimisation steps, so its figures are worse
-# than those of `make lobby`; every step is the same.
+# measured in it. It runs on a CPU, on the photos of one part of the room and with few optimisation steps, so its
+# figures are worse than those of `make lobby`; every step is the same.
 #
 # 1. [The photos](#photos) and what they must show
 # 2. [Structure from motion](#sfm): cameras and sparse points, up to scale
@@ -33,7 +33,6 @@
 # from the receiver to where the path last met something.
 
 # %%
-import json
 import time
 from pathlib import Path
 
@@ -46,7 +45,9 @@ from warprrf.bench.lobby import pipeline, report
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 WORK = DATA.parent.parent / "runs" / "notebook"
-plt.rcParams.update({"figure.dpi": 70, "figure.constrained_layout.use": True, "image.interpolation": "nearest"})
+plt.rcParams.update(
+    {"figure.dpi": 70, "figure.constrained_layout.use": True, "image.interpolation": "nearest"}
+)
 clock = time.perf_counter()
 
 # %% [markdown]
@@ -60,10 +61,12 @@ clock = time.perf_counter()
 
 # %%
 photos, held_out, surveyed = pipeline.photos(DATA, pipeline.REDUCED)
-print(f"{len(photos)} photos, {len(held_out)} of them held out for scoring, {len(surveyed)} with surveyed positions")
+print(
+    f"{len(photos)} photos, {len(held_out)} of them held out for scoring, {len(surveyed)} with surveyed positions"
+)
 
 figure, axes = plt.subplots(2, 4, figsize=(13, 5))
-for ax, path in zip(axes.flat, photos[:: max(1, len(photos) // 8)]):
+for ax, path in zip(axes.flat, photos[:: max(1, len(photos) // 8)], strict=False):
     ax.imshow(Image.open(path).resize((320, 240)))
     ax.set_title(path.name, fontsize=9)
     ax.axis("off")
@@ -81,17 +84,20 @@ for ax, path in zip(axes.flat, photos[:: max(1, len(photos) // 8)]):
 from warprrf.geometry.sfm import align_to_known, structure_from_motion
 
 start = time.perf_counter()
-sparse = structure_from_motion(photos, workspace=WORK / "workspace", seed=0)
-print(f"{len(sparse.cameras)} of {len(photos)} photos posed, {len(sparse.points)} points, "
-      f"{time.perf_counter() - start:.0f} s")
+sparse = structure_from_motion(
+    photos, workspace=WORK / "workspace", max_features=pipeline.REDUCED.features, seed=0
+)
+print(
+    f"{len(sparse.cameras)} of {len(photos)} photos posed, {len(sparse.points)} points, "
+    f"{time.perf_counter() - start:.0f} s"
+)
 
 figure, axes = plt.subplots(1, 2, figsize=(11, 3))
 axes[0].hist(sparse.track_length, bins=np.arange(1.5, 20), color="#0b6e99")
 axes[0].set_xlabel("photos that see a point")
 axes[1].hist(sparse.reprojection_error, bins=40, range=(0, 2), color="#0b6e99")
 axes[1].set_xlabel("reprojection error [pixels]")
-axes[0].set_ylabel("points");
-
+axes[0].set_ylabel("points")
 # %% [markdown]
 # <a id="metres"></a>
 # ## 3. Metres
@@ -103,9 +109,11 @@ axes[0].set_ylabel("points");
 
 # %%
 metric = align_to_known(sparse, surveyed)
-true_cameras = pipeline.true_cameras(DATA)
+true_cameras = pipeline.truth_scores.true_cameras(DATA / "poses_true.json")
 error = np.array([np.linalg.norm(c.position - true_cameras[n].position) for n, c in metric.cameras.items()])
-print(f"rms at the surveyed positions {100 * metric.scale_rms_m:.2f} cm, at all cameras {100 * np.sqrt(np.mean(error**2)):.2f} cm")
+print(
+    f"rms at the surveyed positions {100 * metric.scale_rms_m:.2f} cm, at all cameras {100 * np.sqrt(np.mean(error**2)):.2f} cm"
+)
 
 figure, ax = plt.subplots(figsize=(9, 6.5))
 ax.scatter(*metric.points[:, :2].T, c=np.clip(metric.colors, 0, 1), s=2, linewidths=0)
@@ -116,8 +124,7 @@ for name, camera in metric.cameras.items():
 ax.set_aspect("equal")
 ax.set_xlim(-0.5, 15.5), ax.set_ylim(-0.5, 12.5)
 ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]")
-ax.set_title("sparse points and cameras from above (red: surveyed)");
-
+ax.set_title("sparse points and cameras from above (red: surveyed)")
 # %% [markdown]
 # <a id="geometry"></a>
 # ## 4. Geometry: Gaussians, then a mesh
@@ -135,16 +142,24 @@ ax.set_title("sparse points and cameras from above (red: surveyed)");
 # %%
 start = time.perf_counter()
 rec = wr.reconstruct(
-    photos, workspace=WORK / "workspace", known_positions=surveyed, seed=0, **pipeline.options(pipeline.REDUCED, held_out)
+    photos,
+    workspace=WORK / "workspace",
+    known_positions=surveyed,
+    seed=0,
+    **pipeline.options(pipeline.REDUCED, held_out),
 )
-print(f"{len(rec.gaussians)} Gaussians, {len(rec.mesh.faces)} triangles, {len(rec.patches)} planar patches, "
-      f"{time.perf_counter() - start:.0f} s")
+print(
+    f"{len(rec.gaussians)} Gaussians, {len(rec.mesh.faces)} triangles, {len(rec.patches)} planar patches, "
+    f"{time.perf_counter() - start:.0f} s"
+)
 
 # %%
 name = held_out[len(held_out) // 2]
 truth = np.asarray(Image.open(DATA / "photos" / name), dtype=np.float32) / 255
 view = wr.render(rec.gaussians, rec.cameras[name])
-print(f"{name}, never shown to the optimiser: {-10 * np.log10(np.mean((np.clip(view.features, 0, 1) - truth) ** 2)):.1f} dB")
+print(
+    f"{name}, never shown to the optimiser: {-10 * np.log10(np.mean((np.clip(view.features, 0, 1) - truth) ** 2)):.1f} dB"
+)
 figure, axes = plt.subplots(1, 3, figsize=(14, 3.7))
 axes[0].imshow(truth), axes[0].set_title("photo")
 axes[1].imshow(np.clip(view.features, 0, 1)), axes[1].set_title("render")
@@ -164,8 +179,7 @@ for mesh, colour, label in ((scene.mesh, "#bbbbbb", "true"), (rec.mesh, "#0b6e99
     lines = report.section(mesh.vertices, mesh.faces, 1.2)
     ax.plot(*lines.transpose(2, 1, 0), color=colour, linewidth=3 if label == "true" else 1)
     ax.plot([], color=colour, label=label)
-ax.set_aspect("equal"), ax.legend(), ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]");
-
+ax.set_aspect("equal"), ax.legend(), ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]")
 # %% [markdown]
 # <a id="los"></a>
 # ## 5. What the transmitter sees
@@ -174,7 +188,7 @@ ax.set_aspect("equal"), ax.legend(), ax.set_xlabel("x [m]"), ax.set_ylabel("y [m
 # weak. Who sees the transmitter is therefore the first question, and a ray query on the mesh answers it.
 
 # %%
-dataset = wr.SpectrumDataset.load(DATA / "spectra_exact.nc")
+dataset = wr.SpectrumDataset.load(DATA / pipeline.TRUTHS["exact"])
 x, y = np.meshgrid(np.arange(0.25, 15, 0.25), np.arange(0.25, 12, 0.25))
 heads = np.stack([x, y, np.full_like(x, 1.5)], axis=-1).reshape(-1, 3)
 seen = rec.mesh.visible(np.broadcast_to(dataset.transmitter, heads.shape).copy(), heads).reshape(x.shape)
@@ -183,8 +197,7 @@ ax.pcolormesh(x, y, seen, cmap="Greys_r", vmin=-1, vmax=1.2, shading="nearest")
 ax.scatter(*dataset.receivers[:, :2].T, c=np.where(dataset.line_of_sight, "#0b6e99", "#c4570f"), s=14)
 ax.scatter(*dataset.transmitter[:2], marker="*", s=250, color="#a8200d")
 ax.set_aspect("equal"), ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]")
-ax.set_title("light: sees the transmitter at 1.5 m height; receivers blue, orange where the truth is blocked");
-
+ax.set_title("light: sees the transmitter at 1.5 m height; receivers blue, orange where the truth is blocked")
 # %% [markdown]
 # <a id="spectrum"></a>
 # ## 6. A spectrum
@@ -195,8 +208,10 @@ ax.set_title("light: sees the transmitter at 1.5 m height; receivers blue, orang
 # data set.
 
 # %%
-train, test = dataset.split(pipeline.REDUCED.train, seed=0)
-print(f"{dataset.frequency_hz / 1e9:g} GHz, {len(train.receivers)} receivers to learn from, {len(test.receivers)} held out")
+train, test = pipeline.receivers(dataset, pipeline.REDUCED)
+print(
+    f"{dataset.frequency_hz / 1e9:g} GHz, {len(train.receivers)} receivers to learn from, {len(test.receivers)} held out"
+)
 blocked = int(np.flatnonzero(~test.line_of_sight)[0])
 open_view = int(np.flatnonzero(test.line_of_sight)[0])
 figure, axes = plt.subplots(1, 2, figsize=(14, 3.6))
@@ -224,8 +239,7 @@ print(f"{time.perf_counter() - start:.1f} s for {len(train.receivers)} receivers
 losses = field.report["losses"]["gain"]
 figure, ax = plt.subplots(figsize=(6, 2.6))
 ax.plot(losses, color="#0b6e99")
-ax.set_xlabel("step"), ax.set_ylabel("0.8 L1 + 0.2 (1 - SSIM)"), ax.grid(alpha=0.3);
-
+ax.set_xlabel("step"), ax.set_ylabel("0.8 L1 + 0.2 (1 - SSIM)"), ax.grid(alpha=0.3)
 # %% [markdown]
 # <a id="truth"></a>
 # ## 8. Against the truth
@@ -242,15 +256,14 @@ for index in (open_view, blocked):
     display(figure)  # noqa: F821
 
 # %%
-from warprrf.rf import lookups
-
-few = test.subset(range(pipeline.REDUCED.test))
 methods = {"rf3dgs+": field.spectrum} | {name: build(train) for name, build in pipeline.LOOKUPS.items()}
 print(f"{'method':<10}{'PSNR dB':>9}{'direction deg':>15}{'within 3 deg':>14}{'beam loss dB':>14}")
 for name, predict in methods.items():
-    figures = wr.evaluate(few, predict)
-    print(f"{name:<10}{figures['psnr_db']:>9.2f}{figures['direction_median_deg']:>15.1f}"
-          f"{figures['direction_within_3deg']:>14.0%}{figures['beam_gain_loss_db']:>14.1f}")
+    figures = wr.evaluate(test, predict)
+    print(
+        f"{name:<10}{figures['psnr_db']:>9.2f}{figures['direction_median_deg']:>15.1f}"
+        f"{figures['direction_within_3deg']:>14.0%}{figures['beam_gain_loss_db']:>14.1f}"
+    )
 
 # %% [markdown]
 # Few photos, few steps, few receivers: look at `make lobby` for figures that count. The structure of the errors is
@@ -267,8 +280,10 @@ for name, predict in methods.items():
 receiver = test.receivers[open_view]
 paths, spectrum = field.paths(receiver), field.spectrum(receiver)
 power = np.abs(paths.gain[paths.valid]) ** 2
-print(f"{paths.valid.sum()} paths, total {10 * np.log10(power.sum()):.2f} dB "
-      f"(spectrum: {10 * np.log10(spectrum.total_path_gain):.2f} dB)")
+print(
+    f"{paths.valid.sum()} paths, total {10 * np.log10(power.sum()):.2f} dB "
+    f"(spectrum: {10 * np.log10(spectrum.total_path_gain):.2f} dB)"
+)
 order = np.argsort(power)[::-1]
 kinds = np.asarray(paths.kind)[paths.valid]
 figure, ax = plt.subplots(figsize=(9, 3))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from warprrf.bench.lobby import pipeline, report
 from warprrf.geometry.discs import discs_on_mesh
 
 LOBBY = Path(__file__).resolve().parents[2] / "data" / "lobby"
-SIZES = replace(pipeline.REDUCED, every_photo=1, steps=20, train=6, test=4)
+SIZES = pipeline.Sizes(steps=20, train=6, test=4)
 MODELS = ("rf3dgs+", "rf3dgs")
 KEYS = (
     "psnr_db",
