@@ -24,7 +24,6 @@ ARGS ?=
 export WARP_CACHE_PATH ?= $(CURDIR)/.cache/warp
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
-export MPLBACKEND ?= Agg
 export PYTHON
 
 # Dr.Jit picks the first LLVM it finds, and aborts on 15 and 16: name the newest where several are installed.

@@ -113,6 +113,8 @@ def _lobby(args: argparse.Namespace, bars: Bars) -> None:
     )
     bars._close()
     print(pipeline.summary(report))
+    for truth, key in (("exact", "methods"), ("Sionna RT", "methods_sionna")):
+        print(f"\nheld-out receivers, truth: {truth}\n{table(report[key])}")
     print(f"\n{Path(args.out) / 'report.html'}: the report with pictures; report.json: every figure")
 
 
