@@ -47,8 +47,7 @@ def paths_of(view: View, *, beam_sigma_rad: float, frequency_hz: float, max_path
     if view.beam is not None:
         line_of_sight, power = min(view.line_of_sight_gain, total), np.maximum(power - view.beam, 0.0)
     elif view.visible:
-        near = toward @ (-outward / distance) >= np.cos(BEAM_REACH * beam_sigma_rad)
-        near[pixel_of(-outward, shape)] = True
+        near = near_line_of_sight(view.receiver, view.transmitter, shape, beam_sigma_rad)
         line_of_sight, power = float(power[near].sum()), np.where(near, 0.0, power)
     rest = total - line_of_sight
     kept = power > spectrum.floor
@@ -77,6 +76,16 @@ def paths_of(view: View, *, beam_sigma_rad: float, frequency_hz: float, max_path
     everything = Paths.concatenate(parts)
     order = np.argsort(-np.abs(everything.gain), kind="stable")[:max_paths]
     return Paths(**{name: getattr(everything, name)[order] for name in Paths.__dataclass_fields__})
+
+
+def near_line_of_sight(
+    receiver: np.ndarray, transmitter: np.ndarray, shape: tuple[int, int], beam_sigma_rad: float
+) -> np.ndarray:
+    """Pixels ``(H, W)`` within :data:`BEAM_REACH` beam sigmas of the transmitter's direction, at least one."""
+    direction = (transmitter - receiver) / np.linalg.norm(transmitter - receiver)
+    near = pixel_directions(shape) @ direction >= np.cos(BEAM_REACH * beam_sigma_rad)
+    near[pixel_of(direction, shape)] = True
+    return near
 
 
 def _single(

@@ -42,7 +42,7 @@ class Rates:
     constant: float = 0.2
     directional: float = 0.1
     ridge: float = 0.02
-    ridge_directional: float = 0.1
+    ridge_directional: float = 0.2
 
 
 @dataclass(frozen=True)
