@@ -23,6 +23,7 @@ ECHO_M, ECHO_CELL_M = (
     0.1,
     0.3,
 )  # noise of a plane passes for a second one this close; compared by cells of this size
+CONTESTED_M = 0.25  # a sign stands off its wall by less
 DRAW = 6000  # points a hypothesis is scored on
 
 
@@ -299,7 +300,42 @@ def occupancy(
         empty = dilate(seen_through > 0, 2) & ~dilate(supported, 1)
         empty |= (seen_through > 2) & ~supported
         result.append(replace(plane, axes=axes, corner=corner, cell_m=cell_m, occupied=inside & ~empty))
-    return result
+    return [_uncontested(k, result, points) for k in range(len(result))]
+
+
+def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray) -> Plane:
+    """Plane ``k`` without the cells that belong to a parallel plane close by, such as the wall behind a sign.
+
+    Lines of sight cannot tell the two apart; of two planes the one with the nearest point of its own has the cell.
+    """
+    plane = planes[k]
+    cells = plane.cells()
+    own: np.ndarray | None = None
+    lost = np.zeros(len(cells), dtype=bool)
+    for other in [*planes[:k], *planes[k + 1 :]]:
+        if other.normal @ plane.normal < np.cos(np.radians(10.0)):
+            continue
+        contested = (np.abs(other.distance(cells)) < CONTESTED_M) & other.covers(cells)
+        if not contested.any():
+            continue
+        if own is None:
+            own = _nearest_gap(plane.to_plane(cells), plane.to_plane(points[plane.inliers]))
+        theirs = np.full(len(cells), np.inf)
+        theirs[contested] = _nearest_gap(plane.to_plane(cells[contested]), plane.to_plane(points[other.inliers]))
+        lost |= theirs < own
+    occupied = plane.occupied.copy()
+    occupied[plane.occupied] = ~lost
+    return replace(plane, occupied=occupied)
+
+
+def _nearest_gap(queries: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distance of each query to the nearest point, shape ``(N,)``; exact, in pieces."""
+    return np.concatenate(
+        [
+            np.sqrt(((piece[:, None] - points[None]) ** 2).sum(axis=2).min(axis=1))
+            for piece in np.array_split(queries, max(1, len(queries) * len(points) // 4_000_000 + 1))
+        ]
+    )
 
 
 def dilate(mask: np.ndarray, steps: int) -> np.ndarray:

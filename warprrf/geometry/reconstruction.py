@@ -56,7 +56,7 @@ class ReconstructionConfig:
         min_patch_m2: smallest planar patch.
     """
 
-    max_features: int = 2000
+    max_features: int = 2400
     pairs: str = "auto"
     max_reprojection_error: float = 1.0
     plane_distance_m: float = 0.015

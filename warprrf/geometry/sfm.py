@@ -32,7 +32,8 @@ MIN_PHOTOS = 3
 # Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
 MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
-COARSE_NEIGHBOURS = 36  # pairs kept for each photo
+COARSE_NEIGHBOURS = 24  # pairs kept for each photo
+PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 
@@ -124,7 +125,7 @@ def structure_from_motion(
     photos: Any,
     *,
     workspace: str | os.PathLike[str],
-    max_features: int = 2000,
+    max_features: int = 2400,
     camera_model: str = "SIMPLE_PINHOLE",
     pairs: str = "auto",
     seed: int = 0,
@@ -399,6 +400,7 @@ def _extract(
     reader.existing_camera_id = 1
     extraction = colmap.FeatureExtractionOptions(use_gpu=False)
     extraction.sift.max_num_features = max_features
+    extraction.sift.peak_threshold = PEAK_THRESHOLD
     for start in range(0, len(names), EXTRACT_BATCH):
         report("features", start, len(names))
         colmap.extract_features(
