@@ -177,9 +177,8 @@ class RadioField:
             n: int(iterations) if n == "gain" else min(CHANNEL_STEPS, int(iterations)) for n in plan.layers
         }
         learned = Rates() if rates is None else rates
-        saver = field_files.Checkpoint(
-            checkpoint, field_files.fingerprint(options, learned, seed, batch, steps, seen, images)
-        )
+        identity = field_files.fingerprint(options, learned, seed, batch, steps, seen, *plan.layers.values())
+        saver = field_files.Checkpoint(checkpoint, identity)
         layers, losses, done = {}, {}, 0
         for name, target in plan.layers.items():
             state = fit_layer(
