@@ -16,7 +16,9 @@ def training_set(positions: list[list[float]], gains: list[float]) -> SimpleName
     return SimpleNamespace(
         receivers=np.array(positions, dtype=float),
         path_gain=np.stack([np.full(SHAPE, g) for g in gains]) if gains else np.zeros((0, *SHAPE)),
-        delay_s=np.stack([np.full(SHAPE, 1e-9 * i) for i in range(count)]) if count else np.zeros((0, *SHAPE)),
+        delay_s=np.stack([np.full(SHAPE, 1e-9 * i) for i in range(count)])
+        if count
+        else np.zeros((0, *SHAPE)),
         aod=np.zeros((count, *SHAPE, 2)),
         floor=FLOOR,
         range_db=(-120.0, -60.0),
@@ -55,7 +57,9 @@ def test_idw_returns_a_training_spectrum_at_its_own_place(domain: str) -> None:
     ("gains", "better"),
     [([1e-8, 1e-9, 1e-10], "db"), ([1.0e-8, 5.05e-9, 1.0e-10], "linear")],
 )
-def test_idw_chooses_the_domain_that_predicts_left_out_receivers_better(gains: list[float], better: str) -> None:
+def test_idw_chooses_the_domain_that_predicts_left_out_receivers_better(
+    gains: list[float], better: str
+) -> None:
     ds = training_set([[0, 0, 0], [1, 0, 0], [2, 0, 0]], gains)
     assert lookups.idw(ds).note.startswith(f"averaged in {better}")
 

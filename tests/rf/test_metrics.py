@@ -29,7 +29,9 @@ def small_dataset(count: int = 3, seed: int = 0) -> SimpleNamespace:
 
 def truth_of(ds: SimpleNamespace, receiver: np.ndarray) -> Spectrum:
     i = int(np.flatnonzero((ds.receivers == receiver).all(axis=1))[0])
-    return Spectrum(path_gain=ds.path_gain[i], delay_s=ds.delay_s[i], aod=ds.aod[i], floor=FLOOR, range_db=RANGE_DB)
+    return Spectrum(
+        path_gain=ds.path_gain[i], delay_s=ds.delay_s[i], aod=ds.aod[i], floor=FLOOR, range_db=RANGE_DB
+    )
 
 
 def test_psnr_of_a_constant_offset_is_twenty_log_of_it() -> None:
@@ -59,7 +61,9 @@ def test_rmse_weighs_rows_by_solid_angle() -> None:
     difference = np.zeros(SHAPE)
     difference[4] = 6.0
     weight = pixel_solid_angles(SHAPE)
-    assert metrics.rmse_db(difference, np.zeros(SHAPE)) == pytest.approx(6 * np.sqrt(weight[4] / weight.sum()))
+    assert metrics.rmse_db(difference, np.zeros(SHAPE)) == pytest.approx(
+        6 * np.sqrt(weight[4] / weight.sum())
+    )
 
 
 def test_strongest_direction_is_that_of_a_path_even_beside_the_pole() -> None:
@@ -92,7 +96,9 @@ def test_steering_half_a_beamwidth_off_a_lone_path_loses_three_decibels() -> Non
     path = pixel_directions(image.shape)[45, 90]
     across = np.cross(path, [0.0, 0.0, 1.0])
     off = np.cos(np.radians(5.0)) * path + np.sin(np.radians(5.0)) * across / np.linalg.norm(across)
-    assert metrics.beam_gain_loss_db(image, off, np.radians(10.0)) == pytest.approx(10 * np.log10(2), abs=1e-9)
+    assert metrics.beam_gain_loss_db(image, off, np.radians(10.0)) == pytest.approx(
+        10 * np.log10(2), abs=1e-9
+    )
     assert metrics.beam_gain_loss_db(image, path, np.radians(10.0)) == pytest.approx(0.0, abs=1e-9)
 
 
