@@ -66,11 +66,12 @@ def test_compact_rounding_stays_within_what_it_states(tmp_path):
     before.save(tmp_path / "b.nc")
     after = SpectrumDataset.load(tmp_path / "a.nc")
     error = np.abs(after.path_gain.astype(float) - before.path_gain)
-    assert (error <= 2.0**-9 * before.path_gain + before.floor / 512 * 1.001).all()
-    assert np.abs(after.path_gain_db - before.path_gain_db).max() < 0.02
+    assert (error <= np.maximum(2.0**-8 * before.path_gain, before.floor / 128) * 1.001).all()
+    assert np.abs(after.path_gain_db - before.path_gain_db).max() < 0.05
     assert np.nanmax(np.abs(after.delay_s - before.delay_s)) <= COMPACT_DELAY_STEP_S / 2
     assert np.nanmax(np.abs(after.aod - before.aod)) <= COMPACT_AOD_STEP_RAD / 2 * 1.001
-    np.testing.assert_array_equal(np.isnan(after.delay_s), np.isnan(before.delay_s))
+    np.testing.assert_array_equal(np.isnan(after.delay_s), after.path_gain == 0)
+    np.testing.assert_array_equal(np.isnan(after.aod[..., 1]), after.path_gain == 0)
     assert (tmp_path / "a.nc").stat().st_size < 0.75 * (tmp_path / "b.nc").stat().st_size
 
 
