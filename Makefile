@@ -76,7 +76,7 @@ test: lint
 	$(RUN) -m pytest $(ARGS)
 
 notebooks: $(VENV)/.test
-	cd notebooks && for notebook in *.py; do $(BIN)/jupytext --to ipynb --update --execute "$$notebook"; done
+	$(RUN) tools/run_notebooks.py
 
 clean:
 	rm -rf .cache build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

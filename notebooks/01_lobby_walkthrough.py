@@ -38,6 +38,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib_inline.backend_inline import set_matplotlib_formats
 from PIL import Image
 
 import warprrf as wr
@@ -45,6 +46,7 @@ from warprrf.bench.lobby import pipeline, report
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 WORK = DATA.parent.parent / "runs" / "notebook"
+set_matplotlib_formats("jpeg", pil_kwargs={"quality": 85})  # photos as PNG would make this file large
 plt.rcParams.update(
     {"figure.dpi": 70, "figure.constrained_layout.use": True, "image.interpolation": "nearest"}
 )
@@ -70,6 +72,7 @@ for ax, path in zip(axes.flat, photos[:: max(1, len(photos) // 8)], strict=False
     ax.imshow(Image.open(path).resize((320, 240)))
     ax.set_title(path.name, fontsize=9)
     ax.axis("off")
+plt.show()
 
 # %% [markdown]
 # <a id="sfm"></a>
@@ -98,6 +101,8 @@ axes[0].set_xlabel("photos that see a point")
 axes[1].hist(sparse.reprojection_error, bins=40, range=(0, 2), color="#0b6e99")
 axes[1].set_xlabel("reprojection error [pixels]")
 axes[0].set_ylabel("points")
+plt.show()
+
 # %% [markdown]
 # <a id="metres"></a>
 # ## 3. Metres
@@ -125,6 +130,8 @@ ax.set_aspect("equal")
 ax.set_xlim(-0.5, 15.5), ax.set_ylim(-0.5, 12.5)
 ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]")
 ax.set_title("sparse points and cameras from above (red: surveyed)")
+plt.show()
+
 # %% [markdown]
 # <a id="geometry"></a>
 # ## 4. Geometry: Gaussians, then a mesh
@@ -154,7 +161,7 @@ print(
 )
 
 # %%
-name = held_out[len(held_out) // 2]
+name = held_out[0]
 truth = np.asarray(Image.open(DATA / "photos" / name), dtype=np.float32) / 255
 view = wr.render(rec.gaussians, rec.cameras[name])
 print(
@@ -168,6 +175,7 @@ axes[2].set_title("depth of the Gaussians")
 figure.colorbar(shown, ax=axes[2], label="range [m]")
 for ax in axes:
     ax.axis("off")
+plt.show()
 
 # %% [markdown]
 # The mesh against the true room, in a horizontal section at 1.2 m. The true scene is used here and in section 8 only.
@@ -180,6 +188,8 @@ for mesh, colour, label in ((scene.mesh, "#bbbbbb", "true"), (rec.mesh, "#0b6e99
     ax.plot(*lines.transpose(2, 1, 0), color=colour, linewidth=3 if label == "true" else 1)
     ax.plot([], color=colour, label=label)
 ax.set_aspect("equal"), ax.legend(), ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]")
+plt.show()
+
 # %% [markdown]
 # <a id="los"></a>
 # ## 5. What the transmitter sees
@@ -198,6 +208,8 @@ ax.scatter(*dataset.receivers[:, :2].T, c=np.where(dataset.line_of_sight, "#0b6e
 ax.scatter(*dataset.transmitter[:2], marker="*", s=250, color="#a8200d")
 ax.set_aspect("equal"), ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]")
 ax.set_title("light: sees the transmitter at 1.5 m height; receivers blue, orange where the truth is blocked")
+plt.show()
+
 # %% [markdown]
 # <a id="spectrum"></a>
 # ## 6. A spectrum
@@ -219,6 +231,7 @@ for ax, index, title in ((axes[0], open_view, "line of sight"), (axes[1], blocke
     truth = test[index]
     truth.plot(ax=ax)
     ax.set_title(f"{title}: {10 * np.log10(truth.total_path_gain):.1f} dB in all")
+plt.show()
 
 # %% [markdown]
 # <a id="fit"></a>
@@ -230,7 +243,8 @@ for ax, index, title in ((axes[0], open_view, "line of sight"), (axes[1], blocke
 #
 # RF-3DGS+ learns how strongly each Gaussian radiates in each direction (spherical harmonics) and takes the decay with
 # distance from the path length transmitter - surface - receiver. That is what it has over RF-3DGS, and delays and
-# departure angles follow from the same geometry instead of being learned.
+# departure angles follow from the same geometry instead of being learned. (The loss goes up and down because every
+# step sees another batch of receivers.)
 
 # %%
 start = time.perf_counter()
@@ -240,6 +254,8 @@ losses = field.report["losses"]["gain"]
 figure, ax = plt.subplots(figsize=(6, 2.6))
 ax.plot(losses, color="#0b6e99")
 ax.set_xlabel("step"), ax.set_ylabel("0.8 L1 + 0.2 (1 - SSIM)"), ax.grid(alpha=0.3)
+plt.show()
+
 # %% [markdown]
 # <a id="truth"></a>
 # ## 8. Against the truth
@@ -292,3 +308,4 @@ ax.set_xlabel("delay [ns]"), ax.set_ylabel("path gain [dB]"), ax.grid(alpha=0.3)
 for i in order[:3]:
     print(f"{10 * np.log10(power[i]):8.2f} dB after {paths.tau[paths.valid][i] * 1e9:7.3f} ns, {kinds[i]}")
 print(f"all of it: {time.perf_counter() - clock:.0f} s")
+plt.show()
