@@ -56,7 +56,8 @@ def joined(*parts):
     """One mesh of several (vertices, faces), and the part each face came from."""
     shift = np.cumsum([0] + [len(v) for v, _ in parts])
     mesh = Mesh(
-        np.concatenate([v for v, _ in parts]), np.concatenate([f + s for (_, f), s in zip(parts, shift)])
+        np.concatenate([v for v, _ in parts]),
+        np.concatenate([f + s for (_, f), s in zip(parts, shift, strict=False)]),
     )
     return mesh, np.repeat(np.arange(len(parts)), [len(f) for _, f in parts])
 
