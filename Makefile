@@ -26,12 +26,6 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
 export PYTHON
 
-# Dr.Jit picks the first LLVM it finds, and aborts on 15 and 16: name the newest where several are installed.
-LLVM := $(shell PATH="$$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null | awk '/libLLVM/ && /(-|so\.)(1[7-9]|2[0-9])/ {print $$NF}' | sort -V | tail -1)
-ifneq ($(LLVM),)
-export DRJIT_LIBLLVM_PATH ?= $(LLVM)
-endif
-
 .PHONY: help lobby test lint data notebooks clean setup setup-test
 
 help:
