@@ -465,7 +465,7 @@ def _field_name(model: str, truth: str) -> str:
 
 def options(sizes: Sizes, held_out: Sequence[str]) -> dict[str, Any]:
     """Arguments of :func:`warprrf.reconstruct` for a run of these sizes."""
-    asked = {"max_features": sizes.features, "gaussians": sizes.gaussians}
+    asked: dict[str, Any] = {"max_features": sizes.features, "gaussians": sizes.gaussians}
     config = ReconstructionConfig(**{name: value for name, value in asked.items() if value is not None})
     return {"held_out": held_out, "iterations": sizes.iterations, "config": config}
 
