@@ -57,6 +57,20 @@ def build(real: Any) -> SimpleNamespace:
         """1 where x > 0, else 0 (NaN-free arithmetic select)."""
         return wp.min(wp.max(x * real(wp.static(big)), strip()), strip(real(1.0)))
 
+    # Reductions as trees: a chain of 16 dependent additions is what wp.dot and wp.max compile to on a CPU.
+    @wp.func
+    def lane_sum(x: strip):
+        return (((x[0] + x[8]) + (x[4] + x[12])) + ((x[2] + x[10]) + (x[6] + x[14]))) + (
+            ((x[1] + x[9]) + (x[5] + x[13])) + ((x[3] + x[11]) + (x[7] + x[15]))
+        )
+
+    @wp.func
+    def lane_max(x: strip):
+        return wp.max(
+            wp.max(wp.max(wp.max(x[0], x[8]), wp.max(x[4], x[12])), wp.max(wp.max(x[2], x[10]), wp.max(x[6], x[14]))),
+            wp.max(wp.max(wp.max(x[1], x[9]), wp.max(x[5], x[13])), wp.max(wp.max(x[3], x[11]), wp.max(x[7], x[15]))),
+        )
+
     if real is wp.float32:
 
         @wp.func
@@ -170,7 +184,7 @@ def build(real: Any) -> SimpleNamespace:
                 n, ag, gg, side = quadratics(rows, k, w, u1, u2)
                 q = wp.cw_div(n, gg)
                 room = strip(rows[k, CUT]) - q
-                if wp.max(room) > real(0.0):
+                if lane_max(room) > real(0.0):
                     keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
                     alpha = wp.min(rows[k, OPACITY] * negative_exponential(real(0.5) * q), amax)
                     alpha = wp.cw_mul(alpha, keep)
@@ -190,7 +204,7 @@ def build(real: Any) -> SimpleNamespace:
                         c2 += features[k, first + 2] * weight
                     if channels > 3:
                         c3 += features[k, first + 3] * weight
-                    if wp.max(transmittance) <= real(rules.transmittance_min):
+                    if lane_max(transmittance) <= real(rules.transmittance_min):
                         break
         c0 += background[first] * transmittance
         if channels > 1:
@@ -229,7 +243,7 @@ def build(real: Any) -> SimpleNamespace:
         view: View,
         rules: Rules,
         image: wp.array(dtype=real, ndim=3),
-        total: wp.array(dtype=real, ndim=2),
+        alpha_sum: wp.array(dtype=real, ndim=2),
         depth_sum: wp.array(dtype=real, ndim=2),
         image_grad: wp.array(dtype=real, ndim=3),
         alpha_grad: wp.array(dtype=real, ndim=2),
@@ -271,13 +285,13 @@ def build(real: Any) -> SimpleNamespace:
                     v3[lane] = image_grad[y, x, first + 3]
                     r += v3[lane] * image[y, x, first + 3]
                 if first == 0:
-                    a = total[y, x]
+                    a = alpha_sum[y, x]
                     if a > real(0.0):
                         vt[lane] = depth_grad[y, x] / a
                         va[lane] = alpha_grad[y, x] - depth_grad[y, x] * depth_sum[y, x] / (a * a)
                         r += vt[lane] * depth_sum[y, x] + va[lane] * a
                 goal[lane] = r
-        with_depth = wp.dot(vt, vt) > real(0.0)
+        with_depth = lane_sum(wp.cw_mul(vt, vt)) > real(0.0)
         row = real(y)
         dx, dy, dz = strip_directions(view, x0, y)
         one = strip(real(1.0))
@@ -291,7 +305,7 @@ def build(real: Any) -> SimpleNamespace:
                 n, ag, gg, side = quadratics(rows, k, w, u1, u2)
                 q = wp.cw_div(n, gg)
                 room = strip(rows[k, CUT]) - q
-                if wp.max(room) > real(0.0):
+                if lane_max(room) > real(0.0):
                     keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
                     response = wp.cw_mul(negative_exponential(real(0.5) * q), keep)
                     raw = rows[k, OPACITY] * response
@@ -326,12 +340,12 @@ def build(real: Any) -> SimpleNamespace:
                     p0 = wp.cw_mul(v, y0)
                     p1 = wp.cw_mul(v, y1)
                     p2 = wp.cw_mul(v, y2)
-                    s00 = wp.dot(p0, y0)
-                    s01 = wp.dot(p0, y1)
-                    s02 = wp.dot(p0, y2)
-                    s11 = wp.dot(p1, y1)
-                    s12 = wp.dot(p1, y2)
-                    s22 = wp.dot(p2, y2)
+                    s00 = lane_sum(wp.cw_mul(p0, y0))
+                    s01 = lane_sum(wp.cw_mul(p0, y1))
+                    s02 = lane_sum(wp.cw_mul(p0, y2))
+                    s11 = lane_sum(wp.cw_mul(p1, y1))
+                    s12 = lane_sum(wp.cw_mul(p1, y2))
+                    s22 = lane_sum(wp.cw_mul(p2, y2))
                     if with_depth:
                         half = (real(0.5) * rows[k, SMALLEST]) * wp.cw_div(wp.cw_mul(weight, vt), gg)
                         h0 = wp.cw_mul(half, rows[k, A] * w + rows[k, B1] * u1 + rows[k, B2] * u2)
@@ -340,32 +354,32 @@ def build(real: Any) -> SimpleNamespace:
                         p0 -= h0
                         p1 -= h1
                         p2 -= h2
-                        s00 -= real(2.0) * wp.dot(h0, y0)
-                        s01 -= wp.dot(h0, y1) + wp.dot(h1, y0)
-                        s02 -= wp.dot(h0, y2) + wp.dot(h2, y0)
-                        s11 -= real(2.0) * wp.dot(h1, y1)
-                        s12 -= wp.dot(h1, y2) + wp.dot(h2, y1)
-                        s22 -= real(2.0) * wp.dot(h2, y2)
-                    wp.atomic_add(sums, piece, k, 0, wp.dot(p0, one))
-                    wp.atomic_add(sums, piece, k, 1, wp.dot(p1, one))
-                    wp.atomic_add(sums, piece, k, 2, wp.dot(p2, one))
+                        s00 -= real(2.0) * lane_sum(wp.cw_mul(h0, y0))
+                        s01 -= lane_sum(wp.cw_mul(h0, y1)) + lane_sum(wp.cw_mul(h1, y0))
+                        s02 -= lane_sum(wp.cw_mul(h0, y2)) + lane_sum(wp.cw_mul(h2, y0))
+                        s11 -= real(2.0) * lane_sum(wp.cw_mul(h1, y1))
+                        s12 -= lane_sum(wp.cw_mul(h1, y2)) + lane_sum(wp.cw_mul(h2, y1))
+                        s22 -= real(2.0) * lane_sum(wp.cw_mul(h2, y2))
+                    wp.atomic_add(sums, piece, k, 0, lane_sum(p0))
+                    wp.atomic_add(sums, piece, k, 1, lane_sum(p1))
+                    wp.atomic_add(sums, piece, k, 2, lane_sum(p2))
                     wp.atomic_add(sums, piece, k, 3, s00)
                     wp.atomic_add(sums, piece, k, 4, s01)
                     wp.atomic_add(sums, piece, k, 5, s02)
                     wp.atomic_add(sums, piece, k, 6, s11)
                     wp.atomic_add(sums, piece, k, 7, s12)
                     wp.atomic_add(sums, piece, k, 8, s22)
-                    wp.atomic_add(sums, piece, k, 9, wp.dot(slope, response))
-                    wp.atomic_add(sums, piece, k, 10, wp.dot(weight, v0))
+                    wp.atomic_add(sums, piece, k, 9, lane_sum(wp.cw_mul(slope, response)))
+                    wp.atomic_add(sums, piece, k, 10, lane_sum(wp.cw_mul(weight, v0)))
                     if channels > 1:
-                        wp.atomic_add(sums, piece, k, 11, wp.dot(weight, v1))
+                        wp.atomic_add(sums, piece, k, 11, lane_sum(wp.cw_mul(weight, v1)))
                     if channels > 2:
-                        wp.atomic_add(sums, piece, k, 12, wp.dot(weight, v2))
+                        wp.atomic_add(sums, piece, k, 12, lane_sum(wp.cw_mul(weight, v2)))
                     if channels > 3:
-                        wp.atomic_add(sums, piece, k, 13, wp.dot(weight, v3))
+                        wp.atomic_add(sums, piece, k, 13, lane_sum(wp.cw_mul(weight, v3)))
                     if first == 0:
-                        wp.atomic_add(sums, piece, k, 14, wp.dot(weight, one))
-                    if wp.max(transmittance) <= real(rules.transmittance_min):
+                        wp.atomic_add(sums, piece, k, 14, lane_sum(weight))
+                    if lane_max(transmittance) <= real(rules.transmittance_min):
                         break
 
     @wp.kernel(module="unique", enable_backward=False)
