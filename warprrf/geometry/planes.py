@@ -212,7 +212,7 @@ def _merged(
     kept = [
         plane for i, plane in enumerate(kept) if not any(_echo(points, plane, strong) for strong in kept[:i])
     ]
-    refitted = []
+    refitted: list[Plane] = []
     for plane in kept:
         normal, offset = plane.normal, plane.offset
         for _ in range(3):
@@ -224,6 +224,32 @@ def _merged(
             replace(plane, normal=normal, offset=offset, rms_m=float(np.sqrt(np.mean(residual**2))))
         )
     return sorted(refitted, key=lambda p: -weight[p.inliers].sum())
+
+
+def aligned(
+    planes: Sequence[Plane], points: np.ndarray, *, angle_rad: float = np.radians(3.0)
+) -> list[Plane]:
+    """``planes`` with weakly supported ones made exactly parallel or level, where their points allow it.
+
+    Built rooms have few directions. A plane takes over the normal of a plane with five times its points, or the
+    vertical, within ``angle_rad`` of its own, if its points then lie hardly further from it.
+    """
+    result: list[Plane] = []
+    vertical = np.array([0.0, 0.0, 1.0])
+    for plane in planes:
+        own = points[plane.inliers]
+        strong = [q.normal for q in planes if len(q.inliers) >= 5 * len(plane.inliers)]
+        directions = [s * n for n in (*strong, vertical) for s in (1.0, -1.0)]
+        directions = [n for n in directions if n @ plane.normal > np.cos(angle_rad)]
+        best = plane
+        for normal in sorted(directions, key=lambda n: -float(n @ plane.normal)):
+            offset = float(np.median(own @ normal))
+            rms = float(np.sqrt(np.mean((own @ normal - offset) ** 2)))
+            if rms < 1.25 * plane.rms_m + 1e-3:
+                best = replace(plane, normal=normal, offset=offset, rms_m=rms)
+                break
+        result.append(best)
+    return result
 
 
 def _echo(points: np.ndarray, plane: Plane, strong: Plane) -> bool:
@@ -321,7 +347,9 @@ def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray) -> Plane:
         if own is None:
             own = _nearest_gap(plane.to_plane(cells), plane.to_plane(points[plane.inliers]))
         theirs = np.full(len(cells), np.inf)
-        theirs[contested] = _nearest_gap(plane.to_plane(cells[contested]), plane.to_plane(points[other.inliers]))
+        theirs[contested] = _nearest_gap(
+            plane.to_plane(cells[contested]), plane.to_plane(points[other.inliers])
+        )
         lost |= theirs < own
     occupied = plane.occupied.copy()
     occupied[plane.occupied] = ~lost
@@ -329,13 +357,10 @@ def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray) -> Plane:
 
 
 def _nearest_gap(queries: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance of each query to the nearest point, shape ``(N,)``; exact, in pieces."""
-    return np.concatenate(
-        [
-            np.sqrt(((piece[:, None] - points[None]) ** 2).sum(axis=2).min(axis=1))
-            for piece in np.array_split(queries, max(1, len(queries) * len(points) // 4_000_000 + 1))
-        ]
-    )
+    """Distance of each query to the nearest of some of the points, shape ``(N,)``."""
+    some = points[:: max(1, len(points) // 500)]
+    pieces = np.array_split(queries, len(queries) * len(some) // 2_000_000 + 1)
+    return np.concatenate([np.sqrt(((q[:, None] - some[None]) ** 2).sum(axis=2).min(axis=1)) for q in pieces])
 
 
 def dilate(mask: np.ndarray, steps: int) -> np.ndarray:

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, check_array, require
-from warprrf.geometry import sfm, surface
+from warprrf.geometry import sfm, surface, sweep
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians, replacing
 from warprrf.geometry.initial import initial_gaussians, seen_cells
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.planes import Plane, detect_planes, occupancy
+from warprrf.geometry.planes import Plane, aligned, occupancy
 from warprrf.geometry.refine import RefineConfig, refine
 from warprrf.geometry.render import render
 from warprrf.geometry.surface import PlanarPatch
@@ -45,6 +45,7 @@ class ReconstructionConfig:
         plane_distance_m: band of the plane detection.
         plane_points: fewest sparse points of a plane.
         cell_m: side of a plane's cells.
+        sweep: correct and complete the planes by comparing the photos (see :mod:`warprrf.geometry.sweep`).
         gaussians: Gaussians to start the refinement from (about).
         refine: settings of the photometric refinement.
         depth_downscale: depth maps are rendered at the photos' size divided by this.
@@ -60,8 +61,9 @@ class ReconstructionConfig:
     pairs: str = "auto"
     max_reprojection_error: float = 1.0
     plane_distance_m: float = 0.015
-    plane_points: int = 50
+    plane_points: int = 40
     cell_m: float = 0.1
+    sweep: bool = True
     gaussians: int = 32_000
     refine: RefineConfig = field(default_factory=RefineConfig)
     depth_downscale: int = 2
@@ -311,8 +313,8 @@ def reconstruct(
 
     stored = steps.load("start", start_key)
     if stored is None:
-        report("planes", 0, 2)
-        planes, start = _start(sparse, cameras, photos_of(cameras), config, seed, report)
+        report("planes", 0, 5)
+        planes, start = _start(sparse, cameras, photos_of(cameras), config, seed, report, device)
         steps.save("start", start_key, {"planes": [_plane_header(p) for p in planes]},
                    _gaussian_arrays(start) | _plane_arrays(planes))  # fmt: skip
     else:
@@ -436,6 +438,7 @@ def _start(
     config: ReconstructionConfig,
     seed: int,
     report: Progress,
+    device: Any = None,
 ) -> tuple[list[Plane], Gaussians]:
     """Planes of the sparse points and the Gaussians that refinement starts from."""
     if len(sparse.points) < 3:
@@ -452,23 +455,36 @@ def _start(
         keep[:] = True
     sparse = sparse.subset(keep)
     normals = surface.estimate_normals(sparse.points, sparse.viewpoints())
-    planes = detect_planes(
-        sparse.points, normals, distance_m=config.plane_distance_m, min_points=config.plane_points, seed=seed
-    )
-    eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
-    planes = occupancy(
-        planes,
+    planes = surface.detect_room_planes(
         sparse.points,
-        eyes,
-        np.repeat(sparse.points, sparse.track_length, axis=0),
-        cell_m=config.cell_m,
+        normals,
+        sparse.viewpoints(),
+        distance_m=config.plane_distance_m,
+        min_points=config.plane_points,
+        seed=seed,
     )
+    planes = aligned(planes, sparse.points) if sparse.metric else planes
+    eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
+    targets = np.repeat(sparse.points, sparse.track_length, axis=0)
+    planes = occupancy(planes, sparse.points, eyes, targets, cell_m=config.cell_m)
+    report("planes", 1, 5)
+    if config.sweep and len(cameras) > 2 and planes:
+        photos = sweep.Photos.upload(list(cameras.values()), images, device)
+        planes = sweep.proven_cells(planes, sparse.points, photos)
+        report("planes", 2, 5)
+        if sparse.metric:  # else z is not up
+            levels = []
+            for k, up in enumerate((True, False)):
+                levels += sweep.level_planes(
+                    planes, sparse.points, photos, eyes, targets, cell_m=config.cell_m, up=up
+                )
+                report("planes", 3 + k, 5)
+            planes = sweep.joined(planes, levels)
     planes = seen_cells(planes, list(sparse.cameras.values()))
-    report("planes", 1, 2)
     start = initial_gaussians(
         sparse.points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
     )
-    report("planes", 2, 2)
+    report("planes", 5, 5)
     return planes, start
 
 

@@ -24,6 +24,7 @@ __all__ = [
     "Plane",
     "clean_points",
     "detect_planes",
+    "detect_room_planes",
     "estimate_normals",
     "flatten",
     "fuse_depth",
@@ -137,6 +138,43 @@ def estimate_normals(points: Any, viewpoints: Any, *, neighbour_count: int = 16)
     away = ((views - points) * normals).sum(axis=1) < 0
     normals[away] *= -1
     return normals
+
+
+def detect_room_planes(
+    points: np.ndarray,
+    normals: np.ndarray,
+    viewpoints: np.ndarray,
+    *,
+    distance_m: float = 0.015,
+    min_points: int = 40,
+    small_points: int = 16,
+    seed: int = 0,
+) -> list[Plane]:
+    """Planes among sparse points in two passes: the large ones, then small ones among the points left over.
+
+    Beside a wall the neighbourhood of a small surface is full of the wall's points, and its normals are poor; without
+    them they are good enough for planes of ``small_points`` (compact ones: within 1.5 m of their middle).
+    """
+    large = detect_planes(points, normals, distance_m=distance_m, min_points=min_points, seed=seed)
+    # A point on a large plane, seen from its front, belongs to it even where its own normal is off.
+    free = np.ones(len(points), dtype=bool)
+    for plane in large:
+        on = np.abs(plane.distance(points)) < 2 * distance_m
+        near = neighbours(points[plane.inliers], 1, points)[1][:, 0] < 0.3
+        free &= ~(on & near & (plane.distance(viewpoints) > 0))
+    rest = np.flatnonzero(free)
+    if len(rest) < small_points:
+        return large
+    again = estimate_normals(points[rest], viewpoints[rest], neighbour_count=10)
+    small = detect_planes(points[rest], again, distance_m=distance_m, min_points=small_points, seed=seed)
+    compact = []
+    for plane in small:
+        own = points[rest[plane.inliers]]
+        spread = np.linalg.norm(own - np.median(own, axis=0), axis=1)
+        close = spread < 1.5
+        if close.sum() >= small_points and close.mean() > 0.6:
+            compact.append(replace(plane, inliers=rest[plane.inliers[close]]))
+    return large + compact
 
 
 def visible_from(
