@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warprrf.kernels.field import WINDOW, WINDOW_RADIUS
+from warprrf.kernels.ssim import RADIUS, WINDOW
 from warprrf.rf.fitting import Layer, Problem, Rates, Target, fit_layer, weighted_means
 from warprrf.rf.spectrum import pixel_directions
 from warprrf.rf.transport import Transport
@@ -93,9 +93,9 @@ def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray)
     a, b = u, target.image
 
     def smooth(image: np.ndarray) -> np.ndarray:
-        padded = np.pad(image, ((0, 0), (WINDOW_RADIUS, WINDOW_RADIUS), (0, 0)))
+        padded = np.pad(image, ((0, 0), (RADIUS, RADIUS), (0, 0)))
         rows = sum(w * padded[:, k : k + image.shape[1]] for k, w in enumerate(WINDOW))
-        return sum(w * np.roll(rows, WINDOW_RADIUS - k, axis=2) for k, w in enumerate(WINDOW))
+        return sum(w * np.roll(rows, RADIUS - k, axis=2) for k, w in enumerate(WINDOW))
 
     ma, mb = smooth(a), smooth(b)
     va, vb, cov = smooth(a * a) - ma**2, smooth(b * b) - mb**2, smooth(a * b) - ma * mb

@@ -11,8 +11,7 @@ the same bits as one thread: rows own their contributions and gradients, pixels 
     adjoint, row:  dL/da_g = sum_e (dL/dP_p F_p) w_e A'(b_p . a_g) b_p
 
 ``b_p`` are the 16 real harmonics of the pixel's ray direction, shared by all its Gaussians and by all receivers.
-SSIM: Wang et al. 2004, Gaussian window of 11 pixels and sigma 1.5, zero beyond the poles, periodic in azimuth; that
-filter is its own adjoint.
+SSIM is that of :mod:`warprrf.kernels.ssim`, zero beyond the poles, periodic in azimuth.
 """
 
 from functools import cache
@@ -23,14 +22,11 @@ import numpy as np
 import warp as wp
 
 from warprrf.kernels import sh as _sh
+from warprrf.kernels import ssim as _ssim
 
 EXPONENTIAL, CLAMPED, SIGNED = 0, 1, 2  # what a gain is of its harmonics' sum
 COEFFICIENTS = 16
-WINDOW_RADIUS = 5  # pixels
-WINDOW = np.exp(-0.5 * (np.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1) / 1.5) ** 2)
-WINDOW /= WINDOW.sum()
 EXPONENT_LIMIT = 60.0  # nepers: keeps a runaway gain finite in float32; 260 dB off the median gain
-C1, C2 = 0.01**2, 0.03**2  # SSIM's constants for images in [0, 1]
 
 
 @cache
@@ -40,10 +36,9 @@ def build(real: Any) -> SimpleNamespace:
     vec16 = wp.types.vector(COEFFICIENTS, real)
     limit = wp.constant(real(EXPONENT_LIMIT))
     per_neper = wp.constant(real(10.0 / np.log(10.0)))  # dB per unit of natural logarithm of power
-    c1 = wp.constant(real(C1))
-    c2 = wp.constant(real(C2))
 
     harmonics = _sh.build(real).basis
+    slope_of = _ssim.build(real).slope
 
     @wp.kernel(module="unique", enable_backward=False)
     def evaluate_basis(offset: int, directions: wp.array(dtype=vec3), out: wp.array(dtype=vec16)):
@@ -113,76 +108,6 @@ def build(real: Any) -> SimpleNamespace:
         moments[p] = vec3(u, u * u, u * target[p])
 
     @wp.kernel(module="unique", enable_backward=False)
-    def filter_azimuth(
-        offset: int,
-        width: int,
-        window: wp.array(dtype=real),
-        source: wp.array(dtype=vec3),
-        out: wp.array(dtype=vec3),
-    ):
-        """Window average along a row, periodic."""
-        p = offset + wp.tid()
-        column = p % width
-        first = p - column
-        total = vec3(real(0.0))
-        for k in range(2 * WINDOW_RADIUS + 1):
-            c = column + k - WINDOW_RADIUS
-            if c < 0:
-                c += width
-            if c >= width:
-                c -= width
-            total += window[k] * source[first + c]
-        out[p] = total
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def filter_zenith(
-        offset: int,
-        height: int,
-        width: int,
-        window: wp.array(dtype=real),
-        source: wp.array(dtype=vec3),
-        out: wp.array(dtype=vec3),
-    ):
-        """Window average along a column, zero beyond the poles."""
-        p = offset + wp.tid()
-        row = (p // width) % height
-        total = vec3(real(0.0))
-        for k in range(2 * WINDOW_RADIUS + 1):
-            r = k - WINDOW_RADIUS
-            if row + r >= 0 and row + r < height:
-                total += window[k] * source[p + r * width]
-        out[p] = total
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def ssim_slopes(
-        offset: int,
-        target_moments: wp.array(dtype=vec3),
-        moments: wp.array(dtype=vec3),
-        score: wp.array(dtype=real),
-        slopes: wp.array(dtype=vec3),
-    ):
-        """SSIM of a pixel and its derivatives with respect to the averages of u, u^2 and u t."""
-        p = offset + wp.tid()
-        m = moments[p]
-        mu = m[0]
-        mt = target_moments[p][0]
-        a1 = real(2.0) * mu * mt + c1
-        a2 = real(2.0) * (m[2] - mu * mt) + c2
-        b1 = mu * mu + mt * mt + c1
-        b2 = (m[1] - mu * mu) + (target_moments[p][1] - mt * mt) + c2
-        s = a1 * a2 / (b1 * b2)
-        of_square = -s / b2
-        of_product = real(2.0) * a1 / (b1 * b2)
-        of_mean = (
-            real(2.0) * mt * a2 / (b1 * b2)
-            - real(2.0) * mu * s / b1
-            - real(2.0) * mu * of_square
-            - mt * of_product
-        )
-        score[p] = s
-        slopes[p] = vec3(of_mean, of_square, of_product)
-
-    @wp.kernel(module="unique", enable_backward=False)
     def loss_adjoint(
         offset: int,
         factor: wp.array(dtype=real),
@@ -202,13 +127,8 @@ def build(real: Any) -> SimpleNamespace:
         """``|u - t|`` and ``dL/d(sum of contributions)``; the shares already hold the division by the pixel count."""
         p = offset + wp.tid()
         u = image[p]
-        difference = u - target[p]
-        absolute[p] = wp.abs(difference)
-        f = slopes[p]
-        slope = absolute_share * wp.sign(difference)
-        if difference == real(0.0):
-            slope = real(0.0)
-        slope -= ssim_share * (f[0] + real(2.0) * u * f[1] + target[p] * f[2])
+        absolute[p] = wp.abs(u - target[p])
+        slope = slope_of(u, target[p], slopes[p], absolute_share, ssim_share)
         power = factor[p] * total[p] + extra[p]
         if power < real(0.0):
             slope = real(0.0)
@@ -314,12 +234,9 @@ def build(real: Any) -> SimpleNamespace:
         coefficient_adjoint=coefficient_adjoint,
         contributions=contributions,
         evaluate_basis=evaluate_basis,
-        filter_azimuth=filter_azimuth,
-        filter_zenith=filter_zenith,
         loss_adjoint=loss_adjoint,
         pixel_sums=pixel_sums,
         predict=predict,
-        ssim_slopes=ssim_slopes,
         to_image=to_image,
         vec16=vec16,
         vec3=vec3,

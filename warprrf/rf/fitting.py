@@ -18,6 +18,7 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.device import Progress
 from warprrf.kernels import field as _kernels
+from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.transport import Transport
 
@@ -137,6 +138,7 @@ class Problem:
         self.precision = np.dtype(precision)
         self.real = wp.float64 if self.precision == np.float64 else wp.float32
         self.kernels = _kernels.build(self.real)
+        self.ssim = _ssim.build(self.real)
         self.seen = np.unique(transport.gaussian)
         self.pixels = transport.shape[0] * transport.shape[1]
         count = len(transport.receivers)
@@ -144,7 +146,6 @@ class Problem:
         parts = np.array_split(order, max(1, round(count / batch)))
         self.batches = [self._batch(np.sort(part)) for part in parts]
         self.basis = harmonics(transport.shape, self.real, self.device)
-        self.window = self.upload(_kernels.WINDOW)
 
     def upload(self, values: np.ndarray, dtype: Any = None) -> wp.array:
         """``values`` on the device, in the problem's precision unless ``dtype`` says otherwise."""
@@ -285,8 +286,8 @@ class Layer:
     ) -> wp.array:
         p, (height, width) = self.problem, self.problem.transport.shape
         size = len(source) if count is None else count
-        p.launch(p.kernels.filter_azimuth, size, width, p.window, source, between)
-        p.launch(p.kernels.filter_zenith, size, height, width, p.window, between, out)
+        p.launch(p.ssim.filter_rows, size, width, 1, 1, source, between)
+        p.launch(p.ssim.filter_columns, size, height, width, between, out)
         return out
 
     def step(self, index: int, coefficients: wp.array, *, need_loss: bool = True) -> float:
@@ -307,7 +308,7 @@ class Layer:
             moments, between, slopes = self.vectors
             p.launch(k.to_image, size, data.factor, data.extra, *scale, data.image, total, image, moments)
             self._filtered(moments, between, slopes, size)
-            p.launch(k.ssim_slopes, size, data.moments, slopes, score, moments)
+            p.launch(p.ssim.slopes, size, data.moments, slopes, score, moments)
             self._filtered(moments, between, slopes, size)
             shares = p.real((1 - target.ssim_share) / size), p.real(target.ssim_share / size)
             p.launch(
