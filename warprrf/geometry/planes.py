@@ -286,7 +286,7 @@ def occupancy(
     targets: Any,
     *,
     cell_m: float = 0.1,
-    margin_m: float = 0.3,
+    margin_m: float = 0.12,
     depth_m: float = 0.1,
 ) -> list[Plane]:
     """``planes`` with the cells where a surface may be.

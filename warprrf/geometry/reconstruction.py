@@ -20,6 +20,7 @@ import numpy as np
 from warprrf.device import Progress, check_array, require
 from warprrf.geometry import sfm, surface, sweep
 from warprrf.geometry.camera import Camera
+from warprrf.geometry.edges import meeting
 from warprrf.geometry.gaussians import Gaussians, replacing
 from warprrf.geometry.initial import initial_gaussians, seen_cells
 from warprrf.geometry.mesh import Mesh
@@ -480,7 +481,7 @@ def _start(
                 )
                 report("planes", 3 + k, 5)
             planes = sweep.joined(planes, levels)
-    planes = seen_cells(planes, list(sparse.cameras.values()))
+    planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
     start = initial_gaussians(
         sparse.points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
     )

@@ -342,7 +342,7 @@ def planar_patches(
         planes: planes known beforehand (from structure-from-motion points, say), which take precedence.
         distance_m: a face within this distance (its centroid) can belong to a plane.
         angle_rad: and its smoothed normal differs by no more than this.
-        min_area_m2: smallest patch.
+        min_area_m2: smallest patch on a given plane; patches found here have twice that.
 
     Returns:
         Patches, largest first.
@@ -357,7 +357,7 @@ def planar_patches(
     if areas[rest].sum() > min_area_m2:
         extra = detect_planes(
             centres[rest], normals[rest], weights=areas[rest], distance_m=0.4 * distance_m, angle_rad=angle_rad,
-            min_points=min_area_m2, seed=seed,
+            min_points=2 * min_area_m2, max_planes=40, seed=seed,
         )  # fmt: skip
         found = _nearest_plane(centres[rest], normals[rest], extra, distance_m, angle_rad)
         label[rest] = np.where(found >= 0, found + len(every), -1)

@@ -25,8 +25,8 @@ VIEWS = 5  # photos compared
 MIN_ANGLE = np.radians(
     6.0
 )  # between any two of them, seen from the patch: without parallax every height fits
-PATCH_M = 0.16  # side of a patch
-AGREES, DISAGREES = 0.6, 0.15  # mean correlation of a true patch, and of one that is certainly not
+PATCH_M = 0.12  # side of a patch
+AGREES, DISAGREES = 0.6, 0.25  # mean correlation of a true patch, and of one that is certainly not
 CONTRAST = 0.012  # flatter patches prove nothing
 STEP_M = 0.03  # between heights of the sweep
 COARSE_M = 0.3  # cells that share the choice of photos
@@ -146,7 +146,7 @@ def proven_cells(
         with np.errstate(invalid="ignore"):
             yes, no = scores[k] > AGREES, scores[k] < DISAGREES
         grown = _majority(yes, 5) & ~insides[k]
-        cut = _majority(no, 4) & ~dilate(own[k], 2)
+        cut = _majority(no, 3) & ~dilate(own[k], 1)
         lost = np.zeros_like(grown)
         cells = plane.cells()
         mine = np.nan_to_num(scores[k][candidates[k]], nan=0.3)
