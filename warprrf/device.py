@@ -145,7 +145,8 @@ def check_array(
     if np.ndim(value) == 0:
         array = array.reshape(())
     if shape is not None and (
-        array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True))
+        array.ndim != len(shape)
+        or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True))
     ):
         wanted = ", ".join("any" if s is None else str(s) for s in shape)
         raise ValueError(f"{name}: got shape {array.shape}, expected ({wanted})")

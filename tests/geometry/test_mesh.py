@@ -128,6 +128,8 @@ def test_bad_rays_are_refused():
 def test_winding_number_counts_the_solids_around_a_point():
     inner_vertices, inner_faces = box((-1, -1, -1), (1, 1, 1))
     outer_vertices, outer_faces = box((-2, -2, -2), (3, 2, 2))
-    mesh = Mesh(np.concatenate([inner_vertices, outer_vertices]), np.concatenate([inner_faces, outer_faces + 8]))
+    mesh = Mesh(
+        np.concatenate([inner_vertices, outer_vertices]), np.concatenate([inner_faces, outer_faces + 8])
+    )
     number = mesh.winding_number([[0.1, 0.2, 0.3], [2.5, 0.1, 0.2], [9, 0, 0]])
     np.testing.assert_allclose(number, [2, 1, 0], atol=1e-12)

@@ -98,7 +98,14 @@ class Camera:
         _check_size(width, height)
         sx, sy = width / self.width, height / self.height
         return Camera(
-            self.kind, width, height, self.world_to_camera, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy
+            self.kind,
+            width,
+            height,
+            self.world_to_camera,
+            self.fx * sx,
+            self.fy * sy,
+            self.cx * sx,
+            self.cy * sy,
         )
 
     def project(self, points: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -62,11 +62,13 @@ class Gaussians:
             raise ValueError(
                 f"quaternions: {int((norm < 1e-12).sum())} are zero, expected wxyz rotations; (1, 0, 0, 0) is none"
             )
-        norm = np.where(np.abs(norm - 1) < 1e-6, 1.0, norm)  # unit up to float32: saving and loading changes nothing
+        norm = np.where(
+            np.abs(norm - 1) < 1e-6, 1.0, norm
+        )  # unit up to float32: saving and loading changes nothing
         smallest = float(np.finfo(np.float32).tiny)
         if (scales < smallest).any():
             raise ValueError(
-                f"scales: {int((scales < smallest).any(axis=1).sum())} Gaussians have a scale that is zero, negative or "
+                f"scales: {int((scales < smallest).any(axis=1).sum())} have a scale that is zero, negative or "
                 "denormal, expected positive metres; a flat Gaussian needs a small scale such as 1e-4"
             )
         if ((opacities < 0) | (opacities > 1)).any():
@@ -85,7 +87,11 @@ class Gaussians:
     def __getitem__(self, chosen: Any) -> Gaussians:
         """The Gaussians that an index array, mask or slice selects."""
         return Gaussians(
-            self.means[chosen], self.quaternions[chosen], self.scales[chosen], self.opacities[chosen], self.sh[chosen]
+            self.means[chosen],
+            self.quaternions[chosen],
+            self.scales[chosen],
+            self.opacities[chosen],
+            self.sh[chosen],
         )
 
     @property
@@ -183,7 +189,8 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     r = np.asarray(rotations, dtype=np.float64)
     d = np.stack([r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]], axis=1)
     four = 1 + np.stack(
-        [d.sum(1), d[:, 0] - d[:, 1] - d[:, 2], d[:, 1] - d[:, 0] - d[:, 2], d[:, 2] - d[:, 0] - d[:, 1]], axis=1
+        [d.sum(1), d[:, 0] - d[:, 1] - d[:, 2], d[:, 1] - d[:, 0] - d[:, 2], d[:, 2] - d[:, 0] - d[:, 1]],
+        axis=1,
     )
     a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
     e, f, g = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]

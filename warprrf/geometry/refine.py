@@ -111,7 +111,9 @@ def refine(
     """
     config = config or RefineConfig()
     if len(images) != len(cameras) or not images:
-        raise ValueError(f"images: got {len(images)} for {len(cameras)} cameras, expected one each and at least one")
+        raise ValueError(
+            f"images: got {len(images)} for {len(cameras)} cameras, expected one each and at least one"
+        )
     for k, (image, camera) in enumerate(zip(images, cameras, strict=True)):
         if camera.kind != "pinhole":
             raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole")
@@ -142,16 +144,24 @@ class PhotoLoss:
         return self.filtered(products, shape)
 
     def filtered(self, source: wp.array, shape: tuple[int, int, int]) -> wp.array:
+        """Window averages of an image of vectors."""
         height, width, channels = shape
         between = wp.empty_like(source)
         out = wp.empty_like(source)
-        launch(self.kernels.filter_rows, source.size, [width, channels, 0, source, between], device=self.device)
         launch(
-            self.kernels.filter_columns, source.size, [height, width * channels, between, out], device=self.device
+            self.kernels.filter_rows, source.size, [width, channels, 0, source, between], device=self.device
+        )
+        launch(
+            self.kernels.filter_columns,
+            source.size,
+            [height, width * channels, between, out],
+            device=self.device,
         )
         return out
 
-    def __call__(self, image: wp.array, target: wp.array, target_moments: wp.array, gradient: wp.array) -> wp.array:
+    def __call__(
+        self, image: wp.array, target: wp.array, target_moments: wp.array, gradient: wp.array
+    ) -> wp.array:
         """Write dL/d(image) to ``gradient``; returns the SSIM of every element, flat."""
         shape, count = image.shape, image.size
         flat, out = image.flatten(), gradient.flatten()
@@ -247,7 +257,9 @@ class _Refinement:
             for name, value in arrays.items()
         }
         self.widths = {**self.WIDTHS, "sh": self.width_sh}
-        self.gradients = {name: wp.zeros(n * k, dtype=float, device=device) for name, k in self.widths.items()}
+        self.gradients = {
+            name: wp.zeros(n * k, dtype=float, device=device) for name, k in self.widths.items()
+        }
         self.scales = wp.zeros(n, dtype=wp.vec3, requires_grad=True, device=device)
         self.opacities = wp.zeros(n, dtype=float, requires_grad=True, device=device)
         self.means = _shaped(self.state["means"], wp.vec3, (n,), self.gradients["means"])
@@ -284,7 +296,10 @@ class _Refinement:
         scale = c.downscale if self.iteration < c.full_from * c.iterations else 1
         camera, target, target_moments = self.target(view, scale)
         launch(
-            optimize.activate, n, [self.log_scales, self.state["logits"], self.scales, self.opacities], device=device
+            optimize.activate,
+            n,
+            [self.log_scales, self.state["logits"], self.scales, self.opacities],
+            device=device,
         )
         colors = wp.zeros((n, 3), dtype=float, requires_grad=True, device=device)
         origin = self.raster.colors_into(self.means, self.sh, camera, colors)
@@ -356,7 +371,9 @@ class _Refinement:
         unseen = (arrays["hits"][:, 0] > 0) & (arrays["seen"][:, 0] < 1e-3)
         keep = ~(huge | unseen | (opacity < c.prune_opacity))
         if not keep.any():
-            raise RuntimeError("refine: every Gaussian would be pruned; do the photos and camera poses belong together?")
+            raise RuntimeError(
+                "refine: every Gaussian would be pruned; do photos and camera poses belong together?"
+            )
         pull = arrays["pull"][:, 0] / np.maximum(arrays["hits"][:, 0], 1)
         room = min(c.max_gaussians - int(keep.sum()), int(c.densify_share * keep.sum()))
         chosen = np.zeros(len(keep), bool)
@@ -375,9 +392,13 @@ class _Refinement:
         shift = np.einsum("nij,nj->ni", rotations, offset)
         jitter = rng.normal(size=(int(chosen.sum()), 3)) * scales[chosen] * 0.3
         jitter[:, 2] = 0  # in the surface
-        step = np.where(split[chosen][:, None], 0.7 * shift[chosen], np.einsum("nij,nj->ni", rotations[chosen], jitter))
+        step = np.where(
+            split[chosen][:, None], 0.7 * shift[chosen], np.einsum("nij,nj->ni", rotations[chosen], jitter)
+        )
         copies["means"] = (copies["means"] + step).astype(np.float32)
-        arrays["means"] = np.where(split[:, None], arrays["means"] - 0.7 * shift, arrays["means"]).astype(np.float32)
+        arrays["means"] = np.where(split[:, None], arrays["means"] - 0.7 * shift, arrays["means"]).astype(
+            np.float32
+        )
         shrink = np.zeros_like(scales)
         shrink[rows, largest] = np.log(1.6)
         arrays["log_scales"] = np.where(split[:, None], arrays["log_scales"] - shrink, arrays["log_scales"])
@@ -406,7 +427,12 @@ class _Refinement:
     def fingerprint(self) -> str:
         """What a checkpoint must agree with to be continued."""
         return json.dumps(
-            {**asdict(self.config), "photos": len(self.images), "planes": len(self.planes), "seed": self.seed},
+            {
+                **asdict(self.config),
+                "photos": len(self.images),
+                "planes": len(self.planes),
+                "seed": self.seed,
+            },
             sort_keys=True,
         )
 
@@ -427,9 +453,13 @@ class _Refinement:
                 metadata = file.metadata() or {}
                 arrays = {name: file.get_tensor(name) for name in file.keys()}
         except (SafetensorError, OSError) as error:
-            raise ValueError(f"checkpoint: {path} cannot be read ({error}); delete it to start over") from error
+            raise ValueError(
+                f"checkpoint: {path} cannot be read ({error}); delete it to start over"
+            ) from error
         if metadata.get("settings") != self.fingerprint():
-            raise ValueError(f"checkpoint: {path} is of other settings or photos; delete it or give another file")
+            raise ValueError(
+                f"checkpoint: {path} is of other settings or photos; delete it or give another file"
+            )
         self.iteration = int(metadata["iteration"])
         self.load(arrays)
 

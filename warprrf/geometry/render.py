@@ -126,7 +126,9 @@ def render(
         )
     back = check_array("background", background, None, np.float32)
     if back.ndim > 1 or (back.ndim == 1 and len(back) != feature_array.shape[1]):
-        raise ValueError(f"background: got shape {back.shape}, expected a scalar or ({feature_array.shape[1]},)")
+        raise ValueError(
+            f"background: got shape {back.shape}, expected a scalar or ({feature_array.shape[1]},)"
+        )
     view = raster.prepare(*scene, cam)
     image = raster.blend(view, feature_array, np.broadcast_to(back, (feature_array.shape[1],)))
     alpha = image.alpha.numpy()
@@ -201,7 +203,9 @@ class Rasterizer:
     scales, opacities, features, background and harmonics; losses may use ``features``, ``alpha`` and ``depth``.
     """
 
-    def __init__(self, *, device: Any = None, blending: Blending | None = None, real: Any = wp.float32) -> None:
+    def __init__(
+        self, *, device: Any = None, blending: Blending | None = None, real: Any = wp.float32
+    ) -> None:
         self.device = resolve(device)
         self.blending = blending or Blending()
         self.real = real
@@ -242,7 +246,9 @@ class Rasterizer:
     def colors(self, means: wp.array, sh: wp.array, cam: Camera) -> wp.array:
         """Colours ``max(0, SH + 0.5)`` towards the camera, shape ``(N, C)``; differentiable on an active tape."""
         tape = _active_tape()
-        out = wp.zeros((len(means), sh.shape[2]), dtype=self.real, device=self.device, requires_grad=tape is not None)
+        out = wp.zeros(
+            (len(means), sh.shape[2]), dtype=self.real, device=self.device, requires_grad=tape is not None
+        )
         origin = self.colors_into(means, sh, cam, out)
         if tape is not None:
             tape.record_func(lambda: self.colors_adjoint(means, sh, origin, out), [means, sh, out])
@@ -257,7 +263,11 @@ class Rasterizer:
     def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
         """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
         launch(
-            sh_kernels.build(self.real).colors, len(means), [means, sh, origin, out], device=self.device, adjoint=True
+            sh_kernels.build(self.real).colors,
+            len(means),
+            [means, sh, origin, out],
+            device=self.device,
+            adjoint=True,
         )
 
     def prepare(
@@ -271,14 +281,21 @@ class Rasterizer:
         count = wp.empty(n, dtype=int, device=device)
         distance = wp.empty(n, dtype=float, device=device)
         inputs = (means, quaternions, scales, opacities)
-        launch(self.project_kernels.project, n, [*inputs, view, self.rules, rows, span, count, distance], device=device)
+        launch(
+            self.project_kernels.project,
+            n,
+            [*inputs, view, self.rules, rows, span, count, distance],
+            device=device,
+        )
         order, ends, entries = _sorted_visible(count, distance)
         tiles = view.tiles_x * view.tiles_y
         keys = wp.empty(2 * max(entries, 1), dtype=int, device=device)
         ids = wp.empty(2 * max(entries, 1), dtype=int, device=device)
         starts = wp.zeros(tiles + 1, dtype=int, device=device)
         if entries:
-            launch(kernels.emit_tiles, len(order), [order, span, ends, view.tiles_x, keys, ids], device=device)
+            launch(
+                kernels.emit_tiles, len(order), [order, span, ends, view.tiles_x, keys, ids], device=device
+            )
             wp.utils.radix_sort_pairs(keys, ids, entries)
             launch(kernels.tile_starts, tiles + 1, [keys, entries, starts], device=device)
         return Prepared(cam, view, inputs, rows, count, ids, starts, entries)
@@ -410,4 +427,6 @@ def _check(g: Any, cam: Any) -> None:
     if not isinstance(g, Gaussians):
         raise TypeError(f"g: got {type(g).__name__}, expected warprrf.Gaussians")
     if not isinstance(cam, Camera):
-        raise TypeError(f"cam: got {type(cam).__name__}, expected warprrf.Camera (Camera.pinhole or Camera.spherical)")
+        raise TypeError(
+            f"cam: got {type(cam).__name__}, expected warprrf.Camera (Camera.pinhole or Camera.spherical)"
+        )

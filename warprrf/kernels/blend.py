@@ -67,8 +67,14 @@ def build(real: Any) -> SimpleNamespace:
     @wp.func
     def lane_max(x: strip):
         return wp.max(
-            wp.max(wp.max(wp.max(x[0], x[8]), wp.max(x[4], x[12])), wp.max(wp.max(x[2], x[10]), wp.max(x[6], x[14]))),
-            wp.max(wp.max(wp.max(x[1], x[9]), wp.max(x[5], x[13])), wp.max(wp.max(x[3], x[11]), wp.max(x[7], x[15]))),
+            wp.max(
+                wp.max(wp.max(x[0], x[8]), wp.max(x[4], x[12])),
+                wp.max(wp.max(x[2], x[10]), wp.max(x[6], x[14])),
+            ),
+            wp.max(
+                wp.max(wp.max(x[1], x[9]), wp.max(x[5], x[13])),
+                wp.max(wp.max(x[3], x[11]), wp.max(x[7], x[15])),
+            ),
         )
 
     if real is wp.float32:
@@ -417,7 +423,9 @@ def build(real: Any) -> SimpleNamespace:
             n = u1 * (rows[k, GRAM] * u1 + real(2.0) * rows[k, GRAM + 1] * u2) + rows[k, GRAM + 2] * u2 * u2
             ag = rows[k, AA] * w + rows[k, AB1] * u1 + rows[k, AB2] * u2
             gg = w * ag + u1 * (rows[k, AB1] * w + rows[k, BB11] * u1 + rows[k, BB12] * u2)
-            gg = wp.max(gg + u2 * (rows[k, AB2] * w + rows[k, BB12] * u1 + rows[k, BB22] * u2), real(wp.static(tiny)))
+            gg = wp.max(
+                gg + u2 * (rows[k, AB2] * w + rows[k, BB12] * u1 + rows[k, BB22] * u2), real(wp.static(tiny))
+            )
             if n < rows[k, CUT] * gg and ag > real(0.0):
                 alpha = wp.min(rows[k, OPACITY] * wp.exp(real(-0.5) * n / gg), real(rules.alpha_max))
                 weight = alpha * transmittance

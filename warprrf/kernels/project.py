@@ -30,7 +30,9 @@ A, B1, B2 = 21, 24, 27
 INVERSE, SMALLEST = 30, 31  # 1 / s_min, s_min [m]
 FIRST_ROW, LAST_ROW = 32, 33  # of pixels
 ROW = 34
-GRADIENTS = 15  # numbers per Gaussian that `blend_adjoint` sums: Y1 3, Y2 6, opacity, features 4, blending weight
+GRADIENTS = (
+    15  # numbers per Gaussian that `blend_adjoint` sums: Y1 3, Y2 6, opacity, features 4, blending weight
+)
 PINHOLE, SPHERICAL = 0, 1
 PRODUCT, EXPONENTIAL = 0, 1  # transmittance rules: prod(1 - alpha), or the paper's exp(-sum alpha)
 
@@ -121,14 +123,18 @@ def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radiu
     A plane through the ray origin with normal l touches the ellipsoid where l^T (r^2 cov - m m^T) l = 0.
     """
     r2 = radius * radius
-    extent = radius * wp.sqrt(wp.max(wp.max(cov[0, 0] + cov[1, 1] + cov[2, 2], wp.float64(0.0)), wp.float64(1.0e-300)))
+    extent = radius * wp.sqrt(
+        wp.max(wp.max(cov[0, 0] + cov[1, 1] + cov[2, 2], wp.float64(0.0)), wp.float64(1.0e-300))
+    )
     distance = wp.length(m)
     everything = wp.vec4i(0, view.tiles_x, 0, view.tiles_y)
     nothing = wp.vec4i(0, 0, 0, 0)
     rows = wp.vec2d(wp.float64(-1.0), wp.float64(view.height + 1))
     if inside:
         return everything, rows
-    cap = wp.float64(3.141592653589793)  # a long ellipsoid close by reaches more than 90 degrees from its mean
+    cap = wp.float64(
+        3.141592653589793
+    )  # a long ellipsoid close by reaches more than 90 degrees from its mean
     if extent < distance:
         cap = wp.asin(extent / distance)
     if view.kind == wp.static(PINHOLE):
@@ -147,7 +153,9 @@ def covered_tiles(view: View, mean: wp.vec3d, m: wp.vec3d, cov: wp.mat33d, radiu
             wp.max(view.cx, wp.float64(view.width) - view.cx) / view.fx,
             wp.max(view.cy, wp.float64(view.height) - view.cy) / view.fy,
         )
-        if wp.acos(wp.clamp(local[2] / distance, wp.float64(-1.0), wp.float64(1.0))) > cap + wp.atan(wp.length(corner)):
+        if wp.acos(wp.clamp(local[2] / distance, wp.float64(-1.0), wp.float64(1.0))) > cap + wp.atan(
+            wp.length(corner)
+        ):
             return nothing, rows
         return everything, rows
     pi = wp.float64(3.141592653589793)
