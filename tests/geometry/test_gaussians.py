@@ -31,8 +31,8 @@ def test_ply_layout_is_the_one_that_other_viewers_read(tmp_path):
     assert (
         names
         == (
-            "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 f_rest_7 "
-            "f_rest_8 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+            "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 "
+            "f_rest_7 f_rest_8 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
         ).split()
     )
     row = dict(zip(names, np.frombuffer(body, "<f4").reshape(2, -1)[1], strict=True))

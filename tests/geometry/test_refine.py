@@ -118,7 +118,8 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
     cameras = ring_of_cameras(4)
     photos = [np.clip(render(start, c, device="cpu").features, 0, 1) for c in cameras]
     plane = Plane(
-        normal=np.array([0, 0, 1.0]), offset=0.0, inliers=np.arange(n), axes=np.eye(3)[:2], corner=np.array([-1.0, -1.0]),
+        normal=np.array([0, 0, 1.0]), offset=0.0, inliers=np.arange(n), axes=np.eye(3)[:2],
+        corner=np.array([-1.0, -1.0]),
         cell_m=0.5, occupied=np.ones((4, 4), bool),
     )  # fmt: skip
     config = RefineConfig(iterations=60, downscale=1, densify_from=999)

@@ -29,8 +29,8 @@ def cloud(rng, n, low=0.02, high=0.4, spread=2.0):
 
 def brute_force(g: Gaussians, camera: Camera, features, *, alpha_min=1 / 255, alpha_max=0.99, transmittance_min=1e-4,
           rule="product", background=0.0):  # fmt: skip
-    """Textbook splatting in float64: every Gaussian on every ray. Features, alpha, depth, and how close the closest cutoff
-    decision of each pixel was."""
+    """Textbook splatting in float64: every Gaussian on every ray. Features, alpha, depth, and how close the closest
+    cutoff decision of each pixel was."""
     origin = camera.position
     directions = camera.directions().reshape(-1, 3)
     m = g.means.astype(np.float64) - origin

@@ -83,7 +83,7 @@ def _scatter(
 
 def _poster(
     image: np.ndarray, texel: float, rng: np.random.Generator, left: float, top: float, w: float, h: float
-):
+) -> None:
     """Paint one poster, ``w`` x ``h`` metres: random shapes above lines of text-like blocks."""
     r0, c0 = int(top / texel), int(left / texel)
     r1, c1 = min(image.shape[0], r0 + int(h / texel)), min(image.shape[1], c0 + int(w / texel))
