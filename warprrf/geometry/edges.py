@@ -26,7 +26,7 @@ def meeting(planes: Sequence[Plane]) -> list[Plane]:
     result = []
     for a, plane in enumerate(wide):
         occupied = plane.occupied.copy()
-        grid = np.stack(np.indices(occupied.shape), axis=-1).reshape(-1, 2)
+        grid = np.moveaxis(np.indices(occupied.shape), 0, -1).reshape(-1, 2)
         centres = plane.to_world(plane.corner + (grid + 0.5) * plane.cell_m)
         reach = REACH_CELLS * plane.cell_m
         beyond = np.zeros(occupied.shape, dtype=bool)

@@ -309,7 +309,7 @@ def occupancy(
         uv = points[plane.inliers] @ axes.T
         corner = uv.min(axis=0) - margin_m - cell_m
         shape = np.ceil((uv.max(axis=0) + margin_m + cell_m - corner) / cell_m).astype(int)
-        centres = corner + (np.stack(np.indices(shape), axis=-1).reshape(-1, 2) + 0.5) * cell_m
+        centres = corner + (np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2) + 0.5) * cell_m
         inside = _in_hull(centres, uv, margin_m).reshape(shape)
         supported = np.zeros(shape, dtype=bool)
         index = np.floor((uv - corner) / cell_m).astype(int)

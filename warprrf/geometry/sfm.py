@@ -474,7 +474,9 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     for i in range(len(names) - 1):
         report("comparing", i, len(names))
         # One product of photo i with all later ones, shape (features of i, photos, features of j).
-        cosine = (stack[i] @ stack[i + 1 :].reshape(-1, stack.shape[2]).T).reshape(COARSE_FEATURES, -1, COARSE_FEATURES)
+        cosine = (stack[i] @ stack[i + 1 :].reshape(-1, stack.shape[2]).T).reshape(
+            COARSE_FEATURES, -1, COARSE_FEATURES
+        )
         back = cosine.argmax(axis=0)
         first = cosine.argmax(axis=2)[..., None]
         top = np.take_along_axis(cosine, first, axis=2)[..., 0]

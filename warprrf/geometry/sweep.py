@@ -178,7 +178,7 @@ def _shared_views(plane: Plane, surface: Any, cameras: Sequence[Camera]) -> tupl
     centres = plane.to_world(plane.corner + (2 * key + 1.0) * plane.cell_m)
     normals = np.broadcast_to(plane.normal, centres.shape)
     seen = visible_from(surface, centres, normals, cameras, clearance_m=0.05)
-    return choose_views(centres, normals, seen, cameras)[group], seen.any(axis=1)[group]
+    return choose_views(centres, normals, seen, cameras)[group], np.asarray(seen.any(axis=1))[group]
 
 
 def level_planes(
@@ -209,7 +209,7 @@ def level_planes(
     normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
     axes = plane_axes(normal)
     shape = np.ceil((high[:2] - low[:2]) / cell_m).astype(int) + 1
-    cells = np.stack(np.indices(shape), axis=-1).reshape(-1, 2)
+    cells = np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2)
     ground = np.zeros((len(cells), 3))
     ground[:, :2] = low[:2] + (cells + 0.5) * cell_m
     coarse = max(1, int(round(COARSE_M / cell_m)))
@@ -265,9 +265,9 @@ def level_planes(
             continue
         # Every connected piece has a height of its own.
         for piece in _split(mask):
-            plane = _settled(piece, levels[k], low[:2], cell_m, normal, axes, photos, surface)
-            if plane is not None and _crossed(plane, eyes, targets) < 0.2:
-                found.append(plane)
+            level = _settled(piece, levels[k], low[:2], cell_m, normal, axes, photos, surface)
+            if level is not None and _crossed(level, eyes, targets) < 0.2:
+                found.append(level)
 
 
 def _crossed(plane: Plane, eyes: np.ndarray, targets: np.ndarray) -> float:
