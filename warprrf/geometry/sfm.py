@@ -95,8 +95,10 @@ def find_photos(photos: Any) -> dict[str, Path]:
     A name is the path below the folder (or below the files' common folder), with forward slashes.
 
     Raises:
+        ImportError: if pycolmap is not installed.
         ValueError: if the folder or files do not exist, or too few photos are there.
     """
+    require("pycolmap", extra="photos")
     if isinstance(photos, str | os.PathLike):
         root = Path(photos)
         if not root.is_dir():

@@ -59,6 +59,7 @@ class SionnaEngine:
         device: Any = None,
     ) -> None:
         select_llvm()
+        self._select_variant()
         self._rt = _device.require("sionna.rt", extra="sionna")
         self.shape = check_shape(shape)
         self.beam_sigma_rad = beam_sigma_rad
@@ -66,7 +67,6 @@ class SionnaEngine:
         self.frequency_hz = check_frequency(frequency_hz)
         self.depth, self.samples, self.refraction, self.seed = depth, samples, refraction, seed
         self.device = device
-        self._select_variant()
         self._scene = self._load(scene)
         self._solver = self._rt.PathSolver(deterministic=True)
         self._solved = 0
@@ -77,7 +77,7 @@ class SionnaEngine:
         return str(self._rt.__version__)
 
     def _select_variant(self) -> None:
-        """Mitsuba may be on another variant in this process, for photos."""
+        """Mitsuba may be on another variant, for photos; Sionna registers its plugins with the one it is imported in."""
         mitsuba = _device.require("mitsuba", extra="sionna")
         if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
             mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
