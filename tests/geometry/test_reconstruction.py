@@ -22,6 +22,7 @@ LOBBY = Path(__file__).parents[2] / "data" / "lobby"
 VIEWS = [f"view_{k:03d}.jpg" for k in range(10)]
 SMALL = ReconstructionConfig(
     max_features=1500,
+    cell_m=0.2,
     gaussians=2500,
     refine=RefineConfig(iterations=12, downscale=4, max_gaussians=3000, checkpoint_every=4),
     depth_downscale=4,

@@ -310,5 +310,5 @@ def test_visibility_knows_frame_side_and_obstacles():
     assert surface.visible_from(None, points, normals, [camera], clearance_m=0.01)[:, 0].tolist() == [
         True, False, False, True,
     ]  # fmt: skip
-    seen = surface.visible_from(shade, points, normals, [camera], clearance_m=0.01)[:, 0]
+    seen = surface.visible_from(surface.Occluder(shade), points, normals, [camera], clearance_m=0.01)[:, 0]
     assert seen.tolist() == [False, False, False, True]

@@ -17,7 +17,7 @@ from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians, quaternions_of
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planes import Plane, plane_axes
-from warprrf.geometry.surface import neighbours, visible_from
+from warprrf.geometry.surface import Occluder, neighbours, visible_from
 
 SH_DC = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi))
 OPACITY = 0.95
@@ -105,7 +105,8 @@ def _discs_on_points(
 
 
 def _discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: np.ndarray) -> Gaussians:
-    axes = np.array([plane_axes(n) for n in normals])
+    kinds, which = np.unique(normals, axis=0, return_inverse=True)
+    axes = np.array([plane_axes(n) for n in kinds])[which.ravel()]
     rotation = np.stack([axes[:, 0], axes[:, 1], normals], axis=2)
     scales = np.stack([radius, radius, np.maximum(FLATNESS * radius, 1e-4)], axis=1)
     sh = ((colors - 0.5) / SH_DC)[:, None, :]
@@ -126,11 +127,18 @@ def plane_mesh(planes: Sequence[Plane]) -> Mesh | None:
     return Mesh(np.concatenate(vertices), np.concatenate(faces)) if total else None
 
 
+def plane_occluder(planes: Sequence[Plane]) -> Occluder | None:
+    """The occupied cells of all planes as an obstacle to sight; None when there are none."""
+    mesh = plane_mesh(planes)
+    return None if mesh is None else Occluder(mesh)
+
+
 def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera], *, min_views: int = 2) -> list[Plane]:
     """``planes`` with only those occupied cells that at least ``min_views`` cameras see past all the others."""
-    surface = plane_mesh(planes)
-    if surface is None:
+    mesh = plane_mesh(planes)
+    if mesh is None:
         return list(planes)
+    surface = Occluder(mesh)
     result = []
     for plane in planes:
         cells = plane.cells()
@@ -146,7 +154,7 @@ def _plane_blocks(
     planes: Sequence[Plane], cameras: Sequence[Camera], images: Sequence[np.ndarray], count: int
 ) -> _Blocks:
     """Blocks of two, one or half a cell, as the colours ask, about ``count`` of them."""
-    surface = plane_mesh(planes)
+    surface = plane_occluder(planes)
     levels: list[list[_Blocks]] = [[], [], []]
     parents: list[list[np.ndarray]] = [[], []]
     offset = [0, 0]

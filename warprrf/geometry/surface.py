@@ -20,6 +20,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planes import Plane, detect_planes, occupancy
 
 __all__ = [
+    "Occluder",
     "PlanarPatch",
     "Plane",
     "clean_points",
@@ -37,6 +38,7 @@ __all__ = [
 
 # Voxels along a block's side, and blocks to set aside for at first (the grid grows when it needs more).
 BLOCK_VOXELS, BLOCKS = 16, 20_000
+RAYS_AT_ONCE = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -177,8 +179,29 @@ def detect_room_planes(
     return large + compact
 
 
+class Occluder:
+    """A surface ready for many visibility queries (the bounding volume hierarchy is built once)."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        o3d = require("open3d", extra="photos")
+        self._tensor = o3d.core.Tensor
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.faces.astype(np.uint32))
+        )
+
+    def blocks(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Whether something lies between ``start`` and ``end`` (N, 3) [m], shape ``(N,)`` bool."""
+        blocked = np.zeros(len(start), dtype=bool)
+        for first in range(0, len(start), RAYS_AT_ONCE):
+            part = slice(first, first + RAYS_AT_ONCE)
+            rays = np.concatenate([start[part], end[part] - start[part]], axis=1).astype(np.float32)
+            blocked[part] = self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0).numpy()
+        return blocked
+
+
 def visible_from(
-    surface: Mesh | None,
+    surface: Occluder | None,
     points: np.ndarray,
     normals: np.ndarray,
     cameras: Sequence[Camera],
@@ -189,28 +212,16 @@ def visible_from(
 
     The line of sight starts ``clearance_m`` above the surface, along the normal.
     """
-    o3d = require("open3d", extra="photos")
-    scene = None
-    if surface is not None:
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(
-            o3d.core.Tensor(surface.vertices.astype(np.float32)),
-            o3d.core.Tensor(surface.faces.astype(np.uint32)),
-        )
     seen = np.zeros((len(points), len(cameras)), dtype=bool)
-    start = points + clearance_m * normals
     for c, camera in enumerate(cameras):
         uv, depth = camera.project(points)
         with np.errstate(invalid="ignore"):
             inside = (depth > 0.05) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
-        facing = ((camera.position - points) * normals).sum(axis=1) > 0
-        index = np.flatnonzero(inside & facing)
-        if scene is not None and len(index):
-            line = camera.position - start[index]
-            rays = np.concatenate([start[index], line], axis=1).astype(np.float32)
-            blocked = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
-            index = index[~blocked]
-        seen[index, c] = True
+        seen[:, c] = inside & (((camera.position - points) * normals).sum(axis=1) > 0)
+    if surface is not None:
+        positions = np.array([camera.position for camera in cameras])
+        point, eye = np.nonzero(seen)
+        seen[point, eye] = ~surface.blocks(points[point] + clearance_m * normals[point], positions[eye])
     return seen
 
 

@@ -16,7 +16,7 @@ import warp as wp
 
 from warprrf.device import launch, resolve
 from warprrf.geometry.camera import Camera
-from warprrf.geometry.initial import plane_mesh
+from warprrf.geometry.initial import plane_occluder
 from warprrf.geometry.planes import CONTESTED_M, Plane, dilate, plane_axes
 from warprrf.geometry.surface import visible_from
 from warprrf.kernels.consistency import SIDE, patch_agreement
@@ -118,7 +118,7 @@ def proven_cells(
     """``planes`` with their cells corrected by the photos: extended (large planes, up to ``reach_m``) where the photos
     agree, emptied where they disagree and no point of the plane is near. Of two parallel planes close to each other,
     such as a sign and its wall, the one that the photos agree on more has the cell."""
-    surface = plane_mesh(planes)
+    surface = plane_occluder(planes)
     wide, candidates, insides, scores, visible, own = [], [], [], [], [], []
     for plane in planes:
         reach = int(round(reach_m / plane.cell_m)) if plane.area() >= large_m2 else 2
@@ -217,7 +217,7 @@ def level_planes(
     group = group.ravel()
     middle = np.zeros((len(key), 3))
     middle[:, :2] = low[:2] + (key + 0.5) * coarse * cell_m
-    surface = plane_mesh(planes)
+    surface = plane_occluder(planes)
     every = max(1, int(round(0.09 / STEP_M)))
     agreement = np.full((len(levels), len(cells)), -1.0, dtype=np.float32)
     views = np.zeros((len(cells), VIEWS), dtype=np.int32)
