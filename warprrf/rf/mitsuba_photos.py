@@ -20,11 +20,12 @@ from warprrf.geometry.camera import Camera
 from warprrf.rf.llvm import select_llvm
 
 VARIANT = "llvm_ad_rgb"
+SIONNA_VARIANT = "llvm_ad_mono_polarized"  # Sionna RT registers its plugins with the variant it is imported in
 
 
 @contextmanager
 def _mitsuba(variant: str) -> Iterator[Any]:
-    """Mitsuba in ``variant``; what was set before (by Sionna RT, say) is set again afterwards."""
+    """Mitsuba in ``variant``; afterwards in what was set before, or in what Sionna RT has to be imported in."""
     select_llvm()
     mi = require("mitsuba", extra="sionna")
     before = mi.variant()
@@ -34,8 +35,7 @@ def _mitsuba(variant: str) -> Iterator[Any]:
     try:
         yield mi
     finally:
-        if before is not None:
-            mi.set_variant(before)
+        mi.set_variant(before or SIONNA_VARIANT)
 
 
 def _sensor(mi: Any, camera: Camera, spp: int) -> Any:

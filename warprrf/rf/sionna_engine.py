@@ -77,7 +77,7 @@ class SionnaEngine:
         return str(self._rt.__version__)
 
     def _select_variant(self) -> None:
-        """Mitsuba may be on another variant, for photos; Sionna registers its plugins with the one it is imported in."""
+        """Mitsuba may be on another variant, for photos; Sionna registers its plugins with the one at its import."""
         mitsuba = _device.require("mitsuba", extra="sionna")
         if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
             mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
