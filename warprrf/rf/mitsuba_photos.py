@@ -20,7 +20,9 @@ from warprrf.geometry.camera import Camera
 from warprrf.rf.llvm import select_llvm
 
 VARIANT = "llvm_ad_rgb"
-SIONNA_VARIANT = "llvm_ad_mono_polarized"  # Sionna RT registers its plugins with the variant it is imported in
+SIONNA_VARIANT = (
+    "llvm_ad_mono_polarized"  # Sionna RT registers its plugins with the variant it is imported in
+)
 
 
 @contextmanager
