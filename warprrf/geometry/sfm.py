@@ -32,7 +32,9 @@ MIN_PHOTOS = 3
 # Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
 MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
-COARSE_NEIGHBOURS = 16  # pairs kept for each photo; on the lobby 24 gives the same errors and takes half as long again
+COARSE_NEIGHBOURS = (
+    16  # pairs kept for each photo; on the lobby 24 gives the same errors and takes half as long again
+)
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
@@ -508,18 +510,32 @@ def _map(colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int,
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time
     options.min_model_size = MIN_PHOTOS
-    posed = itertools.count(2)
-    report("mapping", 0, len(named))
-    models = colmap.incremental_mapping(
-        working,
-        folder / "images",
-        output,
-        options,
-        next_image_callback=lambda: report("mapping", min(next(posed), len(named)), len(named)),
-    )
+    models: dict[int, Any] = {}
+    for relaxed in (False, True):
+        # Few photos, or all from nearly one direction: a weaker first pair, when COLMAP's own limits find none.
+        if relaxed:
+            options.mapper.init_min_num_inliers = 40
+            options.mapper.init_min_tri_angle = 4.0
+            options.mapper.abs_pose_min_num_inliers = 20
+        posed = itertools.count(2)
+        report("mapping", 0, len(named))
+        models = colmap.incremental_mapping(
+            working,
+            folder / "images",
+            output,
+            options,
+            next_image_callback=lambda posed=posed: report(
+                "mapping", min(next(posed), len(named)), len(named)
+            ),
+        )
+        models = {k: m for k, m in models.items() if m.num_reg_images() >= MIN_PHOTOS}
+        if models:
+            break
     if not models:
         with colmap.Database.open(str(working)) as database:
-            linked = database.num_verified_image_pairs()
+            linked = int(
+                (np.array(database.read_two_view_geometry_num_inliers()[1]) >= options.min_num_matches).sum()
+            )
         raise ValueError(
             f"photos: too few matches between the {len(named)} photos to pose any ({linked} pairs of photos match); "
             f"expected photos of one textured place that overlap by half or more: {_some(list(named))}"
