@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -253,9 +254,14 @@ def _geometry(
     out: Path, data: Path, sizes: Sizes, seed: int, device: Any, progress: Progress
 ) -> dict[str, Any]:
     files, held_out, surveyed = photos(data, sizes)
+    # Unfinished steps of other code are not continued: neither figures nor times would be this code's.
+    workspace = out / "workspace" / source(*SOURCE_OF_GEOMETRY)[:12]
+    for other in workspace.parent.glob("*"):
+        if other != workspace:
+            shutil.rmtree(other) if other.is_dir() else other.unlink()
     reconstruction = wr.reconstruct(
         files,
-        workspace=out / "workspace",
+        workspace=workspace,
         known_positions=surveyed,
         seed=seed,
         device=device,
