@@ -219,7 +219,16 @@ class _SubPixels:
 
 @lru_cache(maxsize=4)
 def _sub_pixel_grid(shape: tuple[int, int], sub_pixels: int, device: str) -> _SubPixels:
-    """``sub_pixels``^2 directions per pixel, pixel by pixel, of equal solid angle within one."""
+    directions, solid_angles = sub_pixel_directions(shape, sub_pixels)
+    return _SubPixels(directions, solid_angles, wp.array(directions, dtype=wp.vec3d, device=device))
+
+
+def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    """``sub_pixels``^2 directions per pixel, pixel by pixel, of equal solid angle within one.
+
+    Returns:
+        Unit directions, shape ``(H W sub_pixels^2, 3)``, and their solid angles [sr].
+    """
     rows, columns = shape
     count = sub_pixels**2
     step = min(
@@ -231,8 +240,4 @@ def _sub_pixel_grid(shape: tuple[int, int], sub_pixels: int, device: str) -> _Su
     top, bottom = np.cos(i * np.pi / rows), np.cos((i + 1) * np.pi / rows)
     azimuth = -np.pi + (j + across) * 2.0 * np.pi / columns
     directions = directions_from_angles(np.arccos(top + (bottom - top) * down), azimuth).reshape(-1, 3)
-    return _SubPixels(
-        directions=directions,
-        solid_angles=np.repeat(pixel_solid_angles(shape) / count, columns * count),
-        on_device=wp.array(directions, dtype=wp.vec3d, device=device),
-    )
+    return directions, np.repeat(pixel_solid_angles(shape) / count, columns * count)

@@ -25,7 +25,7 @@ GAINS = ("exp", "linear")
 
 @dataclass(frozen=True)
 class FieldOptions:
-    """What a field computes; see :meth:`RadioField.fit`."""
+    """What a field computes; see :meth:`HarmonicField.fit`."""
 
     model: str = "rf3dgs+"
     transmittance: str = "product"
@@ -37,8 +37,7 @@ class FieldOptions:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
-            later = "; the bistatic model is not in this version" if self.model == "bistatic" else ""
-            raise ValueError(f"model: got {self.model!r}, expected one of {', '.join(MODELS)}{later}")
+            raise ValueError(f"model: got {self.model!r}, expected one of {', '.join(MODELS)}")
         for name, known in (
             ("transmittance", _transport.TRANSMITTANCE),
             ("interaction_point", _transport.INTERACTION_POINTS),

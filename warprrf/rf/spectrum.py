@@ -225,6 +225,7 @@ class Spectrum:
         aod: Its zenith and azimuth of departure at the transmitter [rad], shape ``(H, W, 2)``; NaN where empty.
         floor: Noise floor N0 added before taking decibels [linear].
         range_db: Lowest and highest value of the data set's dB images [dB].
+        std_db: Standard deviation of the dB image per pixel [dB], shape ``(H, W)``; None where it is not known.
     """
 
     path_gain: np.ndarray
@@ -232,6 +233,7 @@ class Spectrum:
     aod: np.ndarray | None = None
     floor: float = 0.0
     range_db: tuple[float, float] | None = None
+    std_db: np.ndarray | None = None
     attributes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property

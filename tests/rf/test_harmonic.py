@@ -9,7 +9,7 @@ import pytest
 from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.field import RadioField
+from warprrf.rf.harmonic import HarmonicField
 from warprrf.rf.field_paths import BEAM_REACH
 from warprrf.rf.metrics import psnr, unit_image
 from warprrf.rf.single_bounce import FieldOptions
@@ -46,8 +46,8 @@ RECEIVERS = RECEIVERS[(RECEIVERS[:, 0] < 1.7) | (RECEIVERS[:, 0] > 2.7)][:16]
 VISIBLE, BLOCKED = np.array([1.5, 2.4, 1.2]), np.array([3.6, 1.2, 1.3])
 
 
-def field_with(room: SimpleNamespace, layers: dict[str, np.ndarray], **options) -> RadioField:
-    return RadioField(
+def field_with(room: SimpleNamespace, layers: dict[str, np.ndarray], **options) -> HarmonicField:
+    return HarmonicField(
         gaussians=room.gaussians, mesh=room.mesh, transmitter=TRANSMITTER, frequency_hz=FREQUENCY, shape=SHAPE,
         floor=FLOOR, range_db=RANGE_DB, beam_sigma_rad=SIGMA, options=FieldOptions(**options), layers=layers,
         gain_unit=0.1, delay_unit=1e-8,
@@ -62,7 +62,7 @@ def smooth_layers(gaussians: Gaussians, seed: int = 0) -> dict[str, np.ndarray]:
     return {"gain": table}
 
 
-def dataset(field: RadioField, receivers: np.ndarray) -> SimpleNamespace:
+def dataset(field: HarmonicField, receivers: np.ndarray) -> SimpleNamespace:
     spectra = [field.spectrum(r) for r in receivers]
     gain = np.stack([s.path_gain for s in spectra])
     return SimpleNamespace(
@@ -74,12 +74,12 @@ def dataset(field: RadioField, receivers: np.ndarray) -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def truth(room: SimpleNamespace) -> RadioField:
+def truth(room: SimpleNamespace) -> HarmonicField:
     return field_with(room, smooth_layers(room.gaussians))
 
 
 @pytest.fixture(scope="module")
-def spectra(truth: RadioField) -> SimpleNamespace:
+def spectra(truth: HarmonicField) -> SimpleNamespace:
     return dataset(truth, RECEIVERS)
 
 
@@ -101,7 +101,7 @@ def test_a_pixel_is_the_papers_equations(rule: str, gain: str) -> None:
         receiver + depth[:, None] * d, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), scale), opacity,
         np.zeros((3, 1, 3)),
     )  # fmt: skip
-    field = RadioField(
+    field = HarmonicField(
         gaussians=balls, mesh=None, transmitter=transmitter, frequency_hz=FREQUENCY, shape=SHAPE, floor=FLOOR,
         range_db=RANGE_DB, beam_sigma_rad=SIGMA, options=FieldOptions(transmittance=rule, gain=gain),
         layers={"gain": table}, gain_unit=0.25, delay_unit=1.0,
@@ -142,7 +142,7 @@ def test_doubling_every_distance_quarters_the_power_only_with_lengths(
     layers = smooth_layers(room.gaussians)
     small = field_with(room, layers, model=model)
     g = room.gaussians
-    large = RadioField(
+    large = HarmonicField(
         gaussians=Gaussians(2 * g.means, g.quaternions, 2 * g.scales, g.opacities, g.sh),
         mesh=Mesh(2 * room.mesh.vertices, room.mesh.faces), transmitter=2 * TRANSMITTER, frequency_hz=FREQUENCY,
         shape=SHAPE, floor=FLOOR, range_db=RANGE_DB, beam_sigma_rad=SIGMA, options=small.options, layers=layers,
@@ -154,7 +154,7 @@ def test_doubling_every_distance_quarters_the_power_only_with_lengths(
         assert b.delay_s == pytest.approx(2 * a.delay_s, rel=1e-9)
 
 
-def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(truth: RadioField) -> None:
+def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(truth: HarmonicField) -> None:
     elsewhere = np.array([1.4, 3.2, 0.9])
     here, there = truth.spectrum(BLOCKED), truth.spectrum(BLOCKED, transmitter=elsewhere)
     paths = [truth.paths(BLOCKED), truth.paths(BLOCKED, transmitter=elsewhere)]
@@ -169,7 +169,7 @@ def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(tr
 def test_mesh_interaction_points_give_exact_lengths(room: SimpleNamespace) -> None:
     """Rays to the walls of an axis-aligned box, by the slab formula in float64."""
     mesh = Mesh(*box([0.0, 0.0, 0.0], [5.0, 4.0, 3.0], inward=True))
-    field = RadioField(
+    field = HarmonicField(
         gaussians=room.gaussians, mesh=mesh, transmitter=TRANSMITTER, frequency_hz=FREQUENCY, shape=SHAPE,
         floor=FLOOR, range_db=RANGE_DB, beam_sigma_rad=1e-3, options=FieldOptions(interaction_point="mesh"),
         layers=smooth_layers(room.gaussians), gain_unit=1.0, delay_unit=1.0,
@@ -205,10 +205,10 @@ def test_a_field_is_recovered_from_spectra_of_its_own_kind(
     train = SimpleNamespace(**{**vars(spectra)})
     for name in ("receivers", "path_gain", "delay_s", "aod", "line_of_sight"):
         setattr(train, name, getattr(spectra, name)[:13])
-    found = RadioField.fit(room, train, iterations=150, seed=0)
-    untrained = RadioField.fit(room, train, iterations=0, seed=0)
+    found = HarmonicField.fit(room, train, iterations=150, seed=0)
+    untrained = HarmonicField.fit(room, train, iterations=0, seed=0)
 
-    def score(field: RadioField, index: int) -> float:
+    def score(field: HarmonicField, index: int) -> float:
         image = unit_image(field.spectrum(spectra.receivers[index]).path_gain, FLOOR, spectra.range_db)
         return psnr(image, unit_image(spectra.path_gain[index], FLOOR, spectra.range_db))
 
@@ -222,7 +222,7 @@ def test_a_field_is_recovered_from_spectra_of_its_own_kind(
 def test_rf3dgs_learns_delay_and_departure_of_its_training_spectra(
     room: SimpleNamespace, spectra: SimpleNamespace
 ) -> None:
-    found = RadioField.fit(room, spectra, "rf3dgs", iterations=100)
+    found = HarmonicField.fit(room, spectra, "rf3dgs", iterations=100)
     blocked = [i for i, r in enumerate(spectra.receivers) if r[0] > 2.7]
     delay = np.stack([found.spectrum(spectra.receivers[i]).delay_s for i in blocked])
     spread_s = np.std(spectra.delay_s[blocked])
@@ -240,7 +240,7 @@ def test_gaussians_that_nobody_saw_keep_the_median_gain(
         np.concatenate([g.scales, g.scales[:1]]), np.concatenate([g.opacities, [0.0]]),
         np.concatenate([g.sh, g.sh[:1]]),
     )  # fmt: skip
-    found = RadioField.fit(SimpleNamespace(gaussians=outside, mesh=room.mesh), spectra, iterations=3)
+    found = HarmonicField.fit(SimpleNamespace(gaussians=outside, mesh=room.mesh), spectra, iterations=3)
     assert not found.layers["gain"][-1].any()
     seen = found.layers["gain"][:-1].any(axis=1)
     assert seen.mean() > 0.9
@@ -249,7 +249,7 @@ def test_gaussians_that_nobody_saw_keep_the_median_gain(
 def test_the_same_seed_gives_the_same_bits_and_another_seed_others(
     room: SimpleNamespace, spectra: SimpleNamespace
 ) -> None:
-    fits = [RadioField.fit(room, spectra, iterations=6, batch=4, seed=s).layers["gain"] for s in (1, 1, 2)]
+    fits = [HarmonicField.fit(room, spectra, iterations=6, batch=4, seed=s).layers["gain"] for s in (1, 1, 2)]
     assert np.array_equal(fits[0], fits[1])
     assert not np.array_equal(fits[0], fits[2])
 
@@ -265,12 +265,12 @@ def test_a_killed_fit_goes_on_and_ends_with_the_same_bits(
             raise Killed
 
     file = tmp_path / "fit.safetensors"
-    whole = RadioField.fit(room, spectra, iterations=80, batch=4)
+    whole = HarmonicField.fit(room, spectra, iterations=80, batch=4)
     with pytest.raises(Killed):
-        RadioField.fit(room, spectra, iterations=80, batch=4, checkpoint=file, progress=killer)
+        HarmonicField.fit(room, spectra, iterations=80, batch=4, checkpoint=file, progress=killer)
     assert file.exists()
     steps = []
-    resumed = RadioField.fit(
+    resumed = HarmonicField.fit(
         room, spectra, iterations=80, batch=4, checkpoint=file, progress=lambda s, d, t: steps.append((s, d))
     )
     assert min(d for s, d in steps if s == "fit") == 51
@@ -283,16 +283,16 @@ def test_a_checkpoint_of_another_fit_is_refused(
     room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
 ) -> None:
     file = tmp_path / "fit.safetensors"
-    RadioField.fit(room, spectra, iterations=1, checkpoint=file)
+    HarmonicField.fit(room, spectra, iterations=1, checkpoint=file)
 
     def killer(stage: str, done: int, total: int) -> None:
         if stage == "fit" and done == 60:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        RadioField.fit(room, spectra, iterations=70, checkpoint=file, progress=killer)
+        HarmonicField.fit(room, spectra, iterations=70, checkpoint=file, progress=killer)
     with pytest.raises(ValueError, match="another fit|other data"):
-        RadioField.fit(room, spectra, iterations=70, checkpoint=file, gain="linear")
+        HarmonicField.fit(room, spectra, iterations=70, checkpoint=file, gain="linear")
     assert file.exists()
 
 
@@ -300,7 +300,7 @@ def test_a_checkpoint_of_another_fit_is_refused(
 
 
 def test_explicit_line_of_sight_adds_friis_gain_where_the_transmitter_is_seen(
-    room: SimpleNamespace, truth: RadioField
+    room: SimpleNamespace, truth: HarmonicField
 ) -> None:
     explicit = field_with(room, truth.layers, line_of_sight="explicit")
     for receiver, seen in ((VISIBLE, 1.0), (BLOCKED, 0.0)):
@@ -312,7 +312,7 @@ def test_explicit_line_of_sight_adds_friis_gain_where_the_transmitter_is_seen(
 @pytest.mark.parametrize("line_of_sight", [None, "explicit"])
 @pytest.mark.parametrize("floor", [1e-16, 1e-9, 1e-3])
 def test_paths_sum_to_the_spectrum_whatever_the_floor(
-    room: SimpleNamespace, truth: RadioField, line_of_sight: str | None, floor: float
+    room: SimpleNamespace, truth: HarmonicField, line_of_sight: str | None, floor: float
 ) -> None:
     field = field_with(room, truth.layers, line_of_sight=line_of_sight)
     object.__setattr__(field, "floor", floor)
@@ -322,7 +322,7 @@ def test_paths_sum_to_the_spectrum_whatever_the_floor(
         assert (np.abs(paths.gain) ** 2).sum() == pytest.approx(total, rel=1e-12)
 
 
-def test_line_of_sight_path_is_exact(room: SimpleNamespace, truth: RadioField) -> None:
+def test_line_of_sight_path_is_exact(room: SimpleNamespace, truth: HarmonicField) -> None:
     outward = VISIBLE - TRANSMITTER
     distance = np.linalg.norm(outward)
     for option in (None, "explicit"):
@@ -341,7 +341,7 @@ def test_line_of_sight_path_is_exact(room: SimpleNamespace, truth: RadioField) -
     assert not (truth.paths(BLOCKED).kind == "los").any()
 
 
-def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth: RadioField) -> None:
+def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth: HarmonicField) -> None:
     paths = truth.paths(BLOCKED)
     point = paths.vertices[:, 0]
     length = np.linalg.norm(point - TRANSMITTER, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
@@ -350,7 +350,7 @@ def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth: RadioField) -
     assert np.abs(np.angle(turned)).max() < 1e-6
 
 
-def test_max_paths_keeps_the_strongest_and_several_receivers_are_padded(truth: RadioField) -> None:
+def test_max_paths_keeps_the_strongest_and_several_receivers_are_padded(truth: HarmonicField) -> None:
     everything, few = truth.paths(VISIBLE), truth.paths(VISIBLE, max_paths=5)
     assert few.gain == pytest.approx(everything.gain[np.argsort(-everything.power)[:5]])
     both = truth.paths(np.stack([VISIBLE, BLOCKED]))
@@ -367,9 +367,9 @@ def test_a_saved_field_predicts_the_same_bits(
     room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
 ) -> None:
     for model in ("rf3dgs+", "rf3dgs"):
-        field = RadioField.fit(room, spectra, model, iterations=2)
+        field = HarmonicField.fit(room, spectra, model, iterations=2)
         field.save(tmp_path / "field.safetensors")
-        again = RadioField.load(tmp_path / "field.safetensors")
+        again = HarmonicField.load(tmp_path / "field.safetensors")
         a, b = field.spectrum(VISIBLE), again.spectrum(VISIBLE)
         assert np.array_equal(a.path_gain, b.path_gain)
         assert np.array_equal(a.delay_s, b.delay_s) and np.array_equal(a.aod, b.aod)
@@ -377,16 +377,16 @@ def test_a_saved_field_predicts_the_same_bits(
     assert [f.name for f in tmp_path.iterdir()] == ["field.safetensors"]
 
 
-def test_a_corrupt_file_is_a_clear_error(truth: RadioField, tmp_path: Path) -> None:
+def test_a_corrupt_file_is_a_clear_error(truth: HarmonicField, tmp_path: Path) -> None:
     file = tmp_path / "field.safetensors"
     truth.save(file)
     data = file.read_bytes()
     for broken in (b"", b"not a field", data[: len(data) // 2], data[:7]):
         file.write_bytes(broken)
         with pytest.raises(ValueError, match="corrupt"):
-            RadioField.load(file)
+            HarmonicField.load(file)
     with pytest.raises(FileNotFoundError, match="nothing.safetensors"):
-        RadioField.load(tmp_path / "nothing.safetensors")
+        HarmonicField.load(tmp_path / "nothing.safetensors")
 
 
 # --- errors
@@ -402,30 +402,32 @@ def test_a_corrupt_file_is_a_clear_error(truth: RadioField, tmp_path: Path) -> N
     ],
 )
 def test_positions_where_nothing_can_be_received_are_refused(
-    truth: RadioField, position: list[float], message: str
+    truth: HarmonicField, position: list[float], message: str
 ) -> None:
     for ask in (truth.spectrum, truth.paths):
         with pytest.raises(ValueError, match=message):
             ask(position)
 
 
-def test_a_millimetre_from_a_wall_is_still_inside(truth: RadioField) -> None:
+def test_a_millimetre_from_a_wall_is_still_inside(truth: HarmonicField) -> None:
     assert np.isfinite(truth.spectrum([4.999, 1.0, 1.0]).path_gain).all()
 
 
 def test_options_that_do_not_exist_are_refused(room: SimpleNamespace, spectra: SimpleNamespace) -> None:
     with pytest.raises(ValueError, match=r"bistatic.*rf3dgs\+, rf3dgs.*not in this version"):
-        RadioField.fit(room, spectra, model="bistatic")
+        HarmonicField.fit(room, spectra, model="bistatic")
     for name in ("transmittance", "interaction_point", "gain", "line_of_sight", "sh_degree"):
         with pytest.raises(ValueError, match=name):
-            RadioField.fit(room, spectra, **{name: 7})
+            HarmonicField.fit(room, spectra, **{name: 7})
     with pytest.raises(TypeError, match="geometry"):
-        RadioField.fit(object(), spectra)
+        HarmonicField.fit(object(), spectra)
     with pytest.raises(ValueError, match="mesh"):
-        RadioField.fit(room.gaussians, spectra, line_of_sight="explicit")
+        HarmonicField.fit(room.gaussians, spectra, line_of_sight="explicit")
 
 
-def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(room: SimpleNamespace, truth: RadioField) -> None:
+def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(
+    room: SimpleNamespace, truth: HarmonicField
+) -> None:
     fixed = field_with(room, truth.layers, model="rf3dgs")
     assert np.array_equal(
         fixed.spectrum(VISIBLE, transmitter=TRANSMITTER).path_gain, fixed.spectrum(VISIBLE).path_gain
@@ -434,7 +436,7 @@ def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(room: SimpleNamespac
         fixed.spectrum(VISIBLE, transmitter=[1.0, 3.0, 1.0])
 
 
-def test_transport_of_other_receivers_is_refused(room: SimpleNamespace, truth: RadioField) -> None:
+def test_transport_of_other_receivers_is_refused(room: SimpleNamespace, truth: HarmonicField) -> None:
     other = transport(room.gaussians, BLOCKED[None], SHAPE, range_db=RANGE_DB)
     with pytest.raises(ValueError, match="transport"):
         truth.spectrum(VISIBLE, transport=other)

@@ -1,0 +1,505 @@
+"""The bistatic radio field: line of sight, mirrors, scattering lobes and what they light further, on frozen geometry.
+
+A pixel holds the power of every path of a scattering surface, spread by the receiver beam:
+
+- line of sight (Friis) and mirror reflections by the image method, blocking softened (:mod:`warprrf.rf.specular`);
+- diffuse scattering (lambda / 4 pi)^2 Omega f_s |Gamma|^2 cos(theta_i) / (cos(theta_s) d1^2), f_s a non-negative mix of
+  normalised lobes (:mod:`warprrf.rf.bounces`);
+- what those light in turn (:mod:`warprrf.rf.second_bounce`), and an indirect radiance of each group.
+
+Parameters belong to groups of surfaces that look alike and are few, so ten spectra suffice; because each term is a
+function of both directions and of the path's lengths, the field holds for a transmitter that it never saw.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf.device import Progress, check_array
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf import field_files
+from warprrf.rf.bistatic_fit import NEPER, Layout, Parameters, View, jacobian, specular_power
+from warprrf.rf.bounces import LOBES, BeamOperator, BounceTracer, Lit, Met
+from warprrf.rf.field import RadioField
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.paths import Paths
+from warprrf.rf.second_bounce import ElementLight, mirrored_scene, sent_image
+from warprrf.rf.specular import SpecularPaths, specular_paths
+from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
+from warprrf.rf.surface import Surface
+from warprrf.rf.transport import check_receiver
+from warprrf.rf.uncertainty import ErrorModel
+
+if TYPE_CHECKING:
+    from warprrf.rf.dataset import SpectrumDataset
+
+MIRRORED_SUB_PIXELS = 2  # square root of the rays per pixel that look into mirrors
+NEGLIGIBLE = (
+    1e-3  # groups that bring a receiver less than this share of N0 at unit weight are not fitted to it
+)
+PATH_SHARE = (
+    1.0 / 200.0
+)  # a ray's part of the power that scattering brings to a pixel, at 64 rays a pixel and a beam of 3
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What a bistatic field models; see :meth:`BistaticField.fit`.
+
+    Attributes:
+        line_of_sight, diffuse: whether there are such paths.
+        mirror_order: most mirror reflections on a path, 0 to 2.
+        lobes: exponents of the scattering lobes, 0 for Lambertian.
+        mirror_scatter: whether mirrors light surfaces.
+        scatter_mirror: whether mirrors show the lit scene.
+        diffuse_order: diffuse bounces on a path, 1 to 3.
+        indirect: whether groups have an indirect radiance.
+        residual: whether elements differ from their group.
+    """
+
+    line_of_sight: bool = True
+    diffuse: bool = True
+    mirror_order: int = 1
+    lobes: tuple[int, ...] = LOBES
+    mirror_scatter: bool = False
+    scatter_mirror: bool = False
+    diffuse_order: int = 1
+    indirect: bool = False
+    residual: bool = False
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("mirror_order", (0, 1, 2)), ("diffuse_order", (1, 2, 3))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {allowed}")
+        if not self.lobes or any(n != int(n) or n < 0 for n in self.lobes):
+            raise ValueError(f"lobes: got {self.lobes!r}, expected exponents, whole numbers of at least 0")
+        object.__setattr__(self, "lobes", tuple(int(n) for n in self.lobes))
+
+    @property
+    def further(self) -> bool:
+        """Whether elements send on what other surfaces gave them."""
+        return self.diffuse and (self.mirror_scatter or self.diffuse_order > 1)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a receiver sees of the geometry under one transmitter, whatever the materials.
+
+    Attributes:
+        receiver, transmitter: positions [m].
+        met: what its rays meet.
+        lit: how the transmitter lights that.
+        paths: its line of sight and mirror paths.
+        beams: unit beam of each, shape ``(L, H, W)`` float32.
+    """
+
+    receiver: np.ndarray
+    transmitter: np.ndarray
+    met: Met
+    lit: Lit
+    paths: SpecularPaths
+    beams: np.ndarray
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A spectrum by its parts, path gain.
+
+    Attributes:
+        rays: of each diffuse ray, before the beam, shape ``(K,)``.
+        specular: of each line-of-sight and mirror path, shape ``(L,)``.
+        further: of what was sent on, per pixel before the beam, shape ``(H, W)``.
+        image: all, after the beam, shape ``(H, W)``.
+    """
+
+    rays: np.ndarray
+    specular: np.ndarray
+    further: np.ndarray
+    image: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class BistaticField(RadioField):
+    """A fitted bistatic field; build it with :meth:`RadioField.fit` or :meth:`RadioField.load`.
+
+    Attributes:
+        surface: patches, material groups and elements.
+        transmitter: position it was fitted for [m], shape ``(3,)``.
+        frequency_hz: carrier [Hz].
+        shape: rows and columns of its spectra.
+        floor, range_db, beam_sigma_rad: of the data set it was fitted to.
+        terms: what it models.
+        parameters: of the groups.
+        residual: ln gain of each element over its group, shape ``(E,)``.
+        errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
+        report: how the fit went.
+    """
+
+    surface: Surface = field(repr=False)
+    transmitter: np.ndarray
+    frequency_hz: float
+    shape: tuple[int, int]
+    floor: float
+    range_db: tuple[float, float]
+    beam_sigma_rad: float
+    terms: Terms
+    parameters: Parameters = field(repr=False)
+    residual: np.ndarray = field(repr=False)
+    errors: ErrorModel | None = field(default=None, repr=False)
+    report: dict[str, Any] = field(default_factory=dict, repr=False)
+    device: Any = field(default=None, repr=False)
+
+    @classmethod
+    def fit(cls, geometry: Any, ds: SpectrumDataset, **options: Any) -> BistaticField:
+        """Fit to the spectra of ``ds``; see :func:`warprrf.rf.bistatic_training.train`."""
+        from warprrf.rf.bistatic_training import train
+
+        return train(geometry, ds, **options)
+
+    # ------------------------------------------------------------------------------------------ asking
+
+    def spectrum(
+        self, rx: Any, transmitter: Any = None, *, uncertainty: bool = False, sight: Sight | None = None
+    ) -> Spectrum:
+        """The spatial spectrum at ``rx`` (3,) [m].
+
+        Args:
+            rx: receiver position.
+            transmitter: position (3,) [m] if another than the fitted one: lengths, visibility and mirror points are
+                computed anew, materials are kept.
+            uncertainty: also give the standard deviation of the dB image per pixel, as ``std_db``.
+            sight: what this receiver sees, if it was traced before (:meth:`see`).
+
+        Raises:
+            ValueError: for a position that is not finite, outside the scene or on a surface, or at the transmitter;
+                for ``uncertainty`` of a field that was fitted to too few receivers to know it.
+        """
+        seen = sight or self.see(rx, transmitter)
+        parts = self.compose(seen)
+        delay, aod = self._strongest(seen, parts)
+        spectrum = Spectrum(
+            path_gain=parts.image.astype(np.float32),
+            delay_s=delay,
+            aod=aod,
+            floor=self.floor,
+            range_db=self.range_db,
+        )
+        return replace(spectrum, std_db=self.std_db(seen, parts)) if uncertainty else spectrum
+
+    def paths(self, rx: Any, transmitter: Any = None, max_paths: int | None = None) -> Paths:
+        """Propagation paths at ``rx``: line of sight, mirrors, and one diffuse path per pixel above the floor.
+
+        The sum of ``|gain|^2`` equals the spectrum's sum: what pixels below the floor hold is shared among the diffuse
+        paths in proportion. A diffuse path goes over the point that the pixel's strongest ray meets; light that came
+        over more surfaces has no path of its own and is counted to that.
+
+        Args:
+            rx: receiver position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded.
+            transmitter: as for :meth:`spectrum`.
+            max_paths: keep the strongest only (the sum is then what they carry).
+
+        Raises:
+            ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
+        """
+        if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
+            raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
+        positions = check_receiver("rx", rx, self.surface.mesh)
+        found = [self._paths(self.see(p, transmitter), max_paths) for p in np.atleast_2d(positions)]
+        return found[0] if positions.ndim == 1 else Paths.stack(found)
+
+    def std_db(self, sight: Sight, parts: Composed) -> np.ndarray:
+        """Standard deviation of the dB image per pixel (H, W); see :mod:`warprrf.rf.uncertainty`."""
+        if self.errors is None:
+            raise ValueError(
+                f"uncertainty: this field was fitted to {self.report.get('receivers', 0)} receivers, too few to hold "
+                "some out and learn its error from; fit to four or more"
+            )
+        p, floor = self.parameters, self.floor
+        layout = next(
+            Layout(*p.log_weight.shape, indirect=self.terms.indirect, gain=g)
+            for g in (False, True)
+            if Layout(*p.log_weight.shape, indirect=self.terms.indirect, gain=g).size
+            == len(self.errors.covariance)
+        )
+        power, slopes, index = jacobian(self.view(sight, np.arange(self.shape[0] * self.shape[1])), p, layout)
+        image = parts.image / floor
+        slopes = slopes * (NEPER / (1.0 + image.ravel()))[:, None]
+        return self.errors.std_db(NEPER * np.log1p(image), sight.receiver, slopes, index)
+
+    def see(self, rx: Any, transmitter: Any = None, *, paths: SpecularPaths | None = None) -> Sight:
+        """What the receiver at ``rx`` (3,) sees of the geometry: the costly part of a spectrum."""
+        receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.surface.mesh)
+        source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
+        if np.linalg.norm(receiver - source) == 0:
+            raise ValueError("rx: got the transmitter's own position; expected them apart")
+        met = self.tracer.meet(receiver)
+        lit = self.tracer.light(met, source)
+        if paths is None:
+            paths = specular_paths(
+                self.surface,
+                source,
+                receiver[None],
+                self.wavelength_m,
+                order=self.terms.mirror_order,
+                device=self.device,
+            )
+        beams = np.zeros((len(paths), *self.shape), np.float32)
+        for k, arrival in enumerate(paths.arrival):
+            beams[k] = spread(arrival[None], np.ones(1), self.shape, self.beam_sigma_rad, device=self.device)
+        return Sight(receiver, source, met, lit, paths, beams)
+
+    def compose(self, sight: Sight) -> Composed:
+        """The spectrum of what is seen, by its parts."""
+        p, gain = self.parameters, np.exp(self.parameters.log_gain)
+        strength = self._specular(sight.paths)
+        image = np.tensordot(strength.astype(np.float32), sight.beams, axes=1).astype(np.float64)
+        rays = np.zeros(len(self.tracer.solid_angle))
+        if self.terms.diffuse:
+            rays = gain * self.tracer.scatter(sight.met, sight.lit, p.weight, p.log_excess, self.wavelength_m)
+            if self.terms.residual:
+                face = sight.met.face.numpy()
+                rays = rays * np.exp(self.residual[self.surface.element[np.maximum(face, 0)]])
+        further = gain * self.further(sight)
+        image += self.beam(rays.reshape(*self.shape, -1).sum(axis=-1) + further)
+        return Composed(rays, strength, further, np.maximum(image, 0.0))
+
+    def further(self, sight: Sight) -> np.ndarray:
+        """Path gain per pixel (H, W), before the beam, of everything after a first bounce."""
+        out = np.zeros(self.shape)
+        sent = self._sent(sight.transmitter)
+        if sent is not None:
+            out += sent_image(self.tracer, sight.met, sent, self.wavelength_m)
+        if self.terms.diffuse and self.terms.scatter_mirror:
+            out += mirrored_scene(
+                self._mirror_tracer,
+                sight.receiver,
+                sight.transmitter,
+                self.parameters,
+                self.wavelength_m,
+                sent,
+            )
+        return out
+
+    def view(self, sight: Sight, pixels: np.ndarray, target_db: np.ndarray | None = None) -> View:
+        """The sight as linear maps from group parameters to ``pixels`` (N,), for :mod:`warprrf.rf.bistatic_fit`."""
+        count, groups = self.shape[0] * self.shape[1], self.surface.groups
+        basis = self.tracer.resolve(sight.met, sight.lit, self.wavelength_m)
+        lit = np.flatnonzero(basis.any(axis=(0, 1, 3, 4)))
+        columns = self.beam(basis[:, :, lit].reshape(*self.shape, -1) / self.floor).reshape(count, -1)
+        basis = columns[pixels].reshape(len(pixels), len(lit), *basis.shape[3:]).astype(np.float32)
+        strong = np.abs(basis).max(axis=(0, 2, 3), initial=0.0) > NEGLIGIBLE
+        face = sight.met.face.numpy()
+        met = np.flatnonzero(face >= 0)
+        rays = (self.wavelength_m / (4.0 * np.pi)) ** 2 * self.tracer.solid_angle[met] / self.floor
+        cell = (met // self.tracer.sub_pixels**2) * groups + self.surface.group[face[met]]
+        dark = np.bincount(cell, rays, minlength=count * groups).reshape(count, groups)
+        visible = np.flatnonzero(dark.any(axis=0))
+        dark = self.beam(dark[:, visible].reshape(*self.shape, -1)).reshape(count, -1)[pixels]
+        gain = (
+            (self.wavelength_m / (4.0 * np.pi * sight.paths.length_m)) ** 2
+            * sight.paths.share**2
+            / self.floor
+        )
+        return View(
+            groups=lit[strong],
+            basis=np.ascontiguousarray(basis[:, strong]),
+            seen=visible,
+            dark=np.maximum(dark, 0.0).astype(np.float32),
+            gain=gain,
+            path_group=self._met_groups(sight.paths),
+            cosine=sight.paths.cosine,
+            beam=sight.beams.reshape(len(gain), -1)[:, pixels],
+            extra=np.zeros(len(pixels), np.float32),
+            target_db=np.zeros(len(pixels)) if target_db is None else target_db.ravel()[pixels],
+        )
+
+    # ------------------------------------------------------------------------------------------ files
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything to one safetensors file, in one go: surface, parameters, terms, report."""
+        s, p = self.surface, self.parameters
+        tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
+        tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
+        tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
+        tensors |= {"residual": self.residual, "transmitter": self.transmitter}
+        if self.errors is not None:
+            tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(self.errors).items()}
+        header = {name: getattr(self, name) for name in _PLAIN}
+        header |= {"model": "bistatic", "terms": asdict(self.terms), "report": self.report}
+        header |= {"log_gain": p.log_gain, "group_names": s.group_names, "skin_m": s.skin_m}
+        field_files.write(path, tensors, header)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> BistaticField:
+        """Read a field that :meth:`save` wrote; errors as for :meth:`RadioField.load`."""
+        tensors, header = field_files.read(path)
+        try:
+            surface = Surface(
+                mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
+                group_names=tuple(header["group_names"]),
+                skin_m=float(header["skin_m"]),
+                **{name: tensors[f"surface/{name}"] for name in _SURFACE},
+            )
+            parameters = Parameters(
+                **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS}, log_gain=header["log_gain"]
+            )
+            if len(surface.patch) != len(surface.mesh.faces) or len(parameters.log_excess) != surface.groups:
+                raise ValueError("its parameters do not fit its surface")
+            errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
+            plain = {name: header[name] for name in _PLAIN}
+            return cls(
+                **{**plain, "shape": tuple(plain["shape"]), "range_db": tuple(plain["range_db"])},
+                surface=surface,
+                transmitter=tensors["transmitter"],
+                terms=Terms(**header["terms"]),
+                parameters=parameters,
+                residual=tensors["residual"],
+                errors=ErrorModel(**errors) if errors else None,
+                report=header["report"],
+                device=device,
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{os.fspath(path)}: corrupt or no bistatic field of this version: {error}"
+            ) from error
+
+    # ------------------------------------------------------------------------------------------ parts
+
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength [m]."""
+        return SPEED_OF_LIGHT / self.frequency_hz
+
+    @cached_property
+    def tracer(self) -> BounceTracer:
+        """Rays of the grid on the surface."""
+        return BounceTracer(self.surface, self.shape, lobes=self.terms.lobes, device=self.device)
+
+    @cached_property
+    def beam(self) -> BeamOperator:
+        """The receiver beam."""
+        return BeamOperator(self.shape, self.beam_sigma_rad, device=self.device)
+
+    @cached_property
+    def _mirror_tracer(self) -> BounceTracer:
+        return BounceTracer(
+            self.surface,
+            self.shape,
+            lobes=self.terms.lobes,
+            sub_pixels=MIRRORED_SUB_PIXELS,
+            device=self.device,
+        )
+
+    @cached_property
+    def _element_light(self) -> dict[bytes, ElementLight]:
+        return {}
+
+    def element_light(self, transmitter: np.ndarray) -> ElementLight:
+        """How ``transmitter`` lights the elements by way of others, traced once."""
+        key = np.asarray(transmitter, np.float64).tobytes()
+        if key not in self._element_light:
+            self._element_light[key] = ElementLight(self.tracer, transmitter, self.wavelength_m)
+        return self._element_light[key]
+
+    def _sent(self, transmitter: np.ndarray) -> np.ndarray | None:
+        """Radiance (E,) that elements send on besides first bounces [1/(m^2 sr)], None where there is none."""
+        sent = None
+        if self.terms.further:
+            light = self.element_light(transmitter)
+            sent = light.radiance(
+                self.parameters, mirrors=self.terms.mirror_scatter, diffuse=self.terms.diffuse_order - 1
+            )
+        if self.terms.indirect:
+            own = np.exp(self.parameters.log_indirect)[self.surface.element_group]
+            sent = own if sent is None else sent + own
+        return sent
+
+    def _specular(self, paths: SpecularPaths) -> np.ndarray:
+        """Power of each line-of-sight and mirror path, shape ``(L,)``."""
+        base = (self.wavelength_m / (4.0 * np.pi * paths.length_m)) ** 2 * paths.share**2
+        power = specular_power(base, self._met_groups(paths), paths.cosine, self.parameters)[0] * np.exp(
+            self.parameters.log_gain
+        )
+        kept = (paths.order <= self.terms.mirror_order) & ((paths.order > 0) | self.terms.line_of_sight)
+        return np.where(kept, power, 0.0)
+
+    def _met_groups(self, paths: SpecularPaths) -> np.ndarray:
+        """Groups that each path meets (L, 2), -1 where fewer."""
+        known = paths.patch >= 0
+        owner = self.surface.patch_group
+        return np.where(known, owner[np.where(known, paths.patch, 0)] if len(owner) else -1, -1)
+
+    def _bounce_points(self, sight: Sight, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of each pixel's strongest ray: its power (H, W), the point met (H, W, 3) and its range (H, W)."""
+        per_pixel = rays.reshape(-1, self.tracer.sub_pixels**2)
+        best = per_pixel.argmax(axis=1) + np.arange(len(per_pixel)) * per_pixel.shape[1]
+        range_m = sight.met.range_m.numpy()[best]
+        with np.errstate(invalid="ignore"):
+            point = sight.receiver + range_m[:, None] * self.tracer.directions[best]
+        return rays[best].reshape(self.shape), point.reshape(*self.shape, 3), range_m.reshape(self.shape)
+
+    def _strongest(self, sight: Sight, parts: Composed) -> tuple[np.ndarray, np.ndarray]:
+        """Delay [s] and angles of departure [rad] of each pixel's strongest path; NaN where empty."""
+        strength, point, range_m = self._bounce_points(sight, parts.rays)
+        dark = strength <= 0
+        outward = point - sight.transmitter
+        length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
+        if len(parts.specular):
+            beams = parts.specular[:, None, None] * sight.beams
+            which = beams.argmax(axis=0)
+            diffuse = np.maximum(parts.image - beams.sum(axis=0), 0.0)
+            direct = np.take_along_axis(beams, which[None], axis=0)[0] > PATH_SHARE * diffuse
+            first = sight.paths.point[:, 0]
+            first = np.where(np.isnan(first), sight.receiver, first) - sight.transmitter
+            outward = np.where(direct[..., None], first[which], outward)
+            length = np.where(direct, sight.paths.length_m[which], length)
+        aod = np.stack(angles_from_directions(np.nan_to_num(outward)), axis=-1)
+        return length / SPEED_OF_LIGHT, np.where(np.isnan(length)[..., None], np.nan, aod).astype(np.float32)
+
+    def _paths(self, sight: Sight, max_paths: int | None) -> Paths:
+        parts = self.compose(sight)
+        exact = np.flatnonzero(parts.specular > 0)
+        total = float(parts.image.sum())
+        p, s = sight.paths, parts.specular[exact]
+        kinds = np.where(p.order[exact] == 0, "los", "mirror").astype("<U7")
+        vertices = p.point[exact]
+        diffuse = parts.rays.reshape(*self.shape, -1).sum(axis=-1) + parts.further
+        point = self._bounce_points(sight, parts.rays + self._anything(sight, parts))[1]
+        kept = diffuse > self.floor
+        if not kept.any() and diffuse.max() > 0:
+            kept = diffuse == diffuse.max()
+        power = diffuse[kept]
+        if len(power):
+            power = power * max(total - s.sum(), 0.0) / power.sum()
+        over = np.full((len(power), 2, 3), np.nan)
+        over[:, 0] = point[kept]
+        whole = np.isfinite(over[:, 0]).all(axis=1)
+        power, over = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)), over[whole]
+        found = Paths.from_points(
+            sight.transmitter,
+            sight.receiver,
+            np.concatenate([vertices, over]),
+            np.sqrt(np.concatenate([s, power])).astype(complex),
+            np.concatenate([kinds, np.full(len(power), "diffuse", dtype="<U7")]),
+            self.frequency_hz,
+        )
+        order = np.argsort(-np.abs(found.gain), kind="stable")[:max_paths]
+        return Paths(**{name: getattr(found, name)[order] for name in Paths.__dataclass_fields__})
+
+    def _anything(self, sight: Sight, parts: Composed) -> np.ndarray:
+        """A trace of power for every ray that meets something, so that a pixel lit by further bounces has a point."""
+        met = sight.met.face.numpy() >= 0
+        return np.where(met, 1e-12 * self.floor * self.tracer.solid_angle, 0.0)
+
+
+_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
+_SURFACE = (
+    "normal", "patch", "plane_normal", "plane_offset", "group", "patch_group", "element", "element_centre", "element_area",
+    "element_group",
+)  # fmt: skip
+_PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")

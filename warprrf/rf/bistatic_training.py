@@ -1,0 +1,386 @@
+"""Fitting a bistatic field: trace once, choose terms on held-out receivers, fit groups, then elements, then the errors."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf.device import Progress, check_array
+from warprrf.rf import bistatic_fit as _fit
+from warprrf.rf.bistatic import BistaticField, Sight, Terms
+from warprrf.rf.bistatic_fit import NEPER, Fit, Parameters, View
+from warprrf.rf.residuals import Shares, fit_residual, gather_shares
+from warprrf.rf.specular import specular_paths
+from warprrf.rf.spectrum import to_db
+from warprrf.rf.surface import Surface
+from warprrf.rf.transport import check_receiver
+from warprrf.rf.uncertainty import ErrorModel, learn_errors
+
+if TYPE_CHECKING:
+    from warprrf.rf.dataset import SpectrumDataset
+
+ROWS = 60_000  # pixels that groups are fitted to, spread over the training receivers
+LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so no term is chosen
+MOST_HELD_OUT = 10
+SHORT_STEPS = 6  # of a fit that only decides about a term
+BETTER = 0.995  # a term must lower the held-out mean square error at least to this share
+OUTER = 2  # rounds of further bounces and groups in turn
+
+
+@dataclass(frozen=True)
+class BistaticTransport:
+    """What the training receivers see of the geometry, whatever the materials: traced once, reused by every fit.
+
+    Attributes:
+        surface: patches, groups, elements.
+        sights: one for each receiver.
+        transmitter, frequency_hz, shape, beam_sigma_rad: what it was traced for.
+        lobes: exponents of the lobes.
+        seconds: what it took.
+    """
+
+    surface: Surface
+    sights: list[Sight]
+    transmitter: np.ndarray
+    frequency_hz: float
+    shape: tuple[int, int]
+    beam_sigma_rad: float
+    lobes: tuple[int, ...]
+    seconds: float
+
+    def subset(self, indices: Sequence[int] | np.ndarray) -> BistaticTransport:
+        """Some of its receivers."""
+        return replace(self, sights=[self.sights[int(i)] for i in indices])
+
+
+def trace(
+    geometry: Any,
+    ds: SpectrumDataset,
+    *,
+    lobes: tuple[int, ...] | None = None,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> BistaticTransport:
+    """Trace the receivers of ``ds`` on ``geometry`` (a Reconstruction, Scene, Mesh or Surface)."""
+    started = time.perf_counter()
+    surface = geometry if isinstance(geometry, Surface) else Surface.of(geometry)
+    receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
+    blank = _blank(surface, ds, Terms(mirror_order=2, **({} if lobes is None else {"lobes": lobes})), device)
+    found = specular_paths(surface, blank.transmitter, receivers, blank.wavelength_m, order=2, device=device)
+    sights = []
+    for r, receiver in enumerate(receivers):
+        sights.append(blank.see(receiver, paths=found.subset(np.flatnonzero(found.receiver == r))))
+        if progress is not None:
+            progress("transport", r + 1, len(receivers))
+    return BistaticTransport(
+        surface, sights, blank.transmitter, blank.frequency_hz, blank.shape, blank.beam_sigma_rad, blank.terms.lobes,
+        time.perf_counter() - started,
+    )  # fmt: skip
+
+
+def train(
+    geometry: Any,
+    ds: SpectrumDataset,
+    *,
+    line_of_sight: bool = True,
+    diffuse: bool = True,
+    mirror_order: int | None = None,
+    lobes: tuple[int, ...] | None = None,
+    mirror_scatter: bool | None = None,
+    scatter_mirror: bool | None = None,
+    diffuse_order: int | None = None,
+    indirect: bool | None = None,
+    residual: bool | None = None,
+    gain_offset: bool = False,
+    iterations: int = _fit.MAX_STEPS,
+    transport: BistaticTransport | None = None,
+    relevance: Any = None,
+    seed: int = 0,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> BistaticField:
+    """Fit a bistatic field.
+
+    A term given as None is kept only if it lowers the error on receivers held out of ``ds`` (a quarter, ten at most);
+    with fewer than four receivers nothing is held out and only single bounces are modelled.
+
+    Args:
+        geometry: Reconstruction, Scene (its materials name the groups, nothing else is taken from them) or Mesh.
+        ds: training set.
+        line_of_sight, diffuse: switches of those terms.
+        mirror_order: mirror reflections on a path: 0, 1 or 2.
+        lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian.
+        mirror_scatter: surfaces lit by mirrors.
+        scatter_mirror: the lit scene seen in mirrors.
+        diffuse_order: diffuse bounces on a path: 1, 2 or 3.
+        indirect: a non-negative radiance of each group, constant in direction.
+        residual: a gain for each surface element.
+        gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
+        iterations: most steps of the groups' fit.
+        transport: what :func:`trace` found for exactly these receivers.
+        relevance: a :class:`warprrf.rf.relevance.Relevance`, whose choice of terms is then taken.
+        seed: of the choice of pixels and held-out receivers.
+        device: where rays are cast.
+        progress: called with the stages ``"transport"`` and ``"fit"``.
+
+    Raises:
+        ValueError: for bad options, receivers on a surface or outside the scene, spectra that are all empty.
+        TypeError: for a geometry without a mesh.
+    """
+    if not isinstance(iterations, int | np.integer) or iterations < 0:
+        raise ValueError(f"iterations: got {iterations!r}, expected a whole number of steps, 0 or more")
+    wanted: dict[str, Any] = {
+        "mirror_order": mirror_order, "mirror_scatter": mirror_scatter, "scatter_mirror": scatter_mirror,
+        "diffuse_order": diffuse_order, "indirect": indirect, "residual": residual,
+    }  # fmt: skip
+    if relevance is not None:
+        chosen = relevance.terms()
+        lobes = chosen.pop("lobes", None) if lobes is None else lobes
+        wanted = {name: chosen.get(name) if value is None else value for name, value in wanted.items()}
+    fixed = {"line_of_sight": bool(line_of_sight), "diffuse": bool(diffuse)}
+    Terms(
+        **fixed,
+        **{k: v for k, v in wanted.items() if v is not None},
+        **({} if lobes is None else {"lobes": lobes}),
+    )
+    check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float32)
+    if len(ds.receivers) == 0 or not (ds.path_gain > ds.floor).any():
+        raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
+    seen = transport or trace(geometry, ds, lobes=lobes, device=device, progress=progress)
+    _check_transport(seen, ds, lobes)
+    return _Training(seen, ds, gain_offset, int(iterations), seed, device, progress).run(fixed, wanted)
+
+
+class _Training:
+    """One fit: the state that its steps share."""
+
+    def __init__(
+        self,
+        seen: BistaticTransport,
+        ds: SpectrumDataset,
+        gain: bool,
+        steps: int,
+        seed: int,
+        device: Any,
+        progress: Any,
+    ) -> None:
+        self.seen, self.ds, self.gain, self.steps, self.device = seen, ds, gain, steps, device
+        self.started = time.perf_counter()
+        self.surface, self.count = seen.surface, len(ds.receivers)
+        self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
+        self.target = to_db(ds.path_gain, ds.floor) - 10.0 * np.log10(ds.floor)
+        rng = np.random.default_rng(seed)
+        self.held = np.zeros(0, int)
+        if self.count >= LEAST_TO_HOLD_OUT:
+            self.held = np.sort(rng.permutation(self.count)[: min(self.count // 4, MOST_HELD_OUT)])
+        self.kept = np.setdiff1d(np.arange(self.count), self.held)
+        self.progress = progress or (lambda stage, done, total: None)
+        pixels = self.target[0].size
+        self.pixels = [
+            np.sort(rng.choice(pixels, min(pixels, max(200, ROWS // self.count)), replace=False))
+            for _ in range(self.count)
+        ]
+        blank = _blank(self.surface, ds, Terms(lobes=seen.lobes, mirror_order=2), device)
+        self.blank = blank
+        self.views = []
+        for r in range(self.count):
+            self.views.append(blank.view(seen.sights[r], self.pixels[r], self.target[r]))
+            self.progress("fit", r, 2 * self.count)
+        self.log: list[dict[str, Any]] = []
+
+    def run(self, fixed: dict[str, Any], wanted: dict[str, Any]) -> BistaticField:
+        terms = Terms(**fixed, lobes=self.seen.lobes, **{k: v for k, v in wanted.items() if v is not None})
+        free = {name for name, value in wanted.items() if value is None} if len(self.held) else set()
+        start = Parameters.prior(self.surface.groups, len(self.seen.lobes))
+        errors: ErrorModel | None = None
+        if len(self.held):
+            fit = self._groups(terms, start, self.kept, SHORT_STEPS * 2)
+            terms, fit, residual = self._choose(terms, free, fit)
+            held = self._field(terms, fit, residual)
+            errors = self._errors(held, fit)
+            start = fit.parameters
+        fit = self._groups(terms, start, np.arange(self.count), self.steps)
+        residual = (
+            self._residual(self._field(terms, fit, None), np.arange(self.count)) if terms.residual else None
+        )
+        field = self._field(terms, fit, residual)
+        if errors is not None:
+            errors = replace(errors, covariance=fit.covariance)
+        report = {
+            "receivers": self.count,
+            "held_out": len(self.held),
+            "transport_time_s": self.seen.seconds,
+            "fit_time_s": time.perf_counter() - self.started,
+            "groups": self.surface.groups,
+            "elements": len(self.surface.element_area),
+            "steps": fit.steps,
+            "losses": {"gain": fit.losses},
+            "choices": self.log,
+        }
+        if self.gain:
+            deviation = float(np.sqrt(fit.covariance[-1, -1]))
+            report["gain_offset_db"] = NEPER * fit.parameters.log_gain
+            report["gain_offset_std_db"] = NEPER * deviation
+        self.progress("fit", 2 * self.count, 2 * self.count)
+        return replace(field, errors=errors, report=report)
+
+    # ------------------------------------------------------------------------------------------ choosing
+
+    def _choose(self, terms: Terms, free: set[str], fit: Fit) -> tuple[Terms, Fit, np.ndarray | None]:
+        """Terms that lower the held-out error, one after another, each with a short fit of its own."""
+        best = self._held_error(self._field(terms, fit, None))
+        self.log.append({"term": "single bounces", "kept": True, "held_out_rmse_db": float(np.sqrt(best))})
+        more = {"mirror_order": 2, "mirror_scatter": True, "scatter_mirror": True, "diffuse_order": 3}
+        steps: list[tuple[str, dict[str, Any]]] = []
+        together = {name: value for name, value in more.items() if name in free}
+        if together and terms.diffuse:
+            steps.append(("further bounces", together))
+        if "indirect" in free:
+            steps.append(("indirect", {"indirect": True}))
+        for name, change in steps:
+            trial = replace(terms, **change)
+            found = self._groups(trial, fit.parameters, self.kept, SHORT_STEPS)
+            error = self._held_error(self._field(trial, found, None))
+            keep = error < BETTER * best
+            self.log.append({"term": name, "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))})
+            if keep:
+                terms, fit, best = trial, found, error
+                if name == "further bounces" and len(together) > 1:
+                    terms, best = self._drop(terms, together, fit, best)
+        residual = None
+        if terms.residual or "residual" in free:
+            base = self._field(terms, fit, None)
+            found_residual = self._residual(base, self.kept)
+            error = self._held_error(
+                replace(base, terms=replace(terms, residual=True), residual=found_residual)
+            )
+            keep = terms.residual or error < BETTER * best
+            self.log.append(
+                {"term": "residual", "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))}
+            )
+            if keep:
+                terms, residual = replace(terms, residual=True), found_residual
+        return terms, fit, residual
+
+    def _drop(self, terms: Terms, together: dict[str, Any], fit: Fit, best: float) -> tuple[Terms, float]:
+        """Leave out what of the further bounces does not help (without fitting again)."""
+        for name in together:
+            trial = replace(terms, **{name: getattr(Terms(), name)})
+            error = self._held_error(self._field(trial, fit, None))
+            if error * BETTER <= best:
+                self.log.append({"term": name, "kept": False, "held_out_rmse_db": float(np.sqrt(error))})
+                terms, best = trial, min(best, error)
+        return terms, best
+
+    def _held_error(self, field: BistaticField) -> float:
+        """Mean square error of the dB images of the held-out receivers [dB^2]."""
+        return float(np.mean([np.mean((self._image(field, r) - self.target[r]) ** 2) for r in self.held]))
+
+    def _image(self, field: BistaticField, receiver: int) -> np.ndarray:
+        return NEPER * np.log1p(field.compose(self.seen.sights[receiver]).image / self.ds.floor)
+
+    def _errors(self, field: BistaticField, fit: Fit) -> ErrorModel:
+        images = [self._image(field, r) for r in self.held]
+        errors = [image - self.target[r] for image, r in zip(images, self.held, strict=True)]
+        kept = np.asarray(self.ds.receivers)[self.kept]
+        gaps = np.array([np.linalg.norm(kept - self.ds.receivers[r], axis=1).min() for r in self.held])
+        return learn_errors(images, errors, gaps, np.asarray(self.ds.receivers, float), fit.covariance)
+
+    # ------------------------------------------------------------------------------------------ fitting
+
+    def _groups(self, terms: Terms, start: Parameters, chosen: np.ndarray, steps: int) -> Fit:
+        """Groups' parameters on the receivers ``chosen``, further bounces recomputed in turn."""
+        further = terms.further or terms.scatter_mirror
+        fit = Fit(
+            start, np.zeros((0, 0)), _fit.Layout(*start.log_weight.shape, indirect=False, gain=False), [], 0
+        )
+        for k in range(OUTER if further else 1):
+            views = [self._limited(self.views[r], terms) for r in chosen]
+            if further:
+                # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
+                known = self._field(replace(terms, indirect=False), fit, None)
+                for i, r in enumerate(chosen):
+                    # No common gain here: the fit applies it to everything.
+                    image = known.beam(known.further(self.seen.sights[r])) / self.ds.floor
+                    views[i] = replace(
+                        views[i], extra=np.maximum(image.ravel()[self.pixels[r]], 0).astype(np.float32)
+                    )
+            fit = _fit.fit_groups(
+                views, fit.parameters if k else start, self.area, indirect=terms.indirect, gain=self.gain,
+                steps=max(steps // 2, 1) if further else steps,
+            )  # fmt: skip
+        return fit
+
+    def _limited(self, view: View, terms: Terms) -> View:
+        """``view`` without the terms that are switched off."""
+        order = (view.path_group >= 0).sum(axis=1)
+        keep = (order <= terms.mirror_order) & ((order > 0) | terms.line_of_sight)
+        view = replace(
+            view, gain=view.gain[keep], path_group=view.path_group[keep], cosine=view.cosine[keep], beam=view.beam[keep]
+        )  # fmt: skip
+        if not terms.diffuse:
+            view = replace(view, groups=view.groups[:0], basis=view.basis[:, :0])
+        return view
+
+    def _residual(self, field: BistaticField, chosen: np.ndarray) -> np.ndarray:
+        shares = []
+        elements = len(self.surface.element_area)
+        for r in chosen:
+            sight = self.seen.sights[r]
+            parts = field.compose(sight)
+            face = sight.met.face.numpy()
+            own = self.surface.element[np.maximum(face, 0)]
+            triples = gather_shares(own, parts.rays / self.ds.floor, field.tracer.sub_pixels**2, elements)
+            diffuse = field.beam(parts.rays.reshape(*field.shape, -1).sum(axis=-1))
+            rest = np.maximum(parts.image - diffuse, 0.0) / self.ds.floor
+            shares.append(Shares(*triples, rest.ravel(), self.target[r].ravel()))
+        return fit_residual(shares, field.beam, elements)
+
+    def _field(self, terms: Terms, fit: Fit, residual: np.ndarray | None) -> BistaticField:
+        zero = np.zeros(len(self.surface.element_area))
+        field = replace(
+            self.blank,
+            terms=terms if residual is not None else replace(terms, residual=False),
+            parameters=fit.parameters,
+            residual=zero if residual is None else residual,
+        )
+        # Geometry that no parameter changes is traced once for all of them.
+        for name in ("tracer", "beam", "_mirror_tracer", "_element_light"):
+            field.__dict__[name] = getattr(self.blank, name)
+        return field
+
+
+def _blank(surface: Surface, ds: SpectrumDataset, terms: Terms, device: Any) -> BistaticField:
+    return BistaticField(
+        surface=surface,
+        transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
+        frequency_hz=float(ds.frequency_hz),
+        shape=(int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])),
+        floor=float(ds.floor),
+        range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
+        beam_sigma_rad=float(ds.beam_sigma_rad),
+        terms=terms,
+        parameters=Parameters.prior(surface.groups, len(terms.lobes)),
+        residual=np.zeros(len(surface.element_area)),
+        device=device,
+    )
+
+
+def _check_transport(seen: BistaticTransport, ds: SpectrumDataset, lobes: tuple[int, ...] | None) -> None:
+    same = (
+        len(seen.sights) == len(ds.receivers)
+        and seen.shape == tuple(ds.path_gain.shape[1:])
+        and all(np.array_equal(s.receiver, r) for s, r in zip(seen.sights, ds.receivers, strict=True))
+        and np.array_equal(seen.transmitter, ds.transmitter)
+        and seen.frequency_hz == ds.frequency_hz
+        and (lobes is None or tuple(lobes) == seen.lobes)
+    )
+    if not same:
+        raise ValueError(
+            f"transport: got what {len(seen.sights)} receivers see with lobes {seen.lobes}; expected exactly the "
+            f"{len(ds.receivers)} receivers, transmitter, carrier, grid and lobes of this fit"
+        )

@@ -1,0 +1,267 @@
+"""Diffuse single bounces of one receiver: what its rays meet, how a source lights it, and the images that follow.
+
+A pixel is seen through a lattice of rays. What they meet depends on the receiver alone, how it is lit on the transmitter
+besides, what it sends on on the materials too: the three steps are kept apart, so that a fit, another transmitter or
+another set of materials repeats only what changes. Path gain per ray, after Degli-Esposti et al. (2007), eq. (5), over
+the footprint of its solid angle Omega:
+
+    (lambda / 4 pi)^2 Omega f_s |Gamma|^2 cos(theta_i) / (cos(theta_s) d1^2)
+
+with f_s a mix of normalised lobes and |Gamma|^2 a Fresnel curve of one permittivity per material group.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.kernels import bounce
+from warprrf.rf.exact import sub_pixel_directions
+from warprrf.rf.fresnel import lobe_norm, slab_reflection
+from warprrf.rf.spectrum import spread
+from warprrf.rf.surface import Surface
+
+LOBES = (0, 2, 5, 12, 30)
+"""Exponents of the lobe mix; 0 is Lambertian."""
+SUB_PIXELS = 4
+"""Square root of the rays per pixel."""
+NEAREST_M = 0.05  # an element at the transmitter spans directions: d1 counts as no less
+_COSINES = 257  # entries of tables over the cosine of incidence
+_PERMITTIVITY = np.geomspace(0.05, 200.0, 97)  # of epsilon_r - 1; the last reflects like metal
+
+
+@dataclass(frozen=True)
+class FresnelCurves:
+    """Power reflection of half-spaces, mean of TE and TM, as a family of curves over the cosine of incidence.
+
+    Attributes:
+        log_excess: ln(epsilon_r - 1) of each member, shape ``(97,)``.
+        curves: reflection, shape ``(97, 257)``.
+        moments: components that resolve the family, shape ``(3, 257)``.
+        coordinates: of each member in them, shape ``(97, 3)``.
+    """
+
+    log_excess: np.ndarray
+    curves: np.ndarray
+    moments: np.ndarray
+    coordinates: np.ndarray
+
+    def at(self, table: np.ndarray, log_excess: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and their derivatives, ``(G, K)``."""
+        step = self.log_excess[1] - self.log_excess[0]
+        x = np.clip(
+            (np.asarray(log_excess, float) - self.log_excess[0]) / step, 0.0, len(self.log_excess) - 1.001
+        )
+        i = x.astype(int)
+        s = (x - i)[:, None]
+        return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
+
+    def value(self, log_excess: Any, cosine: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Reflection (N,) at ``log_excess`` (N,) and ``cosine`` (N,), and its derivative to ``log_excess``."""
+        curve, slope = self.at(self.curves, log_excess)
+        x = np.clip(np.asarray(cosine, float), 0.0, 1.0) * (_COSINES - 1)
+        j = np.minimum(x.astype(int), _COSINES - 2)
+        s, row = x - j, np.arange(len(j))
+        return (
+            (1 - s) * curve[row, j] + s * curve[row, j + 1],
+            (1 - s) * slope[row, j] + s * slope[row, j + 1],
+        )
+
+
+@lru_cache(maxsize=1)
+def fresnel_curves() -> FresnelCurves:
+    """The family of half-spaces from epsilon_r 1.05 to 201."""
+    cosine = np.linspace(0.0, 1.0, _COSINES)
+    curves = np.stack(
+        [
+            0.5 * sum(np.abs(r) ** 2 for r in slab_reflection(cosine, 1.0 + x, np.inf, 1.0))
+            for x in _PERMITTIVITY
+        ]
+    )
+    # relative errors count: each curve is weighted by its mean
+    moments = np.linalg.svd(curves / curves.mean(axis=1, keepdims=True), full_matrices=False)[2][
+        : bounce.MOMENTS
+    ]
+    return FresnelCurves(np.log(_PERMITTIVITY), curves, moments, curves @ moments.T)
+
+
+@lru_cache(maxsize=8)
+def _lobe_tables(exponents: tuple[int, ...], device: str) -> tuple[wp.array, wp.array]:
+    cosine = np.linspace(0.0, 1.0, _COSINES)
+    inverse = np.array([np.ones(_COSINES) if n == 0 else 1.0 / lobe_norm(n, cosine) for n in exponents])
+    return (
+        wp.array(np.array(exponents, np.float32), dtype=wp.float32, device=device),
+        wp.array(inverse.astype(np.float32), dtype=wp.float32, device=device),
+    )
+
+
+class BeamOperator:
+    """The receiver beam as a linear map of images: a pixel's power, even over the pixel, spread over the grid.
+
+    Columns are shifts of each other, so azimuth is done by FFT. Sums are kept.
+    """
+
+    def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
+        rows, columns = shape
+        directions = sub_pixel_directions(shape, SUB_PIXELS)[0].reshape(rows, columns, -1, 3)
+        kernel = np.zeros((rows, rows, columns))
+        for i in range(rows):
+            beams = directions[i, 0]
+            kernel[:, i] = spread(beams, np.full(len(beams), 1.0 / len(beams)), shape, sigma, device=device)
+        self.shape = shape
+        self._kernel = np.ascontiguousarray(np.moveaxis(np.fft.rfft(kernel, axis=2), 2, 0))  # (F, out, in)
+
+    def __call__(self, images: np.ndarray) -> np.ndarray:
+        """Spread ``images`` (H, W, ...)."""
+        return self._apply(images, self._kernel)
+
+    def adjoint(self, images: np.ndarray) -> np.ndarray:
+        """The transposed map of ``images`` (H, W, ...)."""
+        return self._apply(images, np.conj(np.swapaxes(self._kernel, 1, 2)))
+
+    def _apply(self, images: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+        rows, columns = self.shape
+        planes = np.ascontiguousarray(images.reshape(rows * columns, -1).T, dtype=np.float64)
+        spectrum = np.ascontiguousarray(
+            np.fft.rfft(planes.reshape(-1, rows, columns), axis=2).transpose(2, 1, 0)
+        )
+        # Four real products: NumPy has no fast stacked complex one.
+        a, b, x, y = kernel.real.copy(), kernel.imag.copy(), spectrum.real.copy(), spectrum.imag.copy()
+        mixed = (a @ x - b @ y) + 1j * (a @ y + b @ x)
+        back = np.fft.irfft(np.ascontiguousarray(mixed.transpose(2, 1, 0)), n=columns, axis=2)
+        return np.ascontiguousarray(back.reshape(-1, rows * columns).T).reshape(images.shape)
+
+
+@dataclass(frozen=True)
+class Met:
+    """What rays meet: their origins (O, 3) and directions, and face (-1: nothing) and range of each, on the device."""
+
+    origins: wp.array
+    directions: wp.array
+    solid_angle: wp.array
+    face: wp.array
+    range_m: wp.array
+
+    @property
+    def inputs(self) -> list[Any]:
+        """In the order that kernels take them."""
+        per_origin = len(self.face) // len(self.origins)
+        return [self.origins, per_origin, self.directions, self.face, self.range_m]
+
+
+@dataclass(frozen=True)
+class Lit:
+    """How one source lights what rays meet; see :func:`warprrf.kernels.bounce.light_surface`."""
+
+    strength: wp.array
+    cos_in: wp.array
+    cos_mirror: wp.array
+    grazing: wp.array
+
+    @property
+    def inputs(self) -> list[wp.array]:
+        """In the order that kernels take them."""
+        return [self.strength, self.cos_in, self.cos_mirror, self.grazing]
+
+
+class BounceTracer:
+    """Rays on a surface.
+
+    Args:
+        surface: what is met.
+        shape: rows and columns of a spectrum.
+        lobes: exponents of the lobe mix.
+        sub_pixels: square root of the rays per pixel.
+        device: where rays are cast.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        shape: tuple[int, int],
+        *,
+        lobes: tuple[int, ...] = LOBES,
+        sub_pixels: int = SUB_PIXELS,
+        device: Any = None,
+    ) -> None:
+        self.surface, self.shape, self.lobes, self.sub_pixels = surface, shape, tuple(lobes), sub_pixels
+        self.device = _device.resolve(device)
+        self.directions, self.solid_angle = sub_pixel_directions(shape, sub_pixels)
+        self._directions = wp.array(self.directions, dtype=wp.vec3d, device=self.device)
+        self._solid_angle = wp.array(self.solid_angle, dtype=wp.float32, device=self.device)
+        self._half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
+        self._exponent, self._norm = _lobe_tables(self.lobes, str(self.device))
+        self._moments = wp.array(fresnel_curves().moments, dtype=wp.float32, device=self.device)
+
+    def meet(self, receiver: np.ndarray) -> Met:
+        """What the grid's rays from ``receiver`` (3,) meet."""
+        return self._meet(np.asarray(receiver, float).reshape(1, 3), self._directions, self._solid_angle)
+
+    def meet_rays(self, origins: np.ndarray, directions: np.ndarray, solid_angle: np.ndarray) -> Met:
+        """What rays meet: ``origins`` (O, 3), a whole number of ``directions`` (K, 3) each."""
+        return self._meet(
+            origins,
+            wp.array(directions, dtype=wp.vec3d, device=self.device),
+            wp.array(solid_angle, dtype=wp.float32, device=self.device),
+        )
+
+    def _meet(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array) -> Met:
+        count = max(len(directions), len(origins))
+        met = Met(
+            wp.array(origins, dtype=wp.vec3d, device=self.device), directions, solid_angle,
+            wp.empty(count, dtype=wp.int32, device=self.device), wp.empty(count, dtype=wp.float64, device=self.device),
+        )  # fmt: skip
+        _device.launch(
+            bounce.meet_surface, count, [self.surface.on_device(self.device), *met.inputs], device=self.device
+        )
+        return met
+
+    def light(
+        self, met: Met, position: np.ndarray, *, real: np.ndarray | None = None, patch: int = -1
+    ) -> Lit:
+        """How the transmitter at ``position`` (3,), or its image in ``patch`` (then ``real`` is itself), lights that."""
+        source = bounce.Source()
+        source.position = wp.vec3d(*position)
+        source.real = wp.vec3d(*(position if real is None else real))
+        source.patch = int(patch)
+        count = len(met.face)
+        lit = Lit(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(4)))
+        inputs = [
+            self.surface.on_device(self.device), source, *met.inputs, met.solid_angle, float(self._half_width), NEAREST_M,
+            *lit.inputs,
+        ]  # fmt: skip
+        _device.launch(bounce.light_surface, count, inputs, device=self.device)
+        return lit
+
+    def resolve(self, met: Met, lit: Lit, wavelength_m: float) -> np.ndarray:
+        """Path gain per pixel of each group, lobe and Fresnel component at unit weight, ``(H, W, G, L, 3)`` float32."""
+        pixels = self.shape[0] * self.shape[1]
+        columns = self.surface.groups * len(self.lobes) * bounce.MOMENTS
+        out = wp.zeros((pixels, columns), dtype=wp.float32, device=self.device)
+        inputs = [
+            self.sub_pixels**2, self.surface.on_device(self.device), met.face, *lit.inputs, self._exponent, self._norm,
+            self._moments, out,
+        ]  # fmt: skip
+        _device.launch(bounce.resolve_bounces, pixels, inputs, device=self.device)
+        image = out.numpy().reshape(*self.shape, self.surface.groups, len(self.lobes), bounce.MOMENTS)
+        return image * np.float32(wavelength_m**2)
+
+    def scatter(
+        self, met: Met, lit: Lit, weight: np.ndarray, log_excess: np.ndarray, wavelength_m: float
+    ) -> np.ndarray:
+        """Path gain of each ray, shape ``(K,)`` float32, for lobe weights ``(G, L)`` and ln(epsilon_r - 1) ``(G,)``."""
+        curves = fresnel_curves()
+        fresnel = curves.at(curves.curves, log_excess)[0]
+        power = wp.empty(len(met.face), dtype=wp.float32, device=self.device)
+        inputs = [
+            self.surface.on_device(self.device), met.face, *lit.inputs, self._exponent, self._norm,
+            wp.array(fresnel, dtype=wp.float32, device=self.device),
+            wp.array(weight * wavelength_m**2, dtype=wp.float32, device=self.device), power,
+        ]  # fmt: skip
+        _device.launch(bounce.scatter_bounces, len(met.face), inputs, device=self.device)
+        return power.numpy()

@@ -1,0 +1,176 @@
+"""What single bounces leave dark: mirror-then-scatter, scatter-then-mirror and further diffuse bounces.
+
+Nothing new is learned: the fitted groups light surface elements by way of mirrors and of each other, elements send that
+on evenly (after two bounces little is left of a lobe's shape), and mirrors show the lit scene a second time.
+Irradiance is in units in which the transmitter gives cos(theta_i) / d1^2 [1/m^2].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from warprrf.rf.bistatic_fit import Parameters
+from warprrf.rf.bounces import BounceTracer, FresnelCurves, fresnel_curves
+from warprrf.rf.specular import specular_paths
+from warprrf.rf.surface import Surface
+
+RAYS = 128  # from each element, over its hemisphere
+LEAST_MIRROR = 1e-4  # reflected share of power below which a patch is no mirror
+LIFT_M = 0.02
+
+
+class ElementLight:
+    """What one transmitter sends to the elements of a surface by way of other surfaces; geometry is traced once.
+
+    Args:
+        tracer: rays and lobes of the field.
+        transmitter: position (3,) [m].
+        wavelength_m: wavelength.
+        seed: of the rays' directions.
+    """
+
+    def __init__(
+        self, tracer: BounceTracer, transmitter: np.ndarray, wavelength_m: float, *, seed: int = 0
+    ) -> None:
+        self.tracer, self.surface, self.wavelength_m = tracer, tracer.surface, wavelength_m
+        point, normal = _sample_points(self.surface)
+        self._mirrored = specular_paths(
+            self.surface, transmitter, point, wavelength_m, order=1, single_ray=True, device=tracer.device
+        )
+        own = self._mirrored.order == 1
+        self._mirrored = self._mirrored.subset(np.flatnonzero(own))
+        facing = (self._mirrored.arrival * normal[self._mirrored.receiver]).sum(axis=1)
+        self._cos_at_element = np.maximum(facing, 0.0)
+        directions = _hemispheres(normal, seed)
+        self._met = tracer.meet_rays(point, directions, np.ones(len(directions)))
+        self._lit = tracer.light(self._met, transmitter)
+        face = self._met.face.numpy()
+        # Rays that meet nothing see the dark: they point at element 0 with weight 0.
+        self._sees = np.where(face >= 0, self.surface.element[np.maximum(face, 0)], 0).reshape(
+            len(point), RAYS
+        )
+        self._meets = (face >= 0).reshape(len(point), RAYS)
+
+    def irradiance(self, p: Parameters, *, mirrors: bool, diffuse: int) -> np.ndarray:
+        """Irradiance of each element (E,) [1/m^2] under parameters ``p``.
+
+        Args:
+            mirrors: whether light that mirrors throw on it counts.
+            diffuse: how many diffuse bounces before it count: 0, 1 or 2.
+        """
+        elements = len(self.surface.element_area)
+        direct = np.zeros(elements)
+        if mirrors and len(self._mirrored):
+            m = self._mirrored
+            group = self.surface.patch_group[m.patch[:, 0]]
+            share = (
+                np.exp(p.log_mirror[group]) * fresnel_curves().value(p.log_excess[group], m.cosine[:, 0])[0]
+            )
+            np.add.at(direct, m.receiver, m.share**2 * share * self._cos_at_element / m.length_m**2)
+        total = direct
+        if diffuse >= 1:
+            power = self.tracer.scatter(self._met, self._lit, p.weight, p.log_excess, self.wavelength_m)
+            radiance = power.reshape(elements, RAYS) * (4.0 * np.pi / self.wavelength_m) ** 2
+            first = np.pi * radiance.mean(axis=1)
+            total = total + first
+            if diffuse >= 2:
+                sent = self.reflectance(p) * total / np.pi
+                total = total + np.pi * np.where(self._meets, sent[self._sees], 0.0).mean(axis=1)
+        return total
+
+    def radiance(self, p: Parameters, *, mirrors: bool, diffuse: int) -> np.ndarray:
+        """Radiance that each element sends on (E,) [1/(m^2 sr)]."""
+        return self.reflectance(p) * self.irradiance(p, mirrors=mirrors, diffuse=diffuse) / np.pi
+
+    def reflectance(self, p: Parameters) -> np.ndarray:
+        """Share of power that each element scatters under even light (E,)."""
+        return scattered_share(p)[self.surface.element_group]
+
+
+def scattered_share(p: Parameters) -> np.ndarray:
+    """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
+    curves = fresnel_curves()
+    return p.weight.sum(axis=1) * _even(curves, p.log_excess)
+
+
+def _even(curves: FresnelCurves, log_excess: np.ndarray) -> np.ndarray:
+    cosine = np.linspace(0.0, 1.0, curves.curves.shape[1])
+    curve = curves.at(curves.curves, log_excess)[0]
+    return (curve * cosine).sum(axis=1) / cosine.sum()
+
+
+def mirrored_scene(
+    tracer: BounceTracer, receiver: np.ndarray, transmitter: np.ndarray, p: Parameters, wavelength_m: float,
+    sent: np.ndarray | None,
+) -> np.ndarray:  # fmt: skip
+    """Path gain per pixel (H, W) that mirrors show ``receiver`` of the lit scene: first bounces, and ``sent`` radiance
+    of the elements (E,) besides. ``tracer`` needs few rays a pixel."""
+    surface = tracer.surface
+    met = tracer.meet(receiver)
+    face, t = met.face.numpy(), met.range_m.numpy()
+    out = np.zeros(len(face))
+    known = (face >= 0) & (surface.patch[np.maximum(face, 0)] >= 0)
+    group = surface.group[np.maximum(face, 0)]
+    normal = surface.plane_normal[np.maximum(surface.patch[np.maximum(face, 0)], 0)]
+    d = tracer.directions
+    cosine = -(d * normal).sum(axis=1)
+    share = np.where(
+        known & (cosine > 0),
+        np.exp(p.log_mirror[group]) * fresnel_curves().value(p.log_excess[group], np.abs(cosine))[0],
+        0.0,
+    )
+    k = np.flatnonzero(share > LEAST_MIRROR)
+    if len(k) == 0:
+        return out.reshape(*tracer.shape, -1).sum(axis=-1)
+    turned = d[k] + 2.0 * cosine[k, None] * normal[k]
+    start = receiver + t[k, None] * d[k] + LIFT_M * normal[k]
+    again = tracer.meet_rays(start, turned, tracer.solid_angle[k])
+    lit = tracer.light(again, transmitter)
+    power = tracer.scatter(again, lit, p.weight, p.log_excess, wavelength_m).astype(float)
+    if sent is not None:
+        second = again.face.numpy()
+        radiance = np.where(second >= 0, sent[surface.element[np.maximum(second, 0)]], 0.0)
+        power += (wavelength_m / (4.0 * np.pi)) ** 2 * tracer.solid_angle[k] * radiance
+    out[k] = share[k] * power
+    return out.reshape(*tracer.shape, -1).sum(axis=-1)
+
+
+def sent_image(tracer: BounceTracer, met: Any, sent: np.ndarray, wavelength_m: float) -> np.ndarray:
+    """Path gain per pixel (H, W) of the radiance (E,) that elements send on evenly."""
+    face = met.face.numpy()
+    radiance = np.where(face >= 0, sent[tracer.surface.element[np.maximum(face, 0)]], 0.0)
+    power = (wavelength_m / (4.0 * np.pi)) ** 2 * tracer.solid_angle * radiance
+    return power.reshape(*tracer.shape, -1).sum(axis=-1)
+
+
+def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """A place on each element, just off the surface, and its normal: the centre of the face nearest to its middle."""
+    centre = surface.mesh.triangles.mean(axis=1)
+    gap = np.linalg.norm(centre - surface.element_centre[surface.element], axis=1)
+    order = np.lexsort((gap, surface.element))
+    first = order[np.searchsorted(surface.element[order], np.arange(len(surface.element_area)))]
+    normal = np.where(
+        ((surface.normal[first] * surface.mesh.face_normals[first]).sum(axis=1) < 0)[:, None],
+        -surface.normal[first],
+        surface.normal[first],
+    )
+    return centre[first] + LIFT_M * normal, normal
+
+
+def _hemispheres(normal: np.ndarray, seed: int) -> np.ndarray:
+    """``RAYS`` directions for each normal, density proportional to the cosine, shape ``(E * RAYS, 3)``."""
+    rng = np.random.default_rng(seed)
+    count = len(normal)
+    k = np.arange(RAYS)
+    u = np.mod(k * 0.7548776662466927 + rng.random((count, 1)), 1.0)  # R2 sequence (Roberts 2018), shifted
+    v = np.mod(k * 0.5698402909980532 + rng.random((count, 1)), 1.0)
+    radius, turn = np.sqrt(u), 2.0 * np.pi * v
+    least = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    a = np.cross(normal, least)
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    b = np.cross(normal, a)
+    x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.sqrt(np.maximum(1.0 - u, 0.0))
+    d = x[..., None] * a[:, None] + y[..., None] * b[:, None] + z[..., None] * normal[:, None]
+    return d.reshape(-1, 3)
