@@ -28,6 +28,14 @@ LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so 
 MOST_HELD_OUT = 10
 SHORT_STEPS = 6  # of a fit that only decides about a term
 BETTER = 0.995  # a term must lower the held-out mean square error at least to this share
+MORE: dict[str, Any] = {
+    "mirror_order": 2,
+    "mirror_scatter": True,
+    "diffuse_order": 3,
+    "scatter_mirror": True,
+    "indirect": True,
+}
+"""Terms that may be added to single bounces, in the order in which they are tried."""
 OUTER = 2  # rounds of further bounces and groups in turn
 
 
@@ -234,23 +242,16 @@ class _Training:
         """Terms that lower the held-out error, one after another, each with a short fit of its own."""
         best = self._held_error(self._field(terms, fit, None))
         self.log.append({"term": "single bounces", "kept": True, "held_out_rmse_db": float(np.sqrt(best))})
-        more = {"mirror_order": 2, "mirror_scatter": True, "scatter_mirror": True, "diffuse_order": 3}
-        steps: list[tuple[str, dict[str, Any]]] = []
-        together = {name: value for name, value in more.items() if name in free}
-        if together and terms.diffuse:
-            steps.append(("further bounces", together))
-        if "indirect" in free:
-            steps.append(("indirect", {"indirect": True}))
-        for name, change in steps:
-            trial = replace(terms, **change)
+        for name, value in MORE.items():
+            if name not in free or (name not in ("mirror_order",) and not terms.diffuse):
+                continue
+            trial = replace(terms, **{name: value})
             found = self._groups(trial, fit.parameters, self.kept, SHORT_STEPS)
             error = self._held_error(self._field(trial, found, None))
             keep = error < BETTER * best
             self.log.append({"term": name, "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))})
             if keep:
                 terms, fit, best = trial, found, error
-                if name == "further bounces" and len(together) > 1:
-                    terms, best = self._drop(terms, together, fit, best)
         residual = None
         if terms.residual or "residual" in free:
             base = self._field(terms, fit, None)
@@ -265,16 +266,6 @@ class _Training:
             if keep:
                 terms, residual = replace(terms, residual=True), found_residual
         return terms, fit, residual
-
-    def _drop(self, terms: Terms, together: dict[str, Any], fit: Fit, best: float) -> tuple[Terms, float]:
-        """Leave out what of the further bounces does not help (without fitting again)."""
-        for name in together:
-            trial = replace(terms, **{name: getattr(Terms(), name)})
-            error = self._held_error(self._field(trial, fit, None))
-            if error * BETTER <= best:
-                self.log.append({"term": name, "kept": False, "held_out_rmse_db": float(np.sqrt(error))})
-                terms, best = trial, min(best, error)
-        return terms, best
 
     def _held_error(self, field: BistaticField) -> float:
         """Mean square error of the dB images of the held-out receivers [dB^2]."""
