@@ -19,7 +19,7 @@ import numpy as np
 from warprrf.device import require
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import PlanarPatch, simplify
+from warprrf.geometry.patches import PlanarPatch, simplify, smoothed_normals
 from warprrf.geometry.planes import Plane
 
 ALIGNED = np.cos(np.radians(4.0))  # a plane this parallel to one of the three directions counts as parallel
@@ -183,6 +183,7 @@ def divided(
             chosen[axis].append(twin)
         face_plane[faces, 0] = sign * (axis + 1)
         face_plane[faces, 1] = twin[1]
+    _more_planes(mesh, face_plane, axes, chosen)
     normals, offsets, known = [], [], []
     corners = mesh.vertices[np.unique(mesh.faces)] @ axes.T
     for axis in range(3):
@@ -204,6 +205,48 @@ def divided(
         grid_d = np.array([m[2] for m in marks])
         normals[-1] = np.concatenate([normals[-1], grid_d[:, None]], axis=1)
     return Grid(axes, normals, offsets, known), face_plane
+
+
+PEAK_M2 = 0.08
+
+
+def _more_planes(mesh, face_plane, axes, chosen):
+    """Planes among the faces that no patch took: peaks of area over height."""
+    rest = face_plane[:, 0] == 0
+    smooth = smoothed_normals(mesh, 3) @ axes.T
+    heights = mesh.triangles.mean(axis=1) @ axes.T
+    for axis in range(3):
+        for sign in (1, -1):
+            own = np.flatnonzero(rest & (sign * smooth[:, axis] > np.cos(np.radians(25.0))))
+            old = [c for c in chosen[axis] if c[0] == sign]
+            if len(own):  # faces near planes known already join them
+                for _, h, *_ in old:
+                    near = np.abs(heights[own, axis] - h) < TWIN_M
+                    face_plane[own[near]] = sign * (axis + 1), h
+                own = own[face_plane[own, 0] == 0]
+            if not len(own):
+                continue
+            x, area = heights[own, axis], mesh.areas[own]
+            order = np.argsort(x)
+            own, x, area = own[order], x[order], area[order]
+            free = np.ones(len(own), dtype=bool)
+            while True:
+                cum = np.concatenate([[0], np.cumsum(area * free)])
+                window = cum[np.searchsorted(x, x + 0.03, side="right")] - cum[:-1]
+                k = int(window.argmax())
+                if window[k] < PEAK_M2:
+                    break
+                inside = free & (x >= x[k]) & (x <= x[k] + 0.03)
+                h = float((x * area)[inside].sum() / area[inside].sum())
+                close = free & (np.abs(x - h) < 2 * TWIN_M)
+                free &= ~close
+                face_plane[own[free_near(x, h, close)]] = sign * (axis + 1), h
+                if not any(abs(c[1] - h) < (TWIN_M if c[0] == sign else THIN_M) for c in chosen[axis]):
+                    chosen[axis].append((sign, h, axes[axis], h))
+
+
+def free_near(x, h, close):
+    return close & (np.abs(x - h) < TWIN_M)
 
 
 def evidence(grid, mesh, face_plane, cameras, depths, stride, seed):
@@ -268,6 +311,8 @@ def evidence(grid, mesh, face_plane, cameras, depths, stride, seed):
 SURE_VOTES = 3.0
 KNOWN, OTHER = 0.4, 1.0
 TRUST = 0.6
+LEAK = 0.05
+PRIOR = 0.3
 
 
 def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray) -> np.ndarray:
@@ -281,7 +326,15 @@ def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray) -> np.ndarray
         w[0][:, None, None] * w[1][None, :, None] * np.ones(len(w[2])),
     ]
     total = 2 * sum(sides)
-    lean = (free - 2 * solid) / (free + 2 * solid + SURE_VOTES)
+    volume = w[0][:, None, None] * w[1][None, :, None] * w[2]
+    padded = np.pad(free / volume, 1)
+    n = free.shape
+    around = np.max(
+        [padded[1 + i : 1 + i + n[0], 1 + j : 1 + j + n[1], 1 + k : 1 + k + n[2]]
+         for i, j, k in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))], axis=0)
+    leak = LEAK * around * volume
+    against = 2 * solid + leak + PRIOR
+    lean = (free - against) / (free + against + SURE_VOTES)
     unary = TRUST * total * lean
     # Beyond the grid all is solid.
     unary -= 0.0
