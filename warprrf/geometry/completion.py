@@ -105,9 +105,10 @@ def complete(
     axes = directions(mesh, patches)
     if axes is None:
         return mesh, list(patches)
-    grid, face_plane = divided(mesh, patches, planes, axes, cell_m)
-    free, solid = evidence(grid, mesh, face_plane, cameras, depths, stride, seed)
+    grid, face_plane, proven = divided(mesh, patches, planes, axes, cell_m)
+    free, solid = evidence(grid, mesh, face_plane, proven, cameras, depths, stride, seed)
     label = least_surface(grid, free, solid)
+    label = reachable(grid, label, np.array([c.position for c in cameras]))
     if debug is not None:
         debug.update(grid=grid, free=free, solid=solid, label=label, face_plane=face_plane)
     return surface_of(grid, label, cell_m=0.25, min_patch_m2=min_patch_m2)
@@ -185,6 +186,7 @@ def divided(
         face_plane[faces, 1] = twin[1]
     _more_planes(mesh, face_plane, axes, chosen)
     normals, offsets, known = [], [], []
+    _covered(mesh, face_plane, axes, chosen, planes)
     corners = mesh.vertices[np.unique(mesh.faces)] @ axes.T
     for axis in range(3):
         planes_here = sorted(chosen[axis], key=lambda c: c[1])
@@ -204,7 +206,7 @@ def divided(
         # vertices use the plane equations
         grid_d = np.array([m[2] for m in marks])
         normals[-1] = np.concatenate([normals[-1], grid_d[:, None]], axis=1)
-    return Grid(axes, normals, offsets, known), face_plane
+    return Grid(axes, normals, offsets, known), face_plane, list(_proven(planes, axes, chosen))
 
 
 PEAK_M2 = 0.08
@@ -245,11 +247,41 @@ def _more_planes(mesh, face_plane, axes, chosen):
                     chosen[axis].append((sign, h, axes[axis], h))
 
 
+REACH_M = 0.12
+
+
+def _covered(mesh, face_plane, axes, chosen, planes):
+    """Faces go to the plane whose occupied cells, proven by the photos, they lie at."""
+    smooth = smoothed_normals(mesh, 3)
+    centres = mesh.triangles.mean(axis=1)
+    best = np.full(len(centres), REACH_M)
+    for plane, axis, sign, height in _proven(planes, axes, chosen):
+        gap = np.abs(centres @ axes[axis] - height)
+        own = np.flatnonzero((gap < best) & (sign * smooth @ axes[axis] > np.cos(np.radians(35.0))))
+        own = own[plane.covers(centres[own])]
+        face_plane[own] = sign * (axis + 1), height
+        best[own] = gap[own]
+
+
+def _proven(planes, axes, chosen):
+    """Given planes that are dividing planes: plane, axis, sign, height of the divider."""
+    for plane in planes:
+        fit = axes @ plane.normal
+        axis = int(np.abs(fit).argmax())
+        if abs(fit[axis]) < ALIGNED or not plane.occupied.any():
+            continue
+        sign = 1 if fit[axis] > 0 else -1
+        height = float(plane.cells().mean(axis=0) @ axes[axis])
+        own = [c[1] for c in chosen[axis] if c[0] == sign and abs(c[1] - height) < TWIN_M]
+        if own:
+            yield plane, axis, sign, min(own, key=lambda h: abs(h - height))
+
+
 def free_near(x, h, close):
     return close & (np.abs(x - h) < TWIN_M)
 
 
-def evidence(grid, mesh, face_plane, cameras, depths, stride, seed):
+def evidence(grid, mesh, face_plane, proven, cameras, depths, stride, seed):
     rng = np.random.default_rng(seed)
     size = int(np.prod(grid.shape))
     free, solid = np.zeros(size), np.zeros(size)
@@ -305,9 +337,18 @@ def evidence(grid, mesh, face_plane, cameras, depths, stride, seed):
     free += np.bincount(index, minlength=size)
     index, _ = locate(p - 0.006 * nn)
     solid += np.bincount(index, minlength=size)
+    for plane, axis, sign, height in proven:
+        cells = plane.cells()
+        quarter = np.array([[i, j] for i in (-1, 1) for j in (-1, 1)]) / 4 * plane.cell_m
+        cells = (cells[:, None] + quarter @ plane.axes).reshape(-1, 3)
+        cells += (height - cells @ grid.axes[axis])[:, None] * grid.axes[axis]
+        shift = sign * 0.006 * grid.axes[axis]
+        solid += PROOF * np.bincount(locate(cells - shift)[0], minlength=size)
+        free += PROOF * np.bincount(locate(cells + shift)[0], minlength=size)
     return free.reshape(grid.shape), solid.reshape(grid.shape)
 
 
+PROOF = 1.0
 SURE_VOTES = 3.0
 KNOWN, OTHER = 0.4, 1.0
 TRUST = 0.6
@@ -373,6 +414,15 @@ def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray) -> np.ndarray
     label = np.ones(free.size + 2, dtype=bool)
     label[reach] = False
     return label[: free.size].reshape(free.shape)
+
+
+def reachable(grid: Grid, solid: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """``solid`` with every hollow filled that none of ``places`` (N, 3) lies in."""
+    image = require("scipy.ndimage", extra="photos")
+    piece, _ = image.label(~solid)
+    index, inside = grid.locate(places)
+    own = np.unique(piece.ravel()[index[inside]])
+    return ~np.isin(piece, own[own > 0])
 
 
 def surface_of(grid: Grid, solid: np.ndarray, *, cell_m: float, min_patch_m2: float) -> tuple[Mesh, list[PlanarPatch]]:
