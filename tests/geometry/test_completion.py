@@ -166,6 +166,14 @@ def test_a_mesh_without_planes_or_views_stays_as_it_is():
         complete(room, patches, views, [])
 
 
+def test_a_place_seen_in_part_only_is_not_guessed():
+    room = as_mesh(box(*ROOM, sign=-1))
+    mesh = as_mesh(punched(box(*ROOM, sign=-1), (1.0, -1.0, -1.0), (5.0, 5.0, 5.0)))  # one end of the room
+    patches = planar_patches(mesh, distance_m=0.01)
+    views = [cameras([[3.0, 1.5, 1.2]])[3]]  # looks there
+    assert complete(mesh, patches, views, seen(mesh, room, views), stride=3) == (mesh, patches)
+
+
 def test_an_oblique_surface_is_kept():
     room = box(*ROOM, sign=-1)
     ramp = sheet(2, 0.0, (1.0, 1.0), (2.0, 2.0), 1)

@@ -36,6 +36,9 @@ STEP_M = 0.06  # mean spacing of samples along lines of sight
 BESIDE_M = 0.006  # a hit votes for the boxes this far before and behind its plane: within the thinnest board
 MARGIN_M = 0.3  # space kept around the mesh
 RIM_M, RIM_SHARE = 0.6, 0.25  # a side is closed when planes this near to it cover so much of it
+# A flat piece of surface is seen when hits lie on so much of it; where less than this of all the surface is, photos
+# cover too little of the place for the rest to be inferred.
+SEEN_PIECE, LEAST_SEEN = 0.1, 0.7
 # Weights of the cut. All are costs in units of one square metre of surface where no plane is known.
 KNOWN = 0.4  # a square metre of surface on a known plane
 TRUST = 0.6  # a box that goes against all its votes, per square metre of its sides
@@ -145,7 +148,7 @@ def complete(
 
     Returns:
         The mesh and its patches, largest first; what was given when most of the mesh lies on no planes along three
-        perpendicular directions, or nothing was seen.
+        perpendicular directions, or the photos show so little of the place that most of it would be a guess.
 
     Raises:
         ValueError: when the numbers of cameras and depth maps differ.
@@ -167,6 +170,8 @@ def complete(
     if filled.all():
         return mesh, list(patches)
     whole, parts, known = surface_of(grid, filled)
+    if seen_share(grid, whole, parts, solid) < LEAST_SEEN:
+        return mesh, list(patches)
     whole, parts = _with_rest(whole, parts, known, mesh, patches, labels)
     whole, parts = simplify(whole, parts)
     return whole, sorted((p for p in parts if p.area >= min_patch_m2), key=lambda p: -p.area)
@@ -343,6 +348,30 @@ def surface_of(grid: Grid, filled: np.ndarray) -> tuple[Mesh, list[PlanarPatch],
         )
     known = np.array([grid.known[a][height] for a, height, _ in kinds])[which]
     return mesh, patches, known
+
+
+def seen_share(grid: Grid, mesh: Mesh, patches: Sequence[PlanarPatch], solid: np.ndarray) -> float:
+    """Share of the surface's area in flat pieces that hits lie on, by the votes ``solid`` of the boxes behind."""
+    behind = grid.locate(mesh.triangles.mean(axis=1) - 0.5 * BESIDE_M * mesh.face_normals)
+    hit = (behind >= 0) & (solid.ravel()[behind] > 0)
+    label = np.full(len(mesh.faces), -1)
+    for k, patch in enumerate(patches):
+        label[patch.faces] = k
+    piece = _pieces(mesh, label)
+    area = np.bincount(piece, weights=mesh.areas)
+    seen = np.bincount(piece, weights=mesh.areas * hit) > SEEN_PIECE * area
+    return float(area[seen].sum() / area.sum())
+
+
+def _pieces(mesh: Mesh, label: np.ndarray) -> np.ndarray:
+    """Numbers of the connected pieces of faces that share a label, shape ``(F,)``; a face labelled -1 is a piece."""
+    graph = require("scipy.sparse.csgraph", extra="photos")
+    sparse = require("scipy.sparse", extra="photos")
+    ring = face_neighbours(mesh.faces)
+    face, side = np.nonzero((ring >= 0) & (label >= 0)[:, None] & (label[ring] == label[:, None]))
+    link = sparse.coo_matrix((np.ones(len(face)), (face, ring[face, side])), shape=(len(label),) * 2)
+    piece: np.ndarray = graph.connected_components(link, directed=False)[1]
+    return piece
 
 
 # ------------------------------------------------------------------------------------------------ planes
@@ -572,17 +601,11 @@ def _with_rest(
     labels: _Labels,
 ) -> tuple[Mesh, list[PlanarPatch]]:
     """The completed surface with round or oblique pieces of the old mesh in place of the steps made for them."""
-    graph = require("scipy.sparse.csgraph", extra="photos")
-    sparse = require("scipy.sparse", extra="photos")
     centres = mesh.triangles.mean(axis=1)
     rest = labels.axis < 0
     if known.any():
         rest[rest] = Mesh(whole.vertices, whole.faces[known]).distance(centres[rest]) > KEEP_M
-    ring = face_neighbours(mesh.faces)
-    joined = (ring >= 0) & rest[:, None] & rest[ring]
-    row, side = np.nonzero(joined)
-    link = sparse.coo_matrix((np.ones(len(row)), (row, ring[row, side])), shape=(len(rest),) * 2)
-    _, piece = graph.connected_components(link, directed=False)
+    piece = _pieces(mesh, np.where(rest, 0, -1))
     rest &= np.bincount(piece, weights=mesh.areas * rest)[piece] >= KEEP_M2
     if not rest.any():
         return whole, list(parts)
