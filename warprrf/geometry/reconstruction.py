@@ -20,6 +20,7 @@ import numpy as np
 from warprrf.device import Progress, check_array, require
 from warprrf.geometry import sfm, surface, sweep
 from warprrf.geometry.camera import Camera
+from warprrf.geometry.completion import complete
 from warprrf.geometry.edges import meeting
 from warprrf.geometry.gaussians import Gaussians, replacing
 from warprrf.geometry.initial import initial_gaussians, seen_cells
@@ -56,6 +57,9 @@ class ReconstructionConfig:
         voxel_m: side of a voxel of the fusion.
         patch_distance_m: a face this close to a plane can belong to its patch.
         min_patch_m2: smallest planar patch.
+        complete: close holes and straighten borders where the planes allow it (see
+            :mod:`warprrf.geometry.completion`).
+        complete_cell_m: largest side of the boxes that space is divided into for that.
     """
 
     max_features: int = 2400
@@ -74,6 +78,8 @@ class ReconstructionConfig:
     voxel_m: float = 0.05
     patch_distance_m: float = 0.06
     min_patch_m2: float = 0.15
+    complete: bool = True
+    complete_cell_m: float = 0.1
 
 
 class Reconstruction:
@@ -388,6 +394,80 @@ def fuse_gaussians(
     what the mesh snaps to first."""
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
+    small, depths = _depth_maps(gaussians, cameras, config, report, device)
+    report("surface", 0, 4)
+    mesh = surface.fuse_depth(depths, small, voxel_m=config.voxel_m)
+    report("surface", 1, 4)
+    patches = surface.planar_patches(
+        mesh, planes=planes, distance_m=config.patch_distance_m, min_area_m2=config.min_patch_m2
+    )
+    flat = surface.flatten(mesh, patches)
+    report("surface", 2, 4)
+    result = surface.simplify(flat, patches)
+    report("surface", 3, 4)
+    if config.complete:
+        result = _complete(*result, small, depths, planes, config)
+    report("surface", 4, 4)
+    return result
+
+
+def completed(
+    reconstruction: Reconstruction,
+    *,
+    config: ReconstructionConfig | None = None,
+    progress: Progress | None = None,
+    device: Any = None,
+) -> Reconstruction:
+    """``reconstruction`` with its mesh completed, as :func:`reconstruct` does: for one saved without that.
+
+    Depth maps are rendered again at its cameras. Without cameras, or where its mesh has no planes along three
+    perpendicular directions, the mesh stays as it is.
+
+    Raises:
+        ValueError: if there is no mesh.
+    """
+    config = config or ReconstructionConfig()
+    report = progress or (lambda stage, done, total: None)
+    mesh, patches = reconstruction.mesh, reconstruction.patches
+    if reconstruction.cameras:
+        cameras = list(reconstruction.cameras.values())
+        small, depths = _depth_maps(reconstruction.gaussians, cameras, config, report, device)
+        mesh, patches = _complete(mesh, patches, small, depths, reconstruction.planes, config)
+    return Reconstruction(
+        reconstruction.gaussians,
+        mesh,
+        reconstruction.cameras,
+        patches=patches,
+        planes=reconstruction.planes,
+        scale_rms_m=reconstruction.scale_rms_m,
+        metric=reconstruction.metric,
+        unposed=reconstruction.unposed,
+        held_out=reconstruction.held_out,
+    )
+
+
+def _complete(
+    mesh: Mesh,
+    patches: list[PlanarPatch],
+    cameras: Sequence[Camera],
+    depths: Sequence[np.ndarray],
+    planes: Sequence[Plane],
+    config: ReconstructionConfig,
+) -> tuple[Mesh, list[PlanarPatch]]:
+    return complete(
+        mesh, patches, cameras, depths, planes=planes,
+        cell_m=config.complete_cell_m, min_patch_m2=config.min_patch_m2,
+    )  # fmt: skip
+
+
+def _depth_maps(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    config: ReconstructionConfig,
+    report: Progress,
+    device: Any,
+) -> tuple[list[Camera], list[np.ndarray]]:
+    """Smaller cameras spread over all ``cameras``, and their depths, 0 where no Gaussian is reliable."""
     chosen = list(cameras)
     if len(chosen) > config.depth_views:
         chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, config.depth_views).round().astype(int)]
@@ -405,17 +485,7 @@ def fuse_gaussians(
         depths.append(np.where(solid, out.depth, 0.0))
         small.append(view)
     report("depth", len(chosen), len(chosen))
-    report("surface", 0, 3)
-    mesh = surface.fuse_depth(depths, small, voxel_m=config.voxel_m)
-    report("surface", 1, 3)
-    patches = surface.planar_patches(
-        mesh, planes=planes, distance_m=config.patch_distance_m, min_area_m2=config.min_patch_m2
-    )
-    flat = surface.flatten(mesh, patches)
-    report("surface", 2, 3)
-    result = surface.simplify(flat, patches)
-    report("surface", 3, 3)
-    return result
+    return small, depths
 
 
 def read_photo(path: str | os.PathLike[str]) -> np.ndarray:
