@@ -167,11 +167,14 @@ def test_a_mesh_without_planes_or_views_stays_as_it_is():
 
 
 def test_a_place_seen_in_part_only_is_not_guessed():
-    room = as_mesh(box(*ROOM, sign=-1))
-    mesh = as_mesh(punched(box(*ROOM, sign=-1), (1.0, -1.0, -1.0), (5.0, 5.0, 5.0)))  # one end of the room
+    hall = box((0.0, 0.0, 0.0), (9.0, 6.0, 5.0), sign=-1)
+    end = punched(hall, (1.0, -1.0, 0.05), (10.0, 7.0, 6.0))
+    end = punched(end, (1.0, 0.5, -1.0), (7.5, 7.0, 1.0))  # and a strip of the floor, up to the camera
+    mesh = as_mesh(end)
     patches = planar_patches(mesh, distance_m=0.01)
-    views = [cameras([[3.0, 1.5, 1.2]])[3]]  # looks there
-    assert complete(mesh, patches, views, seen(mesh, room, views), stride=3) == (mesh, patches)
+    views = [cameras([[8.0, 3.0, 2.0]])[3]]  # looks there
+    depths = seen(mesh, as_mesh(hall), views)
+    assert complete(mesh, patches, views, depths, stride=1, cell_m=0.25) == (mesh, patches)
 
 
 def test_an_oblique_surface_is_kept():
