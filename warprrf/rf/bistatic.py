@@ -313,7 +313,7 @@ class BistaticField(RadioField):
             gain=gain,
             path_group=self._met_groups(sight.paths),
             cosine=sight.paths.cosine,
-            beam=sight.beams.reshape(len(gain), -1)[:, pixels],
+            beam=sight.beams.reshape(len(gain), count)[:, pixels],
             extra=np.zeros(len(pixels), np.float32),
             target_db=np.zeros(len(pixels)) if target_db is None else target_db.ravel()[pixels],
         )
@@ -447,7 +447,7 @@ class BistaticField(RadioField):
         """Delay [s] and angles of departure [rad] of each pixel's strongest path; NaN where empty."""
         strength, point, range_m = self._bounce_points(sight, parts.rays)
         dark = strength <= 0
-        outward = point - sight.transmitter
+        outward = np.where(dark[..., None], 1.0, point - sight.transmitter)
         length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
         if len(parts.specular):
             beams = parts.specular[:, None, None] * sight.beams
@@ -458,7 +458,9 @@ class BistaticField(RadioField):
             first = np.where(np.isnan(first), sight.receiver, first) - sight.transmitter
             outward = np.where(direct[..., None], first[which], outward)
             length = np.where(direct, sight.paths.length_m[which], length)
-        aod = np.stack(angles_from_directions(np.nan_to_num(outward)), axis=-1)
+        length = np.where(np.isfinite(length), length, np.nan)
+        outward = np.where(np.isnan(length)[..., None], 1.0, outward)
+        aod = np.stack(angles_from_directions(outward), axis=-1)
         return length / SPEED_OF_LIGHT, np.where(np.isnan(length)[..., None], np.nan, aod).astype(np.float32)
 
     def _paths(self, sight: Sight, max_paths: int | None) -> Paths:

@@ -19,7 +19,7 @@ from warprrf.rf.bounces import fresnel_curves
 NEPER = 10.0 / np.log(10.0)
 HUBER_DB = 3.0  # larger residuals count linearly: shadows that the geometry puts in the wrong place
 MAX_STEPS = 40
-TOLERANCE = 1e-4  # relative fall of the objective that ends the fit
+TOLERANCE = 1e-3  # relative fall of the objective that ends the fit
 
 
 @dataclass(frozen=True)

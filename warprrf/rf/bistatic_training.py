@@ -23,7 +23,7 @@ from warprrf.rf.uncertainty import ErrorModel, learn_errors
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
 
-ROWS = 60_000  # pixels that groups are fitted to, spread over the training receivers
+ROWS = 30_000  # pixels that groups are fitted to, spread over the training receivers
 LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so no term is chosen
 MOST_HELD_OUT = 10
 SHORT_STEPS = 6  # of a fit that only decides about a term

@@ -15,7 +15,7 @@ import numpy as np
 STEEPNESS_DB = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 20.0)  # lower ends of the bins
 LEVEL_DB = (0.0, 0.02, 0.3, 3.0, 12.0, 30.0)
 ENOUGH = 60  # errors in a bin
-LEAST_DB = 0.005
+LEAST_DB = 0.1
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,8 @@ def learn_errors(
 
 
 def _scale(error: np.ndarray) -> float:
-    """Standard deviation that puts about 68 and 95 % of ``error`` inside one and two of it, tails being heavier than
-    Gaussian: the geometric mean of what either share asks for."""
+    """Standard deviation of ``error``, whose tails are heavier than Gaussian: the geometric mean of what the shares of
+    68 and 95 % and the root mean square ask for, so that neither many small nor a few large errors decide alone."""
     one, two = np.quantile(error, (0.6827, 0.9545))
-    return float(np.sqrt(max(one, 1e-6) * max(0.5 * two, 1e-6)))
+    wanted = np.maximum([one, 0.5 * two, np.sqrt(np.mean(error**2))], LEAST_DB)
+    return float(np.exp(np.log(wanted).mean()))
