@@ -209,7 +209,7 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
     field = wr.RadioField.load(_existing(args.field))
     dataset = wr.SpectrumDataset.load(_existing(args.spectra))
     train, test = dataset.split(args.train, seed=args.seed)
-    methods: dict[str, Any] = {field.options.model: field.spectrum}
+    methods: dict[str, Any] = {field.model: field.spectrum}
     if args.lookups:
         known = (lookups.nearest, lookups.idw, lookups.constant, lookups.mean)
         methods |= {lookup.name: lookup for lookup in (build(train) for build in known)}
@@ -431,7 +431,9 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("geometry", help="a reconstruction's folder, splats (.ply) or a scene (.xml)")
     fit.add_argument("spectra", help="NetCDF file of spectra")
     fit.add_argument("-o", "--out", required=True, help="field file (.safetensors)")
-    fit.add_argument("--model", choices=("rf3dgs+", "rf3dgs"), default="rf3dgs+", help="default rf3dgs+")
+    fit.add_argument(
+        "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
+    )
     fit.add_argument(
         "--train", type=int, metavar="N", help="receivers of the nested training subset (default: all)"
     )
@@ -507,6 +509,7 @@ examples:
 HELP_FIT = """\
 Geometry stays frozen; blending weights are computed once per receiver, then the radio part is fitted on them.
 
+  bistatic  line of sight, mirrors and scattering lobes of material groups; holds for other transmitters too
   rf3dgs+   directional gain per Gaussian times the path-length law; delay and departure angle from geometry
   rf3dgs    directional gain without lengths; delay and departure angle as trained channels of their own
 

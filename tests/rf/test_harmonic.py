@@ -9,8 +9,8 @@ import pytest
 from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.harmonic import HarmonicField
 from warprrf.rf.field_paths import BEAM_REACH
+from warprrf.rf.harmonic import HarmonicField
 from warprrf.rf.metrics import psnr, unit_image
 from warprrf.rf.single_bounce import FieldOptions
 from warprrf.rf.spectrum import angles_from_directions, pixel_directions, pixel_solid_angles

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_array
+from warprrf.device import check_array
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf import field_files
 from warprrf.rf.bistatic_fit import NEPER, Layout, Parameters, View, jacobian, specular_power
@@ -29,8 +29,8 @@ from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.paths import Paths
 from warprrf.rf.second_bounce import ElementLight, mirrored_scene, sent_image
-from warprrf.rf.specular import SpecularPaths, specular_paths
 from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
+from warprrf.rf.specular import SpecularPaths, specular_paths
 from warprrf.rf.surface import Surface
 from warprrf.rf.transport import check_receiver
 from warprrf.rf.uncertainty import ErrorModel
@@ -154,8 +154,13 @@ class BistaticField(RadioField):
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: Any = field(default=None, repr=False)
 
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+        return "bistatic"
+
     @classmethod
-    def fit(cls, geometry: Any, ds: SpectrumDataset, **options: Any) -> BistaticField:
+    def fit(cls, geometry: Any, ds: SpectrumDataset, **options: Any) -> BistaticField:  # type: ignore[override]
         """Fit to the spectra of ``ds``; see :func:`warprrf.rf.bistatic_training.train`."""
         from warprrf.rf.bistatic_training import train
 
@@ -501,7 +506,7 @@ class BistaticField(RadioField):
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 _SURFACE = (
-    "normal", "patch", "plane_normal", "plane_offset", "group", "patch_group", "element", "element_centre", "element_area",
-    "element_group",
+    "normal", "patch", "plane_normal", "plane_offset", "group", "patch_group", "element", "element_centre",
+    "element_area",    "element_group",
 )  # fmt: skip
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")

@@ -178,7 +178,7 @@ def predict(view: View, p: Parameters) -> np.ndarray:
 
 
 def jacobian(view: View, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Power ``(N,)``, its derivatives to the parameters that this view depends on ``(N, C)`` and their indices ``(C,)``."""
+    """Power ``(N,)``, its derivatives to what this view depends on ``(N, C)`` and the indices of that ``(C,)``."""
     curves = fresnel_curves()
     alpha, slope = curves.at(curves.coordinates, p.log_excess[view.groups])
     weight = p.weight[view.groups]

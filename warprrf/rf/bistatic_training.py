@@ -1,4 +1,4 @@
-"""Fitting a bistatic field: trace once, choose terms on held-out receivers, fit groups, then elements, then the errors."""
+"""Fitting a bistatic field: trace once, choose terms on held-out receivers, fit groups, elements, then the errors."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from warprrf.device import Progress, check_array
 from warprrf.rf import bistatic_fit as _fit
 from warprrf.rf.bistatic import BistaticField, Sight, Terms
 from warprrf.rf.bistatic_fit import NEPER, Fit, Parameters, View
+from warprrf.rf.bounces import LOBES
 from warprrf.rf.residuals import Shares, fit_residual, gather_shares
-from warprrf.rf.specular import specular_paths
 from warprrf.rf.spectrum import to_db
+from warprrf.rf.specular import specular_paths
 from warprrf.rf.surface import Surface
 from warprrf.rf.transport import check_receiver
 from warprrf.rf.uncertainty import ErrorModel, learn_errors
@@ -77,7 +78,7 @@ def trace(
     started = time.perf_counter()
     surface = geometry if isinstance(geometry, Surface) else Surface.of(geometry)
     receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
-    blank = _blank(surface, ds, Terms(mirror_order=2, **({} if lobes is None else {"lobes": lobes})), device)
+    blank = _blank(surface, ds, Terms(mirror_order=2, lobes=LOBES if lobes is None else lobes), device)
     found = specular_paths(surface, blank.transmitter, receivers, blank.wavelength_m, order=2, device=device)
     sights = []
     for r, receiver in enumerate(receivers):
@@ -106,7 +107,6 @@ def train(
     gain_offset: bool = False,
     iterations: int = _fit.MAX_STEPS,
     transport: BistaticTransport | None = None,
-    relevance: Any = None,
     seed: int = 0,
     device: Any = None,
     progress: Progress | None = None,
@@ -130,7 +130,6 @@ def train(
         gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
         iterations: most steps of the groups' fit.
         transport: what :func:`trace` found for exactly these receivers.
-        relevance: a :class:`warprrf.rf.relevance.Relevance`, whose choice of terms is then taken.
         seed: of the choice of pixels and held-out receivers.
         device: where rays are cast.
         progress: called with the stages ``"transport"`` and ``"fit"``.
@@ -145,16 +144,9 @@ def train(
         "mirror_order": mirror_order, "mirror_scatter": mirror_scatter, "scatter_mirror": scatter_mirror,
         "diffuse_order": diffuse_order, "indirect": indirect, "residual": residual,
     }  # fmt: skip
-    if relevance is not None:
-        chosen = relevance.terms()
-        lobes = chosen.pop("lobes", None) if lobes is None else lobes
-        wanted = {name: chosen.get(name) if value is None else value for name, value in wanted.items()}
-    fixed = {"line_of_sight": bool(line_of_sight), "diffuse": bool(diffuse)}
-    Terms(
-        **fixed,
-        **{k: v for k, v in wanted.items() if v is not None},
-        **({} if lobes is None else {"lobes": lobes}),
-    )
+    fixed: dict[str, Any] = {"line_of_sight": bool(line_of_sight), "diffuse": bool(diffuse)}
+    given: dict[str, Any] = {k: v for k, v in wanted.items() if v is not None}
+    Terms(**fixed, lobes=LOBES if lobes is None else lobes, **given)
     check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float32)
     if len(ds.receivers) == 0 or not (ds.path_gain > ds.floor).any():
         raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")

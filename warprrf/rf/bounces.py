@@ -1,6 +1,6 @@
 """Diffuse single bounces of one receiver: what its rays meet, how a source lights it, and the images that follow.
 
-A pixel is seen through a lattice of rays. What they meet depends on the receiver alone, how it is lit on the transmitter
+A pixel is seen through a lattice of rays. What they meet depends on the receiver alone, how it is lit on the source
 besides, what it sends on on the materials too: the three steps are kept apart, so that a fit, another transmitter or
 another set of materials repeats only what changes. Path gain per ray, after Degli-Esposti et al. (2007), eq. (5), over
 the footprint of its solid angle Omega:
@@ -52,7 +52,7 @@ class FresnelCurves:
     coordinates: np.ndarray
 
     def at(self, table: np.ndarray, log_excess: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and their derivatives, ``(G, K)``."""
+        """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and derivatives, ``(G, K)``."""
         step = self.log_excess[1] - self.log_excess[0]
         x = np.clip(
             (np.asarray(log_excess, float) - self.log_excess[0]) / step, 0.0, len(self.log_excess) - 1.001
@@ -224,7 +224,7 @@ class BounceTracer:
     def light(
         self, met: Met, position: np.ndarray, *, real: np.ndarray | None = None, patch: int = -1
     ) -> Lit:
-        """How the transmitter at ``position`` (3,), or its image in ``patch`` (then ``real`` is itself), lights that."""
+        """How the transmitter at ``position`` (3,), or its image in ``patch`` (``real`` is then itself), lights it."""
         source = bounce.Source()
         source.position = wp.vec3d(*position)
         source.real = wp.vec3d(*(position if real is None else real))
@@ -232,8 +232,8 @@ class BounceTracer:
         count = len(met.face)
         lit = Lit(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(4)))
         inputs = [
-            self.surface.on_device(self.device), source, *met.inputs, met.solid_angle, float(self._half_width), NEAREST_M,
-            *lit.inputs,
+            self.surface.on_device(self.device), source, *met.inputs, met.solid_angle, float(self._half_width),
+            NEAREST_M,            *lit.inputs,
         ]  # fmt: skip
         _device.launch(bounce.light_surface, count, inputs, device=self.device)
         return lit

@@ -21,7 +21,18 @@ MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
 
 
 class RadioField(ABC):
-    """A fitted radio field; build it with :meth:`fit` or :meth:`load`."""
+    """A fitted radio field; build it with :meth:`fit` or :meth:`load`.
+
+    Attributes:
+        report: how the fit went.
+    """
+
+    report: dict[str, Any]
+
+    @property
+    @abstractmethod
+    def model(self) -> str:
+        """Name of the model."""
 
     @classmethod
     def fit(cls, geometry: Any, ds: SpectrumDataset, model: str = "bistatic", **options: Any) -> RadioField:

@@ -31,8 +31,8 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.kernels import field as _kernels
 from warprrf.rf import field_files
 from warprrf.rf import transport as _transport
-from warprrf.rf.field_paths import View, near_line_of_sight, paths_of
 from warprrf.rf.field import RadioField
+from warprrf.rf.field_paths import View, near_line_of_sight, paths_of
 from warprrf.rf.field_targets import targets
 from warprrf.rf.fitting import KINDS, Problem, Rates, fit_layer, harmonics
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
@@ -84,8 +84,13 @@ class HarmonicField(RadioField):
     device: Any = field(default=None, repr=False)
     _uploaded: dict[str, wp.array] = field(default_factory=dict, init=False, repr=False)
 
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+        return self.options.model
+
     @classmethod
-    def fit(
+    def fit(  # type: ignore[override]
         cls,
         geometry: Any,
         ds: SpectrumDataset,

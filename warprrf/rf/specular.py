@@ -63,7 +63,7 @@ def specular_paths(
     single_ray: bool = False,
     device: Any = None,
 ) -> SpecularPaths:
-    """Paths of ``receivers`` (R, 3) with at most ``order`` (0, 1 or 2) reflections; ``single_ray`` tries one ray each."""
+    """Paths of ``receivers`` (R, 3) with at most ``order`` (0, 1 or 2) reflections; ``single_ray``: one ray each."""
     samples = np.zeros((1, 2)) if single_ray else zone_samples()
     parts = [_line_of_sight(surface, transmitter, receivers, wavelength_m, samples, device)]
     if order >= 1 and len(surface.plane_offset):

@@ -17,7 +17,7 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import PlanarPatch, face_neighbours, smoothed_normals
+from warprrf.geometry.patches import PlanarPatch, smoothed_normals
 from warprrf.kernels import bounce
 from warprrf.rf.paths import planar_patches as exact_patches
 
@@ -162,7 +162,7 @@ class Surface:
         return {}
 
     def images(self, transmitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Image of ``transmitter`` (3,) in every patch's plane, shape ``(P, 3)``, and its height over it, ``(P,)`` [m]."""
+        """Image of ``transmitter`` (3,) in every patch's plane, ``(P, 3)``, and its height over it, ``(P,)`` [m]."""
         height = self.plane_normal @ transmitter - self.plane_offset
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
 
@@ -227,7 +227,7 @@ def _colour_groups(mesh: Mesh, patch: np.ndarray, gaussians: Gaussians) -> tuple
     )
     size = np.bincount(unit, area, minlength=count) + 1e-9
     known = total > 1e-9
-    mean[known] /= total[known, None]
+    mean[known] = mean[known] / total[known, None]
     owner = np.full(count, -1)
     owner[unit] = patch
     for p in np.unique(owner):  # a unit without Gaussians looks like its patch
@@ -268,8 +268,8 @@ def _colour_groups(mesh: Mesh, patch: np.ndarray, gaussians: Gaussians) -> tuple
         tiny = np.flatnonzero((whole > 0) & (whole < SMALLEST_GROUP_M2))
         if len(tiny) == 0:
             break
-        centre_of = np.stack([np.bincount(group, real * look[:, k]) for k in range(4)], axis=1)
-        centre_of /= np.maximum(whole, 1e-12)[:, None]
+        centre_of: np.ndarray = np.stack([np.bincount(group, real * look[:, k]) for k in range(4)], axis=1)
+        centre_of = centre_of / np.maximum(whole, 1e-12)[:, None]
         g = tiny[whole[tiny].argmin()]
         gap = np.where(whole > 0, np.linalg.norm(centre_of - centre_of[g], axis=1), np.inf)
         gap[g] = np.inf

@@ -34,7 +34,7 @@ from warprrf.rf import lookups, metrics
 from warprrf.rf.spectrum import to_db
 from warprrf.rf.transport import Transport, transport
 
-MODELS = ("rf3dgs+", "rf3dgs")
+MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
 LOOKUPS = {"nearest": lookups.nearest, "idw": lookups.idw, "constant": lookups.constant, "mean": lookups.mean}
 TRAIN_RECEIVERS = 50  # the training subset that the asked fit time is stated for
 PACKAGES = ("warprrf", "warp-lang", "numpy", "pycolmap", "open3d", "xarray", "h5netcdf", "safetensors")
@@ -344,26 +344,29 @@ def _fit(
     out: Path, file: Path, view: _View, model: str, truth: str, seed: int, progress: Progress
 ) -> dict[str, Any]:
     train, _ = view.split(file, seed)
-    weights, seconds = view.transport(train, progress)
     options: dict[str, Any] = {} if view.sizes.steps is None else {"iterations": view.sizes.steps}
+    seconds = 0.0
+    if model != "bistatic":  # which traces rays of its own, in seconds
+        options["transport"], seconds = view.transport(train, progress)
+        options["checkpoint"] = out / f"{_field_name(model, truth)}.checkpoint"
     field = wr.RadioField.fit(
         view.reconstruction,
         train,
         model=model,
-        transport=weights,
-        checkpoint=out / f"{_field_name(model, truth)}.checkpoint",
         seed=seed,
         device=view.device,
         progress=progress,
         **options,
     )
     write_atomically(out / _field_name(model, truth), field.save)
+    seconds = seconds or field.report["transport_time_s"]
     return {
         "transport_time_s": seconds,
         "fit_time_s": seconds + field.report["fit_time_s"],
         "loss_first": {name: losses[0] for name, losses in field.report["losses"].items() if losses},
         "loss_last": {name: losses[-1] for name, losses in field.report["losses"].items() if losses},
-        "gaussians_seen": field.report["gaussians_seen"],
+        "gaussians_seen": field.report.get("gaussians_seen"),
+        "terms": field.report.get("choices"),
         "model_bytes": (out / _field_name(model, truth)).stat().st_size,
     }
 
@@ -383,6 +386,9 @@ def _evaluation(
         def predict(receiver: np.ndarray, field: Any = field) -> Any:
             return field.spectrum(receiver, transport=weights.subset([order[tuple(receiver)]]))
 
+        if model == "bistatic":
+            methods[model] = metrics.evaluate(test, field.spectrum, progress=progress)
+            continue
         methods[model] = metrics.evaluate(test, predict, progress=progress)
         # Weights were computed beforehand for all methods: the time of a spectrum from nothing includes them.
         methods[model]["seconds_per_spectrum"] += seconds / len(test.receivers)

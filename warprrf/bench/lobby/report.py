@@ -21,6 +21,7 @@ from warprrf.bench.stages import write_atomically
 from warprrf.device import require
 
 METHODS = {
+    "bistatic": ("bistatic (ours)", "#b3123c"),
     "rf3dgs+": ("RF-3DGS+", "#0b6e99"),
     "rf3dgs": ("RF-3DGS", "#c4570f"),
     "nearest": ("nearest", "#6b4c9a"),
