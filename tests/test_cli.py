@@ -164,7 +164,7 @@ def test_simulate_fit_evaluate_and_render_round_trip(
     simulate = ["simulate", SCENE, "-o", spectra, "--receivers", tmp_path / "receivers.csv"]
     simulate += ["--transmitter", 3.2, 2.6, 3.2, "--shape", 16, 32]
     assert cli.main([str(word) for word in [*simulate, *common]]) == 0
-    fit = ["fit", SCENE, spectra, "-o", field, "--train", 10, "--iterations", 60]
+    fit = ["fit", SCENE, spectra, "-o", field, "--train", 10, "--iterations", 60, "--model", "rf3dgs+"]
     assert cli.main([str(word) for word in [*fit, *common]]) == 0
     evaluate = ["evaluate", field, spectra, "--train", 10, "-o", tmp_path / "figures.json"]
     assert cli.main([str(word) for word in [*evaluate, *common]]) == 0
