@@ -13,7 +13,7 @@ from warprrf import cli
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
-COMMANDS = ("lobby", "reconstruct", "simulate", "fit", "render", "evaluate", "data")
+COMMANDS = ("lobby", "reconstruct", "simulate", "fit", "render", "evaluate", "bench", "data")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -66,6 +66,7 @@ BAD = {
         "--look-at",
     ),
     "field without receiver": ([*RENDER, "{tmp}/bad.safetensors"], "--receiver"),
+    "no rays": (["bench", "newrf", "--data", "{tmp}", "--out", "{tmp}/run"], "newrf_conference.npz"),
     "no lobby": (["lobby", "--data", "{tmp}", "--out", "{tmp}/run"], "photos"),
     "positions that are no positions": (
         ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/words.txt"],

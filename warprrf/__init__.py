@@ -34,6 +34,8 @@ _HOMES = {
     "SpectrumDataset": "rf.dataset",
     "blend_weights": "geometry.render",
     "evaluate": "rf.metrics",
+    "fit_reflections": "rf.reflections",
+    "load_newrf": "rf.newrf",
     "reconstruct": "geometry.reconstruction",
     "render": "geometry.render",
     "simulate": "rf.simulate",
@@ -57,8 +59,10 @@ if TYPE_CHECKING:
     from warprrf.rf.field import RadioField as RadioField
     from warprrf.rf.materials import Material as Material
     from warprrf.rf.metrics import evaluate as evaluate
+    from warprrf.rf.newrf import load_newrf as load_newrf
     from warprrf.rf.paths import Paths as Paths
     from warprrf.rf.paths import trace_paths as trace_paths
+    from warprrf.rf.reflections import fit_reflections as fit_reflections
     from warprrf.rf.scene import Scene as Scene
     from warprrf.rf.simulate import simulate as simulate
     from warprrf.rf.spectrum import Spectrum as Spectrum

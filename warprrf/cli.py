@@ -224,6 +224,22 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
         write_json(args.out, figures)
 
 
+def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import newrf
+
+    report = newrf.run(args.out or "runs/newrf", args.data or newrf.DATA, device=args.device, progress=bars)
+    bars._close()
+    print(newrf.summary_text(report))
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {"newrf": _bench_newrf}
+"""Benchmarks by name: what `warprrf bench NAME` runs."""
+
+
+def _bench(args: argparse.Namespace, bars: Bars) -> None:
+    BENCHES[args.name](args, bars)
+
+
 def table(methods: dict[str, dict[str, Any]]) -> str:
     """The figures of several methods as aligned text, one row a method."""
     columns = {
@@ -464,6 +480,11 @@ def _parser() -> argparse.ArgumentParser:
     eva.add_argument("--no-lookups", dest="lookups", action="store_false", help="the field alone")
     eva.add_argument("-o", "--out", help="JSON file of the figures")
 
+    bench = add("bench", _bench, "one table of figures, from one command", HELP_BENCH)
+    bench.add_argument("name", choices=sorted(BENCHES), help="which table")
+    bench.add_argument("--out", help="folder of the results (default runs/NAME)")
+    bench.add_argument("--data", help="folder of the data that it reads (default: the table's own)")
+
     data = add("data", _data, "regenerate data/lobby/ from nothing (hours; resumable)", HELP_DATA)
     data.add_argument("--data", default="data/lobby", help="folder to write (default data/lobby)")
     data.add_argument("--only", nargs="+", choices=("scene", "photos", "spectra"), help="these steps alone")
@@ -531,6 +552,16 @@ measurement, inverse distance, a constant, the mean image). `blocked` counts rec
 
 examples:
   warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
+"""
+
+HELP_BENCH = """\
+Prints a table and writes it as JSON and Markdown.
+
+  newrf   rays and channels of NeWRF's conference room (MATLAB's image method) beside ours
+
+examples:
+  warprrf bench newrf
+  warprrf bench newrf --data external/newrf --out runs/newrf
 """
 
 HELP_DATA = """\

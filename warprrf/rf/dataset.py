@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
+from warprrf.rf.antenna import deembed_dataset
 from warprrf.rf.paths import check_frequency
 from warprrf.rf.spectrum import Spectrum, check_shape, default_floor, pixel_angles, to_db
 
@@ -210,6 +211,48 @@ class SpectrumDataset:
         if seed != 0:
             train = np.random.default_rng(seed).permutation(train)
         return self.subset(train[:n_train]), self.subset(test)
+
+    def deembed(
+        self,
+        pattern: Any,
+        *,
+        boresight_gain_dbi: float | None = None,
+        noise: float = 0.0,
+        progress: _device.Progress | None = None,
+        **options: Any,
+    ) -> SpectrumDataset:
+        """These spectra without the antenna that measured them.
+
+        A *scanned* antenna was steered to every pixel centre, and a pixel holds what it received there over what was
+        transmitted: path gain times antenna gain, summed over all directions. ``pattern`` is then its power gain over
+        the angle off boresight [rad]: a function, or samples ``(N,)`` from 0 to pi, both included. The result is
+        spread by ``beam_sigma_rad``, and its sum is the total path gain between isotropic antennas: that of
+        ``sum over pixels of (value - noise) times solid angle / integral of the pattern over the sphere``; a spectrum
+        of which noise leaves nothing comes out empty.
+
+        A *fixed* antenna did not turn, and directions were told apart otherwise. ``pattern`` is then its gain in each
+        pixel's direction, ``(H, W)``: pixels are divided by it. Where it lies more than ``limit_db`` below its peak
+        nothing can be told: those pixels become empty, and the sum is that of the others.
+
+        Delay and angle of departure are those measured in the direction that gives a pixel most of its power. The
+        floor and range are chosen anew; attributes ``deembedded...`` say what was done.
+
+        Args:
+            pattern: Linear power gain over isotropic; see above.
+            boresight_gain_dbi: Scales the pattern to this gain at its strongest: 0 where measurements had the
+                boresight gain divided out.
+            noise: Mean noise power in every value of a scan [linear, over transmitted power].
+            progress: Called once a receiver with the stage ``"deembed"``.
+            **options: For a scan ``snapshots`` (1, over which each value's noise was averaged), ``iterations`` (2000),
+                ``tolerance`` (1e-3) and ``device``; for a fixed antenna ``limit_db`` (20).
+
+        Raises:
+            TypeError: on a pattern that does not read as numbers, or an option of the other kind of antenna.
+            ValueError: on negative, NaN or infinite gains, a scanned antenna without directivity, another shape.
+        """
+        return deembed_dataset(
+            self, pattern, boresight_gain_dbi=boresight_gain_dbi, noise=noise, progress=progress, **options
+        )
 
     def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
         """Write NetCDF-4, whole or not at all.
