@@ -17,7 +17,7 @@ from warprrf.geometry.discs import discs_on_mesh
 
 LOBBY = Path(__file__).resolve().parents[2] / "data" / "lobby"
 SIZES = pipeline.Sizes(steps=20, train=6, test=4)
-MODELS = ("rf3dgs+", "rf3dgs")
+MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
 KEYS = (
     "psnr_db",
     "ssim",
@@ -155,7 +155,7 @@ def test_killed_run_ends_with_the_same_figures(
     with pytest.raises(KeyboardInterrupt):
         pipeline.run(tmp_path, data, reduced=True, device="cpu", progress=kill)
     again = pipeline.run(tmp_path, data, reduced=True, device="cpu")
-    assert again["stages"]["fit rf3dgs+, exact"]["attempts"] == 2
+    assert again["stages"]["fit bistatic, exact"]["attempts"] == 2
     assert again["stages"]["geometry"]["attempts"] == 1
     for name, figures in finished[1]["methods"].items():
         for key in KEYS:
