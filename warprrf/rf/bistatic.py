@@ -294,9 +294,10 @@ class BistaticField(RadioField):
         """The sight as linear maps from group parameters to ``pixels`` (N,), for :mod:`warprrf.rf.bistatic_fit`."""
         count, groups = self.shape[0] * self.shape[1], self.surface.groups
         basis = self.tracer.resolve(sight.met, sight.lit, self.wavelength_m)
+        basis *= np.float32(1.0 / self.floor)
         lit = np.flatnonzero(basis.any(axis=(0, 1, 3, 4)))
-        columns = self.beam(basis[:, :, lit].reshape(*self.shape, -1) / self.floor).reshape(count, -1)
-        basis = columns[pixels].reshape(len(pixels), len(lit), *basis.shape[3:]).astype(np.float32)
+        columns = self.beam.at(pixels, basis[:, :, lit].reshape(count, -1))
+        basis = columns.reshape(len(pixels), len(lit), *basis.shape[3:])
         strong = np.abs(basis).max(axis=(0, 2, 3), initial=0.0) > NEGLIGIBLE
         face = sight.met.face.numpy()
         met = np.flatnonzero(face >= 0)
@@ -304,7 +305,7 @@ class BistaticField(RadioField):
         cell = (met // self.tracer.sub_pixels**2) * groups + self.surface.group[face[met]]
         dark = np.bincount(cell, rays, minlength=count * groups).reshape(count, groups)
         visible = np.flatnonzero(dark.any(axis=0))
-        dark = self.beam(dark[:, visible].reshape(*self.shape, -1)).reshape(count, -1)[pixels]
+        dark = self.beam.at(pixels, dark[:, visible])
         gain = (
             (self.wavelength_m / (4.0 * np.pi * sight.paths.length_m)) ** 2
             * sight.paths.share**2
@@ -314,7 +315,7 @@ class BistaticField(RadioField):
             groups=lit[strong],
             basis=np.ascontiguousarray(basis[:, strong]),
             seen=visible,
-            dark=np.maximum(dark, 0.0).astype(np.float32),
+            dark=dark,
             gain=gain,
             path_group=self._met_groups(sight.paths),
             cosine=sight.paths.cosine,
@@ -404,6 +405,10 @@ class BistaticField(RadioField):
     def _element_light(self) -> dict[bytes, ElementLight]:
         return {}
 
+    @cached_property
+    def _radiance(self) -> dict[bytes, np.ndarray]:
+        return {}
+
     def element_light(self, transmitter: np.ndarray) -> ElementLight:
         """How ``transmitter`` lights the elements by way of others, traced once."""
         key = np.asarray(transmitter, np.float64).tobytes()
@@ -413,16 +418,20 @@ class BistaticField(RadioField):
 
     def _sent(self, transmitter: np.ndarray) -> np.ndarray | None:
         """Radiance (E,) that elements send on besides first bounces [1/(m^2 sr)], None where there is none."""
-        sent = None
-        if self.terms.further:
-            light = self.element_light(transmitter)
-            sent = light.radiance(
-                self.parameters, mirrors=self.terms.mirror_scatter, diffuse=self.terms.diffuse_order - 1
-            )
-        if self.terms.indirect:
-            own = np.exp(self.parameters.log_indirect)[self.surface.element_group]
-            sent = own if sent is None else sent + own
-        return sent
+        if not (self.terms.further or self.terms.indirect):
+            return None
+        key = np.asarray(transmitter, np.float64).tobytes()
+        if key not in self._radiance:
+            sent = np.zeros(len(self.surface.element_area))
+            if self.terms.further:
+                light = self.element_light(transmitter)
+                sent += light.radiance(
+                    self.parameters, mirrors=self.terms.mirror_scatter, diffuse=self.terms.diffuse_order - 1
+                )
+            if self.terms.indirect:
+                sent += np.exp(self.parameters.log_indirect)[self.surface.element_group]
+            self._radiance[key] = sent
+        return self._radiance[key]
 
     def _specular(self, paths: SpecularPaths) -> np.ndarray:
         """Power of each line-of-sight and mirror path, shape ``(L,)``."""

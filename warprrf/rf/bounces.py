@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.sparse import csr_matrix
 
 from warprrf import device as _device
 from warprrf.kernels import bounce
@@ -53,24 +54,28 @@ class FresnelCurves:
 
     def at(self, table: np.ndarray, log_excess: Any) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and derivatives, ``(G, K)``."""
+        i, s, step = self._place(log_excess)
+        s = s[:, None]
+        return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
+
+    def value(self, log_excess: Any, cosine: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Reflection (N,) at ``log_excess`` (N,) and ``cosine`` (N,), and its derivative to ``log_excess``."""
+        i, s, step = self._place(log_excess)
+        x = np.clip(np.asarray(cosine, float), 0.0, 1.0) * (_COSINES - 1)
+        j = np.minimum(x.astype(int), _COSINES - 2)
+        r = x - j
+        low = (1 - r) * self.curves[i, j] + r * self.curves[i, j + 1]
+        high = (1 - r) * self.curves[i + 1, j] + r * self.curves[i + 1, j + 1]
+        return (1 - s) * low + s * high, (high - low) / step
+
+    def _place(self, log_excess: Any) -> tuple[np.ndarray, np.ndarray, float]:
+        """Row below each ``log_excess``, the share of the next, and the distance of rows."""
         step = self.log_excess[1] - self.log_excess[0]
         x = np.clip(
             (np.asarray(log_excess, float) - self.log_excess[0]) / step, 0.0, len(self.log_excess) - 1.001
         )
         i = x.astype(int)
-        s = (x - i)[:, None]
-        return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
-
-    def value(self, log_excess: Any, cosine: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Reflection (N,) at ``log_excess`` (N,) and ``cosine`` (N,), and its derivative to ``log_excess``."""
-        curve, slope = self.at(self.curves, log_excess)
-        x = np.clip(np.asarray(cosine, float), 0.0, 1.0) * (_COSINES - 1)
-        j = np.minimum(x.astype(int), _COSINES - 2)
-        s, row = x - j, np.arange(len(j))
-        return (
-            (1 - s) * curve[row, j] + s * curve[row, j + 1],
-            (1 - s) * slope[row, j] + s * slope[row, j + 1],
-        )
+        return i, x - i, float(step)
 
 
 @lru_cache(maxsize=1)
@@ -103,38 +108,40 @@ def _lobe_tables(exponents: tuple[int, ...], device: str) -> tuple[wp.array, wp.
 class BeamOperator:
     """The receiver beam as a linear map of images: a pixel's power, even over the pixel, spread over the grid.
 
-    Columns are shifts of each other, so azimuth is done by FFT. Sums are kept.
+    A sparse matrix, because a beam ends a few widths from its centre. Sums are kept.
     """
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
         rows, columns = shape
         directions = sub_pixel_directions(shape, SUB_PIXELS)[0].reshape(rows, columns, -1, 3)
-        kernel = np.zeros((rows, rows, columns))
-        for i in range(rows):
+        out, own, value = [], [], []
+        turn = np.arange(columns)
+        for i in range(rows):  # columns of the grid are shifts of each other
             beams = directions[i, 0]
-            kernel[:, i] = spread(beams, np.full(len(beams), 1.0 / len(beams)), shape, sigma, device=device)
+            kernel = spread(beams, np.full(len(beams), 1.0 / len(beams)), shape, sigma, device=device)
+            m, j = np.nonzero(kernel)
+            out.append((m[:, None] * columns + (j[:, None] + turn) % columns).ravel())
+            own.append(np.broadcast_to(i * columns + turn, (len(m), columns)).ravel())
+            value.append(np.repeat(kernel[m, j], columns))
+        pixels = rows * columns
         self.shape = shape
-        self._kernel = np.ascontiguousarray(np.moveaxis(np.fft.rfft(kernel, axis=2), 2, 0))  # (F, out, in)
+        self.matrix = csr_matrix(
+            (np.concatenate(value), (np.concatenate(out), np.concatenate(own))), shape=(pixels, pixels)
+        )
+        self._narrow = self.matrix.astype(np.float32)
+        self._transposed = self.matrix.T.tocsr()
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
         """Spread ``images`` (H, W, ...)."""
-        return self._apply(images, self._kernel)
+        return (self.matrix @ images.reshape(self.matrix.shape[1], -1)).reshape(images.shape)
 
     def adjoint(self, images: np.ndarray) -> np.ndarray:
         """The transposed map of ``images`` (H, W, ...)."""
-        return self._apply(images, np.conj(np.swapaxes(self._kernel, 1, 2)))
+        return (self._transposed @ images.reshape(self.matrix.shape[0], -1)).reshape(images.shape)
 
-    def _apply(self, images: np.ndarray, kernel: np.ndarray) -> np.ndarray:
-        rows, columns = self.shape
-        planes = np.ascontiguousarray(images.reshape(rows * columns, -1).T, dtype=np.float64)
-        spectrum = np.ascontiguousarray(
-            np.fft.rfft(planes.reshape(-1, rows, columns), axis=2).transpose(2, 1, 0)
-        )
-        # Four real products: NumPy has no fast stacked complex one.
-        a, b, x, y = kernel.real.copy(), kernel.imag.copy(), spectrum.real.copy(), spectrum.imag.copy()
-        mixed = (a @ x - b @ y) + 1j * (a @ y + b @ x)
-        back = np.fft.irfft(np.ascontiguousarray(mixed.transpose(2, 1, 0)), n=columns, axis=2)
-        return np.ascontiguousarray(back.reshape(-1, rows * columns).T).reshape(images.shape)
+    def at(self, pixels: np.ndarray, images: np.ndarray) -> np.ndarray:
+        """``images`` (H W, C) spread, at ``pixels`` (N,) alone, in single precision, shape ``(N, C)``."""
+        return self._narrow[pixels] @ images.astype(np.float32, copy=False)
 
 
 @dataclass(frozen=True)
