@@ -290,7 +290,7 @@ def test_bad_options_are_refused(scene: RadioScene, data: SpectrumDataset) -> No
     few = data.subset([0])
     with pytest.raises(ValueError, match=r"bistatic, rf3dgs\+, rf3dgs"):
         RadioField.fit(scene, few, model="magic")
-    for options, name in (({"mirror_order": 3}, "mirror_order"), ({"diffuse_order": 0}, "diffuse_order"),
+    for options, name in (({"mirror_order": 4}, "mirror_order"), ({"diffuse_order": 0}, "diffuse_order"),
                           ({"lobes": ()}, "lobes"), ({"iterations": -1}, "iterations")):  # fmt: skip
         with pytest.raises(ValueError, match=name):
             RadioField.fit(scene, few, **options)

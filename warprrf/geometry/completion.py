@@ -248,8 +248,8 @@ def least_surface(
         closed: whether all beyond the lower and upper end of each direction is solid (else it is free), shape
             ``(3, 2)`` bool; default: all.
     """
-    sparse = require("scipy.sparse", extra="photos")
-    graph = require("scipy.sparse.csgraph", extra="photos")
+    from scipy import sparse
+    from scipy.sparse import csgraph as graph
     shape = grid.shape
     x, y, z = (np.diff(h) for h in grid.heights)
     sides = [
@@ -300,7 +300,7 @@ def least_surface(
 
 def without_hollows(grid: Grid, filled: np.ndarray, places: np.ndarray) -> np.ndarray:
     """``filled`` with every hollow filled that none of ``places`` (N, 3) lies in: no photo was taken there."""
-    image = require("scipy.ndimage", extra="photos")
+    from scipy import ndimage as image
     piece, _ = image.label(~filled)
     index = grid.locate(places)
     own = np.unique(piece.ravel()[index[index >= 0]])
@@ -365,8 +365,8 @@ def seen_share(grid: Grid, mesh: Mesh, patches: Sequence[PlanarPatch], solid: np
 
 def _pieces(mesh: Mesh, label: np.ndarray) -> np.ndarray:
     """Numbers of the connected pieces of faces that share a label, shape ``(F,)``; a face labelled -1 is a piece."""
-    graph = require("scipy.sparse.csgraph", extra="photos")
-    sparse = require("scipy.sparse", extra="photos")
+    from scipy.sparse import csgraph as graph
+    from scipy import sparse
     ring = face_neighbours(mesh.faces)
     face, side = np.nonzero((ring >= 0) & (label >= 0)[:, None] & (label[ring] == label[:, None]))
     link = sparse.coo_matrix((np.ones(len(face)), (face, ring[face, side])), shape=(len(label),) * 2)

@@ -195,6 +195,7 @@ def resolve_bounces(
     offset: int,
     per_pixel: int,
     surface: Surface,
+    place: wp.array(dtype=wp.int32),
     face: wp.array(dtype=wp.int32),
     strength: wp.array(dtype=wp.float32),
     cos_in: wp.array(dtype=wp.float32),
@@ -205,13 +206,13 @@ def resolve_bounces(
     moments: wp.array2d(dtype=wp.float32),
     out: wp.array2d(dtype=wp.float32),
 ):
-    """Per pixel, what each group, lobe and Fresnel component would send on: column (group, lobe, component)."""
+    """Per pixel, what each group, lobe and Fresnel component would send on: column (group's place, lobe, component)."""
     p = offset + wp.tid()
     lobes = exponent.shape[0]
     for s in range(per_pixel):
         k = p * per_pixel + s
         if strength[k] > 0.0:
-            base = surface.group[face[k]] * lobes * MOMENTS
+            base = place[surface.group[face[k]]] * lobes * MOMENTS
             for j in range(lobes):
                 value = strength[k] * lobe_value(exponent, norm, j, cos_in[k], cos_mirror[k], grazing[k])
                 for m in range(MOMENTS):

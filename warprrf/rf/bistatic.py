@@ -27,6 +27,8 @@ from warprrf.rf.bistatic_fit import NEPER, Layout, Parameters, View, jacobian, s
 from warprrf.rf.bounces import LOBES, BeamOperator, BounceTracer, Lit, Met
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.mirror_light import MirrorSight
+from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.paths import Paths
 from warprrf.rf.second_bounce import ElementLight, mirrored_scene, sent_image
 from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
@@ -53,7 +55,7 @@ class Terms:
 
     Attributes:
         line_of_sight, diffuse: whether there are such paths.
-        mirror_order: most mirror reflections on a path, 0 to 2.
+        mirror_order: most mirror reflections on a path, 0 to 3.
         lobes: exponents of the scattering lobes, 0 for Lambertian.
         mirror_scatter: whether mirrors light surfaces.
         scatter_mirror: whether mirrors show the lit scene.
@@ -73,7 +75,7 @@ class Terms:
     residual: bool = False
 
     def __post_init__(self) -> None:
-        for name, allowed in (("mirror_order", (0, 1, 2)), ("diffuse_order", (1, 2, 3))):
+        for name, allowed in (("mirror_order", (0, 1, 2, 3)), ("diffuse_order", (1, 2, 3))):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {allowed}")
         if not self.lobes or any(n != int(n) or n < 0 for n in self.lobes):
@@ -82,8 +84,8 @@ class Terms:
 
     @property
     def further(self) -> bool:
-        """Whether elements send on what other surfaces gave them."""
-        return self.diffuse and (self.mirror_scatter or self.diffuse_order > 1)
+        """Whether elements send on what other surfaces scattered to them."""
+        return self.diffuse and self.diffuse_order > 1
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ class Sight:
         lit: how the transmitter lights that.
         paths: its line of sight and mirror paths.
         beams: unit beam of each, shape ``(L, H, W)`` float32.
+        mirrored: what its rays see of mirrored light; None if that is not modelled.
     """
 
     receiver: np.ndarray
@@ -104,6 +107,7 @@ class Sight:
     lit: Lit
     paths: SpecularPaths
     beams: np.ndarray
+    mirrored: MirrorSight | None = None
 
 
 @dataclass(frozen=True)
@@ -134,7 +138,8 @@ class BistaticField(RadioField):
         shape: rows and columns of its spectra.
         floor, range_db, beam_sigma_rad: of the data set it was fitted to.
         terms: what it models.
-        parameters: of the groups.
+        parameters: of the groups; those of one material are alike.
+        material: of each group, shape ``(G,)``.
         residual: ln gain of each element over its group, shape ``(E,)``.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         report: how the fit went.
@@ -149,6 +154,7 @@ class BistaticField(RadioField):
     beam_sigma_rad: float
     terms: Terms
     parameters: Parameters = field(repr=False)
+    material: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
     errors: ErrorModel | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
@@ -224,14 +230,15 @@ class BistaticField(RadioField):
                 f"uncertainty: this field was fitted to {self.report.get('receivers', 0)} receivers, too few to hold "
                 "some out and learn its error from; fit to four or more"
             )
-        p, floor = self.parameters, self.floor
+        p, floor = self.parameters.take(np.unique(self.material, return_index=True)[1]), self.floor
         layout = next(
             Layout(*p.log_weight.shape, indirect=self.terms.indirect, gain=g)
             for g in (False, True)
             if Layout(*p.log_weight.shape, indirect=self.terms.indirect, gain=g).size
             == len(self.errors.covariance)
         )
-        power, slopes, index = jacobian(self.view(sight, np.arange(self.shape[0] * self.shape[1])), p, layout)
+        view = self.view(sight, np.arange(self.shape[0] * self.shape[1])).tied(self.material)
+        slopes, index = jacobian(view, p, layout)[1:]
         image = parts.image / floor
         slopes = slopes * (NEPER / (1.0 + image.ravel()))[:, None]
         return self.errors.std_db(NEPER * np.log1p(image), sight.receiver, slopes, index)
@@ -251,12 +258,16 @@ class BistaticField(RadioField):
                 receiver[None],
                 self.wavelength_m,
                 order=self.terms.mirror_order,
+                tree=self.mirror_tree(source),
                 device=self.device,
             )
         beams = np.zeros((len(paths), *self.shape), np.float32)
         for k, arrival in enumerate(paths.arrival):
             beams[k] = spread(arrival[None], np.ones(1), self.shape, self.beam_sigma_rad, device=self.device)
-        return Sight(receiver, source, met, lit, paths, beams)
+        mirrored = None
+        if self.terms.diffuse and self.terms.mirror_scatter:
+            mirrored = self.element_light(source).mirrors.sight(receiver, met)
+        return Sight(receiver, source, met, lit, paths, beams, mirrored)
 
     def compose(self, sight: Sight) -> Composed:
         """The spectrum of what is seen, by its parts."""
@@ -279,6 +290,9 @@ class BistaticField(RadioField):
         sent = self._sent(sight.transmitter)
         if sent is not None:
             out += sent_image(self.tracer, sight.met, sent, self.wavelength_m)
+        if self.terms.diffuse and self.terms.mirror_scatter and sight.mirrored is not None:
+            light = self.element_light(sight.transmitter).mirrors
+            out += light.image(sight.mirrored, self.parameters, self.wavelength_m)
         if self.terms.diffuse and self.terms.scatter_mirror:
             out += mirrored_scene(
                 self._mirror_tracer,
@@ -293,11 +307,9 @@ class BistaticField(RadioField):
     def view(self, sight: Sight, pixels: np.ndarray, target_db: np.ndarray | None = None) -> View:
         """The sight as linear maps from group parameters to ``pixels`` (N,), for :mod:`warprrf.rf.bistatic_fit`."""
         count, groups = self.shape[0] * self.shape[1], self.surface.groups
-        basis = self.tracer.resolve(sight.met, sight.lit, self.wavelength_m)
-        basis *= np.float32(1.0 / self.floor)
-        lit = np.flatnonzero(basis.any(axis=(0, 1, 3, 4)))
-        columns = self.beam.at(pixels, basis[:, :, lit].reshape(count, -1))
-        basis = columns.reshape(len(pixels), len(lit), *basis.shape[3:])
+        lit, images = self.tracer.resolve(sight.met, sight.lit, self.wavelength_m)
+        columns = self.beam.at(pixels, images.reshape(count, -1)) / np.float32(self.floor)
+        basis = columns.reshape(len(pixels), *images.shape[1:])
         strong = np.abs(basis).max(axis=(0, 2, 3), initial=0.0) > NEGLIGIBLE
         face = sight.met.face.numpy()
         met = np.flatnonzero(face >= 0)
@@ -332,7 +344,7 @@ class BistaticField(RadioField):
         tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
         tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
         tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
-        tensors |= {"residual": self.residual, "transmitter": self.transmitter}
+        tensors |= {"residual": self.residual, "material": self.material, "transmitter": self.transmitter}
         if self.errors is not None:
             tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(self.errors).items()}
         header = {name: getattr(self, name) for name in _PLAIN}
@@ -364,6 +376,7 @@ class BistaticField(RadioField):
                 transmitter=tensors["transmitter"],
                 terms=Terms(**header["terms"]),
                 parameters=parameters,
+                material=tensors["material"],
                 residual=tensors["residual"],
                 errors=ErrorModel(**errors) if errors else None,
                 report=header["report"],
@@ -409,6 +422,19 @@ class BistaticField(RadioField):
     def _radiance(self) -> dict[bytes, np.ndarray]:
         return {}
 
+    @cached_property
+    def _mirror_trees(self) -> dict[bytes, MirrorTree]:
+        return {}
+
+    def mirror_tree(self, transmitter: np.ndarray) -> MirrorTree | None:
+        """Chains of mirrors that ``transmitter`` may be seen in, found once; None where one mirror is the most."""
+        if self.terms.mirror_order < 2:
+            return None
+        key = np.asarray(transmitter, np.float64).tobytes()
+        if key not in self._mirror_trees:
+            self._mirror_trees[key] = MirrorTree(self.surface, transmitter, self.terms.mirror_order)
+        return self._mirror_trees[key]
+
     def element_light(self, transmitter: np.ndarray) -> ElementLight:
         """How ``transmitter`` lights the elements by way of others, traced once."""
         key = np.asarray(transmitter, np.float64).tobytes()
@@ -443,7 +469,7 @@ class BistaticField(RadioField):
         return np.where(kept, power, 0.0)
 
     def _met_groups(self, paths: SpecularPaths) -> np.ndarray:
-        """Groups that each path meets (L, 2), -1 where fewer."""
+        """Groups that each path meets (L, 3), -1 where fewer."""
         known = paths.patch >= 0
         owner = self.surface.patch_group
         return np.where(known, owner[np.where(known, paths.patch, 0)] if len(owner) else -1, -1)
@@ -492,7 +518,7 @@ class BistaticField(RadioField):
         power = diffuse[kept]
         if len(power):
             power = power * max(total - s.sum(), 0.0) / power.sum()
-        over = np.full((len(power), 2, 3), np.nan)
+        over = np.full((len(power), *vertices.shape[1:]), np.nan)
         over[:, 0] = point[kept]
         whole = np.isfinite(over[:, 0]).all(axis=1)
         power, over = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)), over[whole]
@@ -515,7 +541,7 @@ class BistaticField(RadioField):
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 _SURFACE = (
-    "normal", "patch", "plane_normal", "plane_offset", "group", "patch_group", "element", "element_centre",
-    "element_area",    "element_group",
+    "normal", "patch", "plane_normal", "plane_offset", "group", "material", "look", "patch_group", "element",
+    "element_centre", "element_area", "element_group",
 )  # fmt: skip
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")

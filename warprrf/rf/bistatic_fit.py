@@ -45,6 +45,13 @@ class Parameters:
         """Lobe weights ``(G, L)``."""
         return np.exp(self.log_weight)
 
+    def take(self, index: np.ndarray) -> Parameters:
+        """The rows ``index``: of materials to those of groups, say."""
+        return replace(
+            self, log_weight=self.log_weight[index], log_excess=self.log_excess[index],
+            log_mirror=self.log_mirror[index], log_indirect=self.log_indirect[index],
+        )  # fmt: skip
+
     @classmethod
     def prior(cls, groups: int, lobes: int) -> Parameters:
         """What a surface is taken for before any measurement: half scattered, half mirrored, epsilon_r of 4."""
@@ -77,7 +84,7 @@ class View:
         seen: groups that it sees at all, shape ``(B,)``.
         dark: indirect power at unit radiance, shape ``(N, B)`` float32.
         gain: power of each specular path without its reflections, shape ``(K,)``.
-        path_group, cosine: groups it meets (-1: none) and cosines of incidence, shapes ``(K, 2)``.
+        path_group, cosine: groups it meets (-1: none) and cosines of incidence, shapes ``(K, 3)``.
         beam: power of each path's beam per pixel, shape ``(K, N)`` float32.
         extra: power that is not fitted, shape ``(N,)``.
         target_db: 10 log10(P / N0 + 1), shape ``(N,)``.
@@ -93,6 +100,22 @@ class View:
     beam: np.ndarray
     extra: np.ndarray
     target_db: np.ndarray
+
+    def tied(self, material: np.ndarray) -> View:
+        """The view by materials instead of groups; ``material`` (G,) is that of each group."""
+        own = material[self.groups]
+        lit, place = np.unique(own, return_inverse=True)
+        shape = self.basis.shape
+        basis = np.zeros((shape[0], len(lit), *shape[2:]), np.float32)
+        for a, k in enumerate(place.reshape(-1)):
+            basis[:, k] += self.basis[:, a]
+        seen, place = np.unique(material[self.seen], return_inverse=True)
+        dark = np.zeros((len(self.dark), len(seen)), np.float32)
+        for a, k in enumerate(place.reshape(-1)):
+            dark[:, k] += self.dark[:, a]
+        met = self.path_group >= 0
+        owner = np.where(met, material[np.where(met, self.path_group, 0)], -1)
+        return replace(self, groups=lit, basis=basis, seen=seen, dark=dark, path_group=owner)
 
     def pixels(self, chosen: np.ndarray) -> View:
         """Some of its pixels."""
@@ -152,7 +175,7 @@ def specular_power(
     gain: np.ndarray, path_group: np.ndarray, cosine: np.ndarray, p: Parameters
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Power of specular paths ``(K,)``, and its logarithmic derivatives to the mirror strength and the excess of each
-    met group, ``(K, 2)`` (zero where none)."""
+    met group, ``(K, 3)`` (zero where none)."""
     power = np.asarray(gain, float).copy()
     slope = np.zeros(path_group.shape)
     for b in range(path_group.shape[1]):
@@ -252,7 +275,7 @@ def _priors(
     return np.concatenate(residuals), np.concatenate(rows)
 
 
-def _huber(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def huber(residual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Loss and weight of each residual [dB]."""
     size = np.abs(residual)
     small = size <= HUBER_DB
@@ -265,7 +288,7 @@ def objective(views: Sequence[View], p: Parameters) -> float:
     """Sum of the robust squares of the dB image's error."""
     total = 0.0
     for view in views:
-        total += float(_huber(NEPER * np.log1p(predict(view, p)) - view.target_db)[0].sum())
+        total += float(huber(NEPER * np.log1p(predict(view, p)) - view.target_db)[0].sum())
     return total
 
 
@@ -346,11 +369,13 @@ def normal_equations(
     for view in views:
         power, table, index = jacobian(view, p, layout)
         residual = NEPER * np.log1p(power) - view.target_db
-        robust = weight * _huber(residual)[1]
+        robust = weight * huber(residual)[1]
         table *= (NEPER / (1.0 + power))[:, None].astype(np.float32)
         weighted = table * robust[:, None].astype(np.float32)
-        np.add.at(hessian, (index[:, None], index[None, :]), (weighted.T @ table).astype(np.float64))
-        np.add.at(gradient, index, weighted.T.astype(np.float64) @ residual)
+        place = index[:, None] * layout.size + index[None, :]  # an index may stand twice
+        own = np.bincount(place.ravel(), (weighted.T @ table).ravel(), minlength=layout.size**2)
+        hessian += own.reshape(layout.size, layout.size)
+        gradient += np.bincount(index, weighted.T.astype(np.float64) @ residual, minlength=layout.size)
     return hessian, gradient
 
 
@@ -379,10 +404,10 @@ def fit_groups_adam(
         for view in views:
             power, table, index = jacobian(view, p, layout)
             residual = NEPER * np.log1p(power) - view.target_db
-            value, robust = _huber(residual)
+            value, robust = huber(residual)
             loss += float(value.sum())
             pull = weight * robust * residual * NEPER / (1.0 + power)
-            np.add.at(gradient, index, table.T @ pull)
+            gradient += np.bincount(index, table.T @ pull, minlength=layout.size)
         r, j = _priors(p, start, layout, sd, area)
         gradient += j.T @ r
         losses.append((loss + float((r**2).sum()) / weight) / count)

@@ -14,9 +14,10 @@ from warprrf.rf import bistatic_fit as _fit
 from warprrf.rf.bistatic import BistaticField, Sight, Terms
 from warprrf.rf.bistatic_fit import NEPER, Fit, Parameters, View
 from warprrf.rf.bounces import LOBES
+from warprrf.rf.grouping import regroup
 from warprrf.rf.residuals import Shares, fit_residual, gather_shares
 from warprrf.rf.spectrum import to_db
-from warprrf.rf.specular import specular_paths
+from warprrf.rf.specular import MOST_MIRRORS, specular_paths
 from warprrf.rf.surface import Surface
 from warprrf.rf.transport import check_receiver
 from warprrf.rf.uncertainty import ErrorModel, learn_errors
@@ -27,16 +28,20 @@ if TYPE_CHECKING:
 ROWS = 30_000  # pixels that groups are fitted to, spread over the training receivers
 LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so no term is chosen
 MOST_HELD_OUT = 10
+MOST_TO_CHOOSE = 20  # receivers that fits which only decide about a term learn from
 SHORT_STEPS = 6  # of a fit that only decides about a term
 BETTER = 0.995  # a term must lower the held-out mean square error at least to this share
-MORE: dict[str, Any] = {
-    "mirror_order": 2,
-    "mirror_scatter": True,
-    "diffuse_order": 3,
-    "scatter_mirror": True,
-    "indirect": True,
-}
+MORE: tuple[tuple[str, Any], ...] = (
+    ("mirror_scatter", True),
+    ("diffuse_order", 2),
+    ("diffuse_order", 3),
+    ("mirror_order", 2),
+    ("mirror_order", 3),
+    ("scatter_mirror", True),
+    ("indirect", True),
+)
 """Terms that may be added to single bounces, in the order in which they are tried."""
+REGROUPED = 3  # rounds of deciding what is of one material, and fitting
 OUTER = 2  # rounds of further bounces and groups in turn
 
 
@@ -78,8 +83,14 @@ def trace(
     started = time.perf_counter()
     surface = geometry if isinstance(geometry, Surface) else Surface.of(geometry)
     receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
-    blank = _blank(surface, ds, Terms(mirror_order=2, lobes=LOBES if lobes is None else lobes), device)
-    found = specular_paths(surface, blank.transmitter, receivers, blank.wavelength_m, order=2, device=device)
+    # everything that may be asked for
+    terms = Terms(mirror_order=MOST_MIRRORS, mirror_scatter=True, lobes=LOBES if lobes is None else lobes)
+    blank = _blank(surface, ds, terms, device)
+    source = blank.transmitter
+    found = specular_paths(
+        surface, source, receivers, blank.wavelength_m, order=MOST_MIRRORS, tree=blank.mirror_tree(source),
+        device=device,
+    )  # fmt: skip
     sights = []
     for r, receiver in enumerate(receivers):
         sights.append(blank.see(receiver, paths=found.subset(np.flatnonzero(found.receiver == r))))
@@ -120,7 +131,7 @@ def train(
         geometry: Reconstruction, Scene (its materials name the groups, nothing else is taken from them) or Mesh.
         ds: training set.
         line_of_sight, diffuse: switches of those terms.
-        mirror_order: mirror reflections on a path: 0, 1 or 2.
+        mirror_order: mirror reflections on a path: 0 to 3.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian.
         mirror_scatter: surfaces lit by mirrors.
         scatter_mirror: the lit scene seen in mirrors.
@@ -172,6 +183,7 @@ class _Training:
         self.started = time.perf_counter()
         self.surface, self.count = seen.surface, len(ds.receivers)
         self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
+        self.material = self.surface.material
         self.target = to_db(ds.path_gain, ds.floor) - 10.0 * np.log10(ds.floor)
         rng = np.random.default_rng(seed)
         self.held = np.zeros(0, int)
@@ -184,7 +196,7 @@ class _Training:
             np.sort(rng.choice(pixels, min(pixels, max(200, ROWS // self.count)), replace=False))
             for _ in range(self.count)
         ]
-        blank = _blank(self.surface, ds, Terms(lobes=seen.lobes, mirror_order=2), device)
+        blank = _blank(self.surface, ds, Terms(lobes=seen.lobes), device)
         self.blank = blank
         self.views = []
         for r in range(self.count):
@@ -195,10 +207,10 @@ class _Training:
     def run(self, fixed: dict[str, Any], wanted: dict[str, Any]) -> BistaticField:
         terms = Terms(**fixed, lobes=self.seen.lobes, **{k: v for k, v in wanted.items() if v is not None})
         free = {name for name, value in wanted.items() if value is None} if len(self.held) else set()
-        start = Parameters.prior(self.surface.groups, len(self.seen.lobes))
+        start = Parameters.prior(int(self.material.max()) + 1, len(self.seen.lobes))
         errors: ErrorModel | None = None
         if len(self.held):
-            fit = self._groups(terms, start, self.kept, SHORT_STEPS * 2)
+            fit = self._groups(terms, start, self.kept[:MOST_TO_CHOOSE], SHORT_STEPS * 2)
             terms, fit, residual = self._choose(terms, free, fit)
             held = self._field(terms, fit, residual)
             errors = self._errors(held, fit)
@@ -216,6 +228,7 @@ class _Training:
             "transport_time_s": self.seen.seconds,
             "fit_time_s": time.perf_counter() - self.started,
             "groups": self.surface.groups,
+            "materials": int(self.material.max()) + 1,
             "elements": len(self.surface.element_area),
             "steps": fit.steps,
             "losses": {"gain": fit.losses},
@@ -232,18 +245,27 @@ class _Training:
 
     def _choose(self, terms: Terms, free: set[str], fit: Fit) -> tuple[Terms, Fit, np.ndarray | None]:
         """Terms that lower the held-out error, one after another, each with a short fit of its own."""
+        some = self.kept[:MOST_TO_CHOOSE]
         best = self._held_error(self._field(terms, fit, None))
         self.log.append({"term": "single bounces", "kept": True, "held_out_rmse_db": float(np.sqrt(best))})
-        for name, value in MORE.items():
+        for name, value in MORE:
             if name not in free or (name not in ("mirror_order",) and not terms.diffuse):
                 continue
             trial = replace(terms, **{name: value})
-            found = self._groups(trial, fit.parameters, self.kept, SHORT_STEPS)
+            found = self._groups(trial, fit.parameters, some, SHORT_STEPS, rounds=1)
             error = self._held_error(self._field(trial, found, None))
             keep = error < BETTER * best
-            self.log.append({"term": name, "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))})
+            self.log.append(
+                {
+                    "term": f"{name} {value}" if value is not True else name,
+                    "kept": bool(keep),
+                    "held_out_rmse_db": float(np.sqrt(error)),
+                }
+            )
             if keep:
                 terms, fit, best = trial, found, error
+        if np.isfinite(self.surface.look).all() and self.material.max() > 0:
+            fit, best = self._regroup(terms, fit, best)
         residual = None
         if terms.residual or "residual" in free:
             base = self._field(terms, fit, None)
@@ -258,6 +280,24 @@ class _Training:
             if keep:
                 terms, residual = replace(terms, residual=True), found_residual
         return terms, fit, residual
+
+    def _regroup(self, terms: Terms, fit: Fit, best: float) -> tuple[Fit, float]:
+        """Materials by what the spectra say, if that lowers the held-out error."""
+        before, trial = self.material, fit
+        for _ in range(REGROUPED):
+            views = self._views(terms, trial, self.kept)
+            self.material, start = regroup(
+                views, trial.parameters, self.material, self.surface.look, self.area
+            )
+            trial = self._groups(terms, start, self.kept, SHORT_STEPS, rounds=1)
+        error = self._held_error(self._field(terms, trial, None))
+        keep = error < best
+        name = f"{before.max() + 1} materials as {self.material.max() + 1}"
+        self.log.append({"term": name, "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))})
+        if not keep:
+            self.material = before
+            return fit, best
+        return trial, error
 
     def _held_error(self, field: BistaticField) -> float:
         """Mean square error of the dB images of the held-out receivers [dB^2]."""
@@ -275,28 +315,35 @@ class _Training:
 
     # ------------------------------------------------------------------------------------------ fitting
 
-    def _groups(self, terms: Terms, start: Parameters, chosen: np.ndarray, steps: int) -> Fit:
-        """Groups' parameters on the receivers ``chosen``, further bounces recomputed in turn."""
-        further = terms.further or terms.scatter_mirror
+    def _groups(
+        self, terms: Terms, start: Parameters, chosen: np.ndarray, steps: int, rounds: int = OUTER
+    ) -> Fit:
+        """Materials' parameters on the receivers ``chosen``, further bounces recomputed in each of ``rounds``."""
+        further = terms.further or terms.mirror_scatter or terms.scatter_mirror
         fit = Fit(
             start, np.zeros((0, 0)), _fit.Layout(*start.log_weight.shape, indirect=False, gain=False), [], 0
         )
-        for k in range(OUTER if further else 1):
-            views = [self._limited(self.views[r], terms) for r in chosen]
-            if further:
-                # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
-                known = self._field(replace(terms, indirect=False), fit, None)
-                for i, r in enumerate(chosen):
-                    # No common gain here: the fit applies it to everything.
-                    image = known.beam(known.further(self.seen.sights[r])) / self.ds.floor
-                    views[i] = replace(
-                        views[i], extra=np.maximum(image.ravel()[self.pixels[r]], 0).astype(np.float32)
-                    )
+        for k in range(rounds if further else 1):
+            views = self._views(terms, fit, chosen)
+            tied = [v.tied(self.material) for v in views]
             fit = _fit.fit_groups(
-                views, fit.parameters if k else start, self.area, indirect=terms.indirect, gain=self.gain,
-                steps=max(steps // 2, 1) if further else steps,
+                tied, fit.parameters if k else start, np.bincount(self.material, self.area),
+                indirect=terms.indirect, gain=self.gain, steps=max(steps // rounds, 1) if further else steps,
             )  # fmt: skip
         return fit
+
+    def _views(self, terms: Terms, fit: Fit, chosen: np.ndarray) -> list[View]:
+        """Views of the receivers ``chosen`` by groups, under ``terms``; what surfaces send on held fixed."""
+        views = [self._limited(self.views[r], terms) for r in chosen]
+        if terms.further or terms.mirror_scatter or terms.scatter_mirror:
+            # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
+            known = self._field(replace(terms, indirect=False), fit, None)
+            for i, r in enumerate(chosen):
+                # No common gain here: the fit applies it to everything.
+                image = known.further(self.seen.sights[r]).ravel() / self.ds.floor
+                extra = known.beam.at(self.pixels[r], image[:, None])[:, 0]
+                views[i] = replace(views[i], extra=np.maximum(extra, 0.0))
+        return views
 
     def _limited(self, view: View, terms: Terms) -> View:
         """``view`` without the terms that are switched off."""
@@ -328,7 +375,8 @@ class _Training:
         field = replace(
             self.blank,
             terms=terms if residual is not None else replace(terms, residual=False),
-            parameters=fit.parameters,
+            parameters=fit.parameters.take(self.material),
+            material=self.material,
             residual=zero if residual is None else residual,
         )
         # Geometry that no parameter changes is traced once for all of them.
@@ -348,6 +396,7 @@ def _blank(surface: Surface, ds: SpectrumDataset, terms: Terms, device: Any) -> 
         beam_sigma_rad=float(ds.beam_sigma_rad),
         terms=terms,
         parameters=Parameters.prior(surface.groups, len(terms.lobes)),
+        material=surface.material,
         residual=np.zeros(len(surface.element_area)),
         device=device,
     )

@@ -201,7 +201,7 @@ class BounceTracer:
         self.directions, self.solid_angle = sub_pixel_directions(shape, sub_pixels)
         self._directions = wp.array(self.directions, dtype=wp.vec3d, device=self.device)
         self._solid_angle = wp.array(self.solid_angle, dtype=wp.float32, device=self.device)
-        self._half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
+        self.half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
         self._exponent, self._norm = _lobe_tables(self.lobes, str(self.device))
         self._moments = wp.array(fresnel_curves().moments, dtype=wp.float32, device=self.device)
 
@@ -239,36 +239,51 @@ class BounceTracer:
         count = len(met.face)
         lit = Lit(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(4)))
         inputs = [
-            self.surface.on_device(self.device), source, *met.inputs, met.solid_angle, float(self._half_width),
+            self.surface.on_device(self.device), source, *met.inputs, met.solid_angle, float(self.half_width),
             NEAREST_M,            *lit.inputs,
         ]  # fmt: skip
         _device.launch(bounce.light_surface, count, inputs, device=self.device)
         return lit
 
-    def resolve(self, met: Met, lit: Lit, wavelength_m: float) -> np.ndarray:
-        """Path gain per pixel of each group, lobe and Fresnel component at unit weight, ``(H, W, G, L, 3)`` float32."""
+    def resolve(self, met: Met, lit: Lit, wavelength_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """Path gain per pixel of each lit group, lobe and Fresnel component at unit weight.
+
+        Returns:
+            The groups that are lit, shape ``(A,)``, and the images, shape ``(H W, A, L, 3)`` float32.
+        """
         pixels = self.shape[0] * self.shape[1]
-        columns = self.surface.groups * len(self.lobes) * bounce.MOMENTS
-        out = wp.zeros((pixels, columns), dtype=wp.float32, device=self.device)
+        group = self.surface.group[met.face.numpy()[lit.strength.numpy() > 0]]
+        groups = np.unique(group)
+        place = np.zeros(self.surface.groups, np.int32)
+        place[groups] = np.arange(len(groups))
+        columns = len(groups) * len(self.lobes) * bounce.MOMENTS
+        out = wp.zeros((pixels, max(columns, 1)), dtype=wp.float32, device=self.device)
         inputs = [
-            self.sub_pixels**2, self.surface.on_device(self.device), met.face, *lit.inputs, self._exponent, self._norm,
+            self.sub_pixels**2, self.surface.on_device(self.device),
+            wp.array(place, dtype=wp.int32, device=self.device), met.face, *lit.inputs, self._exponent, self._norm,
             self._moments, out,
         ]  # fmt: skip
         _device.launch(bounce.resolve_bounces, pixels, inputs, device=self.device)
-        image = out.numpy().reshape(*self.shape, self.surface.groups, len(self.lobes), bounce.MOMENTS)
-        return image * np.float32(wavelength_m**2)
+        image = out.numpy()[:, :columns] * np.float32(wavelength_m**2)
+        return groups, image.reshape(pixels, len(groups), len(self.lobes), bounce.MOMENTS)
 
     def scatter(
         self, met: Met, lit: Lit, weight: np.ndarray, log_excess: np.ndarray, wavelength_m: float
     ) -> np.ndarray:
         """Path gain of each ray, shape ``(K,)`` float32, for lobe weights ``(G, L)`` and ln(epsilon_r - 1) ``(G,)``."""
+        return self.scatter_faces(met.face, lit, weight, log_excess, wavelength_m)
+
+    def scatter_faces(
+        self, face: wp.array, lit: Lit, weight: np.ndarray, log_excess: np.ndarray, wavelength_m: float
+    ) -> np.ndarray:
+        """:meth:`scatter` for the faces alone that rays met."""
         curves = fresnel_curves()
         fresnel = curves.at(curves.curves, log_excess)[0]
-        power = wp.empty(len(met.face), dtype=wp.float32, device=self.device)
+        power = wp.empty(len(face), dtype=wp.float32, device=self.device)
         inputs = [
-            self.surface.on_device(self.device), met.face, *lit.inputs, self._exponent, self._norm,
+            self.surface.on_device(self.device), face, *lit.inputs, self._exponent, self._norm,
             wp.array(fresnel, dtype=wp.float32, device=self.device),
             wp.array(weight * wavelength_m**2, dtype=wp.float32, device=self.device), power,
         ]  # fmt: skip
-        _device.launch(bounce.scatter_bounces, len(met.face), inputs, device=self.device)
+        _device.launch(bounce.scatter_bounces, len(face), inputs, device=self.device)
         return power.numpy()

@@ -13,7 +13,7 @@ import numpy as np
 
 from warprrf.rf.bistatic_fit import Parameters
 from warprrf.rf.bounces import BounceTracer, FresnelCurves, fresnel_curves
-from warprrf.rf.specular import specular_paths
+from warprrf.rf.mirror_light import MirrorLight
 from warprrf.rf.surface import Surface
 
 RAYS = 128  # from each element, over its hemisphere
@@ -35,14 +35,8 @@ class ElementLight:
         self, tracer: BounceTracer, transmitter: np.ndarray, wavelength_m: float, *, seed: int = 0
     ) -> None:
         self.tracer, self.surface, self.wavelength_m = tracer, tracer.surface, wavelength_m
+        self.mirrors = MirrorLight(tracer, transmitter)
         point, normal = _sample_points(self.surface)
-        self._mirrored = specular_paths(
-            self.surface, transmitter, point, wavelength_m, order=1, single_ray=True, device=tracer.device
-        )
-        own = self._mirrored.order == 1
-        self._mirrored = self._mirrored.subset(np.flatnonzero(own))
-        facing = (self._mirrored.arrival * normal[self._mirrored.receiver]).sum(axis=1)
-        self._cos_at_element = np.maximum(facing, 0.0)
         directions = _hemispheres(normal, seed)
         self._met = tracer.meet_rays(point, directions, np.ones(len(directions)))
         self._lit = tracer.light(self._met, transmitter)
@@ -53,36 +47,24 @@ class ElementLight:
         )
         self._meets = (face >= 0).reshape(len(point), RAYS)
 
-    def irradiance(self, p: Parameters, *, mirrors: bool, diffuse: int) -> np.ndarray:
-        """Irradiance of each element (E,) [1/m^2] under parameters ``p``.
+    def radiance(self, p: Parameters, *, mirrors: bool, diffuse: int) -> np.ndarray:
+        """Radiance that each element sends on under parameters ``p``, shape ``(E,)`` [1/(m^2 sr)].
 
         Args:
-            mirrors: whether light that mirrors throw on it counts.
-            diffuse: how many diffuse bounces before it count: 0, 1 or 2.
+            p: parameters of the groups.
+            mirrors: whether light that mirrors throw on surfaces counts as well as the transmitter's own.
+            diffuse: scattering at other surfaces before, at most: 1 or 2.
         """
         elements = len(self.surface.element_area)
-        direct = np.zeros(elements)
-        if mirrors and len(self._mirrored):
-            m = self._mirrored
-            group = self.surface.patch_group[m.patch[:, 0]]
-            share = (
-                np.exp(p.log_mirror[group]) * fresnel_curves().value(p.log_excess[group], m.cosine[:, 0])[0]
-            )
-            np.add.at(direct, m.receiver, m.share**2 * share * self._cos_at_element / m.length_m**2)
-        total = direct
-        if diffuse >= 1:
-            power = self.tracer.scatter(self._met, self._lit, p.weight, p.log_excess, self.wavelength_m)
-            radiance = power.reshape(elements, RAYS) * (4.0 * np.pi / self.wavelength_m) ** 2
-            first = np.pi * radiance.mean(axis=1)
-            total = total + first
-            if diffuse >= 2:
-                sent = self.reflectance(p) * total / np.pi
-                total = total + np.pi * np.where(self._meets, sent[self._sees], 0.0).mean(axis=1)
-        return total
-
-    def radiance(self, p: Parameters, *, mirrors: bool, diffuse: int) -> np.ndarray:
-        """Radiance that each element sends on (E,) [1/(m^2 sr)]."""
-        return self.reflectance(p) * self.irradiance(p, mirrors=mirrors, diffuse=diffuse) / np.pi
+        power = self.tracer.scatter(self._met, self._lit, p.weight, p.log_excess, self.wavelength_m)
+        seen = power.reshape(elements, RAYS) * (4.0 * np.pi / self.wavelength_m) ** 2
+        total = np.pi * seen.mean(axis=1)
+        share = self.reflectance(p) / np.pi
+        if diffuse >= 2:
+            before = total + self.mirrors.irradiance(p) if mirrors else total
+            sent = share * before
+            total = total + np.pi * np.where(self._meets, sent[self._sees], 0.0).mean(axis=1)
+        return share * total
 
     def reflectance(self, p: Parameters) -> np.ndarray:
         """Share of power that each element scatters under even light (E,)."""

@@ -14,10 +14,13 @@ from typing import Any
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.mirror_tree import SLACK_M, MirrorTree
 from warprrf.rf.surface import Surface
 
 _RINGS = ((0.0, 1), (0.5, 6), (0.9, 8))
 """Radii (share of the zone's) and numbers of the rays that fill it: about equal areas each."""
+MOST_MIRRORS = 3
+"""Most reflections on a path."""
 LEAST_SHARE = 0.05  # paths that keep less of their field are dropped: -26 dB
 
 
@@ -28,9 +31,9 @@ class SpecularPaths:
     Attributes:
         receiver: index of the receiver, shape ``(L,)``.
         order: reflections, 0 for line of sight, shape ``(L,)``.
-        patch: patches met, from the transmitter on, -1 where fewer, shape ``(L, 2)``.
-        cosine: cosine of incidence at each, shape ``(L, 2)``.
-        point: mirror points [m], shape ``(L, 2, 3)``; NaN where fewer.
+        patch: patches met, from the transmitter on, -1 where fewer, shape ``(L, 3)``.
+        cosine: cosine of incidence at each, shape ``(L, 3)``.
+        point: mirror points [m], shape ``(L, 3, 3)``; NaN where fewer.
         length_m: total length, shape ``(L,)``.
         arrival: unit direction of arrival, shape ``(L, 3)``.
         share: part of the field that is not blocked, shape ``(L,)``, in (0, 1].
@@ -60,16 +63,20 @@ def specular_paths(
     wavelength_m: float,
     *,
     order: int = 1,
-    single_ray: bool = False,
+    tree: MirrorTree | None = None,
     device: Any = None,
 ) -> SpecularPaths:
-    """Paths of ``receivers`` (R, 3) with at most ``order`` (0, 1 or 2) reflections; ``single_ray``: one ray each."""
-    samples = np.zeros((1, 2)) if single_ray else zone_samples()
+    """Paths of ``receivers`` (R, 3) with at most ``order`` (0 to 3) reflections.
+
+    ``tree`` holds chains of at least that order, if they are known already.
+    """
+    samples = zone_samples()
     parts = [_line_of_sight(surface, transmitter, receivers, wavelength_m, samples, device)]
     if order >= 1 and len(surface.plane_offset):
         parts.append(_mirror_once(surface, transmitter, receivers, wavelength_m, samples, device))
     if order >= 2 and len(surface.plane_offset):
-        parts.append(_mirror_twice(surface, transmitter, receivers, device))
+        tree = tree or MirrorTree(surface, transmitter, order)
+        parts += [_mirror_chains(surface, tree, receivers, k, device) for k in range(2, order + 1)]
     return SpecularPaths(
         **{
             name: np.concatenate([getattr(p, name) for p in parts])
@@ -115,9 +122,13 @@ def _rows(
     receiver: np.ndarray, order: int, patch: np.ndarray, cosine: np.ndarray, point: np.ndarray, length: np.ndarray,
     arrival: np.ndarray, share: np.ndarray,
 ) -> SpecularPaths:  # fmt: skip
+    """Rows of paths with ``order`` reflections, what they lack of ``MOST_MIRRORS`` filled up."""
     kept = np.flatnonzero(share >= LEAST_SHARE)
+    empty = MOST_MIRRORS - order
     return SpecularPaths(
-        receiver, np.full(len(receiver), order), patch, cosine, point, length, arrival, share
+        receiver, np.full(len(receiver), order), np.pad(patch, ((0, 0), (0, empty)), constant_values=-1),
+        np.pad(cosine, ((0, 0), (0, empty))), np.pad(point, ((0, 0), (0, empty), (0, 0)), constant_values=np.nan),
+        length, arrival, share,
     ).subset(kept)  # fmt: skip
 
 
@@ -143,16 +154,9 @@ def _line_of_sight(
     tx = np.broadcast_to(transmitter, (len(left), 3))
     free[left] = _clear(surface.mesh, middle.reshape(-1, 3)[left], tx, surface.skin_m, device)
     share = free.reshape(count, -1).mean(axis=1)
-    nothing = np.full((count, 2), -1)
+    nothing = np.zeros((count, 0))
     return _rows(
-        np.arange(count),
-        0,
-        nothing,
-        np.zeros((count, 2)),
-        np.full((count, 2, 3), np.nan),
-        length,
-        toward,
-        share,
+        np.arange(count), 0, nothing.astype(int), nothing, np.zeros((count, 0, 3)), length, toward, share
     )
 
 
@@ -195,21 +199,13 @@ def _mirror_once(
     tx = np.broadcast_to(transmitter, (len(idx), 3))
     met[idx] = _clear(surface.mesh, flat[idx], tx, surface.skin_m, device)
     share = met.reshape(shape[:2]).mean(axis=1)
-    patch = np.column_stack([p, np.full(len(p), -1)])
-    points = np.stack([point, np.full_like(point, np.nan)], axis=1)
-    return _rows(r, 1, patch, np.column_stack([cosine, np.zeros(len(p))]), points, length, toward, share)
+    return _rows(r, 1, p[:, None], cosine[:, None], point[:, None], length, toward, share)
 
 
 def _near_patch(surface: Surface, point: np.ndarray, patch: np.ndarray) -> np.ndarray:
     """Whether ``point`` lies in the box of its patch, a little widened."""
-    low = np.full((len(surface.plane_offset), 3), np.inf)
-    high = np.full((len(surface.plane_offset), 3), -np.inf)
-    own = surface.patch >= 0
-    corner = surface.mesh.triangles[own]
-    np.minimum.at(low, surface.patch[own], corner.min(axis=1))
-    np.maximum.at(high, surface.patch[own], corner.max(axis=1))
-    slack = 0.1
-    return ((point >= low[patch] - slack) & (point <= high[patch] + slack)).all(axis=1)
+    low, high = surface.patch_boxes
+    return ((point >= low[patch] - SLACK_M) & (point <= high[patch] + SLACK_M)).all(axis=1)
 
 
 def _reaches(
@@ -229,67 +225,51 @@ def _reaches(
     return (hit.face >= 0) & (same | (near & (off <= surface.skin_m) & (surface.patch[face] < 0)))
 
 
-def _mirror_twice(
-    surface: Surface, transmitter: np.ndarray, receivers: np.ndarray, device: Any
+def _mirror_chains(
+    surface: Surface, tree: MirrorTree, receivers: np.ndarray, order: int, device: Any
 ) -> SpecularPaths:
-    first_image, height = surface.images(transmitter)
-    n, o = surface.plane_normal, surface.plane_offset
-    # image of image a in plane b; the first mirror must lie before the second, and be lit
-    behind = first_image @ n.T - o  # (a, b): height of image a over plane b
-    a, b = np.nonzero((height[:, None] > 0) & (behind > 0))
-    keep = a != b
-    a, b = a[keep], b[keep]
-    image = first_image[a] - 2.0 * behind[a, b][:, None] * n[b]
-    parts = []
-    for r, receiver in enumerate(receivers):
-        below = (n[b] * receiver).sum(axis=1) - o[b]
-        k = np.flatnonzero(below > 0)
-        way = image[k] - receiver
-        length = np.linalg.norm(way, axis=1)
-        toward = way / length[:, None]
-        t = length * below[k] / (below[k] + behind[a[k], b[k]])
-        last = receiver + t[:, None] * toward
-        ok = _near_patch(surface, last, b[k])
-        k, length, toward, last = k[ok], length[ok], toward[ok], last[ok]
-        back = first_image[a[k]] - last
-        side = (n[a[k]] * last).sum(axis=1) - o[a[k]]
-        share = side / (side + height[a[k]])
-        start = last + share[:, None] * back
-        ok = (side > 0) & _near_patch(surface, start, a[k])
-        k, length, toward, last, start = k[ok], length[ok], toward[ok], last[ok], start[ok]
-        if len(k) == 0:
-            continue
-        here = np.broadcast_to(receiver, last.shape)
-        ok = _reaches(surface, here, last, b[k], device)
-        idx = np.flatnonzero(ok)
-        lift = surface.skin_m * n[b[k[idx]]]
-        ok[idx] = _reaches(surface, last[idx] + lift, start[idx], a[k[idx]], device)
-        idx = np.flatnonzero(ok)
-        ok[idx] = _clear(
-            surface.mesh, start[idx], np.broadcast_to(transmitter, (len(idx), 3)), surface.skin_m, device
-        )
-        k, length, toward, last, start = k[ok], length[ok], toward[ok], last[ok], start[ok]
-        if len(k) == 0:
-            continue
-        leg = last - start
-        leg /= np.linalg.norm(leg, axis=1, keepdims=True)
-        cosine = np.column_stack(
-            [np.abs((leg * n[a[k]]).sum(axis=1)), np.abs((toward * n[b[k]]).sum(axis=1))]
-        )
-        parts.append(
-            _rows(
-                np.full(len(k), r), 2, np.column_stack([a[k], b[k]]), cosine, np.stack([start, last], axis=1), length,
-                toward, np.ones(len(k)),
-            )
-        )  # fmt: skip
-    if not parts:
-        return _rows(
-            np.zeros(0, int), 2, np.zeros((0, 2), int), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros(0),
-            np.zeros((0, 3)), np.zeros(0),
-        )  # fmt: skip
-    return SpecularPaths(
-        **{
-            name: np.concatenate([getattr(q, name) for q in parts])
-            for name in SpecularPaths.__dataclass_fields__
-        }
+    """Paths of ``order`` reflections, each leg tried along one ray."""
+    row, chain, point = tree.candidates(receivers, order)
+    free = unobstructed(surface, tree, receivers[row], chain, point, device)
+    row, chain, point = row[free], chain[free], point[free]
+    patch = tree.levels[order - 1].patch[chain]
+    stops = np.concatenate(
+        [np.broadcast_to(tree.transmitter, (len(row), 1, 3)), point, receivers[row][:, None]], axis=1
     )
+    legs = np.diff(stops, axis=1)
+    lengths = np.linalg.norm(legs, axis=2)
+    along = legs / np.maximum(lengths, 1e-12)[..., None]
+    cosine = np.abs((along[:, :-1] * surface.plane_normal[patch]).sum(axis=2))
+    return _rows(row, order, patch, cosine, point, lengths.sum(axis=1), -along[:, -1], np.ones(len(row)))
+
+
+def unobstructed(
+    surface: Surface,
+    tree: MirrorTree,
+    ends: np.ndarray,
+    chain: np.ndarray,
+    point: np.ndarray,
+    device: Any = None,
+    lift: np.ndarray | None = None,
+) -> np.ndarray:
+    """Whether each chain's legs reach their patches and nothing stands between, shape ``(L,)``.
+
+    Args:
+        surface: what blocks.
+        tree: patches of the chains.
+        ends: receivers, shape ``(L, 3)``.
+        chain, point: as :meth:`MirrorTree.candidates` gives them.
+        lift: added to ``ends`` where rays start, for ends on a surface.
+    """
+    order = point.shape[1]
+    free = np.ones(len(chain), bool)
+    here = ends if lift is None else ends + lift
+    for k in range(order - 1, -1, -1):
+        own = np.flatnonzero(free)
+        patch = tree.levels[order - 1].patch[chain[own], k]
+        free[own] = _reaches(surface, here[own], point[own, k], patch, device)
+        here = point[:, k] + surface.skin_m * surface.plane_normal[tree.levels[order - 1].patch[chain, k]]
+    own = np.flatnonzero(free)
+    source = np.broadcast_to(tree.transmitter, (len(own), 3))
+    free[own] = _clear(surface.mesh, point[own, 0], source, surface.skin_m, device)
+    return free

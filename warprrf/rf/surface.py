@@ -43,7 +43,9 @@ class Surface:
         normal: unit normals that scattering uses: of the patch, or smoothed, shape ``(F, 3)``.
         patch: planar patch of each face, -1 for none, shape ``(F,)`` int32.
         plane_normal, plane_offset: planes of the patches, ``normal . x = offset`` [m], shapes ``(P, 3)``, ``(P,)``.
-        group: material group of each face, shape ``(F,)`` int32.
+        group: group of each face, the smallest unit that may be of a material of its own, shape ``(F,)`` int32.
+        material: which groups are taken for the same material before any measurement, shape ``(G,)`` int32.
+        look: colour of each group, scaled so that 1 tells materials apart, shape ``(G, 4)``; NaN where unknown.
         patch_group: group of each patch, shape ``(P,)`` int32.
         element: surface element of each face, shape ``(F,)`` int32.
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
@@ -57,6 +59,8 @@ class Surface:
     plane_normal: np.ndarray
     plane_offset: np.ndarray
     group: np.ndarray
+    material: np.ndarray
+    look: np.ndarray
     patch_group: np.ndarray
     element: np.ndarray
     element_centre: np.ndarray
@@ -67,7 +71,7 @@ class Surface:
 
     @property
     def groups(self) -> int:
-        """Number of material groups."""
+        """Number of groups."""
         return len(self.group_names)
 
     @classmethod
@@ -87,8 +91,8 @@ class Surface:
         found = list(getattr(geometry, "patches", []))
         if material is None and found and isinstance(gaussians, Gaussians):
             normal, patch, planes = _reconstructed_patches(mesh, found)
-            group, names = _colour_groups(mesh, patch, gaussians)
-            skin = SKIN_M
+            group, sort, look = _colour_groups(mesh, patch, gaussians)
+            names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
             patches = exact_patches(mesh, material)
             large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
@@ -102,9 +106,10 @@ class Surface:
             else:
                 group = np.asarray(material, np.int32)
                 names = tuple(m.name for m in geometry.materials)
+            sort, look = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         mesh, parent = _split_long(mesh)
         return cls._assemble(
-            mesh, normal[parent], patch[parent], planes, group[parent], names, skin, element_m
+            mesh, normal[parent], patch[parent], planes, group[parent], (sort, look), names, skin, element_m
         )
 
     @classmethod
@@ -115,6 +120,7 @@ class Surface:
         patch: Any,
         planes: Any,
         group: Any,
+        kinds: Any,
         names: Any,
         skin: float,
         element_m: float,
@@ -136,7 +142,7 @@ class Surface:
                 patch_group[p] = np.bincount(group[own], area[own]).argmax()
         return cls(
             mesh, np.asarray(normal), np.asarray(patch, np.int32), planes[0], planes[1], np.asarray(group, np.int32),
-            patch_group, element, middle, total, owner, tuple(names), skin,
+            kinds[0], kinds[1], patch_group, element, middle, total, owner, tuple(names), skin,
         )  # fmt: skip
 
     def on_device(self, device: Any) -> Any:
@@ -160,6 +166,19 @@ class Surface:
     @cached_property
     def _uploaded(self) -> dict[str, Any]:
         return {}
+
+    @cached_property
+    def patch_boxes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corners of every patch's faces, ``(P, 3)`` each [m]."""
+        low, high = (
+            np.full((len(self.plane_offset), 3), np.inf),
+            np.full((len(self.plane_offset), 3), -np.inf),
+        )
+        own = self.patch >= 0
+        corner = self.mesh.triangles[own]
+        np.minimum.at(low, self.patch[own], corner.min(axis=1))
+        np.maximum.at(high, self.patch[own], corner.max(axis=1))
+        return low, high
 
     def images(self, transmitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Image of ``transmitter`` (3,) in every patch's plane, ``(P, 3)``, and its height over it, ``(P,)`` [m]."""
@@ -207,12 +226,14 @@ def _reconstructed_patches(
     return normal, label, planes
 
 
-def _colour_groups(mesh: Mesh, patch: np.ndarray, gaussians: Gaussians) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Groups of faces by patch and photo colour.
+def _colour_groups(
+    mesh: Mesh, patch: np.ndarray, gaussians: Gaussians
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Groups of faces by patch and photo colour; the material that each is taken for, and its look.
 
-    A patch is split where its colour changes (another material in the same plane). Each large piece is a group of its
-    own: grey stone and grey paint look alike. Small pieces join the large one that looks most like them, if any does,
-    else each other. Chromaticity counts more than luminance, which is also shade.
+    A patch is split where its colour changes (another material in the same plane): such pieces are the groups. Each
+    large one is taken for a material of its own: grey stone and grey paint look alike. Small pieces join the large one
+    that looks most like them, if any does, else each other. Chromaticity counts more than luminance (also shade).
     """
     centre, area = mesh.triangles.mean(axis=1), mesh.areas
     colour = np.log(np.clip(gaussians.sh[:, 0, :].astype(np.float64) * Y00 + 0.5, 0.01, 1.0))
@@ -244,7 +265,7 @@ def _colour_groups(mesh: Mesh, patch: np.ndarray, gaussians: Gaussians) -> tuple
     sizes: list[float] = []
     for p in np.unique(owner):
         own = np.flatnonzero(owner == p)
-        split = _two_means(feature[own], size[own]) if p >= 0 else _linkage(feature[own], size[own], 2.0)
+        split = _clusters(feature[own], size[own]) if p >= 0 else _linkage(feature[own], size[own], 2.0)
         for k in range(split.max() + 1):
             part = own[split == k]
             piece[part] = len(looks)
@@ -275,12 +296,23 @@ def _colour_groups(mesh: Mesh, patch: np.ndarray, gaussians: Gaussians) -> tuple
         gap[g] = np.inf
         group[group == g] = gap.argmin()
     group = np.unique(group, return_inverse=True)[1].reshape(-1)
-    return group[piece[unit]].astype(np.int32), tuple(f"group_{k}" for k in range(int(group.max()) + 1))
+    return piece[unit].astype(np.int32), group.astype(np.int32), look
+
+
+def _clusters(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Cluster of each row: halved as long as the halves are clearly apart."""
+    label = _two_means(feature, size)
+    if label.any():
+        one, two = label == 0, label == 1
+        first = _clusters(feature[one], size[one])
+        label[one] = first
+        label[two] = first.max() + 1 + _clusters(feature[two], size[two])
+    return label
 
 
 def _two_means(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
     """0 or 1 for each row: two clusters if they are clearly apart, else one."""
-    if len(feature) < 4 or size.sum() < 1.0:
+    if len(feature) < 4 or size.sum() < 0.5:
         return np.zeros(len(feature), np.int64)
     mean = np.average(feature, axis=0, weights=size)
     axis = np.linalg.svd((feature - mean) * np.sqrt(size)[:, None], full_matrices=False)[2][0]
@@ -300,7 +332,7 @@ def _two_means(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
     share = size[label == 1].sum() / size.sum()
     return (
         label
-        if apart > 1.5 and apart > 5.0 * inner and 0.03 < share < 0.97
+        if apart > 1.2 and apart > 4.0 * inner and 0.03 < share < 0.97
         else np.zeros(len(feature), np.int64)
     )
 

@@ -1,0 +1,151 @@
+"""Which patches of a surface can reflect a transmitter one after the other, and where: images of images, pruned.
+
+An image of the transmitter shines through its patch as through a window. A further patch can follow only if the cone
+from the image through the window's bounding ball meets its own: small patches far apart drop out, and what is left of
+the P^k chains of a room is few enough to try for every receiver.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warprrf.rf.surface import Surface
+
+SLACK_M = 0.1  # boxes of patches are widened by it: outlines of a reconstructed mesh are torn
+_BLOCK = 2_000_000  # candidates that are tried at once
+
+
+@dataclass(frozen=True)
+class Level:
+    """All chains of k reflections.
+
+    Attributes:
+        patch: patches in the order in which the wave meets them, shape ``(C, k)``.
+        parent: the chain of the level before that each continues, shape ``(C,)``.
+        image: image of the transmitter in the last patch, shape ``(C, 3)``.
+        depth: height of the image before over the last patch's plane [m], shape ``(C,)``, positive.
+    """
+
+    patch: np.ndarray
+    parent: np.ndarray
+    image: np.ndarray
+    depth: np.ndarray
+
+
+class MirrorTree:
+    """Chains of up to ``order`` mirror reflections of a transmitter on the patches of a surface.
+
+    Args:
+        surface: its patches.
+        transmitter: position (3,) [m].
+        order: most reflections.
+    """
+
+    def __init__(self, surface: Surface, transmitter: np.ndarray, order: int) -> None:
+        self.surface = surface
+        self.transmitter = np.asarray(transmitter, float)
+        self.normal, self.offset = surface.plane_normal, surface.plane_offset
+        self.low, self.high = surface.patch_boxes
+        self.middle = 0.5 * (self.low + self.high)
+        self.radius = 0.5 * np.linalg.norm(self.high - self.low, axis=1) + SLACK_M
+        corner = np.array(np.meshgrid(*[[0.0, 1.0]] * 3)).reshape(3, -1).T
+        boxes = self.low[:, None] + corner * (self.high - self.low)[:, None]
+        reach = np.einsum("bck,ak->abc", boxes, self.normal) - self.offset[:, None, None]
+        before = reach.max(axis=2) > 0.0
+        self._mutual = before & before.T
+        self.levels: list[Level] = []
+        for k in range(min(order, len(self.offset)) if len(self.offset) else 0):
+            self.levels.append(self._next(self.levels[-1]) if k else self._first())
+
+    @property
+    def order(self) -> int:
+        """Most reflections."""
+        return len(self.levels)
+
+    def _first(self) -> Level:
+        height = self.normal @ self.transmitter - self.offset
+        p = np.flatnonzero(height > 0)
+        image = self.transmitter - 2.0 * height[p, None] * self.normal[p]
+        return Level(p[:, None], np.full(len(p), -1), image, height[p])
+
+    def _next(self, last: Level) -> Level:
+        a = last.patch[:, -1]
+        height = last.image @ self.normal.T - self.offset
+        chain, b = np.nonzero((height > 0) & self._mutual[a])
+        # the cone from the image through the window's ball must meet the next ball
+        to_window = self.middle[a[chain]] - last.image[chain]
+        to_next = self.middle[b] - last.image[chain]
+        far, further = np.linalg.norm(to_window, axis=1), np.linalg.norm(to_next, axis=1)
+        window = _angular_radius(self.radius[a[chain]], far)
+        own = _angular_radius(self.radius[b], further)
+        cosine = (to_window * to_next).sum(axis=1) / np.maximum(far * further, 1e-12)
+        keep = np.arccos(np.clip(cosine, -1.0, 1.0)) <= window + own
+        keep &= further + self.radius[b] >= far - self.radius[a[chain]]
+        chain, b = chain[keep], b[keep]
+        depth = height[chain, b]
+        image = last.image[chain] - 2.0 * depth[:, None] * self.normal[b]
+        return Level(np.column_stack([last.patch[chain], b]), chain, image, depth)
+
+    def candidates(
+        self,
+        points: np.ndarray,
+        order: int,
+        *,
+        chains: np.ndarray | None = None,
+        rows: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Chains of ``order`` reflections whose points lie in the boxes of their patches; nothing is cast.
+
+        Args:
+            points: where the chains end (N, 3).
+            order: reflections.
+            chains, rows: pairs of a chain and a point to try; all by default.
+
+        Returns:
+            Index of the point and of the chain, shape ``(L,)`` each, and interaction points from the transmitter on,
+            shape ``(L, order, 3)``.
+        """
+        level = self.levels[order - 1]
+        if chains is not None and rows is not None:
+            return self._unfold(points, rows, chains, order)
+        step = max(1, _BLOCK // max(len(level.depth), 1))
+        parts = []
+        for start in range(0, len(points), step):
+            block = points[start : start + step]
+            last = level.patch[:, -1]
+            below = (block @ self.normal.T - self.offset)[:, last]
+            row, chain = np.nonzero(below > 0)
+            parts.append(self._unfold(points, row + start, chain, order))
+        if not parts:
+            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, order, 3))
+        return tuple(np.concatenate(p) for p in zip(*parts, strict=True))  # type: ignore[return-value]
+
+    def _unfold(
+        self, points: np.ndarray, row: np.ndarray, chain: np.ndarray, order: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mirror points from the receiver back to the transmitter, dropping pairs as soon as one misses its box."""
+        here = points[row]
+        link = chain
+        found = np.zeros((len(row), order, 3))
+        for k in range(order - 1, -1, -1):
+            level = self.levels[k]
+            p = level.patch[link, k]
+            side = np.einsum("nk,nk->n", self.normal[p], here) - self.offset[p]
+            share = side / np.maximum(side + level.depth[link], 1e-12)
+            point = here + share[:, None] * (level.image[link] - here)
+            keep = (side > 0) & ((point >= self.low[p] - SLACK_M) & (point <= self.high[p] + SLACK_M)).all(
+                axis=1
+            )
+            row, chain, link, found = row[keep], chain[keep], level.parent[link[keep]], found[keep]
+            here = point[keep]
+            found[:, k] = here
+        return row, chain, found
+
+
+def _angular_radius(radius: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Angle under which a ball is seen [rad]; pi from inside."""
+    return np.where(
+        distance > radius, np.arcsin(np.clip(radius / np.maximum(distance, 1e-12), 0.0, 1.0)), np.pi
+    )
