@@ -37,7 +37,8 @@ def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
         frequency_hz: Carrier frequency [Hz]; materials are those of this frequency.
 
     Returns:
-        The ``sionna.rt.Scene``, objects kept apart, named as in the XML, materials as in the table.
+        The ``sionna.rt.Scene``, objects kept apart and named as in the XML. Materials that the XML does not give in full
+        (ITU ones) are replaced by ``warprrf-<name>``.
 
     Raises:
         ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
@@ -79,7 +80,7 @@ def _radio_material(loaded: Any, rt: Any, material: Any, frequency: float) -> An
         )
     radio = loaded.radio_materials.get(material.name)
     if type(radio) is not rt.RadioMaterial:  # an ITU material keeps its own permittivity
-        radio = rt.RadioMaterial(material.name if radio is None else f"{material.name}-warprrf")
+        radio = rt.RadioMaterial(f"warprrf-{material.name}")  # objects and materials share one set of names
         loaded.add(radio)
     eta = complex(material.permittivity(frequency))
     radio.relative_permittivity = eta.real

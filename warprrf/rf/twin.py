@@ -1,0 +1,398 @@
+"""A calibrated digital twin: the reconstructed mesh with what the bistatic field learned, as a scene for ray tracers.
+
+A group of the field scatters as a mix of lobes times the Fresnel curve of a half-space, and mirrors a share of that
+curve. A Sionna radio material has one curve |Gamma|^2, one scattering coefficient S and one lobe: it scatters
+S^2 |Gamma|^2 f_s and mirrors (1 - S^2) |Gamma|^2 (Degli-Esposti et al. 2007). Each group is projected on that:
+
+- permittivity and S are those of the half-space that comes nearest to both powers, in dB over the cosine of incidence,
+  weighted by it (what a surface takes in under even light). Where lobe weights W and mirror strength m sum to one that
+  is the fitted curve and S^2 = W; where they do not, the mirror gives way: it shows in few pixels, scattering in all;
+- the lobe is the one exponent nearest to the mix, in dB over both hemispheres, weighted by the solid angle that a
+  receiver sees and with a floor where scattered power is lost in noise.
+
+What cannot be said is stated: both errors of each group, and what has no place in a material at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from warprrf.geometry.meshio import write_mesh
+from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.bistatic_fit import NEPER
+from warprrf.rf.bounces import fresnel_curves
+from warprrf.rf.fresnel import LAMBERTIAN, SPEED_OF_LIGHT, lobe, slab_reflection
+from warprrf.rf.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
+
+ABOUT = "Digital twin written by warprrf.write_twin."
+"""First line of a twin's ``materials.json``: a folder that says so may be replaced."""
+THICKNESS_WAVELENGTHS = 1e4  # of a slab that stands for a half-space
+ECHO_NEPERS = 20.0  # what its far side sends back has lost this much, so that nothing interferes
+BAND_SHARE = 0.1  # a material holds this far from the carrier: it was fitted at one frequency
+NARROWEST_LOBE = 60  # largest exponent that is tried
+MIRROR_SHARE = 0.01  # weight of mirrored power: about the share of a spectrum's pixels that a mirror's beam fills
+LOST_IN_NOISE = 1e-2 / np.pi  # [1/sr], 20 dB below a white Lambertian lobe: darker directions hardly count
+_EXCESS = np.geomspace(1e-2, 1e6, 1601)  # of epsilon_r - 1; the last reflects like metal
+_MATERIAL = "fitted_"  # Sionna keeps names of materials and objects apart, and reserves those of the ITU
+_FILES = {"scene.xml", "materials.json", "meshes"}
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """What a material can say of a group's reflection; see :func:`project_reflection`.
+
+    Attributes:
+        relative_permittivity: of a lossless half-space.
+        scattering: scattering coefficient S.
+        scattering_error_db: error of S^2 |Gamma|^2, rms over incidence [dB].
+        mirror_error_db: error of (1 - S^2) |Gamma|^2, rms over incidence [dB].
+    """
+
+    relative_permittivity: float
+    scattering: float
+    scattering_error_db: float
+    mirror_error_db: float
+
+
+@dataclass(frozen=True)
+class TwinGroup:
+    """One material group of a twin.
+
+    Attributes:
+        name: the group's name in the field.
+        area_m2: area of its faces [m^2].
+        material: what it became.
+        permittivity: complex relative permittivity at the carrier.
+        scattering: scattering coefficient S.
+        alpha_r: exponent of its lobe, 0 for Lambertian.
+        scattering_error_db: error of the power that it scatters, rms over incidence [dB].
+        mirror_error_db: error of the power that it mirrors, rms over incidence [dB].
+        lobe_error_db: what one lobe misses of the fitted mix, rms over both directions [dB].
+    """
+
+    name: str
+    area_m2: float
+    material: Material = dataclasses.field(repr=False)
+    permittivity: complex
+    scattering: float
+    alpha_r: int
+    scattering_error_db: float
+    mirror_error_db: float
+    lobe_error_db: float
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A digital twin on disk; see :func:`write_twin`.
+
+    Attributes:
+        xml: its scene file, for :meth:`Scene.load`, :func:`load_sionna_scene` and ``sionna.rt.load_scene``.
+        frequency_hz: carrier that its materials were fitted at [Hz].
+        groups: its materials, largest area first.
+        left_out: what of the field no material can hold, in words with numbers.
+    """
+
+    xml: Path
+    frequency_hz: float
+    groups: tuple[TwinGroup, ...] = dataclasses.field(repr=False)
+    left_out: tuple[str, ...]
+
+    @property
+    def scattering_error_db(self) -> float:
+        """Error of the scattered power over all groups, rms weighted by area [dB]."""
+        return self._rms("scattering_error_db")
+
+    @property
+    def mirror_error_db(self) -> float:
+        """Error of the mirrored power over all groups, rms weighted by area [dB]."""
+        return self._rms("mirror_error_db")
+
+    @property
+    def lobe_error_db(self) -> float:
+        """Error of the lobes over all groups, rms weighted by area [dB]."""
+        return self._rms("lobe_error_db")
+
+    def _rms(self, name: str) -> float:
+        squares = [getattr(group, name) ** 2 for group in self.groups]
+        return float(np.sqrt(np.average(squares, weights=[group.area_m2 for group in self.groups])))
+
+
+def write_twin(field: BistaticField, folder: str | os.PathLike[str]) -> Twin:
+    """Write the reconstructed mesh with a field's materials as ``scene.xml``, ``materials.json`` and ``meshes/``.
+
+    ``sionna.rt.load_scene`` opens the XML as it is, all lobes Lambertian; :func:`load_sionna_scene` sets the scattering
+    patterns too; :meth:`Scene.load` and :func:`simulate` take it as any scene. Each group with faces is an object
+    ``surface_<group>`` of a material ``fitted_<group>``, which holds within 10 % of the field's carrier.
+
+    No material can hold a common gain (an uncalibrated receiver), residuals of elements or an indirect radiance, and
+    softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former.
+
+    Args:
+        field: a fitted bistatic field.
+        folder: a new or empty folder, or an earlier twin's, which is replaced. It is written beside and renamed.
+
+    Raises:
+        TypeError: if the field is of another model.
+        ValueError: if the folder holds anything else, or the field models line of sight alone.
+    """
+    if not isinstance(field, BistaticField):
+        raise TypeError(f"field: got {type(field).__name__}, expected a field of model 'bistatic'")
+    if not field.terms.diffuse and field.terms.mirror_order == 0:
+        raise ValueError("field: it models line of sight alone, expected one with diffuse or mirror paths")
+    folder = Path(folder)
+    _check_replaceable(folder)
+    surface = field.surface
+    area = np.bincount(surface.group, surface.mesh.areas, minlength=surface.groups)
+    names = _identifiers(surface.group_names)
+    used = [g for g in np.argsort(-area, kind="stable").tolist() if area[g] > 0]
+    groups = [_project(field, g, names[g], float(area[g])) for g in used]
+    left_out = _left_out(field)
+    table = {
+        "about": [ABOUT, f"Fitted to spectra at {field.frequency_hz / 1e9:g} GHz. Left out:", *left_out],
+        "materials": [table_entry(group.material) for group in groups],
+    }
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    try:
+        part.chmod(0o755)
+        for g in used:
+            kept, faces = np.unique(surface.mesh.faces[surface.group == g], return_inverse=True)
+            write_mesh(
+                part / "meshes" / f"{names[g]}.ply", surface.mesh.vertices[kept], faces.reshape(-1, 3)
+            )
+        (part / "materials.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        (part / "scene.xml").write_text(
+            _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
+        )
+        earlier = part.with_name(part.name + ".earlier")
+        if folder.exists():
+            folder.rename(earlier)
+        part.rename(folder)
+        shutil.rmtree(earlier, ignore_errors=True)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return Twin(folder / "scene.xml", field.frequency_hz, tuple(groups), left_out)
+
+
+def project_reflection(log_excess: float, scattered: float, mirrored: float) -> Reflection:
+    """The half-space and the S that come nearest to what a group scatters and mirrors.
+
+    Args:
+        log_excess: ln(epsilon_r - 1) of the group's curve, clipped to the family that fields know.
+        scattered: W, what it scatters of that curve; 0 for nothing.
+        mirrored: m, what it mirrors of that curve; 0 for nothing.
+    """
+    cosine, weight, family = _half_spaces()
+    gap = family - NEPER * np.log(fresnel_curves().value(np.full(len(cosine), log_excess), cosine)[0])[:, None]
+    level = weight @ gap
+    shape = weight @ (gap - level) ** 2
+    excess = np.log(_EXCESS)
+    wanted = NEPER * np.log(np.maximum([scattered, mirrored], 1e-30))
+    share = np.where([scattered > 0, mirrored > 0], [1.0 - MIRROR_SHARE, MIRROR_SHARE], 0.0)
+
+    def errors(x: np.ndarray, odds: np.ndarray) -> np.ndarray:
+        """Mean square errors [dB^2] of scattered and mirrored power, ``(2, ...)``, at ln(epsilon_r - 1) and logit S^2."""
+        split = -NEPER * np.logaddexp(0.0, np.stack([-odds, odds]))  # S^2 and 1 - S^2 in dB
+        miss = split - wanted.reshape(2, *np.ones(x.ndim, int)) + np.interp(x, excess, level)
+        return np.asarray(miss**2 + np.interp(x, excess, shape))
+
+    spans = (excess[[0, -1]], np.array([-14.0, 14.0]))
+    grid = [np.linspace(*span, 141) for span in spans]
+    if mirrored <= 0 or scattered <= 0:  # all is scattered, or all mirrored
+        grid[1] = np.full(1, 40.0 if mirrored <= 0 else -40.0)
+    for _ in range(12):  # around the best of a grid a finer one
+        x, odds = np.meshgrid(*grid, indexing="ij")
+        found = np.tensordot(share, errors(x, odds), axes=1)
+        at = np.unravel_index(found.argmin(), found.shape)
+        best = [float(axis[k]) for axis, k in zip(grid, at, strict=True)]
+        step = [axis[1] - axis[0] if len(axis) > 1 else 0.0 for axis in grid]
+        grid = [
+            np.clip(np.linspace(c - d, c + d, 9 if d > 0 else 1), min(axis[0], c), max(axis[-1], c))
+            for c, d, axis in zip(best, step, grid, strict=True)
+        ]
+    rms = np.sqrt(errors(np.array(best[0]), np.array(best[1])))
+    return Reflection(
+        relative_permittivity=1.0 + float(np.exp(best[0])),
+        scattering=float(np.exp(-0.5 * np.logaddexp(0.0, -best[1]))),
+        scattering_error_db=float(rms[0]) if scattered > 0 else 0.0,
+        mirror_error_db=float(rms[1]) if mirrored > 0 else 0.0,
+    )
+
+
+def project_lobes(exponents: Sequence[int], weight: np.ndarray) -> tuple[int, float]:
+    """The one exponent (0: Lambertian) whose lobe is nearest to a mix, and its error.
+
+    Args:
+        exponents: of the mixed lobes, 0 for Lambertian.
+        weight: of each, shape ``(L,)``; their scale plays no part.
+
+    Returns:
+        The exponent, and the rms difference of the lobes [dB] over cosines of incidence (evenly) and the projected
+        hemisphere of scattering, both raised by :data:`LOST_IN_NOISE`.
+    """
+    most = max(NARROWEST_LOBE, *exponents)
+    lobes, solid_angle = _lobe_table(most)
+    mix = np.asarray(weight, float) @ lobes[list(exponents)] / np.sum(weight)
+    gap = NEPER * np.log((lobes + LOST_IN_NOISE) / (mix + LOST_IN_NOISE))
+    error = np.sqrt(gap**2 @ solid_angle)
+    best = int(error.argmin())
+    return best, float(error[best])
+
+
+def endless_slab(relative_permittivity: float, frequency_hz: float) -> tuple[float, float]:
+    """Conductivity [S/m] and thickness [m] of a slab that reflects like the lossless half-space, within 1e-3 in |r|.
+
+    Its losses take :data:`ECHO_NEPERS` from the wave that comes back from the far side (ITU-R P.2040-4, eq. (44)) and
+    are too small to change the front's reflection.
+    """
+    loss = ECHO_NEPERS * np.sqrt(relative_permittivity) / (2.0 * np.pi * THICKNESS_WAVELENGTHS)
+    conductivity = loss * 2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY
+    return float(conductivity), THICKNESS_WAVELENGTHS * SPEED_OF_LIGHT / frequency_hz
+
+
+def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
+    """What group ``g`` becomes."""
+    p, terms, frequency = field.parameters, field.terms, field.frequency_hz
+    scattered = float(p.weight[g].sum()) if terms.diffuse else 0.0
+    mirrored = float(np.exp(p.log_mirror[g])) if terms.mirror_order > 0 else 0.0
+    reflection = project_reflection(float(p.log_excess[g]), scattered, mirrored)
+    permittivity = reflection.relative_permittivity
+    alpha_r, lobe_error = project_lobes(terms.lobes, p.weight[g]) if scattered > 0 else (LAMBERTIAN, 0.0)
+    conductivity, thickness = endless_slab(permittivity, frequency)
+    low, high = (1.0 - BAND_SHARE) * frequency, (1.0 + BAND_SHARE) * frequency
+    fitted = f"fitted at {frequency / 1e9:g} GHz"
+    row = Band(low, high, permittivity, 0.0, conductivity, 0.0, fitted)
+    material = Material(
+        _MATERIAL + name,
+        (row,),
+        thickness_m=thickness,
+        scattering=reflection.scattering,
+        pattern="lambertian" if alpha_r == LAMBERTIAN else "directive",
+        alpha_r=max(alpha_r, 1),
+        sources={
+            "thickness_m": "stands for a half-space",
+            "scattering": f"{fitted}; errors {reflection.scattering_error_db:.2f} dB rms scattered, "
+            f"{reflection.mirror_error_db:.2f} dB rms mirrored",
+            "pattern": f"{fitted}; one lobe for the mix: {lobe_error:.2f} dB rms",
+        },
+    )
+    return TwinGroup(
+        name=field.surface.group_names[g],
+        area_m2=area,
+        material=material,
+        permittivity=material.permittivity(frequency),
+        scattering=material.scattering_coefficient(frequency),
+        alpha_r=alpha_r,
+        scattering_error_db=reflection.scattering_error_db,
+        mirror_error_db=reflection.mirror_error_db,
+        lobe_error_db=lobe_error,
+    )
+
+
+def _left_out(field: BistaticField) -> tuple[str, ...]:
+    found, p, s = [], field.parameters, field.surface
+    if p.log_gain != 0.0:
+        found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
+    if field.terms.residual:
+        squares = np.average(field.residual**2, weights=s.element_area)
+        found.append(f"residuals of surface elements, {NEPER * np.sqrt(squares):.2f} dB rms over area")
+    if field.terms.indirect:
+        found.append("indirect radiance of each group: further bounces are the ray tracer's")
+    return tuple(found)
+
+
+def _mean_reflection(cosine: np.ndarray, permittivity: complex | np.ndarray) -> np.ndarray:
+    """|Gamma|^2 of half-spaces, mean of TE and TM."""
+    te, tm = slab_reflection(cosine, permittivity, np.inf, 1.0)
+    return np.asarray(0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2))
+
+
+@lru_cache(maxsize=1)
+def _half_spaces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cosines of incidence ``(C,)``, their weights 2 cos dcos, and the family's |Gamma|^2 there [dB], ``(C, E)``."""
+    node, step = np.polynomial.legendre.leggauss(48)
+    cosine = 0.5 * (1.0 + node)
+    curves = _mean_reflection(cosine[:, None], 1.0 + _EXCESS[None, :])
+    return cosine, step * cosine, NEPER * np.log(curves)
+
+
+@lru_cache(maxsize=2)
+def _lobe_table(most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lobes of exponents 0 to ``most`` at pairs of directions [1/sr], ``(most + 1, N)``, and weights that sum to one."""
+    incidence, di = np.polynomial.legendre.leggauss(10)
+    scatter, ds = np.polynomial.legendre.leggauss(28)
+    turn = (np.arange(28) + 0.5) * np.pi / 28  # of azimuth; the other half is the same
+    ci, cs, az = np.meshgrid(0.5 * (1.0 + incidence), 0.5 * (1.0 + scatter), turn, indexing="ij")
+    psi = ci * cs + np.sqrt((1.0 - ci**2) * (1.0 - cs**2)) * np.cos(az)
+    weight = di[:, None, None] * ds[None, :, None] * cs
+    lobes = np.stack([lobe(n, ci, cs, psi).ravel() for n in range(most + 1)])
+    return lobes, weight.ravel() / weight.sum()
+
+
+def _identifiers(names: Sequence[str]) -> list[str]:
+    """Names for files and XML: characters other than letters, digits, ``_`` and ``-`` become ``_``; all differ."""
+    found: list[str] = []
+    for k, name in enumerate(names):
+        plain = re.sub(r"[^A-Za-z0-9_-]", "_", name)
+        found.append(plain if plain not in found else f"{plain}_{k}")
+    return found
+
+
+def _scene_xml(materials: Sequence[Material], frequency_hz: float) -> str:
+    """The scene as Sionna RT reads it: a radio material and a mesh for each group."""
+    lines = ['<scene version="3.0.0">', f"  <!-- {ABOUT} Scattering patterns stand in materials.json. -->", ""]
+    for material in materials:
+        values = {
+            "relative_permittivity": material.relative_permittivity(frequency_hz),
+            "conductivity": material.conductivity(frequency_hz),
+            "thickness": material.thickness_m,
+            "scattering_coefficient": material.scattering_coefficient(frequency_hz),
+            "xpd_coefficient": 0.0,
+        }
+        lines += [
+            f'  <bsdf type="radio-material" id="mat-{material.name}">',
+            *(f'    <float name="{key}" value="{value:.9g}"/>' for key, value in values.items()),
+            "  </bsdf>",
+        ]
+    for material in materials:
+        name = material.name.removeprefix(_MATERIAL)
+        lines += [
+            f'  <shape type="ply" id="surface_{name}">',
+            f'    <string name="filename" value="meshes/{name}.ply"/>',
+            '    <boolean name="face_normals" value="true"/>',
+            f'    <ref id="mat-{material.name}" name="bsdf"/>',
+            "  </shape>",
+        ]
+    return "\n".join([*lines, "</scene>", ""])
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Refuse what is neither new, empty nor an earlier twin."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise ValueError(f"folder: got the file {folder}, expected a folder")
+    found = {item.name for item in folder.iterdir()}
+    if not found:
+        return
+    try:
+        table = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
+        twin = found <= _FILES and table["about"][0] == ABOUT
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        twin = False
+    if not twin:
+        raise ValueError(
+            f"folder: {folder} holds {', '.join(sorted(found)[:5])} and is no earlier twin, expected a new or an "
+            "empty folder"
+        )
