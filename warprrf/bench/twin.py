@@ -8,7 +8,10 @@ ray tracer on the true scene with another seed than the truth's: how far the tru
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from warprrf.device import Progress
@@ -17,6 +20,7 @@ from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.metrics import evaluate
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import simulate
+from warprrf.rf.spectrum import Spectrum
 from warprrf.rf.twin import write_twin
 
 
@@ -47,6 +51,7 @@ def compare_twin(
         scenes["true_scene"] = true_scene
     figures: dict[str, Any] = {"field": evaluate(test, field.spectrum)}
     for name, one in scenes.items():
+        start = time.perf_counter()
         spectra = simulate(
             one,
             transmitter=test.transmitter,
@@ -61,8 +66,10 @@ def compare_twin(
             progress=progress,
             device=device,
         )
-        answers = iter([spectra[k] for k in range(len(spectra))])
-        figures[name] = evaluate(test, lambda _, answers=answers: next(answers))
+        seconds = (time.perf_counter() - start) / len(spectra)
+        answers = iter([spectra[k] for k in range(len(spectra))])  # receivers are asked for in order
+        figures[name] = evaluate(test, partial(_next, answers))
+        figures[name]["seconds_per_spectrum"] = seconds
     figures["projection"] = {
         "scattering_error_db": twin.scattering_error_db,
         "mirror_error_db": twin.mirror_error_db,
@@ -72,6 +79,10 @@ def compare_twin(
         "triangles": len(scene.mesh.faces),
     }
     return figures
+
+
+def _next(answers: Iterator[Spectrum], _receiver: Any) -> Spectrum:
+    return next(answers)
 
 
 def _with_materials(scene: Scene, materials: list[Any]) -> Scene:

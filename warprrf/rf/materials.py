@@ -241,7 +241,7 @@ def _material(entry: Mapping[str, Any], path: Path) -> Material:
 def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     """Read a table of materials (see ``data/lobby/materials.json``), by name.
 
-    An entry has a ``roughness_m`` or, where that is not known, a ``scattering`` coefficient, which counts if both stand.
+    An entry has a ``roughness_m`` or, where that is not known, a ``scattering`` coefficient; of both the latter counts.
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -37,8 +37,8 @@ def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
         frequency_hz: Carrier frequency [Hz]; materials are those of this frequency.
 
     Returns:
-        The ``sionna.rt.Scene``, objects kept apart and named as in the XML. Materials that the XML does not give in full
-        (ITU ones) are replaced by ``warprrf-<name>``.
+        The ``sionna.rt.Scene``, objects kept apart and named as in the XML. Materials that the XML gives by their ITU
+        name alone are replaced by ``warprrf-<name>``.
 
     Raises:
         ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.

@@ -21,7 +21,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -32,18 +32,24 @@ from warprrf.geometry.meshio import write_mesh
 from warprrf.rf.bistatic import BistaticField
 from warprrf.rf.bistatic_fit import NEPER
 from warprrf.rf.bounces import fresnel_curves
-from warprrf.rf.fresnel import LAMBERTIAN, SPEED_OF_LIGHT, lobe, slab_reflection
+from warprrf.rf.field import RadioField
+from warprrf.rf.fresnel import LAMBERTIAN, lobe, slab_reflection
 from warprrf.rf.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
 
 ABOUT = "Digital twin written by warprrf.write_twin."
 """First line of a twin's ``materials.json``: a folder that says so may be replaced."""
-THICKNESS_WAVELENGTHS = 1e4  # of a slab that stands for a half-space
-ECHO_NEPERS = 20.0  # what its far side sends back has lost this much, so that nothing interferes
+LOSS_TANGENT = 0.02  # least that single precision, which Sionna computes in, surely turns into a decay
+THICKNESS_WAVELENGTHS = (
+    200.0  # then what the far side sends back has lost 25 nepers: the slab is a half-space
+)
 BAND_SHARE = 0.1  # a material holds this far from the carrier: it was fitted at one frequency
 NARROWEST_LOBE = 60  # largest exponent that is tried
-MIRROR_SHARE = 0.01  # weight of mirrored power: about the share of a spectrum's pixels that a mirror's beam fills
+MIRROR_SHARE = (
+    0.01  # weight of mirrored power: about the share of a spectrum's pixels that a mirror's beam fills
+)
 LOST_IN_NOISE = 1e-2 / np.pi  # [1/sr], 20 dB below a white Lambertian lobe: darker directions hardly count
 _EXCESS = np.geomspace(1e-2, 1e6, 1601)  # of epsilon_r - 1; the last reflects like metal
+CERTAIN = 40.0  # logit of an S^2 of one
 _MATERIAL = "fitted_"  # Sionna keeps names of materials and objects apart, and reserves those of the ITU
 _FILES = {"scene.xml", "materials.json", "meshes"}
 
@@ -53,7 +59,7 @@ class Reflection:
     """What a material can say of a group's reflection; see :func:`project_reflection`.
 
     Attributes:
-        relative_permittivity: of a lossless half-space.
+        relative_permittivity: of a half-space with losses of :data:`LOSS_TANGENT`.
         scattering: scattering coefficient S.
         scattering_error_db: error of S^2 |Gamma|^2, rms over incidence [dB].
         mirror_error_db: error of (1 - S^2) |Gamma|^2, rms over incidence [dB].
@@ -128,7 +134,7 @@ class Twin:
         return float(np.sqrt(np.average(squares, weights=[group.area_m2 for group in self.groups])))
 
 
-def write_twin(field: BistaticField, folder: str | os.PathLike[str]) -> Twin:
+def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     """Write the reconstructed mesh with a field's materials as ``scene.xml``, ``materials.json`` and ``meshes/``.
 
     ``sionna.rt.load_scene`` opens the XML as it is, all lobes Lambertian; :func:`load_sionna_scene` sets the scattering
@@ -168,9 +174,7 @@ def write_twin(field: BistaticField, folder: str | os.PathLike[str]) -> Twin:
         part.chmod(0o755)
         for g in used:
             kept, faces = np.unique(surface.mesh.faces[surface.group == g], return_inverse=True)
-            write_mesh(
-                part / "meshes" / f"{names[g]}.ply", surface.mesh.vertices[kept], faces.reshape(-1, 3)
-            )
+            write_mesh(part / "meshes" / f"{names[g]}.ply", surface.mesh.vertices[kept], faces.reshape(-1, 3))
         (part / "materials.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
         (part / "scene.xml").write_text(
             _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
@@ -194,7 +198,9 @@ def project_reflection(log_excess: float, scattered: float, mirrored: float) -> 
         mirrored: m, what it mirrors of that curve; 0 for nothing.
     """
     cosine, weight, family = _half_spaces()
-    gap = family - NEPER * np.log(fresnel_curves().value(np.full(len(cosine), log_excess), cosine)[0])[:, None]
+    gap = (
+        family - NEPER * np.log(fresnel_curves().value(np.full(len(cosine), log_excess), cosine)[0])[:, None]
+    )
     level = weight @ gap
     shape = weight @ (gap - level) ** 2
     excess = np.log(_EXCESS)
@@ -202,32 +208,44 @@ def project_reflection(log_excess: float, scattered: float, mirrored: float) -> 
     share = np.where([scattered > 0, mirrored > 0], [1.0 - MIRROR_SHARE, MIRROR_SHARE], 0.0)
 
     def errors(x: np.ndarray, odds: np.ndarray) -> np.ndarray:
-        """Mean square errors [dB^2] of scattered and mirrored power, ``(2, ...)``, at ln(epsilon_r - 1) and logit S^2."""
+        """Mean square errors [dB^2] of scattered and mirrored power, ``(2, ...)``; ``odds`` is the logit of S^2."""
         split = -NEPER * np.logaddexp(0.0, np.stack([-odds, odds]))  # S^2 and 1 - S^2 in dB
-        miss = split - wanted.reshape(2, *np.ones(x.ndim, int)) + np.interp(x, excess, level)
+        miss = split - wanted.reshape(2, *np.ones(odds.ndim, int)) + np.interp(x, excess, level)
         return np.asarray(miss**2 + np.interp(x, excess, shape))
 
-    spans = (excess[[0, -1]], np.array([-14.0, 14.0]))
-    grid = [np.linspace(*span, 141) for span in spans]
-    if mirrored <= 0 or scattered <= 0:  # all is scattered, or all mirrored
-        grid[1] = np.full(1, 40.0 if mirrored <= 0 else -40.0)
-    for _ in range(12):  # around the best of a grid a finer one
-        x, odds = np.meshgrid(*grid, indexing="ij")
-        found = np.tensordot(share, errors(x, odds), axes=1)
-        at = np.unravel_index(found.argmin(), found.shape)
-        best = [float(axis[k]) for axis, k in zip(grid, at, strict=True)]
-        step = [axis[1] - axis[0] if len(axis) > 1 else 0.0 for axis in grid]
-        grid = [
-            np.clip(np.linspace(c - d, c + d, 9 if d > 0 else 1), min(axis[0], c), max(axis[-1], c))
-            for c, d, axis in zip(best, step, grid, strict=True)
-        ]
-    rms = np.sqrt(errors(np.array(best[0]), np.array(best[1])))
+    def best_odds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Logit of the S^2 that suits each ``x`` (N,) best, and what is left of the error."""
+        if mirrored <= 0 or scattered <= 0:
+            odds = np.full(len(x), CERTAIN if mirrored <= 0 else -CERTAIN)
+        else:
+            odds = _refined(
+                lambda trial: np.tensordot(share, errors(x[:, None], trial), axes=1), np.zeros(len(x)), 14.0
+            )
+        return odds, share @ errors(x, odds)
+
+    coarse = best_odds(excess)[1]
+    start = np.array([excess[coarse.argmin()]])
+    x = _refined(
+        lambda trial: best_odds(np.clip(trial[0], *excess[[0, -1]]))[1][None], start, excess[1] - excess[0]
+    )
+    x = np.clip(x, *excess[[0, -1]])
+    odds = best_odds(x)[0]
+    rms = np.sqrt(errors(x, odds)[:, 0])
     return Reflection(
-        relative_permittivity=1.0 + float(np.exp(best[0])),
-        scattering=float(np.exp(-0.5 * np.logaddexp(0.0, -best[1]))),
+        relative_permittivity=1.0 + float(np.exp(x[0])),
+        scattering=float(np.exp(-0.5 * np.logaddexp(0.0, -odds[0]))),
         scattering_error_db=float(rms[0]) if scattered > 0 else 0.0,
         mirror_error_db=float(rms[1]) if mirrored > 0 else 0.0,
     )
+
+
+def _refined(cost: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, reach: float) -> np.ndarray:
+    """Where ``cost``, of trials ``(N, T)``, is least within ``reach`` of each ``centre`` (N,): grids that close in."""
+    for _ in range(9):
+        trial = centre[:, None] + np.linspace(-reach, reach, 29)
+        centre = np.take_along_axis(trial, cost(trial).argmin(axis=1)[:, None], axis=1)[:, 0]
+        reach /= 7.0
+    return centre
 
 
 def project_lobes(exponents: Sequence[int], weight: np.ndarray) -> tuple[int, float]:
@@ -250,17 +268,6 @@ def project_lobes(exponents: Sequence[int], weight: np.ndarray) -> tuple[int, fl
     return best, float(error[best])
 
 
-def endless_slab(relative_permittivity: float, frequency_hz: float) -> tuple[float, float]:
-    """Conductivity [S/m] and thickness [m] of a slab that reflects like the lossless half-space, within 1e-3 in |r|.
-
-    Its losses take :data:`ECHO_NEPERS` from the wave that comes back from the far side (ITU-R P.2040-4, eq. (44)) and
-    are too small to change the front's reflection.
-    """
-    loss = ECHO_NEPERS * np.sqrt(relative_permittivity) / (2.0 * np.pi * THICKNESS_WAVELENGTHS)
-    conductivity = loss * 2.0 * np.pi * frequency_hz * VACUUM_PERMITTIVITY
-    return float(conductivity), THICKNESS_WAVELENGTHS * SPEED_OF_LIGHT / frequency_hz
-
-
 def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
     """What group ``g`` becomes."""
     p, terms, frequency = field.parameters, field.terms, field.frequency_hz
@@ -269,14 +276,14 @@ def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
     reflection = project_reflection(float(p.log_excess[g]), scattered, mirrored)
     permittivity = reflection.relative_permittivity
     alpha_r, lobe_error = project_lobes(terms.lobes, p.weight[g]) if scattered > 0 else (LAMBERTIAN, 0.0)
-    conductivity, thickness = endless_slab(permittivity, frequency)
+    conductivity = LOSS_TANGENT * permittivity * 2.0 * np.pi * frequency * VACUUM_PERMITTIVITY
     low, high = (1.0 - BAND_SHARE) * frequency, (1.0 + BAND_SHARE) * frequency
     fitted = f"fitted at {frequency / 1e9:g} GHz"
     row = Band(low, high, permittivity, 0.0, conductivity, 0.0, fitted)
     material = Material(
         _MATERIAL + name,
         (row,),
-        thickness_m=thickness,
+        thickness_m=THICKNESS_WAVELENGTHS * field.wavelength_m,
         scattering=reflection.scattering,
         pattern="lambertian" if alpha_r == LAMBERTIAN else "directive",
         alpha_r=max(alpha_r, 1),
@@ -312,24 +319,18 @@ def _left_out(field: BistaticField) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _mean_reflection(cosine: np.ndarray, permittivity: complex | np.ndarray) -> np.ndarray:
-    """|Gamma|^2 of half-spaces, mean of TE and TM."""
-    te, tm = slab_reflection(cosine, permittivity, np.inf, 1.0)
-    return np.asarray(0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2))
-
-
 @lru_cache(maxsize=1)
 def _half_spaces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cosines of incidence ``(C,)``, their weights 2 cos dcos, and the family's |Gamma|^2 there [dB], ``(C, E)``."""
     node, step = np.polynomial.legendre.leggauss(48)
     cosine = 0.5 * (1.0 + node)
-    curves = _mean_reflection(cosine[:, None], 1.0 + _EXCESS[None, :])
-    return cosine, step * cosine, NEPER * np.log(curves)
+    te, tm = slab_reflection(cosine[:, None], (1.0 + _EXCESS) * (1.0 - 1j * LOSS_TANGENT), np.inf, 1.0)
+    return cosine, step * cosine, NEPER * np.log(0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2))
 
 
 @lru_cache(maxsize=2)
 def _lobe_table(most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Lobes of exponents 0 to ``most`` at pairs of directions [1/sr], ``(most + 1, N)``, and weights that sum to one."""
+    """Lobes of exponents 0 to ``most`` at pairs of directions [1/sr], ``(most + 1, N)``, and weights that sum to 1."""
     incidence, di = np.polynomial.legendre.leggauss(10)
     scatter, ds = np.polynomial.legendre.leggauss(28)
     turn = (np.arange(28) + 0.5) * np.pi / 28  # of azimuth; the other half is the same
@@ -351,7 +352,11 @@ def _identifiers(names: Sequence[str]) -> list[str]:
 
 def _scene_xml(materials: Sequence[Material], frequency_hz: float) -> str:
     """The scene as Sionna RT reads it: a radio material and a mesh for each group."""
-    lines = ['<scene version="3.0.0">', f"  <!-- {ABOUT} Scattering patterns stand in materials.json. -->", ""]
+    lines = [
+        '<scene version="3.0.0">',
+        f"  <!-- {ABOUT} Scattering patterns stand in materials.json. -->",
+        "",
+    ]
     for material in materials:
         values = {
             "relative_permittivity": material.relative_permittivity(frequency_hz),
