@@ -266,6 +266,19 @@ def test_a_failed_write_leaves_the_earlier_twin(field, tmp_path, monkeypatch):
         wr.write_twin(field, folder)
     assert (folder / "scene.xml").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["twin"]
+    monkeypatch.undo()
+    rename = Path.rename
+
+    def stuck(self, target):
+        if Path(target) == folder and not self.name.endswith(".earlier"):
+            raise OSError("stale handle")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", stuck)
+    with pytest.raises(OSError, match="stale handle"):
+        wr.write_twin(field, folder)
+    assert (folder / "scene.xml").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["twin"]
 
 
 def test_fields_without_materials_are_refused(field, tmp_path):

@@ -170,6 +170,7 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     }
     folder.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    earlier = part.with_name(part.name + ".earlier")
     try:
         part.chmod(0o755)
         for g in used:
@@ -179,13 +180,14 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
         (part / "scene.xml").write_text(
             _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
         )
-        earlier = part.with_name(part.name + ".earlier")
         if folder.exists():
-            folder.rename(earlier)
+            folder.rename(earlier)  # a folder cannot be renamed over one that holds something
         part.rename(folder)
-        shutil.rmtree(earlier, ignore_errors=True)
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        if earlier.exists() and not folder.exists():
+            earlier.rename(folder)
+        for rest in (part, earlier):
+            shutil.rmtree(rest, ignore_errors=True)
     return Twin(folder / "scene.xml", field.frequency_hz, tuple(groups), left_out)
 
 
