@@ -14,6 +14,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.exact import ReceivedPaths
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.llvm import select_llvm
 from warprrf.rf.paths import check_frequency
 from warprrf.rf.scene import Scene
@@ -23,6 +24,10 @@ from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_ang
 _PATHS_PER_SAMPLE_AND_BOUNCE = 1
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
+SAME_LENGTH_M = (
+    5e-3  # paths nearer than this in length and direction are one: Sionna takes planes 1 cm apart for one
+)
+SAME_DIRECTION_RAD = 1e-3
 _DIFFUSE = 2  # sionna.rt.InteractionType.DIFFUSE
 _VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
 
@@ -107,6 +112,28 @@ def _select_variant() -> None:
     mitsuba = _device.require("mitsuba", extra="sionna")
     if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
         mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
+
+
+def repeated(tau: np.ndarray, arrival: np.ndarray, aod: np.ndarray, bounces: np.ndarray) -> np.ndarray:
+    """Which specular paths repeat an earlier one, shape ``(L,)`` bool.
+
+    Sionna tells mirrors apart by the rounded plane of the triangle met. Small triangles of one surface have planes that
+    differ by rounding, and each is then taken for a mirror of its own: one reflection is counted several times.
+
+    Args:
+        tau: delays [s], shape ``(L,)``.
+        arrival: unit directions of arrival, shape ``(L, 3)``.
+        aod: zenith and azimuth of departure [rad], shape ``(L, 2)``.
+        bounces: interactions, shape ``(L,)``.
+    """
+    departure = directions_from_angles(aod[:, 0], aod[:, 1])
+    same = (
+        (np.abs(tau[:, None] - tau) * SPEED_OF_LIGHT < SAME_LENGTH_M)
+        & (np.linalg.norm(arrival[:, None] - arrival, axis=-1) < SAME_DIRECTION_RAD)
+        & (np.linalg.norm(departure[:, None] - departure, axis=-1) < SAME_DIRECTION_RAD)
+        & (bounces[:, None] == bounces)
+    )
+    return np.asarray(np.tril(same, -1).any(axis=1))
 
 
 class SionnaEngine:
@@ -208,7 +235,7 @@ class SionnaEngine:
         def field(values: Any) -> np.ndarray:
             return np.asarray(values.numpy(), dtype=np.float64).reshape(-1)[valid]
 
-        return {
+        found = {
             "power": per_path.sum(axis=0)[valid] / 2.0,
             "tau": field(paths.tau),
             "arrival": directions_from_angles(field(paths.theta_r), field(paths.phi_r)),
@@ -216,6 +243,9 @@ class SionnaEngine:
             "diffuse": (kinds == _DIFFUSE).any(axis=0)[valid],
             "bounces": (kinds != 0).sum(axis=0)[valid],
         }
+        sharp = np.flatnonzero(~found["diffuse"])
+        copies = sharp[repeated(*(found[name][sharp] for name in ("tau", "arrival", "aod", "bounces")))]
+        return {name: np.delete(values, copies, axis=0) for name, values in found.items()}
 
     def _flush(self) -> None:
         drjit = _device.require("drjit", extra="sionna")
