@@ -142,8 +142,8 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     ``surface_<group>`` of a material ``fitted_<group>``, which holds within 10 % of the field's carrier.
 
     No material can hold a common gain (an uncalibrated receiver), residuals of elements or an indirect radiance, and
-    softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former. Sionna
-    may find one mirror in several small triangles and count it as often; :func:`simulate` counts it once.
+    softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former.
+    Sionna may find one mirror in several small triangles and count it as often; :func:`simulate` counts it once.
 
     Args:
         field: a fitted bistatic field.
