@@ -13,7 +13,7 @@ from warprrf import cli
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
-COMMANDS = ("lobby", "reconstruct", "simulate", "fit", "render", "evaluate", "bench", "data")
+COMMANDS = ("lobby", "reconstruct", "simulate", "fit", "render", "evaluate", "twin", "bench", "data")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -36,10 +36,12 @@ _HOMES = {
     "evaluate": "rf.metrics",
     "fit_reflections": "rf.reflections",
     "load_newrf": "rf.newrf",
+    "load_sionna_scene": "rf.sionna_engine",
     "reconstruct": "geometry.reconstruction",
     "render": "geometry.render",
     "simulate": "rf.simulate",
     "trace_paths": "rf.paths",
+    "write_twin": "rf.twin",
 }
 
 __all__ = ["__version__", *_HOMES]
@@ -65,7 +67,9 @@ if TYPE_CHECKING:
     from warprrf.rf.reflections import fit_reflections as fit_reflections
     from warprrf.rf.scene import Scene as Scene
     from warprrf.rf.simulate import simulate as simulate
+    from warprrf.rf.sionna_engine import load_sionna_scene as load_sionna_scene
     from warprrf.rf.spectrum import Spectrum as Spectrum
+    from warprrf.rf.twin import write_twin as write_twin
 
 
 def __getattr__(name: str) -> Any:

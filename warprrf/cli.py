@@ -31,6 +31,7 @@ a walk through, in a checkout:
   warprrf fit room spectra.nc -o field.safetensors --model rf3dgs+
   warprrf evaluate field.safetensors spectra.nc --train 50
   warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
+  warprrf twin field.safetensors -o twin           scene.xml and materials.json for Sionna RT
 
 Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
 """
@@ -224,6 +225,30 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
         write_json(args.out, figures)
 
 
+def _twin(args: argparse.Namespace, bars: Bars) -> None:
+    twin = wr.write_twin(wr.RadioField.load(_existing(args.field)), args.out)
+    rows = [["surface", "area m2", "permittivity", "S", "lobe", "lobe error dB"]]
+    for group in twin.groups:
+        rows.append(
+            [
+                group.name,
+                f"{group.area_m2:.1f}",
+                f"{group.permittivity.real:.3g}",
+                f"{group.scattering:.3f}",
+                f"{group.alpha_r}" if group.alpha_r else "Lambertian",
+                f"{group.lobe_error_db:.2f}",
+            ]
+        )
+    print(_aligned(rows))
+    print(
+        f"\n{twin.xml}: {len(twin.groups)} materials; rms errors of the projection over area: scattered power "
+        f"{twin.scattering_error_db:.2f} dB, mirrored power {twin.mirror_error_db:.2f} dB, lobes "
+        f"{twin.lobe_error_db:.2f} dB"
+    )
+    for line in twin.left_out:
+        print(f"left out: {line}")
+
+
 def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
     from warprrf.bench import newrf
 
@@ -263,6 +288,11 @@ def table(methods: dict[str, dict[str, Any]]) -> str:
                 *("-" if cell is None else f"{cell:.3g}" if cell < 10 else f"{cell:.2f}" for cell in cells),
             ]
         )
+    return _aligned(rows)
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of text with their columns flush right."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return "\n".join(
         "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows
@@ -480,6 +510,12 @@ def _parser() -> argparse.ArgumentParser:
     eva.add_argument("--no-lookups", dest="lookups", action="store_false", help="the field alone")
     eva.add_argument("-o", "--out", help="JSON file of the figures")
 
+    twin = add("twin", _twin, "a field's digital twin: a scene for Sionna RT", HELP_TWIN)
+    twin.add_argument("field", help="field file (.safetensors) of model bistatic")
+    twin.add_argument(
+        "-o", "--out", required=True, help="folder of the twin: new, empty or an earlier twin's"
+    )
+
     bench = add("bench", _bench, "one table of figures, from one command", HELP_BENCH)
     bench.add_argument("name", choices=sorted(BENCHES), help="which table")
     bench.add_argument("--out", help="folder of the results (default runs/NAME)")
@@ -552,6 +588,16 @@ measurement, inverse distance, a constant, the mean image). `blocked` counts rec
 
 examples:
   warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
+"""
+
+HELP_TWIN = """\
+Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
+opens the scene as it is, all lobes Lambertian; `warprrf.load_sionna_scene` sets the scattering patterns too, and
+`warprrf simulate` takes it as any scene. A material has one curve and one lobe: what the projection misses is printed.
+
+examples:
+  warprrf twin field.safetensors -o twin
+  warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
 """
 
 HELP_BENCH = """\

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from warprrf.rf.materials import Band, Material, load_materials, roughness_scattering
+from warprrf.rf.materials import Band, Material, load_materials, roughness_scattering, table_entry
 
 TABLE = Path(__file__).parents[2] / "data" / "lobby" / "materials.json"
 
@@ -109,6 +109,43 @@ def test_a_broken_table_says_which_material_and_what(tmp_path: Path) -> None:
     broken.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"marble.*thickness_m"):
         load_materials(broken)
+
+
+def test_a_table_may_give_the_scattering_coefficient_itself(tmp_path: Path) -> None:
+    content = json.loads(TABLE.read_text())
+    brick = next(entry for entry in content["materials"] if entry["name"] == "brick")
+    del brick["roughness_m"]
+    file = tmp_path / "materials.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"brick.*neither 'roughness_m' nor 'scattering'"):
+        load_materials(file)
+    brick["scattering"] = {"value": 0.43, "source": "fitted"}
+    file.write_text(json.dumps(content))
+    read = load_materials(file)["brick"]
+    assert read.scattering_coefficient(300e9) == read.scattering_coefficient(140e9) == 0.43
+    assert read.sources is not None
+    assert read.sources["scattering"] == "fitted"
+    brick["scattering"]["value"] = 1.43
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"scattering.*1\.43.*brick"):
+        load_materials(file)
+
+
+def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], tmp_path: Path) -> None:
+    given = [
+        *table.values(),
+        Material.custom("own", relative_permittivity=2.5, scattering=0.3, pattern="directive", alpha_r=7),
+    ]
+    file = tmp_path / "materials.json"
+    file.write_text(json.dumps({"materials": [table_entry(material) for material in given]}))
+    read = load_materials(file)
+    for material in given:
+        again = read[material.name]
+        assert again.bands == material.bands
+        for name in ("thickness_m", "pattern", "roughness_m", "scattering", "itu"):
+            assert getattr(again, name) == getattr(material, name)
+        if material.pattern == "directive":
+            assert again.alpha_r == material.alpha_r
 
 
 def test_every_value_of_the_table_has_a_source() -> None:

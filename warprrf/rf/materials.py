@@ -169,6 +169,31 @@ def roughness_scattering(roughness_m: float, frequency_hz: float) -> float:
     return float(np.sqrt(-np.expm1(-2 * exponent)))
 
 
+_PARTS = ("thickness_m", "roughness_m", "scattering", "pattern")
+"""Parts of a table's entry with a value and a source each."""
+
+
+def table_entry(material: Material) -> dict[str, Any]:
+    """The entry of a table of materials that :func:`load_materials` reads as ``material``."""
+    sources = material.sources or {}
+    values: dict[str, Any] = {"thickness_m": material.thickness_m, "pattern": material.pattern}
+    if material.scattering is None:
+        values["roughness_m"] = material.roughness_m
+    else:
+        values["scattering"] = material.scattering
+    rows = [
+        {"low_ghz": b.low_hz / 1e9, "high_ghz": b.high_hz / 1e9, "a": b.a, "b": b.b, "c": b.c, "d": b.d,
+         "source": b.source}
+        for b in material.bands
+    ]  # fmt: skip
+    entry: dict[str, Any] = {"name": material.name, "itu": material.itu, "permittivity": rows}
+    for key in (key for key in _PARTS if key in values):
+        entry[key] = {"value": values[key], "source": sources.get(key, "assumed")}
+    if material.pattern == "directive":
+        entry["pattern"]["alpha_r"] = int(material.alpha_r)
+    return entry
+
+
 def _number(entry: Mapping[str, Any], key: str, where: str) -> float:
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -181,9 +206,11 @@ def _material(entry: Mapping[str, Any], path: Path) -> Material:
     if not isinstance(name, str):
         raise ValueError(f"path: an entry of {path} has no 'name'")
     where = f"path: material {name!r} in {path}"
-    for key in ("permittivity", "thickness_m", "roughness_m", "pattern"):
+    for key in ("permittivity", "thickness_m", "pattern"):
         if key not in entry:
             raise ValueError(f"{where} has no {key!r}")
+    if "roughness_m" not in entry and "scattering" not in entry:
+        raise ValueError(f"{where} has neither 'roughness_m' nor 'scattering', expected one of them")
     bands = tuple(
         Band(
             low_hz=_number(row, "low_ghz", where) * 1e9,
@@ -196,12 +223,14 @@ def _material(entry: Mapping[str, Any], path: Path) -> Material:
         )
         for row in entry["permittivity"]
     )
-    parts = {key: entry[key] for key in ("thickness_m", "roughness_m", "pattern")}
+    parts = {key: entry[key] for key in _PARTS if key in entry}
+    scattering = _number(parts["scattering"], "value", where) if "scattering" in parts else None
     return Material(
         name=name,
         bands=bands,
         thickness_m=_number(parts["thickness_m"], "value", where),
-        roughness_m=_number(parts["roughness_m"], "value", where),
+        roughness_m=_number(parts["roughness_m"], "value", where) if "roughness_m" in parts else 0.0,
+        scattering=scattering,
         pattern=str(parts["pattern"].get("value")),
         alpha_r=int(parts["pattern"].get("alpha_r", 4)),
         itu=entry.get("itu"),
@@ -211,6 +240,8 @@ def _material(entry: Mapping[str, Any], path: Path) -> Material:
 
 def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     """Read a table of materials (see ``data/lobby/materials.json``), by name.
+
+    An entry has a ``roughness_m`` or, where that is not known, a ``scattering`` coefficient; of both the latter counts.
 
     Raises:
         FileNotFoundError: if there is no such file.

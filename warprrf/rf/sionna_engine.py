@@ -7,21 +7,133 @@ the sum over the latter. One solve per receiver, because Sionna shares its cap o
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.exact import ReceivedPaths
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.llvm import select_llvm
 from warprrf.rf.paths import check_frequency
+from warprrf.rf.scene import Scene
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
 
 # Sionna's default cap of 1e6 paths truncates silently; each sample can give one path a bounce.
 _PATHS_PER_SAMPLE_AND_BOUNCE = 1
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
+SAME_LENGTH_M = (
+    5e-3  # paths nearer than this in length and direction are one: Sionna takes planes 1 cm apart for one
+)
+SAME_DIRECTION_RAD = 1e-3
 _DIFFUSE = 2  # sionna.rt.InteractionType.DIFFUSE
+_VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
+
+
+def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
+    """Open a scene in Sionna RT with its table of materials, scattering patterns included.
+
+    Sionna's own ``load_scene`` knows no patterns (every material is Lambertian) and takes what it can from the XML.
+
+    Args:
+        scene: Path of an XML with ``materials.json`` beside it (a digital twin, the lobby), or a loaded :class:`Scene`.
+        frequency_hz: Carrier frequency [Hz]; materials are those of this frequency.
+
+    Returns:
+        The ``sionna.rt.Scene``, objects kept apart and named as in the XML. Materials that the XML gives by their ITU
+        name alone are replaced by ``warprrf-<name>``.
+
+    Raises:
+        ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
+        FileNotFoundError: if the XML, a mesh or the table is missing.
+        ValueError: if the scene was not loaded from a file, a material is not known at this frequency or is infinitely
+            thick, or an object has more than one.
+    """
+    if isinstance(scene, str | os.PathLike):
+        scene = Scene.load(scene)
+    frequency = check_frequency(frequency_hz)
+    if getattr(scene, "xml_path", None) is None:
+        raise ValueError(
+            "scene: got one without an XML file, which Sionna needs; use Scene.load or engine='exact'"
+        )
+    rt = _sionna()
+    loaded = rt.load_scene(str(scene.xml_path), merge_shapes=False)
+    before = list(loaded.radio_materials)
+    materials = [_radio_material(loaded, rt, material, frequency) for material in scene.materials]
+    objects = dict(loaded.objects)
+    for index, name in enumerate(scene.object_names):
+        if name not in objects:
+            raise ValueError(f"scene: object {name!r} is not in {scene.xml_path} as Sionna reads it")
+        used = np.unique(np.asarray(scene.face_material)[np.asarray(scene.face_object) == index])
+        if len(used) != 1:
+            raise ValueError(f"scene: object {name!r} has {len(used)} materials, Sionna allows one an object")
+        objects[name].radio_material = materials[int(used[0])]
+    for name in before:
+        if not loaded.radio_materials[name].is_used:
+            loaded.remove(name)
+    loaded.frequency = frequency
+    return loaded
+
+
+def _radio_material(loaded: Any, rt: Any, material: Any, frequency: float) -> Any:
+    """The material of this name in Sionna's scene, added if it has none that can be set, with our values."""
+    if not np.isfinite(material.thickness_m):
+        raise ValueError(
+            f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
+        )
+    radio = loaded.radio_materials.get(material.name)
+    if type(radio) is not rt.RadioMaterial:  # an ITU material keeps its own permittivity
+        radio = rt.RadioMaterial(f"warprrf-{material.name}")  # objects and materials share one set of names
+        loaded.add(radio)
+    eta = complex(material.permittivity(frequency))
+    radio.relative_permittivity = eta.real
+    radio.conductivity = -eta.imag * 2.0 * np.pi * frequency * _VACUUM_PERMITTIVITY
+    radio.thickness = float(material.thickness_m)
+    radio.scattering_coefficient = float(material.scattering_coefficient(frequency))
+    radio.xpd_coefficient = 0.0
+    directive = material.pattern == "directive"
+    radio.scattering_pattern = (
+        rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
+    )
+    return radio
+
+
+def _sionna() -> Any:
+    """Sionna RT, on a variant of Mitsuba and an LLVM that it can use."""
+    select_llvm()
+    _select_variant()
+    return _device.require("sionna.rt", extra="sionna")
+
+
+def _select_variant() -> None:
+    """Mitsuba may be on another variant, for photos; Sionna registers its plugins with the one at its import."""
+    mitsuba = _device.require("mitsuba", extra="sionna")
+    if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
+        mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
+
+
+def repeated(tau: np.ndarray, arrival: np.ndarray, aod: np.ndarray, bounces: np.ndarray) -> np.ndarray:
+    """Which specular paths repeat an earlier one, shape ``(L,)`` bool.
+
+    Sionna tells mirrors apart by the rounded plane of the triangle met. Small triangles of one surface have planes that
+    differ by rounding, and each is then taken for a mirror of its own: one reflection is counted several times.
+
+    Args:
+        tau: delays [s], shape ``(L,)``.
+        arrival: unit directions of arrival, shape ``(L, 3)``.
+        aod: zenith and azimuth of departure [rad], shape ``(L, 2)``.
+        bounces: interactions, shape ``(L,)``.
+    """
+    departure = directions_from_angles(aod[:, 0], aod[:, 1])
+    same = (
+        (np.abs(tau[:, None] - tau) * SPEED_OF_LIGHT < SAME_LENGTH_M)
+        & (np.linalg.norm(arrival[:, None] - arrival, axis=-1) < SAME_DIRECTION_RAD)
+        & (np.linalg.norm(departure[:, None] - departure, axis=-1) < SAME_DIRECTION_RAD)
+        & (bounces[:, None] == bounces)
+    )
+    return np.asarray(np.tril(same, -1).any(axis=1))
 
 
 class SionnaEngine:
@@ -58,16 +170,18 @@ class SionnaEngine:
         seed: int = 0,
         device: Any = None,
     ) -> None:
-        select_llvm()
-        self._select_variant()
-        self._rt = _device.require("sionna.rt", extra="sionna")
         self.shape = check_shape(shape)
         self.beam_sigma_rad = beam_sigma_rad
         self.transmitter = _device.check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
         self.depth, self.samples, self.refraction, self.seed = depth, samples, refraction, seed
         self.device = device
-        self._scene = self._load(scene)
+        self._rt = _sionna()
+        self._scene = load_sionna_scene(scene, frequency_hz=self.frequency_hz)
+        both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
+        self._scene.tx_array = self._rt.PlanarArray(**both)
+        self._scene.rx_array = self._rt.PlanarArray(**both)
+        self._scene.add(self._rt.Transmitter("tx", position=self.transmitter.tolist()))
         self._solver = self._rt.PathSolver(deterministic=True)
         self._solved = 0
 
@@ -76,67 +190,13 @@ class SionnaEngine:
         """Sionna RT's version."""
         return str(self._rt.__version__)
 
-    def _select_variant(self) -> None:
-        """Mitsuba may be on another variant, for photos; Sionna registers its plugins with the one at its import."""
-        mitsuba = _device.require("mitsuba", extra="sionna")
-        if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
-            mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
-
-    def _load(self, scene: Any) -> Any:
-        if getattr(scene, "xml_path", None) is None:
-            raise ValueError(
-                "scene: got one without an XML file, which Sionna needs; use Scene.load or engine='exact'"
-            )
-        rt = self._rt
-        loaded = rt.load_scene(str(scene.xml_path), merge_shapes=False)
-        before = list(loaded.radio_materials)
-        materials = []
-        for k, material in enumerate(scene.materials):
-            if not np.isfinite(material.thickness_m):
-                raise ValueError(
-                    f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
-                )
-            eta = complex(material.permittivity(self.frequency_hz))
-            radio = rt.RadioMaterial(
-                f"warprrf-{k}-{material.name}",
-                thickness=material.thickness_m,
-                relative_permittivity=eta.real,
-                conductivity=-eta.imag * 2.0 * np.pi * self.frequency_hz * _VACUUM_PERMITTIVITY,
-                scattering_coefficient=material.scattering_coefficient(self.frequency_hz),
-                xpd_coefficient=0.0,
-            )
-            directive = material.pattern == "directive"
-            radio.scattering_pattern = (
-                rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
-            )
-            loaded.add(radio)
-            materials.append(radio)
-        objects = dict(loaded.objects)
-        for index, name in enumerate(scene.object_names):
-            if name not in objects:
-                raise ValueError(f"scene: object {name!r} is not in {scene.xml_path} as Sionna reads it")
-            used = np.unique(np.asarray(scene.face_material)[np.asarray(scene.face_object) == index])
-            if len(used) != 1:
-                raise ValueError(
-                    f"scene: object {name!r} has {len(used)} materials, Sionna allows one an object"
-                )
-            objects[name].radio_material = materials[int(used[0])]
-        for name in before:
-            if not loaded.radio_materials[name].is_used:
-                loaded.remove(name)
-        loaded.frequency = self.frequency_hz
-        both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
-        loaded.tx_array, loaded.rx_array = rt.PlanarArray(**both), rt.PlanarArray(**both)
-        loaded.add(rt.Transmitter("tx", position=self.transmitter.tolist()))
-        return loaded
-
     def solve(self, receiver: Any, *, specular: bool = True) -> dict[str, np.ndarray]:
         """Paths of one receiver (3,): ``power``, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.
 
         Without ``specular`` reflections every ray scatters, and at depth 1 Sionna's result hardly depends on chance.
         """
         point = _device.check_array("receiver", receiver, (3,))
-        self._select_variant()
+        _select_variant()
         self._scene.add(self._rt.Receiver("rx", position=point.tolist()))
         try:
             paths = self._solver(
@@ -175,7 +235,7 @@ class SionnaEngine:
         def field(values: Any) -> np.ndarray:
             return np.asarray(values.numpy(), dtype=np.float64).reshape(-1)[valid]
 
-        return {
+        found = {
             "power": per_path.sum(axis=0)[valid] / 2.0,
             "tau": field(paths.tau),
             "arrival": directions_from_angles(field(paths.theta_r), field(paths.phi_r)),
@@ -183,6 +243,9 @@ class SionnaEngine:
             "diffuse": (kinds == _DIFFUSE).any(axis=0)[valid],
             "bounces": (kinds != 0).sum(axis=0)[valid],
         }
+        sharp = np.flatnonzero(~found["diffuse"])
+        copies = sharp[repeated(*(found[name][sharp] for name in ("tau", "arrival", "aod", "bounces")))]
+        return {name: np.delete(values, copies, axis=0) for name, values in found.items()}
 
     def _flush(self) -> None:
         drjit = _device.require("drjit", extra="sionna")
@@ -212,6 +275,3 @@ class SionnaEngine:
                 "diffuse": float(power[diffuse].sum()),
             },
         )
-
-
-_VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
