@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.bench.pictures import METHODS, figure_of
+from warprrf.device import require
 
 ASKED_WITHIN = {1: (0.60, 0.76), 2: (0.90, 0.98)}
 """Share of pixels within so many standard deviations."""
@@ -50,20 +51,23 @@ def ablation_bars(rows: list[Row]) -> Any:
     """PSNR of the model with parts left out, a panel a truth."""
     truths = list(dict.fromkeys(row["truth"] for row in rows))
     names = list(dict.fromkeys(row["model"] for row in rows))
-    order = [WHOLE, *(n for n in names if n != WHOLE)]
+    others = {
+        "zero spectra": "zero",
+        "RF-3DGS+ with line of sight": "rf3dgs+los",
+    }  # last, in their own colours
+    order = [WHOLE, *(n for n in names if n != WHOLE and n not in others), *others]
     figure, axes = figure_of(len(truths), size=(7.0 * len(truths), 0.42 * len(order) + 1.2))
     for ax, truth in zip(axes, truths, strict=True):
         own = {row["model"]: row for row in rows if row["truth"] == truth}
         shown = [name for name in order if name in own]
         values = [own[name]["psnr_db"] for name in shown]
-        others = {"zero spectra": "zero", "RF-3DGS+ with line of sight": "rf3dgs+los"}
         colours = [METHODS[others.get(name, "bistatic")][1] for name in shown]
         bars = ax.barh(
             ["the whole model" if name == WHOLE else name for name in shown], values, color=colours
         )
         bars[0].set_edgecolor("black")
         ax.bar_label(bars, [f"{v:.1f}" for v in values], padding=4, fontsize=9)
-        ax.axvline(values[0], color="black", linewidth=0.8, linestyle=":")
+        ax.axvline(values[0], color="black", linewidth=0.8, linestyle=":", zorder=0)
         ax.invert_yaxis()
         ax.set_xlim(0, 1.12 * max(values))
         ax.set_title(
@@ -119,6 +123,9 @@ def optimiser_curves(found: Row) -> Any:
         label = f"{name}: {row['objective']:.3f} dB$^2$ in {row['seconds']:.1f} s, {row['steps']} steps"
         ax.plot(at, losses, color=colour, marker=marker, markersize=4, label=label)
     ax.set_yscale("log")
+    plain = require("matplotlib.ticker", extra="plots").ScalarFormatter
+    ax.yaxis.set_major_formatter(plain())
+    ax.yaxis.set_minor_formatter(plain())
     first = max(found["gauss_newton"]["at_s"][1] if len(found["gauss_newton"]["at_s"]) > 1 else 0.1, 1e-3)
     ax.set_xscale("symlog", linthresh=first)
     ax.set_xlim(left=0)

@@ -314,7 +314,7 @@ class _Bench:
                     count,
                     self.geometry.scene_mark,
                     self.checks,
-                    source("rf/metrics.py"),
+                    source("rf/sionna_engine.py", "rf/simulate.py", "rf/metrics.py"),
                 ],
             )
             rows.append({"truth": truth.name, **row})
@@ -334,7 +334,13 @@ class _Bench:
                 write_atomically(file, ds.save)
                 return {"receivers": len(ds)}
 
-            inputs = [truth.mark, self.geometry.scene_mark, transmitter, source("rf/exact.py"), self.checks]
+            inputs = [
+                truth.mark,
+                self.geometry.scene_mark,
+                transmitter,
+                source("rf/exact.py", "rf/simulate.py"),
+                self.checks,
+            ]
             self.rows.row("second-spectra", make, inputs, (file.name,))
         ds = SpectrumDataset.load(file)
         mark = fingerprint([file])
