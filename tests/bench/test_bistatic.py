@@ -163,6 +163,7 @@ def test_on_the_true_mesh_delays_are_right_and_the_model_is_ahead(
         assert row["mirror"]["median_ns"] < 1e-6
         assert row["scattering"]["pixels"] > 100
         assert row["scattering"]["median_ns"] < 1.0  # pixels are 15 degrees wide
+        assert row["scattering"]["median_by_power_ns"] < 1.0
     assert all(
         m[base]["margin_db"] > 3 for m in report.margins(found["rows"]) for base in ("rf3dgs+", "rf3dgs+los")
     )
@@ -313,6 +314,7 @@ def test_calibration_of_errors_that_are_as_large_as_stated(data: Path) -> None:
     row = checks.calibration(SimpleNamespace(errors=True, spectrum=spectrum), truth, lambda *_: None)  # type: ignore[arg-type]
     # 4 x 288 independent pixels: the standard deviation of a share is at most 1.5 %.
     assert row["within_1_sigma"] == pytest.approx(0.683, abs=0.05)
+    assert row["within_1_sigma_lit"] == row["within_1_sigma"]  # all are 30 dB above the floor
     assert row["within_2_sigma"] == pytest.approx(0.954, abs=0.03)
     assert np.abs(np.array(row["shares"]) - row["levels"]).max() < 0.06
     assert row["nll"] == pytest.approx(0.5, abs=0.12)  # mean of ln sigma is 0

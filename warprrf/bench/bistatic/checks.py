@@ -73,21 +73,24 @@ def ablation(
 def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[str, Any]:
     """How often the truth lies as near to the prediction as its standard deviation says, over the test pixels.
 
-    Returns ``within_1_sigma`` and ``within_2_sigma`` (also ``..._blocked``); negative log likelihood of a pixel [nat],
+    Returns ``within_1_sigma`` and ``within_2_sigma`` (also ``..._blocked``, and ``..._lit`` of pixels whose truth or
+    prediction exceeds N0: the others are easy, and many); negative log likelihood of a pixel [nat],
     less ln sqrt(2 pi), of the stated standard deviations and of the best constant one; the reliability curve
     ``levels`` (stated share) and ``shares`` (found). ``{}`` if the field was fitted to too few receivers to know it.
     """
     if field.errors is None:
         return {}
     test = truth.test
-    errors, deviations = [], []
+    errors, deviations, levels = [], [], []
     for i, receiver in enumerate(test.receivers):
         found = field.spectrum(receiver, uncertainty=True)
         errors.append(to_db(found.path_gain, test.floor) - to_db(test.path_gain[i], test.floor))
         deviations.append(np.asarray(found.std_db, np.float64))
+        levels.append(np.maximum(found.path_gain, test.path_gain[i]))
         progress("uncertainty", i + 1, len(test))
     e, s = np.stack(errors), np.stack(deviations)
     blocked = ~test.line_of_sight
+    lit = np.stack(levels) > test.floor
     rms = float(np.sqrt(np.mean(e**2)))
     normal = NormalDist()
     row: dict[str, Any] = {
@@ -101,6 +104,7 @@ def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[
     for k in (1, 2):
         inside = np.abs(e) <= k * s
         row[f"within_{k}_sigma"] = float(inside.mean())
+        row[f"within_{k}_sigma_lit"] = float(inside[lit].mean()) if lit.any() else None
         row[f"within_{k}_sigma_blocked"] = float(inside[blocked].mean()) if blocked.any() else None
     return row
 
@@ -161,7 +165,8 @@ def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Pro
     Sionna's agree with them), where their path gain exceeds N0. A pixel is compared with the data set's delay there.
 
     Returns for ``line_of_sight`` and ``mirror``: ``paths``, the share ``found`` within 3 degrees, and ``median_ns`` and
-    ``p90_ns`` of those; for ``scattering``: ``pixels``, ``median_ns``, ``p90_ns``, a missing delay counted as infinite.
+    ``p90_ns`` of those; for ``scattering``: ``pixels``, ``median_ns``, ``p90_ns`` and the power-weighted
+    ``median_by_power_ns``, a missing delay counted as infinite.
     """
     test = truth.test
     tracer = MirrorTracer(
@@ -172,6 +177,7 @@ def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Pro
     errors: dict[str, list[float]] = {kind: [] for kind in names}
     paths = dict.fromkeys(names, 0)
     scattered: list[np.ndarray] = []
+    weights: list[np.ndarray] = []
     for i, receiver in enumerate(test.receivers):
         true, ours = tracer.trace(receiver, 1), field.paths(receiver)
         for kind in names:
@@ -190,6 +196,7 @@ def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Pro
         predicted = np.asarray(field.spectrum(receiver).delay_s)
         error = 1e9 * np.abs(predicted - test.delay_s[i])[away]
         scattered.append(np.where(np.isnan(error), np.inf, error))
+        weights.append(test.path_gain[i][away].astype(np.float64))
         progress("delays", i + 1, len(test))
     row: dict[str, Any] = {
         name: {
@@ -200,7 +207,10 @@ def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Pro
         for kind, name in names.items()
     }
     everywhere = np.concatenate(scattered)
-    return row | {"scattering": {"pixels": len(everywhere), **_quantiles(everywhere)}}
+    by_power = metrics.weighted_median(everywhere, np.concatenate(weights))
+    return row | {
+        "scattering": {"pixels": len(everywhere), **_quantiles(everywhere), "median_by_power_ns": by_power}
+    }
 
 
 def _quantiles(errors_ns: np.ndarray) -> dict[str, float | None]:

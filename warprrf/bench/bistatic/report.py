@@ -303,7 +303,11 @@ def _calibration_table(rows: list[Row]) -> str:
             [
                 TRUTH_NAMES[row["truth"]],
                 str(row["n_train"]),
-                *(_cell(row.get(f"within_{k}_sigma{b}"), "{:.1%}") for k in (1, 2) for b in ("", "_blocked")),
+                *(
+                    _cell(row.get(f"within_{k}_sigma{b}"), "{:.1%}")
+                    for k in (1, 2)
+                    for b in ("", "_lit", "_blocked")
+                ),
                 _cell(row.get("nll"), "{:.3f}"),
                 _cell(row.get("nll_constant"), "{:.3f}"),
                 _cell(row.get("sigma_median_db"), "{:.2f}"),
@@ -312,12 +316,14 @@ def _calibration_table(rows: list[Row]) -> str:
         )
     wanted = "; ".join(f"{low:.0%} to {high:.0%} within {k} sigma" for k, (low, high) in ASKED_WITHIN.items())
     head = (
-        "truth", "receivers", "within 1 sigma", "blocked", "within 2 sigma", "blocked", "negative log likelihood",
-        "of the best constant sigma", "median sigma [dB]", "rms error [dB]",
+        "truth", "receivers", "within 1 sigma", "lit", "blocked", "within 2 sigma", "lit", "blocked",
+        "negative log likelihood", "of the best constant sigma", "median sigma [dB]", "rms error [dB]",
     )  # fmt: skip
-    return (
-        f"Asked: {wanted}. Negative log likelihood of a pixel, less ln sqrt(2 pi).\n\n{_table(head, lines)}"
+    text = (
+        f"Asked: {wanted}. `lit`: pixels whose truth or prediction is above the floor. Negative log likelihood of a "
+        "pixel, less ln sqrt(2 pi)."
     )
+    return f"{text}\n\n{_table(head, lines)}"
 
 
 def _optimiser_table(found: Row) -> str:
@@ -346,14 +352,16 @@ def _delay_table(rows: list[Row]) -> str:
             r = row[kind]
             cells += [f"{_cell(r['found'], '{:.0%}')} of {r['paths']}", _pair(r)]
         cells += [str(row["scattering"]["pixels"]), _pair(row["scattering"])]
+        cells.append(_cell(row["scattering"]["median_by_power_ns"], "{:.2g}"))
         lines.append([TRUTH_NAMES[row["truth"]], str(row["n_train"]), *cells])
     head = (
         "truth", "receivers", "line of sight found", "median / 90 % [ns]", "mirror found", "median / 90 % [ns]",
-        "pixels of scattering", "median / 90 % [ns]",
+        "pixels of scattering", "median / 90 % [ns]", "median by power [ns]",
     )  # fmt: skip
     return (
         "Paths of the true scene (image method, at most one reflection) above the floor, found within 3 degrees; "
-        "pixels away from those, delay of the data set.\n\n" + _table(head, lines)
+        "pixels away from those, delay of the data set. `-`: no delay is predicted at that quantile.\n\n"
+        + _table(head, lines)
     )
 
 
