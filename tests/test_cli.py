@@ -16,12 +16,12 @@ SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = ("lobby", "reconstruct", "simulate", "fit", "render", "evaluate", "twin", "bench", "data")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", (*COMMANDS, "bench newrf", "bench bistatic"))
 def test_help_shows_an_example_that_the_parser_takes(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
-        cli.main([command, "--help"])
+        cli.main([*command.split(), "--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
     examples = [

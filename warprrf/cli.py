@@ -257,7 +257,37 @@ def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
     print(newrf.summary_text(report))
 
 
-BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {"newrf": _bench_newrf}
+def _bench_bistatic(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import bistatic
+
+    out = args.out or "runs/bistatic"
+    given = {
+        "data": args.data and (args.data if len(args.data) > 1 else args.data[0]),
+        "geometry": args.geometry,
+        "scene": args.scene,
+        "second": args.second,
+        "counts": args.counts,
+        "truths": args.truths,
+    }
+    report = bistatic.run(
+        out,
+        every=args.every,
+        repeat=args.repeat,
+        seed=args.seed,
+        fresh=args.fresh,
+        device=args.device,
+        progress=bars,
+        **{name: value for name, value in given.items() if value is not None},
+    )
+    bars._close()
+    print(bistatic.summary_text(report))
+    print(f"\n{Path(out) / 'bistatic.md'}: the tables with pictures; bistatic.json: every figure")
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
+    "newrf": _bench_newrf,
+    "bistatic": _bench_bistatic,
+}
 """Benchmarks by name: what `warprrf bench NAME` runs."""
 
 
@@ -420,13 +450,15 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"warprrf {wr.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
-    def add(name: str, run: Callable[..., None], line: str, text: str) -> argparse.ArgumentParser:
-        one = commands.add_parser(
+    def add(
+        name: str, run: Callable[..., None], line: str, text: str, to: Any = commands, options: bool = True
+    ) -> argparse.ArgumentParser:
+        one: argparse.ArgumentParser = to.add_parser(
             name,
             help=line,
             description=f"{line[0].upper()}{line[1:]}.",
             epilog=text,
-            parents=[common],
+            parents=[common] if options else [],
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         one.set_defaults(command=run)
@@ -516,10 +548,26 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--out", required=True, help="folder of the twin: new, empty or an earlier twin's"
     )
 
-    bench = add("bench", _bench, "one table of figures, from one command", HELP_BENCH)
-    bench.add_argument("name", choices=sorted(BENCHES), help="which table")
-    bench.add_argument("--out", help="folder of the results (default runs/NAME)")
-    bench.add_argument("--data", help="folder of the data that it reads (default: the table's own)")
+    bench = add("bench", _bench, "one table of figures, from one command", HELP_BENCH, options=False)
+    tables = bench.add_subparsers(title="tables", metavar="TABLE", dest="name", required=True)
+    newrf = add("newrf", _bench, "rays and channels of NeWRF's conference room", HELP_BENCH, tables)
+    newrf.add_argument("--out", help="folder of the results (default runs/newrf)")
+    newrf.add_argument("--data", help="folder of its files")
+    ours = add("bistatic", _bench, "the bistatic field beside other systems", HELP_BENCH_BISTATIC, tables)
+    ours.add_argument("--out", help="folder of the results (default runs/bistatic)")
+    ours.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    ours.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    ours.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    ours.add_argument("--second", metavar="FILE", help="spectra under another transmitter (default: made)")
+    ours.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (10 50 400)")
+    ours.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
+    ours.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
+    ours.add_argument(
+        "--repeat", type=int, default=10, metavar="N", help="receivers of Sionna's second solve (10; 0: none)"
+    )
+    ours.add_argument("--fresh", action="store_true", help="start over instead of continuing")
 
     data = add("data", _data, "regenerate data/lobby/ from nothing (hours; resumable)", HELP_DATA)
     data.add_argument("--data", default="data/lobby", help="folder to write (default data/lobby)")
@@ -603,11 +651,21 @@ examples:
 HELP_BENCH = """\
 Prints a table and writes it as JSON and Markdown.
 
-  newrf   rays and channels of NeWRF's conference room (MATLAB's image method) beside ours
-
 examples:
   warprrf bench newrf
   warprrf bench newrf --data external/newrf --out runs/newrf
+  warprrf bench bistatic --truths exact --counts 10 50
+"""
+
+HELP_BENCH_BISTATIC = """\
+Fits the bistatic field, RF-3DGS+ and lookups on the same receivers and scores them on held-out ones; then ablation,
+stated uncertainty, delays, a second transmitter, Sionna against itself, Gauss-Newton against Adam. Every row is kept:
+a killed run loses one, and a row is made again only if its data, geometry, options or code changed.
+
+examples:
+  warprrf bench bistatic
+  warprrf bench bistatic --truths exact --counts 10 --every 4 --out runs/quick     a first look, in minutes
+  warprrf bench bistatic --data spectra_full.nc spectra_sionna_full.nc --geometry room
 """
 
 HELP_DATA = """\

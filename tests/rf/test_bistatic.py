@@ -1,6 +1,7 @@
 """The bistatic field: laws it must obey, a fit to deterministic spectra of a furnished room, and hard cases."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -117,6 +118,17 @@ def test_a_saved_field_answers_the_same(field: BistaticField, tmp_path: Path) ->
     file.write_bytes(file.read_bytes()[:-100])
     with pytest.raises(ValueError, match="corrupt"):
         RadioField.load(file)
+
+
+def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, data: SpectrumDataset) -> None:
+    prior = BistaticField.prior(scene, data)
+    unfitted = BistaticField.fit(scene, data.subset([0]), iterations=0)
+    image = prior.spectrum(RECEIVERS[4]).path_gain
+    assert np.allclose(image, unfitted.spectrum(RECEIVERS[4]).path_gain, rtol=1e-6)
+    dark = replace(data, path_gain=np.zeros_like(data.path_gain))
+    assert np.array_equal(image, BistaticField.prior(scene, dark).spectrum(RECEIVERS[4]).path_gain)
+    bare = BistaticField.prior(scene, data, terms=Terms(line_of_sight=False, mirror_order=0, diffuse=False))
+    assert bare.spectrum(RECEIVERS[4]).path_gain.max() == 0
 
 
 def test_fitting_twice_gives_the_same_numbers(scene: RadioScene, data: SpectrumDataset) -> None:

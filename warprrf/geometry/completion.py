@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from warprrf.device import require
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.patches import PlanarPatch, face_neighbours, simplify, smoothed_normals
@@ -250,6 +249,7 @@ def least_surface(
     """
     from scipy import sparse
     from scipy.sparse import csgraph as graph
+
     shape = grid.shape
     x, y, z = (np.diff(h) for h in grid.heights)
     sides = [
@@ -301,6 +301,7 @@ def least_surface(
 def without_hollows(grid: Grid, filled: np.ndarray, places: np.ndarray) -> np.ndarray:
     """``filled`` with every hollow filled that none of ``places`` (N, 3) lies in: no photo was taken there."""
     from scipy import ndimage as image
+
     piece, _ = image.label(~filled)
     index = grid.locate(places)
     own = np.unique(piece.ravel()[index[index >= 0]])
@@ -365,8 +366,9 @@ def seen_share(grid: Grid, mesh: Mesh, patches: Sequence[PlanarPatch], solid: np
 
 def _pieces(mesh: Mesh, label: np.ndarray) -> np.ndarray:
     """Numbers of the connected pieces of faces that share a label, shape ``(F,)``; a face labelled -1 is a piece."""
-    from scipy.sparse import csgraph as graph
     from scipy import sparse
+    from scipy.sparse import csgraph as graph
+
     ring = face_neighbours(mesh.faces)
     face, side = np.nonzero((ring >= 0) & (label >= 0)[:, None] & (label[ring] == label[:, None]))
     link = sparse.coo_matrix((np.ones(len(face)), (face, ring[face, side])), shape=(len(label),) * 2)

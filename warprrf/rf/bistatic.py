@@ -172,6 +172,39 @@ class BistaticField(RadioField):
 
         return train(geometry, ds, **options)
 
+    @classmethod
+    def prior(
+        cls, geometry: Any, ds: SpectrumDataset, *, terms: Terms | None = None, device: Any = None
+    ) -> BistaticField:
+        """The field before any measurement: every surface is taken for :meth:`Parameters.prior`.
+
+        Of ``ds`` only transmitter, carrier, grid, beam, floor and range count; its spectra are not looked at.
+
+        Args:
+            geometry: Reconstruction, Scene, Mesh or Surface.
+            ds: data set that it is asked to predict.
+            terms: what is modelled; single bounces by default.
+
+        Raises:
+            TypeError: for a geometry without a mesh.
+        """
+        modelled = Terms() if terms is None else terms
+        surface = geometry if isinstance(geometry, Surface) else Surface.of(geometry)
+        return cls(
+            surface=surface,
+            transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
+            frequency_hz=float(ds.frequency_hz),
+            shape=(int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])),
+            floor=float(ds.floor),
+            range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
+            beam_sigma_rad=float(ds.beam_sigma_rad),
+            terms=modelled,
+            parameters=Parameters.prior(surface.groups, len(modelled.lobes)),
+            material=surface.material,
+            residual=np.zeros(len(surface.element_area)),
+            device=device,
+        )
+
     # ------------------------------------------------------------------------------------------ asking
 
     def spectrum(

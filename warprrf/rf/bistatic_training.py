@@ -386,20 +386,7 @@ class _Training:
 
 
 def _blank(surface: Surface, ds: SpectrumDataset, terms: Terms, device: Any) -> BistaticField:
-    return BistaticField(
-        surface=surface,
-        transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
-        frequency_hz=float(ds.frequency_hz),
-        shape=(int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])),
-        floor=float(ds.floor),
-        range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
-        beam_sigma_rad=float(ds.beam_sigma_rad),
-        terms=terms,
-        parameters=Parameters.prior(surface.groups, len(terms.lobes)),
-        material=surface.material,
-        residual=np.zeros(len(surface.element_area)),
-        device=device,
-    )
+    return BistaticField.prior(surface, ds, terms=terms, device=device)
 
 
 def _check_transport(seen: BistaticTransport, ds: SpectrumDataset, lobes: tuple[int, ...] | None) -> None:

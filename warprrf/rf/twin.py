@@ -73,10 +73,10 @@ class Reflection:
 
 @dataclass(frozen=True)
 class TwinGroup:
-    """One material group of a twin.
+    """One material of a twin.
 
     Attributes:
-        name: the group's name in the field.
+        name: its largest group's name in the field.
         area_m2: area of its faces [m^2].
         material: what it became.
         permittivity: complex relative permittivity at the carrier.
@@ -138,8 +138,8 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     """Write the reconstructed mesh with a field's materials as ``scene.xml``, ``materials.json`` and ``meshes/``.
 
     ``sionna.rt.load_scene`` opens the XML as it is, all lobes Lambertian; :func:`load_sionna_scene` sets the scattering
-    patterns too; :meth:`Scene.load` and :func:`simulate` take it as any scene. Each group with faces is an object
-    ``surface_<group>`` of a material ``fitted_<group>``, which holds within 10 % of the field's carrier.
+    patterns too; :meth:`Scene.load` and :func:`simulate` take it as any scene. Each material of the field is an object
+    ``surface_<group>`` of a material ``fitted_<group>``, named by its largest group, which holds within 10 % of the field's carrier.
 
     No material can hold a common gain (an uncalibrated receiver), residuals of elements or an indirect radiance, and
     softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former.
@@ -160,10 +160,13 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     folder = Path(folder)
     _check_replaceable(folder)
     surface = field.surface
-    area = np.bincount(surface.group, surface.mesh.areas, minlength=surface.groups)
+    face_material = field.material[surface.group]
+    area = np.bincount(face_material, surface.mesh.areas)
+    own = np.bincount(surface.group, surface.mesh.areas, minlength=surface.groups)
+    used = [m for m in np.argsort(-area, kind="stable").tolist() if area[m] > 0]
+    largest = {m: int(np.where(field.material == m, own, -1.0).argmax()) for m in used}  # a material's name
     names = _identifiers(surface.group_names)
-    used = [g for g in np.argsort(-area, kind="stable").tolist() if area[g] > 0]
-    groups = [_project(field, g, names[g], float(area[g])) for g in used]
+    groups = [_project(field, largest[m], names[largest[m]], float(area[m])) for m in used]
     left_out = _left_out(field)
     table = {
         "about": [ABOUT, f"Fitted to spectra at {field.frequency_hz / 1e9:g} GHz. Left out:", *left_out],
@@ -174,9 +177,13 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     earlier = part.with_name(part.name + ".earlier")
     try:
         part.chmod(0o755)
-        for g in used:
-            kept, faces = np.unique(surface.mesh.faces[surface.group == g], return_inverse=True)
-            write_mesh(part / "meshes" / f"{names[g]}.ply", surface.mesh.vertices[kept], faces.reshape(-1, 3))
+        for m in used:
+            kept, faces = np.unique(surface.mesh.faces[face_material == m], return_inverse=True)
+            write_mesh(
+                part / "meshes" / f"{names[largest[m]]}.ply",
+                surface.mesh.vertices[kept],
+                faces.reshape(-1, 3),
+            )
         (part / "materials.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
         (part / "scene.xml").write_text(
             _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +24,9 @@ from warprrf.bench.lobby import report as page
 from warprrf.bench.lobby import score as truth_scores
 from warprrf.bench.lobby.photos import noise_psnr_db
 from warprrf.bench.lobby.spectra import FILES as TRUTHS
+from warprrf.bench.machine import machine
 from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
-from warprrf.device import Progress, resolve, threads
+from warprrf.device import Progress
 from warprrf.geometry.meshio import write_mesh
 from warprrf.geometry.reconstruction import ReconstructionConfig, read_photo
 from warprrf.rf import lookups, metrics
@@ -37,7 +36,6 @@ from warprrf.rf.transport import Transport, transport
 MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
 LOOKUPS = {"nearest": lookups.nearest, "idw": lookups.idw, "constant": lookups.constant, "mean": lookups.mean}
 TRAIN_RECEIVERS = 50  # the training subset that the asked fit time is stated for
-PACKAGES = ("warprrf", "warp-lang", "numpy", "pycolmap", "open3d", "xarray", "h5netcdf", "safetensors")
 MAP_POINTS = 40_000  # of the mesh, drawn in the report
 SECTION_HEIGHT_M = 1.2
 SOURCE_OF_GEOMETRY = ("device.py", "kernels", "geometry")
@@ -186,30 +184,6 @@ def summary(report: dict[str, Any]) -> str:
         wanted = "" if asked is None else f"(asked: at {'least' if more else 'most'} {asked:g})"
         lines.append(f"{name:<62} {shown:>16}  {wanted}".rstrip())
     return "\n".join(lines)
-
-
-def machine(device: Any = None) -> dict[str, Any]:
-    """What the figures were measured on: processor, cores, system, versions."""
-    processor = platform.processor() or platform.machine()
-    if Path("/proc/cpuinfo").is_file():
-        names = [
-            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")
-        ]
-        processor = names[0].split(":", 1)[1].strip() if names else processor
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return {
-        "processor": processor,
-        "cores": threads(),
-        "device": str(resolve(device)),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-        "versions": versions,
-    }
 
 
 # ----------------------------------------------------------------------------------------------------- stages

@@ -11,24 +11,14 @@ import html
 import io
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from warprrf.bench.pictures import METHODS, figure_of, spectrum_rows
 from warprrf.bench.stages import write_atomically
 from warprrf.device import require
-
-METHODS = {
-    "bistatic": ("bistatic (ours)", "#b3123c"),
-    "rf3dgs+": ("RF-3DGS+", "#0b6e99"),
-    "rf3dgs": ("RF-3DGS", "#c4570f"),
-    "nearest": ("nearest", "#6b4c9a"),
-    "idw": ("IDW", "#3a7d44"),
-    "mean": ("mean image", "#8c8c8c"),
-    "constant": ("constant", "#bdbdbd"),
-}
 
 # Key of report.json, its name, unit, what is asked (None: measured only), and whether more is better.
 FIGURES: tuple[tuple[str, str, str, float | None, bool], ...] = (
@@ -245,7 +235,7 @@ def time_bars(stages: dict[str, dict[str, Any]]) -> Any:
             continue
         bars |= {f"{name}: {step}": s for step, s in steps.items()}
         bars[f"{name}: rest"] = max(stage["seconds"] - sum(steps.values()), 0.0)
-    figure, (ax,) = _figure_of(1, size=(9.0, 0.34 * len(bars) + 0.8))
+    figure, (ax,) = figure_of(1, size=(9.0, 0.34 * len(bars) + 0.8))
     drawn = ax.barh(list(bars), list(bars.values()), color=METHODS["rf3dgs+"][1])
     ax.bar_label(
         drawn, [f"{s:.0f} s" if s >= 10 else f"{s:.1f} s" for s in bars.values()], padding=4, fontsize=9
@@ -259,7 +249,7 @@ def time_bars(stages: dict[str, dict[str, Any]]) -> Any:
 def photo_row(truth: np.ndarray, render: np.ndarray) -> Any:
     """Photo, render and four times their absolute difference, side by side; arrays (H, W, 3) in [0, 1] or uint8."""
     truth, render = (image / 255.0 if image.dtype == np.uint8 else image for image in (truth, render))
-    figure, axes = _figure_of(3, size=(13.0, 13.0 / 3 * truth.shape[0] / truth.shape[1] + 0.3))
+    figure, axes = figure_of(3, size=(13.0, 13.0 / 3 * truth.shape[0] / truth.shape[1] + 0.3))
     difference = np.clip(4.0 * np.abs(render - truth), 0.0, 1.0)
     for ax, image, title in zip(
         axes, (truth, render, difference), ("photo", "render", "difference x 4"), strict=True
@@ -274,7 +264,7 @@ def mesh_error_map(pictures: dict[str, np.ndarray]) -> Any:
     """Distance to the true surface of points on the mesh, from above and from the side, and its distribution."""
     points, error = pictures["mesh_points"], pictures["mesh_error_m"]
     order = np.argsort(error)
-    figure, axes = _figure_of(3, size=(14.0, 4.3), widths=(1.0, 1.0, 0.75))
+    figure, axes = figure_of(3, size=(14.0, 4.3), widths=(1.0, 1.0, 0.75))
     for ax, rows, labels in ((axes[0], (0, 1), "xy"), (axes[1], (0, 2), "xz")):
         shown = ax.scatter(
             *points[order][:, rows].T,
@@ -306,7 +296,7 @@ def mesh_error_map(pictures: dict[str, np.ndarray]) -> Any:
 
 def floor_plan(pictures: dict[str, np.ndarray]) -> Any:
     """Section of the room with transmitter, training and test receivers."""
-    figure, (ax,) = _figure_of(1, size=(10.0, 7.0))
+    figure, (ax,) = figure_of(1, size=(10.0, 7.0))
     lines = require("matplotlib.collections", extra="plots").LineCollection
     ax.add_collection(lines(pictures["section"], colors="#444444", linewidths=1.0))
     train, test = pictures["train_receivers"], pictures["test_receivers"]
@@ -332,7 +322,7 @@ def floor_plan(pictures: dict[str, np.ndarray]) -> Any:
 
 def psnr_curves(methods: dict[str, dict[str, Any]]) -> Any:
     """PSNR of every test receiver: sorted per method, and against the distance to the nearest training receiver."""
-    figure, axes = _figure_of(2, size=(13.0, 4.4))
+    figure, axes = figure_of(2, size=(13.0, 4.4))
     for key, (name, colour) in METHODS.items():
         if key in methods:
             values = np.sort(np.array(methods[key]["per_receiver"]["psnr_db"], dtype=np.float64))
@@ -356,38 +346,6 @@ def psnr_curves(methods: dict[str, dict[str, Any]]) -> Any:
     return figure
 
 
-def spectrum_rows(
-    truth_db: np.ndarray, predictions_db: dict[str, np.ndarray], low: float, high: float
-) -> Any:
-    """Truth above, then each prediction beside its difference from the truth; dB images (H, W)."""
-    count = len(predictions_db) + 1
-    figure = require("matplotlib.figure", extra="plots").Figure(
-        figsize=(13.0, 2.55 * count), layout="constrained"
-    )
-    axes = figure.subplots(count, 2, sharex=True, sharey=True, squeeze=False)
-    box = {"extent": (-180.0, 180.0, 180.0, 0.0), "aspect": "auto", "interpolation": "nearest"}
-    gain = {"vmin": low, "vmax": high, "cmap": "viridis", **box}
-    shown = axes[0, 0].imshow(truth_db, **gain)
-    axes[0, 0].set_title("truth", fontsize=10)
-    axes[0, 1].axis("off")
-    for (name, image), (left, right) in zip(predictions_db.items(), axes[1:], strict=True):
-        left.imshow(image, **gain)
-        left.set_title(name, fontsize=10)
-        wrong = right.imshow(image - truth_db, vmin=-20.0, vmax=20.0, cmap="RdBu_r", **box)
-        right.set_title(
-            f"{name} - truth, rms {np.sqrt(np.mean((image - truth_db) ** 2)):.1f} dB", fontsize=10
-        )
-    for place, image, name, extend in (
-        (0.72, shown, "path gain [dB]", "neither"),
-        (0.28, wrong, "difference [dB]", "both"),
-    ):
-        bar = axes[0, 1].inset_axes((0.1, place, 0.8, 0.09))
-        figure.colorbar(image, cax=bar, label=name, extend=extend, orientation="horizontal")
-    figure.supxlabel("azimuth [degrees]", fontsize=10)
-    figure.supylabel("zenith [degrees]", fontsize=10)
-    return figure
-
-
 def section(vertices: np.ndarray, faces: np.ndarray, height: float) -> np.ndarray:
     """Line segments (S, 2, 2) [m] where a mesh meets the plane z = ``height``."""
     corners = np.asarray(vertices, dtype=np.float64)[np.asarray(faces)]
@@ -402,14 +360,6 @@ def section(vertices: np.ndarray, faces: np.ndarray, height: float) -> np.ndarra
         ends.append(a[:, :2] + share[:, None] * (b - a)[:, :2])
     points = np.stack(ends, axis=1)  # exactly two of the three edges cross
     return points[~np.isnan(points[:, :, 0])].reshape(-1, 2, 2)
-
-
-def _figure_of(
-    count: int, size: tuple[float, float], widths: Sequence[float] | None = None
-) -> tuple[Any, Any]:
-    figure = require("matplotlib.figure", extra="plots").Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(1, count, squeeze=False, gridspec_kw={"width_ratios": widths} if widths else None)
-    return figure, axes[0]
 
 
 def _figure(figure: Any, caption: str, alternative: str, jpeg: bool = False) -> str:
