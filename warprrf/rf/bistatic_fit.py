@@ -407,6 +407,7 @@ def fit_groups_adam(
             value, robust = huber(residual)
             loss += float(value.sum())
             pull = weight * robust * residual * NEPER / (1.0 + power)
+            pull = pull.astype(np.float32)
             gradient += np.bincount(index, table.T @ pull, minlength=layout.size)
         r, j = _priors(p, start, layout, sd, area)
         gradient += j.T @ r

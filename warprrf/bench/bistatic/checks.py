@@ -110,7 +110,7 @@ def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[
 
 
 def optimisers(truth: Truth, count: int, geometry: Geometry, seed: int, progress: Progress) -> dict[str, Any]:
-    """Gauss-Newton and Adam on the same cached views of ``count`` receivers, single bounces, all groups free.
+    """Gauss-Newton and Adam on the same cached views of ``count`` receivers, single bounces, all materials free.
 
     Returns for each ``seconds``, ``steps``, the final ``objective`` per pixel [dB^2] and the curves ``at_s`` and
     ``losses``; ``adam_reaches_s``, when Adam is first within 1 % of what Gauss-Newton ends at (None: never).
@@ -124,20 +124,21 @@ def optimisers(truth: Truth, count: int, geometry: Geometry, seed: int, progress
     views = []
     for r, sight in enumerate(rays.sights):
         chosen = np.sort(rng.choice(pixels, min(pixels, max(200, ROWS // count)), replace=False))
-        views.append(start.view(sight, chosen, target[r]))
+        views.append(start.view(sight, chosen, target[r]).tied(rays.surface.material))
         progress("views", r + 1, len(rays.sights))
     surface = rays.surface
-    area = np.bincount(surface.group, surface.mesh.areas, minlength=surface.groups)
-    bistatic_fit.objective(views, start.parameters)  # tables are made on first use, which is no fit's time
+    area = np.bincount(surface.material[surface.group], surface.mesh.areas)
+    prior = bistatic_fit.Parameters.prior(len(area), len(start.terms.lobes))
+    bistatic_fit.objective(views, prior)  # tables are made on first use, which is no fit's time
     times: list[float] = []
     began = time.perf_counter()
     newton = bistatic_fit.fit_groups(
-        views, start.parameters, area, progress=lambda *_: times.append(time.perf_counter() - began)
+        views, prior, area, progress=lambda *_: times.append(time.perf_counter() - began)
     )
     newton_s = time.perf_counter() - began
     progress("optimisers", 1, 2)
     began = time.perf_counter()
-    adam = bistatic_fit.fit_groups_adam(views, start.parameters, area, steps=ADAM_STEPS)
+    adam = bistatic_fit.fit_groups_adam(views, prior, area, steps=ADAM_STEPS)
     adam_s = time.perf_counter() - began
     progress("optimisers", 2, 2)
     losses = [adam.losses[0], *newton.losses]  # both start from the same parameters
