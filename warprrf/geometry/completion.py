@@ -18,7 +18,12 @@ import numpy as np
 
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import PlanarPatch, face_neighbours, simplify, smoothed_normals
+from warprrf.geometry.patches import (
+    PlanarPatch,
+    connected_pieces,
+    simplify,
+    smoothed_normals,
+)
 from warprrf.geometry.planes import Plane
 
 ALIGNED = np.cos(np.radians(4.0))  # a plane this parallel to a direction counts as parallel
@@ -358,22 +363,10 @@ def seen_share(grid: Grid, mesh: Mesh, patches: Sequence[PlanarPatch], solid: np
     label = np.full(len(mesh.faces), -1)
     for k, patch in enumerate(patches):
         label[patch.faces] = k
-    piece = _pieces(mesh, label)
+    piece = connected_pieces(mesh, label)
     area = np.bincount(piece, weights=mesh.areas)
     seen = np.bincount(piece, weights=mesh.areas * hit) > SEEN_PIECE * area
     return float(area[seen].sum() / area.sum())
-
-
-def _pieces(mesh: Mesh, label: np.ndarray) -> np.ndarray:
-    """Numbers of the connected pieces of faces that share a label, shape ``(F,)``; a face labelled -1 is a piece."""
-    from scipy import sparse
-    from scipy.sparse import csgraph as graph
-
-    ring = face_neighbours(mesh.faces)
-    face, side = np.nonzero((ring >= 0) & (label >= 0)[:, None] & (label[ring] == label[:, None]))
-    link = sparse.coo_matrix((np.ones(len(face)), (face, ring[face, side])), shape=(len(label),) * 2)
-    piece: np.ndarray = graph.connected_components(link, directed=False)[1]
-    return piece
 
 
 # ------------------------------------------------------------------------------------------------ planes
@@ -607,7 +600,7 @@ def _with_rest(
     rest = labels.axis < 0
     if known.any():
         rest[rest] = Mesh(whole.vertices, whole.faces[known]).distance(centres[rest]) > KEEP_M
-    piece = _pieces(mesh, np.where(rest, 0, -1))
+    piece = connected_pieces(mesh, np.where(rest, 0, -1))
     rest &= np.bincount(piece, weights=mesh.areas * rest)[piece] >= KEEP_M2
     if not rest.any():
         return whole, list(parts)

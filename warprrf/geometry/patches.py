@@ -208,6 +208,18 @@ def face_neighbours(faces: np.ndarray) -> np.ndarray:
     return across.reshape(-1, 3)
 
 
+def connected_pieces(mesh: Mesh, label: np.ndarray) -> np.ndarray:
+    """Numbers of the connected pieces of faces that share a label, shape ``(F,)``; a face labelled -1 is a piece."""
+    from scipy import sparse
+    from scipy.sparse import csgraph
+
+    ring = face_neighbours(mesh.faces)
+    face, side = np.nonzero((ring >= 0) & (label >= 0)[:, None] & (label[ring] == label[:, None]))
+    link = sparse.coo_matrix((np.ones(len(face)), (face, ring[face, side])), shape=(len(label),) * 2)
+    piece: np.ndarray = csgraph.connected_components(link, directed=False)[1]
+    return piece
+
+
 def smoothed_normals(mesh: Mesh, rounds: int) -> np.ndarray:
     """Face normals averaged, by area, with those of the faces across the edges, ``rounds`` times, shape ``(F, 3)``.
 

@@ -30,7 +30,7 @@ from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.mirror_light import MirrorSight
 from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.paths import Paths
-from warprrf.rf.second_bounce import ElementLight, mirrored_scene, sent_image
+from warprrf.rf.second_bounce import ElementLight, mirrored_scene, sent_power
 from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
 from warprrf.rf.specular import SpecularPaths, specular_paths
 from warprrf.rf.surface import Surface
@@ -319,23 +319,51 @@ class BistaticField(RadioField):
 
     def further(self, sight: Sight) -> np.ndarray:
         """Path gain per pixel (H, W), before the beam, of everything after a first bounce."""
-        out = np.zeros(self.shape)
+        out = np.zeros(self.shape[0] * self.shape[1])
+        for pixel, _, power in self._sent_on(sight):
+            out += np.bincount(pixel, power, minlength=len(out))
+        return out.reshape(self.shape) + self._mirrored_scene(sight)
+
+    def further_by_group(self, sight: Sight, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What :meth:`further` is made of, after the beam, at ``pixels`` (N,).
+
+        Returns:
+            The groups that send it (B,), their images (N, B), and what mirrors show besides (N,).
+        """
+        count = self.shape[0] * self.shape[1]
+        parts = self._sent_on(sight)
+        found = np.unique(np.concatenate([np.zeros(0, int), *(group for _, group, _ in parts)]))
+        images = np.zeros((count, len(found)))
+        for pixel, group, power in parts:
+            cell = pixel * len(found) + np.searchsorted(found, group)
+            images += np.bincount(cell, power, minlength=images.size).reshape(images.shape)
+        shown = self._mirrored_scene(sight).reshape(-1, 1)
+        return found, self.beam.at(pixels, images), self.beam.at(pixels, shown)[:, 0]
+
+    def _sent_on(self, sight: Sight) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Pixel, group and path gain of what groups send on of light that other surfaces gave them."""
+        parts = []
         sent = self._sent(sight.transmitter)
         if sent is not None:
-            out += sent_image(self.tracer, sight.met, sent, self.wavelength_m)
+            power = sent_power(self.tracer, sight.met, sent, self.wavelength_m)
+            ray = np.flatnonzero(power > 0)
+            group = self.surface.group[sight.met.face.numpy()[ray]]
+            parts.append((ray // self.tracer.sub_pixels**2, group, power[ray]))
         if self.terms.diffuse and self.terms.mirror_scatter and sight.mirrored is not None:
             light = self.element_light(sight.transmitter).mirrors
-            out += light.image(sight.mirrored, self.parameters, self.wavelength_m)
-        if self.terms.diffuse and self.terms.scatter_mirror:
-            out += mirrored_scene(
-                self._mirror_tracer,
-                sight.receiver,
-                sight.transmitter,
-                self.parameters,
-                self.wavelength_m,
-                sent,
-            )
-        return out
+            seen = sight.mirrored
+            power = light.power(seen, self.parameters, self.wavelength_m)
+            parts.append((seen.pixel, self.surface.group[seen.face.numpy()], power))
+        return parts
+
+    def _mirrored_scene(self, sight: Sight) -> np.ndarray:
+        """Path gain per pixel (H, W), before the beam, of the lit scene that mirrors show."""
+        if not (self.terms.diffuse and self.terms.scatter_mirror):
+            return np.zeros(self.shape)
+        return mirrored_scene(
+            self._mirror_tracer, sight.receiver, sight.transmitter, self.parameters, self.wavelength_m,
+            self._sent(sight.transmitter),
+        )  # fmt: skip
 
     def view(self, sight: Sight, pixels: np.ndarray, target_db: np.ndarray | None = None) -> View:
         """The sight as linear maps from group parameters to ``pixels`` (N,), for :mod:`warprrf.rf.bistatic_fit`."""
@@ -366,6 +394,8 @@ class BistaticField(RadioField):
             cosine=sight.paths.cosine,
             beam=sight.beams.reshape(len(gain), count)[:, pixels],
             extra=np.zeros(len(pixels), np.float32),
+            again_group=np.zeros(0, int),
+            again=np.zeros((len(pixels), 0), np.float32),
             target_db=np.zeros(len(pixels)) if target_db is None else target_db.ravel()[pixels],
         )
 

@@ -87,6 +87,8 @@ class View:
         path_group, cosine: groups it meets (-1: none) and cosines of incidence, shapes ``(K, 3)``.
         beam: power of each path's beam per pixel, shape ``(K, N)`` float32.
         extra: power that is not fitted, shape ``(N,)``.
+        again_group, again: groups that send on light of other surfaces, shape ``(C,)``, and what they send, shape
+            ``(N, C)`` float32, per unit of what they scatter of even light.
         target_db: 10 log10(P / N0 + 1), shape ``(N,)``.
     """
 
@@ -99,6 +101,8 @@ class View:
     cosine: np.ndarray
     beam: np.ndarray
     extra: np.ndarray
+    again_group: np.ndarray
+    again: np.ndarray
     target_db: np.ndarray
 
     def tied(self, material: np.ndarray) -> View:
@@ -109,20 +113,29 @@ class View:
         basis = np.zeros((shape[0], len(lit), *shape[2:]), np.float32)
         for a, k in enumerate(place.reshape(-1)):
             basis[:, k] += self.basis[:, a]
-        seen, place = np.unique(material[self.seen], return_inverse=True)
-        dark = np.zeros((len(self.dark), len(seen)), np.float32)
-        for a, k in enumerate(place.reshape(-1)):
-            dark[:, k] += self.dark[:, a]
+        seen, dark = _gathered(material[self.seen], self.dark)
+        again_group, again = _gathered(material[self.again_group], self.again)
         met = self.path_group >= 0
         owner = np.where(met, material[np.where(met, self.path_group, 0)], -1)
-        return replace(self, groups=lit, basis=basis, seen=seen, dark=dark, path_group=owner)
+        return replace(
+            self, groups=lit, basis=basis, seen=seen, dark=dark, path_group=owner, again_group=again_group, again=again
+        )  # fmt: skip
 
     def pixels(self, chosen: np.ndarray) -> View:
         """Some of its pixels."""
         return replace(
             self, basis=self.basis[chosen], dark=self.dark[chosen], beam=self.beam[:, chosen], extra=self.extra[chosen],
-            target_db=self.target_db[chosen],
+            again=self.again[chosen], target_db=self.target_db[chosen],
         )  # fmt: skip
+
+
+def _gathered(owner: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns (N, C) summed by ``owner`` (C,): the owners, and a column of each."""
+    found, place = np.unique(owner, return_inverse=True)
+    out = np.zeros((len(columns), len(found)), np.float32)
+    for a, k in enumerate(place.reshape(-1)):
+        out[:, k] += columns[:, a]
+    return found, out
 
 
 @dataclass(frozen=True)
@@ -188,6 +201,11 @@ def specular_power(
     return power, (path_group >= 0).astype(float), slope
 
 
+def scattered_share(p: Parameters) -> np.ndarray:
+    """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
+    return p.weight.sum(axis=1) * fresnel_curves().even(p.log_excess)[0]
+
+
 def predict(view: View, p: Parameters) -> np.ndarray:
     """Power per pixel in units of N0, shape ``(N,)``."""
     curves = fresnel_curves()
@@ -195,6 +213,8 @@ def predict(view: View, p: Parameters) -> np.ndarray:
     mixed = (p.weight[view.groups][:, :, None] * alpha[:, None, :]).astype(np.float32)
     power = view.basis.reshape(len(view.basis), -1) @ mixed.ravel()
     power = np.maximum(power, 0.0) + view.extra
+    if len(view.again_group):
+        power = power + view.again @ scattered_share(p.take(view.again_group)).astype(np.float32)
     power = power + view.dark @ np.exp(p.log_indirect[view.seen]).astype(np.float32)
     strength = specular_power(view.gain, view.path_group, view.cosine, p)[0]
     return np.exp(p.log_gain) * (power + strength.astype(np.float32) @ view.beam)
@@ -215,6 +235,17 @@ def jacobian(view: View, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.
     indices = [(first[:, None] + np.arange(layout.lobes)).ravel(), first + layout.lobes]
     columns = [per_lobe.reshape(len(per_lobe), -1), to_excess]
     power = np.maximum(per_lobe.sum(axis=(1, 2)), 0.0) + view.extra
+    if len(view.again_group):
+        own = p.take(view.again_group)
+        even, rise = curves.even(own.log_excess)
+        share = own.weight * even[:, None]
+        again = view.again[:, :, None] * share.astype(np.float32)
+        power = power + again.sum(axis=(1, 2))
+        first = layout.stride * view.again_group
+        indices += [(first[:, None] + np.arange(layout.lobes)).ravel(), first + layout.lobes]
+        columns += [
+            again.reshape(len(power), -1), view.again * (own.weight.sum(axis=1) * rise).astype(np.float32)
+        ]  # fmt: skip
     if layout.indirect:
         dark = view.dark * np.exp(p.log_indirect[view.seen]).astype(np.float32)
         power = power + dark.sum(axis=1)

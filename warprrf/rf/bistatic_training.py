@@ -41,6 +41,7 @@ MORE: tuple[tuple[str, Any], ...] = (
     ("indirect", True),
 )
 """Terms that may be added to single bounces, in the order in which they are tried."""
+FEW_MATERIALS = 30
 REGROUPED = 3  # rounds of deciding what is of one material, and fitting
 OUTER = 2  # rounds of further bounces and groups in turn
 
@@ -285,7 +286,7 @@ class _Training:
         """Materials by what the spectra say, if that lowers the held-out error."""
         before, trial = self.material, fit
         for _ in range(REGROUPED):
-            views = self._views(terms, trial, self.kept)
+            views = self._views(terms, trial, self.kept, True)
             self.material, start = regroup(
                 views, trial.parameters, self.material, self.surface.look, self.area
             )
@@ -324,7 +325,7 @@ class _Training:
             start, np.zeros((0, 0)), _fit.Layout(*start.log_weight.shape, indirect=False, gain=False), [], 0
         )
         for k in range(rounds if further else 1):
-            views = self._views(terms, fit, chosen)
+            views = self._views(terms, fit, chosen, self.material.max() < FEW_MATERIALS)
             tied = [v.tied(self.material) for v in views]
             fit = _fit.fit_groups(
                 tied, fit.parameters if k else start, np.bincount(self.material, self.area),
@@ -332,17 +333,25 @@ class _Training:
             )  # fmt: skip
         return fit
 
-    def _views(self, terms: Terms, fit: Fit, chosen: np.ndarray) -> list[View]:
-        """Views of the receivers ``chosen`` by groups, under ``terms``; what surfaces send on held fixed."""
+    def _views(self, terms: Terms, fit: Fit, chosen: np.ndarray, follow: bool) -> list[View]:
+        """Views of the receivers ``chosen`` by groups, under ``terms``; light that reaches surfaces from others held
+        fixed. ``follow``: what they send on of it follows their parameters (which costs columns)."""
         views = [self._limited(self.views[r], terms) for r in chosen]
         if terms.further or terms.mirror_scatter or terms.scatter_mirror:
             # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
             known = self._field(replace(terms, indirect=False), fit, None)
+            share = _fit.scattered_share(known.parameters)
             for i, r in enumerate(chosen):
                 # No common gain here: the fit applies it to everything.
-                image = known.further(self.seen.sights[r]).ravel() / self.ds.floor
-                extra = known.beam.at(self.pixels[r], image[:, None])[:, 0]
-                views[i] = replace(views[i], extra=np.maximum(extra, 0.0))
+                groups, sent, shown = known.further_by_group(self.seen.sights[r], self.pixels[r])
+                sent, shown = np.maximum(sent, 0.0) / self.ds.floor, np.maximum(shown, 0.0) / self.ds.floor
+                if follow:
+                    unit = (sent / np.maximum(share[groups], 1e-12)).astype(np.float32)
+                    views[i] = replace(
+                        views[i], again_group=groups, again=unit, extra=shown.astype(np.float32)
+                    )
+                else:
+                    views[i] = replace(views[i], extra=(sent.sum(axis=1) + shown).astype(np.float32))
         return views
 
     def _limited(self, view: View, terms: Terms) -> View:

@@ -68,6 +68,11 @@ class FresnelCurves:
         high = (1 - r) * self.curves[i + 1, j] + r * self.curves[i + 1, j + 1]
         return (1 - s) * low + s * high, (high - low) / step
 
+    def even(self, log_excess: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Reflection under even light, 2 int F cos dcos, at ``log_excess`` (G,), and its derivative."""
+        cosine = np.linspace(0.0, 1.0, _COSINES)
+        return tuple(rows @ cosine / cosine.sum() for rows in self.at(self.curves, log_excess))  # type: ignore[return-value]
+
     def _place(self, log_excess: Any) -> tuple[np.ndarray, np.ndarray, float]:
         """Row below each ``log_excess``, the share of the next, and the distance of rows."""
         step = self.log_excess[1] - self.log_excess[0]

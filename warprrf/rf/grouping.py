@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warprrf.rf.bistatic_fit import NEPER, Parameters, View, huber, predict, specular_power
+from warprrf.rf.bistatic_fit import NEPER, Parameters, View, huber, predict, scattered_share, specular_power
 from warprrf.rf.bounces import fresnel_curves
 
 LOOK_COST = 1.0  # what one unit of difference in look, squared, counts as in the objective
@@ -97,6 +97,7 @@ def _costs(views: Sequence[View], p: Parameters, owner: np.ndarray, noise_db: fl
     count = len(p.log_excess)
     alpha = curves.at(curves.coordinates, p.log_excess)[0]
     mix = (p.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
+    share = scattered_share(p).astype(np.float32)
     out = np.zeros((len(owner), count))
     for view in views:
         power = predict(view.tied(owner), p)
@@ -104,12 +105,16 @@ def _costs(views: Sequence[View], p: Parameters, owner: np.ndarray, noise_db: fl
         met = view.path_group >= 0
         now = np.where(met, owner[np.where(met, view.path_group, 0)], -1)
         strength = specular_power(view.gain, now, view.cosine, p)[0]
-        for unit in np.union1d(view.groups, np.unique(view.path_group[met])):
+        units = np.unique(np.concatenate([view.groups, view.again_group, view.path_group[met]]))
+        for unit in units:
             change = np.zeros((len(power), count), np.float32)
             a = np.searchsorted(view.groups, unit)
             if a < len(view.groups) and view.groups[a] == unit:
                 own = view.basis[:, a].reshape(len(power), -1)
                 change += own @ (mix - mix[owner[unit]]).T
+            c = np.searchsorted(view.again_group, unit)
+            if c < len(view.again_group) and view.again_group[c] == unit:
+                change += view.again[:, c, None] * (share - share[owner[unit]])
             paths = np.flatnonzero((view.path_group == unit).any(axis=1))
             if len(paths):
                 trial = np.repeat(now[paths][None], count, axis=0)

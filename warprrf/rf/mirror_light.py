@@ -154,11 +154,9 @@ class MirrorLight:
             Lit(*(wp.array(value, dtype=wp.float32, device=where) for value in lit)),
         )  # fmt: skip
 
-    def image(self, sight: MirrorSight, p: Parameters, wavelength_m: float) -> np.ndarray:
-        """Path gain per pixel (H, W), before the beam, of mirrored light that surfaces scatter."""
-        rows, columns = self.tracer.shape
+    def power(self, sight: MirrorSight, p: Parameters, wavelength_m: float) -> np.ndarray:
+        """Path gain of each row of ``sight``, shape ``(L,)``, before the beam."""
         if len(sight.pixel) == 0:
-            return np.zeros((rows, columns))
+            return np.zeros(0)
         power = self.tracer.scatter_faces(sight.face, sight.lit, p.weight, p.log_excess, wavelength_m)
-        power = power * reflected_share(self.tracer, p, sight.patch, sight.cosine)
-        return np.bincount(sight.pixel, power, minlength=rows * columns).reshape(rows, columns)
+        return power * reflected_share(self.tracer, p, sight.patch, sight.cosine)

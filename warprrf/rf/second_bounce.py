@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.rf.bistatic_fit import Parameters
-from warprrf.rf.bounces import BounceTracer, FresnelCurves, fresnel_curves
+from warprrf.rf.bistatic_fit import Parameters, scattered_share
+from warprrf.rf.bounces import BounceTracer, fresnel_curves
 from warprrf.rf.mirror_light import MirrorLight
 from warprrf.rf.surface import Surface
 
@@ -71,18 +71,6 @@ class ElementLight:
         return scattered_share(p)[self.surface.element_group]
 
 
-def scattered_share(p: Parameters) -> np.ndarray:
-    """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
-    curves = fresnel_curves()
-    return p.weight.sum(axis=1) * _even(curves, p.log_excess)
-
-
-def _even(curves: FresnelCurves, log_excess: np.ndarray) -> np.ndarray:
-    cosine = np.linspace(0.0, 1.0, curves.curves.shape[1])
-    curve = curves.at(curves.curves, log_excess)[0]
-    return (curve * cosine).sum(axis=1) / cosine.sum()
-
-
 def mirrored_scene(
     tracer: BounceTracer, receiver: np.ndarray, transmitter: np.ndarray, p: Parameters, wavelength_m: float,
     sent: np.ndarray | None,
@@ -119,12 +107,11 @@ def mirrored_scene(
     return out.reshape(*tracer.shape, -1).sum(axis=-1)
 
 
-def sent_image(tracer: BounceTracer, met: Any, sent: np.ndarray, wavelength_m: float) -> np.ndarray:
-    """Path gain per pixel (H, W) of the radiance (E,) that elements send on evenly."""
+def sent_power(tracer: BounceTracer, met: Any, sent: np.ndarray, wavelength_m: float) -> np.ndarray:
+    """Path gain of each ray (K,) of the radiance (E,) that elements send on evenly."""
     face = met.face.numpy()
     radiance = np.where(face >= 0, sent[tracer.surface.element[np.maximum(face, 0)]], 0.0)
-    power = (wavelength_m / (4.0 * np.pi)) ** 2 * tracer.solid_angle * radiance
-    return power.reshape(*tracer.shape, -1).sum(axis=-1)
+    return (wavelength_m / (4.0 * np.pi)) ** 2 * tracer.solid_angle * radiance
 
 
 def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:

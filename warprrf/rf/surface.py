@@ -17,7 +17,7 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import PlanarPatch, smoothed_normals
+from warprrf.geometry.patches import PlanarPatch, connected_pieces, smoothed_normals
 from warprrf.kernels import bounce
 from warprrf.rf.paths import planar_patches as exact_patches
 
@@ -26,6 +26,7 @@ LARGEST_FACE_M = 0.6  # longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
 LARGE_PIECE_M2 = 1.5  # a piece of a patch this large is a group of its own
 SMALLEST_GROUP_M2 = 0.5
+SMALLEST_SHEET_M2 = 0.2
 COLOUR_CELL_M = 0.4  # colours are averaged over cells of this size
 CHROMA_STEP = 0.05  # log chromaticities that differ by less look alike
 LUMINANCE_STEP = 0.3  # and log luminances
@@ -231,15 +232,17 @@ def _colour_groups(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Groups of faces by patch and photo colour; the material that each is taken for, and its look.
 
-    A patch is split where its colour changes (another material in the same plane): such pieces are the groups. Each
-    large one is taken for a material of its own: grey stone and grey paint look alike. Small pieces join the large one
-    that looks most like them, if any does, else each other. Chromaticity counts more than luminance (also shade).
+    A patch is split into its connected sheets (other things in the same plane), and a sheet where its colour changes:
+    such pieces are the groups. Each large one is taken for a material of its own: grey stone and grey paint look alike.
+    Small pieces join the large one that looks most like them, if any does, else each other. Chromaticity counts more
+    than luminance, which is also shade.
     """
     centre, area = mesh.triangles.mean(axis=1), mesh.areas
     colour = np.log(np.clip(gaussians.sh[:, 0, :].astype(np.float64) * Y00 + 0.5, 0.01, 1.0))
     face = mesh.closest(gaussians.means).face
     weight = gaussians.opacities * np.sort(gaussians.scales, axis=1)[:, 1:].prod(axis=1)
-    key = np.column_stack([patch, np.floor((centre - mesh.bounds[0]) / COLOUR_CELL_M).astype(np.int64)])
+    sheet = _sheets(mesh, patch)
+    key = np.column_stack([sheet, np.floor((centre - mesh.bounds[0]) / COLOUR_CELL_M).astype(np.int64)])
     unit = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
     count = int(unit.max()) + 1
     total = np.bincount(unit[face], weight, minlength=count)
@@ -250,8 +253,8 @@ def _colour_groups(
     known = total > 1e-9
     mean[known] = mean[known] / total[known, None]
     owner = np.full(count, -1)
-    owner[unit] = patch
-    for p in np.unique(owner):  # a unit without Gaussians looks like its patch
+    owner[unit] = sheet
+    for p in np.unique(owner):  # a unit without Gaussians looks like its sheet
         seen = (owner == p) & known
         usual = mean[seen] if seen.any() else mean[known]
         mean[(owner == p) & ~known] = np.average(
@@ -297,6 +300,17 @@ def _colour_groups(
         group[group == g] = gap.argmin()
     group = np.unique(group, return_inverse=True)[1].reshape(-1)
     return piece[unit].astype(np.int32), group.astype(np.int32), look
+
+
+def _sheets(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
+    """Connected pieces of each patch, shape ``(F,)``, its crumbs together; -1 off all patches."""
+    piece = connected_pieces(mesh, patch)
+    crumb = np.bincount(piece, mesh.areas)[piece] < SMALLEST_SHEET_M2
+    key = np.where(crumb, patch + int(piece.max()) + 1, piece)
+    sheet = np.full(len(patch), -1)
+    own = patch >= 0
+    sheet[own] = np.unique(key[own], return_inverse=True)[1].reshape(-1)
+    return sheet
 
 
 def _clusters(feature: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -139,8 +139,8 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
 
     ``sionna.rt.load_scene`` opens the XML as it is, all lobes Lambertian; :func:`load_sionna_scene` sets the scattering
     patterns too; :meth:`Scene.load` and :func:`simulate` take it as any scene. Each material of the field is an object
-    ``surface_<group>`` of a material ``fitted_<group>``, named by its largest group; it holds within 10 % of the field's
-    carrier.
+    ``surface_<group>`` of a material ``fitted_<group>``, named by its largest group; it holds within 10 % of the
+    field's carrier.
 
     No material can hold a common gain (an uncalibrated receiver), residuals of elements or an indirect radiance, and
     softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former.
