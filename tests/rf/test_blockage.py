@@ -38,10 +38,14 @@ def test_a_screen_diffracts_over_its_top_by_the_height_it_stands_above_the_ray()
 
 def test_a_deeper_shadow_and_a_higher_carrier_get_less() -> None:
     transmitter = np.array([-10.0, 0, 1.9])
-    heights = [diffracted(WALL, transmitter, np.array([[10.0, 0, z]]), WAVELENGTH).power.max() for z in (1.8, 1.0)]
+    heights = [
+        diffracted(WALL, transmitter, np.array([[10.0, 0, z]]), WAVELENGTH).power.max() for z in (1.8, 1.0)
+    ]
     assert heights[0] > 5 * heights[1]
     low = diffracted(WALL, transmitter, np.array([[10.0, 0, 1.0]]), 10 * WAVELENGTH).power.max()
-    assert low / heights[1] == pytest.approx(100 * 10, rel=0.05)  # Friis by its square, the edge by its first power
+    assert low / heights[1] == pytest.approx(
+        100 * 10, rel=0.05
+    )  # Friis by its square, the edge by its first power
 
 
 def test_inner_corners_and_flat_seams_do_not_diffract() -> None:
@@ -54,7 +58,9 @@ def test_a_pillar_is_passed_on_both_sides() -> None:
     found = diffracted(mesh, np.array([-5.0, 0, 1]), np.array([[5.0, 0, 1]]), WAVELENGTH)
     # Front edges alone see both ends of neither side: a ray bends at the corner once, so none passes a wide pillar.
     assert len(found.power) == 0
-    thin, _ = joined(box_mesh([-9, -9, 0], [9, 9, 3], inward=True), box_mesh([-0.001, -0.5, 0], [0.001, 0.5, 3]))
+    thin, _ = joined(
+        box_mesh([-9, -9, 0], [9, 9, 3], inward=True), box_mesh([-0.001, -0.5, 0], [0.001, 0.5, 3])
+    )
     found = diffracted(thin, np.array([-5.0, 0, 1]), np.array([[5.0, 0, 1]]), WAVELENGTH)
     assert {-1, 1} <= set(np.sign(np.round(found.arrival[:, 1], 9)))
     assert found.power.max() == pytest.approx(found.power[found.arrival[:, 1] > 0].max(), rel=1e-3)

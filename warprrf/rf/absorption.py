@@ -1,7 +1,7 @@
 """Specific attenuation of air by oxygen and water vapour, 1 to 1000 GHz.
 
-Source: ITU-R P.676-13 (08/2022), Annex 1, the sum over spectroscopic lines of its tables 1 and 2 with Zeeman and Doppler
-broadening, and the dry continuum. No line data is fetched: both tables stand below.
+Source: ITU-R P.676-13 (08/2022), Annex 1, the sum over spectroscopic lines of its tables 1 and 2 with Zeeman and
+Doppler broadening, and the dry continuum. No line data is fetched: both tables stand below.
 """
 
 from __future__ import annotations
@@ -50,7 +50,9 @@ def gas_attenuation_db_per_m(
     f = f_hz[..., None] * 1e-9
     theta = 300.0 / temperature_k
     vapour_hpa = water_vapour_g_m3 * temperature_k / 216.7  # eq. (4)
-    imaginary = _oxygen(f, theta, pressure_hpa, vapour_hpa) + _water_vapour(f, theta, pressure_hpa, vapour_hpa)
+    imaginary = _oxygen(f, theta, pressure_hpa, vapour_hpa) + _water_vapour(
+        f, theta, pressure_hpa, vapour_hpa
+    )
     per_km = 0.1820 * f[..., 0] * imaginary  # eq. (1)
     return float(per_km) * 1e-3 if f_hz.ndim == 0 else per_km * 1e-3
 
@@ -83,11 +85,10 @@ def _water_vapour(f: np.ndarray, theta: float, p: float, e: float) -> np.ndarray
 
 def _shape(f: np.ndarray, f0: np.ndarray, width: np.ndarray, interference: np.ndarray) -> np.ndarray:
     """Line shape, eq. (5)."""
-    below, above = f0 - f, f0 + f
-    return (
-        f / f0
-        * ((width - interference * below) / (below**2 + width**2) + (width - interference * above) / (above**2 + width**2))
-    )  # fmt: skip
+    total = np.zeros(1)
+    for offset in (f0 - f, f0 + f):
+        total = total + (width - interference * offset) / (offset**2 + width**2)
+    return f / f0 * total
 
 
 def _table(text: str) -> np.ndarray:

@@ -59,18 +59,21 @@ def diffracted(
 ) -> SidePaths:
     """Paths of ``receivers`` (R, 3), all without line of sight, over one edge of the mesh each.
 
-    The point on an edge is the one of least detour (it lies between the edge's ends, or there is no path), and must see
+    What goes over two edges, as round a thick pillar, loses at least both edges' losses and is left out. The point on
+    an edge is the one of least detour (it lies between the edge's ends, or there is no path), and must see
     transmitter and receiver. Its loss is that of a knife edge, v = 2 sqrt(detour / wavelength), which for small angles
     is ITU-R P.526-15, eq. (26).
     """
     start, along, length, outward = _edges(mesh)
-    parts = []
+    parts: list[tuple[np.ndarray, ...]] = []
     source_at, source_off = _on_line(transmitter, start, along)
     for r, receiver in enumerate(receivers):
         direct = float(np.linalg.norm(receiver - transmitter))
         at, off = _on_line(receiver, start, along)
         with np.errstate(invalid="ignore", divide="ignore"):
-            s = (source_at * off + at * source_off) / (off + source_off)  # equal angles with the edge (Keller)
+            s = (source_at * off + at * source_off) / (
+                off + source_off
+            )  # equal angles with the edge (Keller)
         total = np.hypot(off + source_off, at - source_at)
         k = np.flatnonzero((s > 0) & (s < length))
         k = k[np.argsort(total[k], kind="stable")[:MOST_EDGES]]
@@ -102,8 +105,8 @@ def transmitted(
 ) -> SidePaths:
     """The straight path of each of ``receivers`` (R, 3) through all that stands in its way.
 
-    Each face met is a slab (ITU-R P.2040-4) of its ``permittivity`` (F,), complex, and ``thickness_m`` (F,); on a closed
-    mesh the faces by which a ray leaves an obstacle are not counted.
+    Each face met is a slab (ITU-R P.2040-4) of its ``permittivity`` (F,), complex, and ``thickness_m`` (F,); on a
+    closed mesh the faces by which a ray leaves an obstacle are not counted.
     """
     way = transmitter - receivers
     distance = np.linalg.norm(way, axis=1)
@@ -111,7 +114,9 @@ def transmitted(
     gone, share = np.zeros(len(receivers)), np.ones(len(receivers))
     open_rays = np.arange(len(receivers))
     for _ in range(MOST_CROSSINGS):
-        hit = mesh.cast(receivers[open_rays] + gone[open_rays, None] * toward[open_rays], toward[open_rays], device=device)
+        hit = mesh.cast(
+            receivers[open_rays] + gone[open_rays, None] * toward[open_rays], toward[open_rays], device=device
+        )
         met = gone[open_rays] + hit.t < distance[open_rays] - skin_m
         open_rays, face, t, normal = open_rays[met], hit.face[met], hit.t[met], hit.normal[met]
         if len(open_rays) == 0:
@@ -127,7 +132,7 @@ def transmitted(
 
 
 def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Outer and open edges: start (E, 3), unit direction (E, 3), length (E,), unit vector away from the solid (E, 3)."""
+    """Outer and open edges: start (E, 3), unit direction (E, 3), length (E,), unit vector off the solid (E, 3)."""
     corner = mesh.welded_faces
     sides = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     face = np.repeat(np.arange(len(corner)), 3)
