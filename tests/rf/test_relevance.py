@@ -45,11 +45,15 @@ def plated(material: object) -> RadioScene:
 
 
 def metal(roughness_m: float) -> Material:
-    return replace(Material.conductor(pattern="directive", alpha_r=4), scattering=roughness_scattering(roughness_m, F))
+    return replace(
+        Material.conductor(pattern="directive", alpha_r=4), scattering=roughness_scattering(roughness_m, F)
+    )
 
 
 def spectra(scene: RadioScene) -> SpectrumDataset:
-    engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, sub_pixels=4)
+    engine = ExactEngine(
+        scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, sub_pixels=4
+    )
     found = [engine.receive(r) for r in RECEIVERS]
     return SpectrumDataset.from_spectra(
         receivers=RECEIVERS, transmitter=TX, frequency_hz=F,
@@ -67,7 +71,7 @@ def furnished() -> RadioScene:
 
 @pytest.fixture(scope="module")
 def several(furnished: RadioScene) -> list[Relevance]:
-    return relevances(furnished, (1e-6, 0.1, 0.5, 2.0, 50.0), receivers=RECEIVERS, **OPTIONS)
+    return relevances(furnished, (1e-6, 0.1, 0.5, 2.0, 1000.0), receivers=RECEIVERS, **OPTIONS)
 
 
 def test_an_empty_room_has_line_of_sight_and_nothing_else() -> None:
@@ -96,7 +100,8 @@ def test_the_worth_of_a_mirror_is_its_power() -> None:
     found = relevance(plate, receivers=receiver, **OPTIONS, gas_db_per_m=0.0)
     image = TX * [1, 1, -1] + [0, 0, 2 * 0.05]
     ratio = (np.linalg.norm(TX - receiver) / np.linalg.norm(image - receiver)) ** 2
-    assert found["mirror_1"].total_db == pytest.approx(10 * np.log10(1 + ratio), rel=2e-3)
+    # A half-space of permittivity 201, scaled, stands for metal: a few percent over the angle of incidence.
+    assert found["mirror_1"].total_db == pytest.approx(10 * np.log10(1 + ratio), abs=0.1)
 
 
 def test_lambertian_materials_leave_one_lobe() -> None:
@@ -106,7 +111,8 @@ def test_lambertian_materials_leave_one_lobe() -> None:
 
 def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept() -> None:
     scene = room(
-        SlabMaterial("a", 4.0, 0.5, 0.1, 0.7, "directive", 5), SlabMaterial("b", 4.0, 0.5, 0.1, 0.7, "directive", 6)
+        SlabMaterial("a", 4.0, 0.5, 0.1, 0.7, "directive", 5),
+        SlabMaterial("b", 4.0, 0.5, 0.1, 0.7, "directive", 6),
     )
     strict, loose = relevances(scene, (1e-4, 1.0), receivers=RECEIVERS, **OPTIONS)
     assert strict.terms.lobes == (5, 6)
@@ -115,19 +121,22 @@ def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept() -> None:
     moved = with_lobes(p, lobes, (5,))
     np.testing.assert_allclose(moved.weight.sum(axis=1), p.weight.sum(axis=1))
     assert not moved.weight[:, 1].any()
-    mixed = with_lobes(material_parameters([*scene.materials, SlabMaterial("c", 4, 0.5, 0.1, 0.7)], F)[0], (0, 5, 6), (0, 6))
+    third = SlabMaterial("c", 4.0, 0.5, 0.1, 0.7)
+    mixed = with_lobes(material_parameters([*scene.materials, third], F)[0], (0, 5, 6), (0, 6))
     assert 0 < mixed.weight[0, 0] < mixed.weight[0, 2]  # exponent 5 is nearer to 6 than to Lambertian
 
 
 def test_gas_matters_over_a_kilometre_and_not_over_ten_metres() -> None:
-    def hall(length: float) -> Relevance:
-        box = box_mesh([0, 0, 0], [length, 8, 8], inward=True)
-        mesh, part = joined(box)
-        scene = RadioScene(mesh, part, [NOTHING])
+    def air(length: float) -> Relevance:
+        """Two boxes as far apart as that, of nothing: only the air between them counts."""
+        mesh, part = joined(
+            box_mesh([0, 0, 0], [0.5, 0.5, 0.5]), box_mesh([length - 0.5, 7, 7], [length, 8, 8])
+        )
+        scene = RadioScene(mesh, np.zeros_like(part), [NOTHING])
         ends = {"transmitter": [0.5, 4, 4], "receivers": [[length - 0.5, 4, 4]]}
         return relevance(scene, **{**OPTIONS, **ends, "shape": (12, 24)})
 
-    short, long = hall(11.0), hall(1001.0)
+    short, long = air(11.0), air(1001.0)
     assert short["gas"].kept is False
     assert short["gas"].total_db == pytest.approx(10 * gas_attenuation_db_per_m(F), rel=1e-3)
     assert long["gas"].kept
@@ -165,7 +174,9 @@ def test_blocked_receivers_have_no_line_of_sight_to_lose(several: list[Relevance
 def test_elements_that_no_receiver_sees_matter_to_further_bounces_alone(furnished: RadioScene) -> None:
     from warprrf.rf.relevance_model import without_elements
 
-    full, walls, source = full_field(furnished, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
+    full, walls, source = full_field(
+        furnished, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA
+    )
     single = replace(full, terms=Terms(lobes=full.terms.lobes, mirror_order=2))
     sight = single.see(RECEIVERS[0])
     face = sight.met.face.numpy()
@@ -234,7 +245,11 @@ def test_a_fitted_field_is_judged_by_its_parameters(furnished: RadioScene) -> No
         ({"receivers": [TX]}, ValueError, "transmitter"),
         ({"shape": (1, 1)}, ValueError, "shape"),
         ({"geometry": "room"}, TypeError, "geometry"),
-        ({"geometry": Mesh(*box_mesh([0, 0, 0], [5, 4, 3])), "frequency_hz": 5e12}, ValueError, "frequency_hz"),
+        (
+            {"geometry": Mesh(*box_mesh([0, 0, 0], [5, 4, 3])), "frequency_hz": 5e12},
+            ValueError,
+            "frequency_hz",
+        ),
     ],
 )
 def test_bad_input_is_named(furnished: RadioScene, change: dict[str, object], error: type, name: str) -> None:

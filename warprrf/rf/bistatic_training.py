@@ -83,7 +83,9 @@ def trace(
     receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
     blank = _blank(surface, ds, Terms(mirror_order=2, lobes=LOBES if lobes is None else lobes), device)
     order = 2 if mirror_order is None else mirror_order
-    found = specular_paths(surface, blank.transmitter, receivers, blank.wavelength_m, order=order, device=device)
+    found = specular_paths(
+        surface, blank.transmitter, receivers, blank.wavelength_m, order=order, device=device
+    )
     sights = []
     for r, receiver in enumerate(receivers):
         sights.append(blank.see(receiver, paths=found.subset(np.flatnonzero(found.receiver == r))))

@@ -29,7 +29,12 @@ from warprrf.rf.surface import Surface
 ASSUMED_PERMITTIVITY = 4.0 * (1.0 - 0.06j)
 """Of walls whose material is not known; loss as of plasterboard and wood at 300 GHz in ITU-R P.2040-4, table 3."""
 ASSUMED_THICKNESS_M = 0.0125  # a plasterboard: thin walls let more through
-ONE_BOUNCE: dict[str, Any] = {"mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False}
+ONE_BOUNCE: dict[str, Any] = {
+    "mirror_scatter": False,
+    "scatter_mirror": False,
+    "diffuse_order": 1,
+    "indirect": False,
+}
 """Terms without anything after a first bounce."""
 
 
@@ -91,7 +96,12 @@ def full_field(
 ) -> tuple[BistaticField, Walls, str]:
     """A field with every term on for a Scene, Reconstruction, Mesh or bistatic field; its walls; and where its
     materials come from: ``"scene"``, ``"fit"`` or ``"assumed"``."""
-    further: dict[str, Any] = {"mirror_scatter": True, "scatter_mirror": True, "diffuse_order": 3, "mirror_order": 2}
+    further: dict[str, Any] = {
+        "mirror_scatter": True,
+        "scatter_mirror": True,
+        "diffuse_order": 3,
+        "mirror_order": 2,
+    }
     if isinstance(geometry, BistaticField):
         terms = replace(geometry.terms, line_of_sight=True, diffuse=True, **further)
         return (
