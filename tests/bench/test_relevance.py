@@ -31,7 +31,9 @@ def test_a_small_run_writes_table_picture_and_figures(tmp_path: Path) -> None:
     )  # fmt: skip
     tight, loose = report["cases"][0]["choices"]
     assert tight["own_image_db"] <= 1.0
-    assert tight["image_db"] < 2.0 < loose["image_db"]  # others judge, so it may exceed the tolerance a little
+    assert (
+        tight["image_db"] < 2.0 < loose["image_db"]
+    )  # others judge, so it may exceed the tolerance a little
     assert tight["psnr_db"] > loose["psnr_db"]
     assert set(loose["kept"]) < set(tight["kept"])
     stored = json.loads((tmp_path / "relevance.json").read_text())

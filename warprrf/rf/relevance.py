@@ -28,7 +28,7 @@ from warprrf.rf.dataset import write_whole
 from warprrf.rf.field import RadioField
 from warprrf.rf.paths import check_frequency
 from warprrf.rf.relevance_choice import Effect, effect_row, gaussians_row, leave_out, open_row
-from warprrf.rf.relevance_model import FullModel, full_field, with_lobes, without_elements
+from warprrf.rf.relevance_model import FullModel, full_field, variant, with_lobes
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape
 from warprrf.rf.transport import check_receiver
 
@@ -133,10 +133,11 @@ class Relevance:
 
     def reduce(self, full: BistaticField) -> BistaticField:
         """``full``, a field with the terms that this was made of, cut down to the smallest model."""
-        p = full.parameters
-        if self.terms.lobes != full.terms.lobes:
-            p = with_lobes(p, full.terms.lobes, self.terms.lobes)
-            p = replace(p, log_weight=p.log_weight[:, [full.terms.lobes.index(n) for n in self.terms.lobes]])
+        p, lobes = full.parameters, self.terms.lobes
+        if lobes == full.terms.lobes:
+            return variant(full, terms=self.terms, errors=None)
+        p = with_lobes(p, full.terms.lobes, lobes)
+        p = replace(p, log_weight=p.log_weight[:, [full.terms.lobes.index(n) for n in lobes]])
         return replace(full, terms=self.terms, parameters=p, errors=None)
 
     def table(self) -> str:
@@ -220,8 +221,8 @@ def relevance(
     """What each effect is worth in a scene and a band, and the smallest model within a tolerance.
 
     Args:
-        geometry: a Scene (its materials count), a fitted bistatic field (its parameters count), or a Reconstruction or
-            Mesh (materials are assumed, and the table says so).
+        geometry: a Scene (its materials count), a fitted bistatic field (its parameters count, also for terms that its
+            fit left out), or a Reconstruction or Mesh (materials are assumed, and the table says so).
         receivers: a handful of positions [m], shape ``(R, 3)``, blocked ones among them: about ten are enough.
         transmitter: position [m], shape ``(3,)``; a field's own by default.
         frequency_hz: carrier [Hz]; a field's own by default.
@@ -311,10 +312,7 @@ def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
             source, full.frequency_hz, tolerance_db, model.floor, len(places), int(model.blocked.sum()), (),
             _terms(full.terms, kept), 0.0, 0.0, model.spectrum_s, 0.0, model.unseen,
         )  # fmt: skip
-        reduced = chosen.reduce(full)
-        image, seconds = _spectra(
-            reduced if "unseen" in kept else without_elements(reduced, model.unseen), places
-        )
+        image, seconds = _spectra(chosen.reduce(full if "unseen" in kept else model.seen_only), places)
         image += model.image(kept) - model.image(kept - set(OUTSIDE))
         found = [float(np.sqrt(np.mean(x**2))) for x in model.difference(np.maximum(image, 0.0))]
         if max(found) <= tolerance_db or not order:
@@ -345,9 +343,8 @@ def _terms(full: Terms, kept: frozenset[str]) -> Terms:
 
 
 def _spectra(field: BistaticField, receivers: np.ndarray) -> tuple[np.ndarray, float]:
-    """Spectra (R, H, W) of a field that nothing is traced for yet, and the time of each [s]."""
-    fresh = replace(field)
-    fresh.compose(fresh.see(receivers[0]))  # tables and, where needed, the light on elements
+    """Spectra (R, H, W), and the time of each [s], set-up apart."""
+    field.compose(field.see(receivers[0]))  # tables and, where needed, the light on elements
     start = time.perf_counter()
-    images = [fresh.compose(fresh.see(r)).image for r in receivers]
+    images = [field.compose(field.see(r)).image for r in receivers]
     return np.stack(images), (time.perf_counter() - start) / len(receivers)

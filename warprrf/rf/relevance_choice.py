@@ -14,6 +14,7 @@ from warprrf.geometry.render import render
 from warprrf.rf.relevance_model import FullModel
 from warprrf.rf.transport import transport
 
+ALL_LAYERS = 128  # Gaussians that may share a pixel and count as seen: more have no weight left
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
 FURTHER = ("mirror_scatter", "scatter_mirror", "diffuse_2")
 NEEDS = {"mirror_1": ("mirror_2",), "diffuse_1": (*FURTHER, "residual")}
@@ -127,7 +128,7 @@ def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if share >= 1e-4 else f"{100 * share:.0e} %"
+    return f"{100 * share:.2g} %" if share >= 1e-4 or share == 0 else f"{100 * share:.0e} %"
 
 
 def _gas(model: FullModel) -> str:
@@ -179,7 +180,7 @@ def gaussians_row(
 ) -> Effect:
     """Gaussians with no blending weight at any receiver; what they could change is rendered, not assumed."""
     start = time.perf_counter()
-    weights = transport(gaussians, receivers, shape, device=device)
+    weights = transport(gaussians, receivers, shape, top_k=ALL_LAYERS, device=device)
     seen = np.zeros(len(gaussians.means), bool)
     seen[weights.gaussian] = True
     seconds = (time.perf_counter() - start) / len(receivers)
@@ -191,5 +192,5 @@ def gaussians_row(
     change = float(-10.0 * np.log10(max(1.0 - share, 1e-12)))
     return Effect(
         "gaussians", change, change, None, None, seconds, change > tolerance_db,
-        f"{int((~seen).sum())} of {len(seen)}; blending gives them {_percent(share) if share else '0 %'} of any pixel",
+        f"{int((~seen).sum())} of {len(seen)}; blending gives them at most {_percent(share)} of a pixel",
     )  # fmt: skip

@@ -232,7 +232,9 @@ class FullModel:
         self._parts: dict[tuple[Any, ...], np.ndarray] = {}
         self.seconds: dict[str, float] = {}
         field.see(receivers[0])  # compile and set up outside the clock
+        start = time.perf_counter()
         field.element_light(field.transmitter)
+        setup_s = (time.perf_counter() - start) / len(receivers)
         start = time.perf_counter()
         self.sights: list[Sight] = []
         for r, receiver in enumerate(receivers):
@@ -245,7 +247,7 @@ class FullModel:
         self.spectrum_s = (time.perf_counter() - start) / len(receivers)
         self._specular_power = [c.specular for c in composed]
         self.blocked = np.array([not (s.paths.order == 0).any() for s in self.sights])
-        self._time()
+        self._time(setup_s)
         self.side = {"diffraction": self._diffracted(), "transmission": self._transmitted()}
         self.effects = self._names()
         self.all = frozenset(self.effects)
@@ -368,7 +370,7 @@ class FullModel:
         indirect: bool,
         unseen: bool,
     ) -> np.ndarray:
-        base = self.field if unseen else self._seen_only
+        base = self.field if unseen else self.seen_only
         terms = replace(
             base.terms, diffuse=diffuse, mirror_scatter=mirror_scatter, scatter_mirror=scatter_mirror,
             diffuse_order=3 if diffuse_2 else 1, indirect=indirect,
@@ -398,7 +400,8 @@ class FullModel:
         return ~seen
 
     @cached_property
-    def _seen_only(self) -> BistaticField:
+    def seen_only(self) -> BistaticField:
+        """The field with every term on but for what elements that no receiver sees scatter."""
         return without_elements(self.field, self.unseen)
 
     # -------------------------------------------------------------------------------------- estimates and times
@@ -425,8 +428,8 @@ class FullModel:
         self.seconds["transmission"] = (time.perf_counter() - start) / len(self.receivers)
         return replace(found, receiver=which[found.receiver])
 
-    def _time(self) -> None:
-        """Seconds per spectrum of the terms, each by itself; set-up is shared among the receivers."""
+    def _time(self, setup_s: float) -> None:
+        """Seconds per spectrum of the terms, each by itself; ``setup_s`` is a receiver's share of lighting elements."""
         f, count = self.field, len(self.receivers)
 
         def clock(work: Callable[[], Any]) -> float:
@@ -451,11 +454,10 @@ class FullModel:
             single.compose(sight)
 
         self.seconds["diffuse_1"] = clock(bounce)
-        setup = clock(lambda: replace(f).element_light(f.transmitter)) / count
         for name, share, terms in (
-            ("mirror_scatter", setup, {"mirror_scatter": True}),
+            ("mirror_scatter", setup_s, {"mirror_scatter": True}),
             ("scatter_mirror", 0.0, {"scatter_mirror": True}),
-            ("diffuse_2", setup, {"diffuse_order": 3}),
+            ("diffuse_2", setup_s, {"diffuse_order": 3}),
         ):
             alone = variant(f, terms=replace(f.terms, **{**ONE_BOUNCE, **terms}))
             self.seconds[name] = share + clock(partial(alone.further, sight))
