@@ -5,7 +5,8 @@ What an effect is worth is the larger of two changes that leaving it out makes, 
 that of the dB image 10 log10(P + N0), over the sphere, and that of the total path gain. The smallest model is found by
 leaving out effects one after another, each time the one whose loss hurts least together with all that went before (the
 costliest of those that hurt alike, to a hundredth of a dB), while the model stays within the tolerance of the full one;
-what is left is then evaluated as a field of its own, to be sure.
+what is left is then evaluated as a field of its own, to be sure. There the mean squares count with one standard error
+more, because few receivers stand for many.
 The order does not depend on the tolerance, so a larger one never keeps more.
 """
 
@@ -27,7 +28,7 @@ from warprrf.rf.bistatic import BistaticField, Terms
 from warprrf.rf.dataset import write_whole
 from warprrf.rf.field import RadioField
 from warprrf.rf.paths import check_frequency
-from warprrf.rf.relevance_choice import Effect, effect_row, gaussians_row, leave_out, open_row
+from warprrf.rf.relevance_choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
 from warprrf.rf.relevance_model import FullModel, full_field, variant, with_lobes
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape
 from warprrf.rf.transport import check_receiver
@@ -297,7 +298,7 @@ def relevances(
             row = gaussians_row(gaussians, places, full.shape, tolerance, device)
             one = replace(one, effects=(*one.effects, row))
         found.append(one)
-    tick("relevance", 2 * len(places), 2 * len(places))
+    tick("relevance", len(places) + 1, len(places) + 1)
     return found
 
 
@@ -314,8 +315,8 @@ def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
         )  # fmt: skip
         image, seconds = _spectra(chosen.reduce(full if "unseen" in kept else model.seen_only), places)
         image += model.image(kept) - model.image(kept - set(OUTSIDE))
-        found = [float(np.sqrt(np.mean(x**2))) for x in model.difference(np.maximum(image, 0.0))]
-        if max(found) <= tolerance_db or not order:
+        loss = model.difference(np.maximum(image, 0.0))
+        if decisive(loss) <= tolerance_db or not order:
             break
         order.pop()
     effects = [effect_row(model, name, kept) for name in model.effects if name in known]
@@ -324,7 +325,9 @@ def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
     for name in ("residual", "indirect"):
         if name not in model.all:
             effects.append(open_row(name, "only a fit tells"))
-    return replace(chosen, effects=tuple(effects), image_db=found[0], total_db=found[1], reduced_s=seconds)
+    return replace(
+        chosen, effects=tuple(effects), image_db=rms(loss[0]), total_db=rms(loss[1]), reduced_s=seconds
+    )
 
 
 def _terms(full: Terms, kept: frozenset[str]) -> Terms:
@@ -343,8 +346,11 @@ def _terms(full: Terms, kept: frozenset[str]) -> Terms:
 
 
 def _spectra(field: BistaticField, receivers: np.ndarray) -> tuple[np.ndarray, float]:
-    """Spectra (R, H, W), and the time of each [s], set-up apart."""
+    """Spectra (R, H, W), and the median time of one [s], set-up apart."""
     field.compose(field.see(receivers[0]))  # tables and, where needed, the light on elements
-    start = time.perf_counter()
-    images = [field.compose(field.see(r)).image for r in receivers]
-    return np.stack(images), (time.perf_counter() - start) / len(receivers)
+    images, seconds = [], []
+    for receiver in receivers:
+        start = time.perf_counter()
+        images.append(field.compose(field.see(receiver)).image)
+        seconds.append(time.perf_counter() - start)
+    return np.stack(images), float(np.median(seconds))

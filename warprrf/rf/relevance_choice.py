@@ -50,13 +50,21 @@ class Effect:
 
     @property
     def worth_db(self) -> float | None:
-        """The larger of both changes, which decides."""
+        """The larger of both changes."""
         return None if self.image_db is None or self.total_db is None else max(self.image_db, self.total_db)
 
 
-def worth(loss: tuple[np.ndarray, np.ndarray]) -> float:
-    """What decides: the larger of both changes, rms over receivers [dB]."""
-    return max(float(np.sqrt(np.mean(x**2))) for x in loss)
+def rms(change: np.ndarray) -> float:
+    """Root mean square over receivers [dB]."""
+    return float(np.sqrt(np.mean(change**2)))
+
+
+def decisive(loss: tuple[np.ndarray, np.ndarray]) -> float:
+    """What decides [dB]: the larger of both changes, rms over receivers, the mean square raised by its standard error.
+
+    A handful of receivers stands for all of a room: one place that an effect matters at tells of others like it.
+    """
+    return max(float(np.sqrt(np.mean(x**2) + np.std(x**2) / np.sqrt(len(x)))) for x in loss)
 
 
 def leave_out(model: FullModel, candidates: frozenset[str], tolerance_db: float) -> list[str]:
@@ -67,7 +75,7 @@ def leave_out(model: FullModel, candidates: frozenset[str], tolerance_db: float)
         trials = []
         for name in sorted(candidates & kept):
             if not _needed(name, kept):
-                loss = worth(model.loss(kept - {name}))
+                loss = decisive(model.loss(kept - {name}))
                 trials.append((round(loss / ALIKE_DB), _rank(name), name, loss))
         if not trials or min(trials)[-1] > tolerance_db:
             return order
@@ -96,12 +104,8 @@ def effect_row(model: FullModel, name: str, kept: frozenset[str]) -> Effect:
             {"diffuse_1", *NEEDS["diffuse_1"]}
         )  # without its only lobe a surface scatters nothing
     loss = model.loss(model.all - lost)
-    image, total = (float(np.sqrt(np.mean(x**2))) for x in loss)
-    dark = (
-        [float(np.sqrt(np.mean(x[model.blocked] ** 2))) for x in loss]
-        if model.blocked.any()
-        else [None, None]
-    )
+    image, total = (rms(x) for x in loss)
+    dark = [rms(x[model.blocked]) if model.blocked.any() else None for x in loss]
     stays = name in kept and not (lobe and "diffuse_1" not in kept)
     seconds, reason = model.seconds.get(name), _reason(model, name, lost)
     return Effect(name, image, total, dark[0], dark[1], seconds, stays, reason)

@@ -235,16 +235,15 @@ class FullModel:
         start = time.perf_counter()
         field.element_light(field.transmitter)
         setup_s = (time.perf_counter() - start) / len(receivers)
-        start = time.perf_counter()
         self.sights: list[Sight] = []
+        composed, seconds = [], []
         for r, receiver in enumerate(receivers):
+            start = time.perf_counter()
             self.sights.append(field.see(receiver))
-            progress("relevance", r, 2 * len(receivers))
-        composed = []
-        for r, sight in enumerate(self.sights):
-            composed.append(field.compose(sight))
-            progress("relevance", len(receivers) + r, 2 * len(receivers))
-        self.spectrum_s = (time.perf_counter() - start) / len(receivers)
+            composed.append(field.compose(self.sights[-1]))
+            seconds.append(time.perf_counter() - start)
+            progress("relevance", r, len(receivers) + 1)
+        self.spectrum_s = float(np.median(seconds))
         self._specular_power = [c.specular for c in composed]
         self.blocked = np.array([not (s.paths.order == 0).any() for s in self.sights])
         self._time(setup_s)
