@@ -32,8 +32,8 @@ DATA = "data/lobby"
 CARRIERS_HZ = (140e9, 300e9)
 ROUGHNESS = {"as assumed": 1.0, "rough (x3)": 3.0, "smooth (x1/3)": 1.0 / 3.0}
 TOLERANCES_DB = (0.1, 1.0)
-CHOOSERS = 8
-JUDGES = 8
+CHOOSERS = 12  # with 8 the few receivers that a mirror lights strongly may be missed
+JUDGES = 12
 TRAINING = 10
 TEST = 20
 

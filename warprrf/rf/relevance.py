@@ -224,7 +224,8 @@ def relevance(
     Args:
         geometry: a Scene (its materials count), a fitted bistatic field (its parameters count, also for terms that its
             fit left out), or a Reconstruction or Mesh (materials are assumed, and the table says so).
-        receivers: a handful of positions [m], shape ``(R, 3)``, blocked ones among them: about ten are enough.
+        receivers: some positions [m], shape ``(R, 3)``, blocked ones among them: a dozen or more, since a mirror may
+            matter much to few.
         transmitter: position [m], shape ``(3,)``; a field's own by default.
         frequency_hz: carrier [Hz]; a field's own by default.
         tolerance_db: what all that is left out may change together [dB].
