@@ -1,8 +1,8 @@
 """What reaches a receiver behind an obstacle, estimated: round its edges by diffraction, through it by transmission.
 
-Neither is part of a radio field: indoors at terahertz both are far below what surfaces scatter and mirror, which
-:func:`warprrf.relevance` checks with these estimates. They err on the strong side: every edge is a knife edge seen
-alone, and of an obstacle only the wall that a ray enters by weakens it.
+Neither is part of a radio field; :func:`warprrf.relevance` tells with these estimates where that matters. They err on
+the strong side: an edge is a knife edge seen alone, and of an obstacle only the wall that a ray enters by weakens it.
+What goes over two edges is left out.
 """
 
 from __future__ import annotations
