@@ -13,7 +13,9 @@ from warprrf import cli
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
-COMMANDS = ("lobby", "reconstruct", "simulate", "fit", "render", "evaluate", "twin", "bench", "data")
+COMMANDS = (
+    "lobby", "reconstruct", "simulate", "fit", "relevance", "render", "evaluate", "twin", "bench", "data",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("command", (*COMMANDS, "bench newrf", "bench bistatic"))
@@ -54,6 +56,23 @@ BAD = {
     "geometry of unknown kind": (
         ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
         ".ply",
+    ),
+    "nowhere to look": (["relevance", "{scene}"], "--receivers"),
+    "relevance of nothing": (["relevance", "{tmp}/none.xml", "--receivers", "2,2,1"], "none.xml"),
+    "carrier of no material": (
+        [
+            "relevance",
+            "{scene}",
+            "--receivers",
+            "2,2,1",
+            "--transmitter",
+            "3",
+            "2",
+            "3",
+            "--frequency",
+            "5e9",
+        ],
+        "frequency",
     ),
     "corrupt spectra": (["fit", "{scene}", "{tmp}/bad.nc", "-o", "{tmp}/f.safetensors"], "bad.nc"),
     "corrupt field": ([*RENDER, "{tmp}/bad.safetensors", "--receiver", "1", "1", "1"], "bad.safetensors"),

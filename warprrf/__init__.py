@@ -28,6 +28,7 @@ _HOMES = {
     "Paths": "rf.paths",
     "RadioField": "rf.field",
     "Rasterizer": "geometry.render",
+    "Relevance": "rf.relevance",
     "Reconstruction": "geometry.reconstruction",
     "Scene": "rf.scene",
     "Spectrum": "rf.spectrum",
@@ -35,9 +36,11 @@ _HOMES = {
     "blend_weights": "geometry.render",
     "evaluate": "rf.metrics",
     "fit_reflections": "rf.reflections",
+    "gas_attenuation_db_per_m": "rf.absorption",
     "load_newrf": "rf.newrf",
     "load_sionna_scene": "rf.sionna_engine",
     "reconstruct": "geometry.reconstruction",
+    "relevance": "rf.relevance",
     "render": "geometry.render",
     "simulate": "rf.simulate",
     "trace_paths": "rf.paths",
@@ -57,6 +60,7 @@ if TYPE_CHECKING:
     from warprrf.geometry.render import Rasterizer as Rasterizer
     from warprrf.geometry.render import blend_weights as blend_weights
     from warprrf.geometry.render import render as render
+    from warprrf.rf.absorption import gas_attenuation_db_per_m as gas_attenuation_db_per_m
     from warprrf.rf.dataset import SpectrumDataset as SpectrumDataset
     from warprrf.rf.field import RadioField as RadioField
     from warprrf.rf.materials import Material as Material
@@ -65,6 +69,8 @@ if TYPE_CHECKING:
     from warprrf.rf.paths import Paths as Paths
     from warprrf.rf.paths import trace_paths as trace_paths
     from warprrf.rf.reflections import fit_reflections as fit_reflections
+    from warprrf.rf.relevance import Relevance as Relevance
+    from warprrf.rf.relevance import relevance as relevance
     from warprrf.rf.scene import Scene as Scene
     from warprrf.rf.simulate import simulate as simulate
     from warprrf.rf.sionna_engine import load_sionna_scene as load_sionna_scene

@@ -167,6 +167,9 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
     dataset = wr.SpectrumDataset.load(_existing(args.spectra))
     if args.train is not None:
         dataset = dataset.split(args.train, seed=args.seed)[0]
+    ruled = {} if args.relevance is None else {"relevance": wr.Relevance.load(_existing(args.relevance))}
+    if ruled and args.model != "bistatic":
+        raise ValueError(f"--relevance: only the bistatic model takes it, got --model {args.model}")
     field = wr.RadioField.fit(
         geometry,
         dataset,
@@ -175,9 +178,42 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
         progress=bars,
         device=args.device,
         **_iterations(args),
+        **ruled,
     )
     field.save(args.out)
     print(f"{args.out}: {args.model} fitted on {len(dataset.receivers)} receivers")
+
+
+def _relevance(args: argparse.Namespace, bars: Bars) -> None:
+    source = _existing(args.source)
+    given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
+    receivers = None if args.receivers is None else _read_receivers(args.receivers)
+    if args.spectra is not None:
+        dataset = wr.SpectrumDataset.load(_existing(args.spectra))
+        measured = {"transmitter": dataset.transmitter, "frequency_hz": float(dataset.frequency_hz)}
+        given = {name: measured[name] if value is None else value for name, value in given.items()}
+        receivers = dataset.receivers if receivers is None else receivers
+    if receivers is None:
+        raise ValueError(
+            "--receivers: none given, expected positions, or --spectra with a file that holds some"
+        )
+    if len(receivers) > args.most:
+        receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
+    fitted = source.suffix == ".safetensors"
+    found = wr.relevance(
+        wr.RadioField.load(source) if fitted else _load_geometry(args.source, args.mesh),
+        receivers=receivers,
+        tolerance_db=args.tolerance,
+        progress=bars,
+        device=args.device,
+        **given,
+    )
+    bars._close()
+    print(found.table())
+    if args.out:
+        found.save(args.out)
+        text = found.table() + "\n"
+        write_atomically(Path(args.out).with_suffix(".md"), lambda name: Path(name).write_text(text))
 
 
 def _render(args: argparse.Namespace, bars: Bars) -> None:
@@ -284,9 +320,20 @@ def _bench_bistatic(args: argparse.Namespace, bars: Bars) -> None:
     print(f"\n{Path(out) / 'bistatic.md'}: the tables with pictures; bistatic.json: every figure")
 
 
+def _bench_relevance(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import relevance
+
+    report = relevance.run(
+        args.out or "runs/relevance", args.data or relevance.DATA, device=args.device, progress=bars
+    )
+    bars._close()
+    print(relevance.summary_text(report))
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "newrf": _bench_newrf,
     "bistatic": _bench_bistatic,
+    "relevance": _bench_relevance,
 }
 """Benchmarks by name: what `warprrf bench NAME` runs."""
 
@@ -516,7 +563,30 @@ def _parser() -> argparse.ArgumentParser:
         "--train", type=int, metavar="N", help="receivers of the nested training subset (default: all)"
     )
     fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is a .ply")
+    fit.add_argument(
+        "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: terms ruled out are off"
+    )
     fit.add_argument("--iterations", type=int, help="optimiser steps (default: the model's)")
+
+    rel = add(
+        "relevance",
+        _relevance,
+        "what each effect is worth in a scene, and the smallest model",
+        HELP_RELEVANCE,
+    )
+    rel.add_argument(
+        "source", help="scene (.xml), reconstruction's folder, splats (.ply) or field (.safetensors)"
+    )
+    rel.add_argument("-o", "--out", help="JSON file; the table goes beside it as Markdown")
+    rel.add_argument("--spectra", help="NetCDF file whose transmitter, carrier and receivers are used")
+    rel.add_argument("--transmitter", nargs=3, type=float, metavar=("X", "Y", "Z"), help="metres")
+    rel.add_argument("--receivers", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")
+    rel.add_argument("--frequency", type=float, metavar="HZ", help="carrier (a field's own)")
+    rel.add_argument("--tolerance", type=float, default=0.1, metavar="DB", help="default 0.1")
+    rel.add_argument(
+        "--most", type=int, default=12, metavar="N", help="receivers used, drawn by --seed (default 12)"
+    )
+    rel.add_argument("--mesh", help="mesh for line of sight, where SOURCE is a .ply")
 
     ren = add("render", _render, "a picture from Gaussians, or a spectrum from a radio field", HELP_RENDER)
     ren.add_argument("source", help="Gaussians (.ply) or a radio field (.safetensors)")
@@ -553,6 +623,11 @@ def _parser() -> argparse.ArgumentParser:
     newrf = add("newrf", _bench, "rays and channels of NeWRF's conference room", HELP_BENCH, tables)
     newrf.add_argument("--out", help="folder of the results (default runs/newrf)")
     newrf.add_argument("--data", help="folder of its files")
+    worth = add(
+        "relevance", _bench, "what each effect is worth, at two bands and roughnesses", HELP_BENCH, tables
+    )
+    worth.add_argument("--out", help="folder of the results (default runs/relevance)")
+    worth.add_argument("--data", help="folder of the scene (default data/lobby)")
     ours = add("bistatic", _bench, "the bistatic field beside other systems", HELP_BENCH_BISTATIC, tables)
     ours.add_argument("--out", help="folder of the results (default runs/bistatic)")
     ours.add_argument(
@@ -623,6 +698,18 @@ examples:
   warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
 """
 
+HELP_RELEVANCE = """\
+Each effect is left out of the full model in turn: line of sight, mirrors, diffuse bounces, lobes, what no receiver
+sees, and, as estimates, the air, diffraction and transmission. What it is worth is the larger of the changes of the dB
+image and of the total path gain, rms over receivers. The smallest model within the tolerance follows; a fit can use it.
+
+examples:
+  warprrf relevance data/lobby/scene.xml --spectra data/lobby/spectra.nc -o relevance.json
+  warprrf relevance data/lobby/scene.xml --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5 --frequency 140e9
+  warprrf relevance field.safetensors --receivers receivers.csv --tolerance 0.5
+  warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
+"""
+
 HELP_RENDER = """\
 examples:
   warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
@@ -652,6 +739,7 @@ HELP_BENCH = """\
 Prints a table and writes it as JSON and Markdown.
 
 examples:
+  warprrf bench relevance
   warprrf bench newrf
   warprrf bench newrf --data external/newrf --out runs/newrf
   warprrf bench bistatic --truths exact --counts 10 50

@@ -24,6 +24,7 @@ from warprrf.rf.uncertainty import ErrorModel, learn_errors
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
+    from warprrf.rf.relevance import Relevance
 
 ROWS = 30_000  # pixels that groups are fitted to, spread over the training receivers
 LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so no term is chosen
@@ -77,21 +78,29 @@ def trace(
     ds: SpectrumDataset,
     *,
     lobes: tuple[int, ...] | None = None,
+    mirror_order: int | None = None,
     device: Any = None,
     progress: Progress | None = None,
 ) -> BistaticTransport:
-    """Trace the receivers of ``ds`` on ``geometry`` (a Reconstruction, Scene, Mesh or Surface)."""
+    """Trace the receivers of ``ds`` on ``geometry`` (a Reconstruction, Scene, Mesh or Surface), mirrors up to
+    ``mirror_order`` (None: 3)."""
     started = time.perf_counter()
     surface = geometry if isinstance(geometry, Surface) else Surface.of(geometry)
     receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
     # everything that may be asked for
-    terms = Terms(mirror_order=MOST_MIRRORS, mirror_scatter=True, lobes=LOBES if lobes is None else lobes)
+    order = MOST_MIRRORS if mirror_order is None else mirror_order
+    terms = Terms(mirror_order=order, mirror_scatter=True, lobes=LOBES if lobes is None else lobes)
     blank = _blank(surface, ds, terms, device)
     source = blank.transmitter
     found = specular_paths(
-        surface, source, receivers, blank.wavelength_m, order=MOST_MIRRORS, tree=blank.mirror_tree(source),
+        surface,
+        source,
+        receivers,
+        blank.wavelength_m,
+        order=order,
+        tree=blank.mirror_tree(source),
         device=device,
-    )  # fmt: skip
+    )
     sights = []
     for r, receiver in enumerate(receivers):
         sights.append(blank.see(receiver, paths=found.subset(np.flatnonzero(found.receiver == r))))
@@ -119,6 +128,7 @@ def train(
     gain_offset: bool = False,
     iterations: int = _fit.MAX_STEPS,
     transport: BistaticTransport | None = None,
+    relevance: Relevance | None = None,
     seed: int = 0,
     device: Any = None,
     progress: Progress | None = None,
@@ -142,6 +152,8 @@ def train(
         gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
         iterations: most steps of the groups' fit.
         transport: what :func:`trace` found for exactly these receivers.
+        relevance: what :func:`warprrf.relevance` found: terms that it rules out are off, others stay free. Terms given
+            here count for more.
         seed: of the choice of pixels and held-out receivers.
         device: where rays are cast.
         progress: called with the stages ``"transport"`` and ``"fit"``.
@@ -157,12 +169,18 @@ def train(
         "diffuse_order": diffuse_order, "indirect": indirect, "residual": residual,
     }  # fmt: skip
     fixed: dict[str, Any] = {"line_of_sight": bool(line_of_sight), "diffuse": bool(diffuse)}
+    if relevance is not None:
+        ruled = relevance.options(float(ds.frequency_hz))
+        fixed = {name: value and ruled[name] for name, value in fixed.items()}
+        wanted = {name: ruled[name] if value is None else value for name, value in wanted.items()}
+        lobes = ruled["lobes"] if lobes is None else lobes
     given: dict[str, Any] = {k: v for k, v in wanted.items() if v is not None}
     Terms(**fixed, lobes=LOBES if lobes is None else lobes, **given)
     check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float32)
     if len(ds.receivers) == 0 or not (ds.path_gain > ds.floor).any():
         raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
-    seen = transport or trace(geometry, ds, lobes=lobes, device=device, progress=progress)
+    order = wanted["mirror_order"]
+    seen = transport or trace(geometry, ds, lobes=lobes, mirror_order=order, device=device, progress=progress)
     _check_transport(seen, ds, lobes)
     return _Training(seen, ds, gain_offset, int(iterations), seed, device, progress).run(fixed, wanted)
 

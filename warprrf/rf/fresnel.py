@@ -97,6 +97,26 @@ def slab_reflection(
     return te * (1.0 - echo) / (1.0 - te**2 * echo), tm * (1.0 - echo) / (1.0 - tm**2 * echo)  # eq. (43a)
 
 
+def slab_transmission(
+    cos_incidence: Any, permittivity: Any, thickness_m: Any, wavelength_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Transmission of a slab: field across (TE) and in (TM) the plane of incidence; nothing leaves a half-space.
+
+    Source: ITU-R P.2040-4, eqs. (37a), (37b), (43b), (44).
+    """
+    cos = np.asarray(cos_incidence, dtype=np.float64)
+    eta = np.asarray(permittivity, dtype=np.complex128)
+    root = np.sqrt(eta - (1.0 - cos**2))
+    thickness = np.asarray(thickness_m, dtype=np.float64)
+    endless = np.isinf(thickness)
+    once = np.where(
+        endless, 0.0, np.exp(-2j * np.pi * np.where(endless, 0.0, thickness) / wavelength_m * root)
+    )
+    te = (cos - root) / (cos + root)
+    tm = (eta * cos - root) / (eta * cos + root)
+    return (1.0 - te**2) * once / (1.0 - te**2 * once**2), (1.0 - tm**2) * once / (1.0 - tm**2 * once**2)
+
+
 def lobe(alpha_r: int, cos_incidence: Any, cos_scatter: Any, cos_to_mirror: Any) -> np.ndarray:
     """Scattering lobe f_s [1/sr]: Lambertian for ``alpha_r`` 0, else ((1 + cos psi) / 2)^alpha_r, normalised.
 
