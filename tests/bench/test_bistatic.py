@@ -311,13 +311,17 @@ def test_calibration_of_errors_that_are_as_large_as_stated(data: Path) -> None:
         gain = (1e3 + 1) * flat.floor * 10 ** (error / 10) - flat.floor
         return SimpleNamespace(path_gain=gain, std_db=sigma)
 
-    row = checks.calibration(SimpleNamespace(errors=True, spectrum=spectrum), truth, lambda *_: None)  # type: ignore[arg-type]
+    field: Any = SimpleNamespace(errors=SimpleNamespace(outlier_db=30.0), spectrum=spectrum)
+    row = checks.calibration(field, truth, lambda *_: None)
     # 4 x 288 independent pixels: the standard deviation of a share is at most 1.5 %.
     assert row["within_1_sigma"] == pytest.approx(0.683, abs=0.05)
     assert row["within_1_sigma_lit"] == row["within_1_sigma"]  # all are 30 dB above the floor
     assert row["within_2_sigma"] == pytest.approx(0.954, abs=0.03)
     assert np.abs(np.array(row["shares"]) - row["levels"]).max() < 0.06
-    assert row["nll"] == pytest.approx(0.5, abs=0.12)  # mean of ln sigma is 0
+    assert row["nll_gaussian"] == pytest.approx(
+        0.5 + 0.5 * np.log(2 * np.pi), abs=0.12
+    )  # mean of ln sigma is 0
+    assert row["nll"] == pytest.approx(row["nll_gaussian"] - np.log(0.95), abs=0.03)  # none is an outlier
     assert row["nll"] < row["nll_constant"] - 0.3
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 ROWS = 30_000  # pixels that groups are fitted to, spread over the training receivers
 LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so no term is chosen
 MOST_HELD_OUT = 10
+FEW_RECEIVERS = 20  # up to which errors are learned from every receiver, held out in turn
 MOST_TO_CHOOSE = 20  # receivers that fits which only decide about a term learn from
 SHORT_STEPS = 6  # of a fit that only decides about a term
 BETTER = 0.995  # a term must lower the held-out mean square error at least to this share
@@ -231,8 +232,7 @@ class _Training:
         if len(self.held):
             fit = self._groups(terms, start, self.kept[:MOST_TO_CHOOSE], SHORT_STEPS * 2)
             terms, fit, residual = self._choose(terms, free, fit)
-            held = self._field(terms, fit, residual)
-            errors = self._errors(held, fit)
+            errors = self._errors(terms, fit, residual)
             start = fit.parameters
         fit = self._groups(terms, start, np.arange(self.count), self.steps)
         residual = (
@@ -325,12 +325,27 @@ class _Training:
     def _image(self, field: BistaticField, receiver: int) -> np.ndarray:
         return NEPER * np.log1p(field.compose(self.seen.sights[receiver]).image / self.ds.floor)
 
-    def _errors(self, field: BistaticField, fit: Fit) -> ErrorModel:
-        images = [self._image(field, r) for r in self.held]
-        errors = [image - self.target[r] for image, r in zip(images, self.held, strict=True)]
-        kept = np.asarray(self.ds.receivers)[self.kept]
-        gaps = np.array([np.linalg.norm(kept - self.ds.receivers[r], axis=1).min() for r in self.held])
-        return learn_errors(images, errors, gaps, np.asarray(self.ds.receivers, float), fit.covariance)
+    def _errors(self, terms: Terms, fit: Fit, residual: np.ndarray | None) -> ErrorModel:
+        """Learned from the receivers held out; where they are few, from all, held out in turn."""
+        receivers = np.asarray(self.ds.receivers, float)
+        images, errors, gaps = [], [], []
+        folds = [self.held]
+        if self.count <= FEW_RECEIVERS:
+            rest = np.array_split(self.kept, max(len(self.kept) // max(len(self.held), 2), 2))
+            folds += rest
+        for held in folds:
+            kept = np.setdiff1d(np.arange(self.count), held)
+            if held is self.held:
+                field = self._field(terms, fit, residual)
+            else:
+                own = self._groups(terms, fit.parameters, kept, SHORT_STEPS, rounds=1)
+                bare = self._field(terms, own, None)
+                field = self._field(terms, own, self._residual(bare, kept)) if terms.residual else bare
+            for r in held:
+                images.append(self._image(field, r))
+                errors.append(images[-1] - self.target[r])
+                gaps.append(np.linalg.norm(receivers[kept] - receivers[r], axis=1).min())
+        return learn_errors(images, errors, np.array(gaps), receivers, fit.covariance)
 
     # ------------------------------------------------------------------------------------------ fitting
 

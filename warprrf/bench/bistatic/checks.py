@@ -23,6 +23,7 @@ from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.paths import MirrorTracer
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectrum import pixel_directions, to_db
+from warprrf.rf.uncertainty import negative_log_likelihood
 
 ABLATION: dict[str, dict[str, Any]] = {
     "no line of sight": {"line_of_sight": False},
@@ -74,8 +75,9 @@ def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[
     """How often the truth lies as near to the prediction as its standard deviation says, over the test pixels.
 
     Returns ``within_1_sigma`` and ``within_2_sigma`` (also ``..._blocked``, and ``..._lit`` of pixels whose truth or
-    prediction exceeds N0: the others are easy, and many); negative log likelihood of a pixel [nat],
-    less ln sqrt(2 pi), of the stated standard deviations and of the best constant one; the reliability curve
+    prediction exceeds N0: the others are easy, and many); negative log likelihood of a pixel [nat] of the stated
+    standard deviations and of the best constant one, both with the field's share of outliers, and as pure Gaussians
+    (``..._gaussian``); the reliability curve
     ``levels`` (stated share) and ``shares`` (found). ``{}`` if the field was fitted to too few receivers to know it.
     """
     if field.errors is None:
@@ -92,12 +94,17 @@ def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[
     blocked = ~test.line_of_sight
     lit = np.stack(levels) > test.floor
     rms = float(np.sqrt(np.mean(e**2)))
-    normal = NormalDist()
+    normal, outlier = NormalDist(), float(np.asarray(field.errors.outlier_db).item())
     row: dict[str, Any] = {
         "sigma_median_db": float(np.median(s)),
         "rms_error_db": rms,
-        "nll": float(np.mean(np.log(s) + 0.5 * (e / s) ** 2)),
-        "nll_constant": float(np.log(rms) + 0.5),
+        "nll": negative_log_likelihood(e, s, outlier),
+        "nll_constant": min(
+            negative_log_likelihood(e, c, outlier) for c in np.geomspace(0.01, 3.0, 200) * rms
+        ),
+        "nll_gaussian": float(0.5 * np.log(2.0 * np.pi) + np.mean(np.log(s) + 0.5 * (e / s) ** 2)),
+        "nll_gaussian_constant": float(0.5 * np.log(2.0 * np.pi) + np.log(rms) + 0.5),
+        "outlier_db": outlier,
         "levels": list(LEVELS),
         "shares": [float(np.mean(np.abs(e) <= normal.inv_cdf(0.5 * (1.0 + p)) * s)) for p in LEVELS],
     }

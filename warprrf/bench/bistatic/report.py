@@ -24,6 +24,7 @@ from warprrf.bench.bistatic.plots import (
 )
 from warprrf.bench.pictures import METHODS, spectrum_rows
 from warprrf.bench.stages import write_atomically
+from warprrf.rf.uncertainty import OUTLIERS
 
 ASKED_MARGIN_DB: dict[str, dict[str, dict[int, float]]] = {
     "exact": {"rf3dgs+": {10: 9.0, 50: 8.0, 400: 6.0}, "rf3dgs+los": {10: 7.0, 50: 6.0, 400: 5.0}},
@@ -310,6 +311,9 @@ def _calibration_table(rows: list[Row]) -> str:
                 ),
                 _cell(row.get("nll"), "{:.3f}"),
                 _cell(row.get("nll_constant"), "{:.3f}"),
+                _cell(row.get("nll_gaussian"), "{:.2f}")
+                + " / "
+                + _cell(row.get("nll_gaussian_constant"), "{:.2f}"),
                 _cell(row.get("sigma_median_db"), "{:.2f}"),
                 _cell(row.get("rms_error_db"), "{:.2f}"),
             ]
@@ -317,11 +321,12 @@ def _calibration_table(rows: list[Row]) -> str:
     wanted = "; ".join(f"{low:.0%} to {high:.0%} within {k} sigma" for k, (low, high) in ASKED_WITHIN.items())
     head = (
         "truth", "receivers", "within 1 sigma", "lit", "blocked", "within 2 sigma", "lit", "blocked",
-        "negative log likelihood", "of the best constant sigma", "median sigma [dB]", "rms error [dB]",
+        "negative log likelihood", "of the best constant sigma", "both as Gaussians", "median sigma [dB]",
+        "rms error [dB]",
     )  # fmt: skip
     text = (
         f"Asked: {wanted}. `lit`: pixels whose truth or prediction is above the floor. Negative log likelihood of a "
-        "pixel, less ln sqrt(2 pi)."
+        f"pixel [nat], a share of {OUTLIERS:g} of the pixels taken to be outliers."
     )
     return f"{text}\n\n{_table(head, lines)}"
 
