@@ -30,7 +30,7 @@ ROWS = 30_000  # pixels that groups are fitted to, spread over the training rece
 LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so no term is chosen
 MOST_HELD_OUT = 10
 FEW_RECEIVERS = 20  # up to which errors are learned from every receiver, held out in turn
-MOST_TO_CHOOSE = 20  # receivers that fits which only decide about a term learn from
+MOST_TO_CHOOSE = 12  # receivers that fits which only decide about a term learn from
 SHORT_STEPS = 6  # of a fit that only decides about a term
 BETTER = 0.995  # a term must lower the held-out mean square error at least to this share
 MORE: tuple[tuple[str, Any], ...] = (
@@ -265,14 +265,14 @@ class _Training:
     def _choose(self, terms: Terms, free: set[str], fit: Fit) -> tuple[Terms, Fit, np.ndarray | None]:
         """Terms that lower the held-out error, one after another, each with a short fit of its own."""
         some = self.kept[:MOST_TO_CHOOSE]
-        best = self._held_error(self._field(terms, fit, None))
+        best = self._held_error(terms, fit)
         self.log.append({"term": "single bounces", "kept": True, "held_out_rmse_db": float(np.sqrt(best))})
         for name, value in MORE:
             if name not in free or (name not in ("mirror_order",) and not terms.diffuse):
                 continue
             trial = replace(terms, **{name: value})
             found = self._groups(trial, fit.parameters, some, SHORT_STEPS, rounds=1)
-            error = self._held_error(self._field(trial, found, None))
+            error = self._held_error(trial, found)
             keep = error < BETTER * best
             self.log.append(
                 {
@@ -289,7 +289,8 @@ class _Training:
         if terms.residual or "residual" in free:
             base = self._field(terms, fit, None)
             found_residual = self._residual(base, self.kept)
-            error = self._held_error(
+            best = self._image_error(base)
+            error = self._image_error(
                 replace(base, terms=replace(terms, residual=True), residual=found_residual)
             )
             keep = terms.residual or error < BETTER * best
@@ -303,13 +304,14 @@ class _Training:
     def _regroup(self, terms: Terms, fit: Fit, best: float) -> tuple[Fit, float]:
         """Materials by what the spectra say, if that lowers the held-out error."""
         before, trial = self.material, fit
-        for _ in range(REGROUPED):
-            views = self._views(terms, trial, self.kept, True)
+        for k in range(REGROUPED):
+            chosen = self.kept if k == REGROUPED - 1 else self.kept[: 2 * MOST_TO_CHOOSE]
+            views = self._views(terms, trial, chosen, True)
             self.material, start = regroup(
                 views, trial.parameters, self.material, self.surface.look, self.area
             )
-            trial = self._groups(terms, start, self.kept, SHORT_STEPS, rounds=1)
-        error = self._held_error(self._field(terms, trial, None))
+            trial = self._groups(terms, start, chosen, SHORT_STEPS, rounds=1)
+        error = self._held_error(terms, trial)
         keep = error < best
         name = f"{before.max() + 1} materials as {self.material.max() + 1}"
         self.log.append({"term": name, "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))})
@@ -318,7 +320,18 @@ class _Training:
             return fit, best
         return trial, error
 
-    def _held_error(self, field: BistaticField) -> float:
+    def _held_error(self, terms: Terms, fit: Fit) -> float:
+        """Mean square error of the held-out receivers without residual [dB^2]: of whole images where they are few,
+        else at the chosen pixels."""
+        if len(self.held) <= LEAST_TO_HOLD_OUT:
+            return self._image_error(self._field(terms, fit, None))
+        views = self._views(terms, fit, self.held, False)
+        gaps = [
+            NEPER * np.log1p(_fit.predict(v.tied(self.material), fit.parameters)) - v.target_db for v in views
+        ]
+        return float(np.mean(np.concatenate(gaps) ** 2))
+
+    def _image_error(self, field: BistaticField) -> float:
         """Mean square error of the dB images of the held-out receivers [dB^2]."""
         return float(np.mean([np.mean((self._image(field, r) - self.target[r]) ** 2) for r in self.held]))
 
