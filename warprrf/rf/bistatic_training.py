@@ -40,9 +40,8 @@ MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_order", 2),
     ("mirror_order", 3),
     ("scatter_mirror", True),
-    ("indirect", True),
 )
-"""Terms that may be added to single bounces, in the order in which they are tried."""
+"""Bounces that may be added to single ones, in the order in which they are tried."""
 FEW_MATERIALS = 30
 REGROUPED = 3  # rounds of deciding what is of one material, and fitting
 OUTER = 2  # rounds of further bounces and groups in turn
@@ -264,27 +263,18 @@ class _Training:
 
     def _choose(self, terms: Terms, free: set[str], fit: Fit) -> tuple[Terms, Fit, np.ndarray | None]:
         """Terms that lower the held-out error, one after another, each with a short fit of its own."""
-        some = self.kept[:MOST_TO_CHOOSE]
         best = self._held_error(terms, fit)
         self.log.append({"term": "single bounces", "kept": True, "held_out_rmse_db": float(np.sqrt(best))})
-        for name, value in MORE:
-            if name not in free or (name not in ("mirror_order",) and not terms.diffuse):
-                continue
-            trial = replace(terms, **{name: value})
-            found = self._groups(trial, fit.parameters, some, SHORT_STEPS, rounds=1)
-            error = self._held_error(trial, found)
-            keep = error < BETTER * best
-            self.log.append(
-                {
-                    "term": f"{name} {value}" if value is not True else name,
-                    "kept": bool(keep),
-                    "held_out_rmse_db": float(np.sqrt(error)),
-                }
-            )
-            if keep:
-                terms, fit, best = trial, found, error
+        bounces = [
+            (name, value) for name, value in MORE if name in free and (terms.diffuse or "order" in name)
+        ]
+        for name, value in bounces:
+            terms, fit, best = self._tried(name, value, terms, fit, best)
         if np.isfinite(self.surface.look).all() and self.material.max() > 0:
             fit, best = self._regroup(terms, fit, best)
+        # Last, because it would stand in for whatever a wrong material leaves dark.
+        if "indirect" in free and terms.diffuse:
+            terms, fit, best = self._tried("indirect", True, terms, fit, best)
         residual = None
         if terms.residual or "residual" in free:
             base = self._field(terms, fit, None)
@@ -300,6 +290,16 @@ class _Training:
             if keep:
                 terms, residual = replace(terms, residual=True), found_residual
         return terms, fit, residual
+
+    def _tried(self, name: str, value: Any, terms: Terms, fit: Fit, best: float) -> tuple[Terms, Fit, float]:
+        """``terms`` with one more, its fit and error, if that error is lower; else as they were."""
+        trial = replace(terms, **{name: value})
+        found = self._groups(trial, fit.parameters, self.kept[:MOST_TO_CHOOSE], SHORT_STEPS, rounds=1)
+        error = self._held_error(trial, found)
+        keep = error < BETTER * best
+        label = name if value is True else f"{name} {value}"
+        self.log.append({"term": label, "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))})
+        return (trial, found, error) if keep else (terms, fit, best)
 
     def _regroup(self, terms: Terms, fit: Fit, best: float) -> tuple[Fit, float]:
         """Materials by what the spectra say, if that lowers the held-out error."""
