@@ -21,6 +21,19 @@ import numpy as np
 
 import warprrf as wr
 from warprrf.bench.stages import write_atomically, write_json
+from warprrf.cli_help import (
+    HELP_BENCH,
+    HELP_BENCH_BISTATIC,
+    HELP_DATA,
+    HELP_EVALUATE,
+    HELP_FIT,
+    HELP_LOBBY,
+    HELP_RECONSTRUCT,
+    HELP_RELEVANCE,
+    HELP_RENDER,
+    HELP_SIMULATE,
+    HELP_TWIN,
+)
 from warprrf.device import require
 
 EPILOG = """\
@@ -653,118 +666,6 @@ def _parser() -> argparse.ArgumentParser:
         help="all 800 receivers too (spectra_full.nc and spectra_sionna_full.nc)",
     )
     return parser
-
-
-HELP_LOBBY = """\
-Continues where a killed run stopped; each stage is redone only if its inputs or its code changed. Writes report.html,
-report.json (every figure), geometry.ply (Gaussians, opens in any splat viewer), mesh.ply, field.safetensors and
-cameras.json. About 15 minutes on two cores, no GPU.
-
-examples:
-  warprrf lobby
-  warprrf lobby --reduced --out runs/quick        few photos and steps, to see it run
-"""
-
-HELP_RECONSTRUCT = """\
-The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
-their depth is fused into a mesh. Photos know no scale: name the measured positions of at least three cameras.
-
-examples:
-  warprrf reconstruct photos/ -o room --known-positions surveyed.json
-  where surveyed.json holds {"view_000.jpg": [1.20, 0.85, 1.60], ...} in metres
-Overlap matters most: every surface in five photos or more, loops that look across the room.
-"""
-
-HELP_SIMULATE = """\
-`exact` evaluates line of sight, mirror reflections and one diffuse bounce without sampling noise, on Warp's mesh rays.
-`sionna` asks Sionna RT's PathSolver (extra: sionna) for line of sight, mirror and diffuse paths up to --depth.
-A killed run continues: finished receivers wait in OUT.receivers/. An eighth of the receivers is marked for test.
-A spectrum is path gain per pixel over the full sphere, spread by the receiver beam; its sum is the total path gain.
-
-examples:
-  warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5
-  warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
-"""
-
-HELP_FIT = """\
-Geometry stays frozen; blending weights are computed once per receiver, then the radio part is fitted on them.
-
-  bistatic  line of sight, mirrors and scattering lobes of material groups; holds for other transmitters too
-  rf3dgs+   directional gain per Gaussian times the path-length law; delay and departure angle from geometry
-  rf3dgs    directional gain without lengths; delay and departure angle as trained channels of their own
-
-examples:
-  warprrf fit room spectra.nc -o field.safetensors
-  warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
-"""
-
-HELP_RELEVANCE = """\
-Each effect is left out of the full model in turn: line of sight, mirrors, diffuse bounces, lobes, what no receiver
-sees, and, as estimates, the air, diffraction and transmission. What it is worth is the larger of the changes of the dB
-image and of the total path gain, rms over receivers. The smallest model within the tolerance follows; a fit can use it.
-
-examples:
-  warprrf relevance data/lobby/scene.xml --spectra data/lobby/spectra.nc -o relevance.json
-  warprrf relevance data/lobby/scene.xml --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5 --frequency 140e9
-  warprrf relevance field.safetensors --receivers receivers.csv --tolerance 0.5
-  warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
-"""
-
-HELP_RENDER = """\
-examples:
-  warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
-  warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.npz       path_gain, delay_s, aod as arrays
-  warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
-"""
-
-HELP_EVALUATE = """\
-Whole receivers are held out, the same for every method; beside the field stand lookups that know no geometry (nearest
-measurement, inverse distance, a constant, the mean image). `blocked` counts receivers without line of sight alone.
-
-examples:
-  warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
-"""
-
-HELP_TWIN = """\
-Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
-opens the scene as it is, all lobes Lambertian; `warprrf.load_sionna_scene` sets the scattering patterns too, and
-`warprrf simulate` takes it as any scene. A material has one curve and one lobe: what the projection misses is printed.
-
-examples:
-  warprrf twin field.safetensors -o twin
-  warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
-"""
-
-HELP_BENCH = """\
-Prints a table and writes it as JSON and Markdown.
-
-examples:
-  warprrf bench relevance
-  warprrf bench newrf
-  warprrf bench newrf --data external/newrf --out runs/newrf
-  warprrf bench bistatic --truths exact --counts 10 50
-"""
-
-HELP_BENCH_BISTATIC = """\
-Fits the bistatic field, RF-3DGS+ and lookups on the same receivers and scores them on held-out ones; then ablation,
-stated uncertainty, delays, a second transmitter, Sionna against itself, Gauss-Newton against Adam. Every row is kept:
-a killed run loses one, and a row is made again only if its data, geometry, options or code changed.
-
-examples:
-  warprrf bench bistatic
-  warprrf bench bistatic --truths exact --counts 10 --every 4 --out runs/quick     a first look, in minutes
-  warprrf bench bistatic --data spectra_full.nc spectra_sionna_full.nc --geometry room
-"""
-
-HELP_DATA = """\
-Builds the scene (meshes, textures, materials), renders the photos with Mitsuba and simulates the spectra with both
-engines; needs the extras photos and sionna, and an LLVM of at least 17 for Dr.Jit. Finished photos and receivers are
-kept, so that a killed run continues.
-
-examples:
-  warprrf data
-  warprrf data --only spectra
-"""
 
 
 if __name__ == "__main__":

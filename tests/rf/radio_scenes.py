@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.dataset import SpectrumDataset
+from warprrf.rf.exact import ExactEngine
 
 EPSILON_0 = 8.8541878128e-12
 
@@ -66,3 +68,18 @@ def square(half, z=0.0):
     """A horizontal square sheet, normal up."""
     v = [[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]
     return np.array(v, float), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, sub_pixels=6):
+    """Spectra of ``receivers`` by the exact engine, as a data set."""
+    engine = ExactEngine(
+        scene, transmitter=transmitter, frequency_hz=frequency_hz, shape=shape, beam_sigma_rad=sigma,
+        sub_pixels=sub_pixels,
+    )  # fmt: skip
+    found = [engine.receive(r) for r in receivers]
+    return SpectrumDataset.from_spectra(
+        receivers=receivers, transmitter=transmitter, frequency_hz=frequency_hz,
+        path_gain=np.stack([f.path_gain for f in found]), delay_s=np.stack([f.delay_s for f in found]),
+        aod=np.stack([f.aod for f in found]), line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=sigma,
+        engine="exact",
+    )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined  # noqa: E402
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.rf import bistatic_fit as fitting
 from warprrf.rf.bistatic import BistaticField, Terms
@@ -49,16 +49,7 @@ def scene() -> RadioScene:
 
 
 def spectra(scene: RadioScene, receivers: np.ndarray, transmitter: np.ndarray = TX) -> SpectrumDataset:
-    engine = ExactEngine(
-        scene, transmitter=transmitter, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, sub_pixels=6
-    )
-    found = [engine.receive(r) for r in receivers]
-    return SpectrumDataset.from_spectra(
-        receivers=receivers, transmitter=transmitter, frequency_hz=F,
-        path_gain=np.stack([f.path_gain for f in found]), delay_s=np.stack([f.delay_s for f in found]),
-        aod=np.stack([f.aod for f in found]), line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=SIGMA,
-        engine="exact",
-    )  # fmt: skip
+    return exact_spectra(scene, receivers, transmitter=transmitter, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
 
 
 @pytest.fixture(scope="module")

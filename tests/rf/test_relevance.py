@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined  # noqa: E402
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.absorption import gas_attenuation_db_per_m
 from warprrf.rf.bistatic import BistaticField, Terms
 from warprrf.rf.dataset import SpectrumDataset
-from warprrf.rf.exact import ExactEngine
 from warprrf.rf.field import RadioField
 from warprrf.rf.materials import Material, roughness_scattering
 from warprrf.rf.relevance import Relevance, relevance, relevances
@@ -51,16 +50,9 @@ def metal(roughness_m: float) -> Material:
 
 
 def spectra(scene: RadioScene) -> SpectrumDataset:
-    engine = ExactEngine(
-        scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA, sub_pixels=4
+    return exact_spectra(
+        scene, RECEIVERS, transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA, sub_pixels=4
     )
-    found = [engine.receive(r) for r in RECEIVERS]
-    return SpectrumDataset.from_spectra(
-        receivers=RECEIVERS, transmitter=TX, frequency_hz=F,
-        path_gain=np.stack([f.path_gain for f in found]), delay_s=np.stack([f.delay_s for f in found]),
-        aod=np.stack([f.aod for f in found]), line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=SIGMA,
-        engine="exact",
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined  # noqa: E402
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.rf.bistatic import BistaticField, Terms
 from warprrf.rf.bistatic_fit import Layout, Parameters, View, fit_groups, jacobian, predict
 from warprrf.rf.bistatic_training import trace
 from warprrf.rf.bounces import BeamOperator, fresnel_curves
 from warprrf.rf.dataset import SpectrumDataset
-from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.grouping import regroup
 from warprrf.rf.mirror_tree import MirrorTree
@@ -153,16 +152,7 @@ def scene() -> RadioScene:
 
 
 def spectra(scene: RadioScene, receivers: np.ndarray) -> SpectrumDataset:
-    sigma = np.radians(5.0)
-    engine = ExactEngine(
-        scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=sigma, sub_pixels=6
-    )
-    found = [engine.receive(r) for r in receivers]
-    return SpectrumDataset.from_spectra(
-        receivers=receivers, transmitter=TX, frequency_hz=F, path_gain=np.stack([f.path_gain for f in found]),
-        delay_s=np.stack([f.delay_s for f in found]), aod=np.stack([f.aod for f in found]),
-        line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=sigma, engine="exact",
-    )  # fmt: skip
+    return exact_spectra(scene, receivers, transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=np.radians(5.0))
 
 
 @pytest.fixture(scope="module")
