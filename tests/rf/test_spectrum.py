@@ -14,6 +14,7 @@ from warprrf.rf.spectrum import (
     spread,
     spread_paths,
     to_db,
+    unit_beams,
 )
 
 SIGMA = np.deg2rad(2.0)
@@ -133,3 +134,15 @@ def test_bad_paths_are_refused():
         spread([[0, 0, 0.0]], [1.0], (4, 8), SIGMA)
     with pytest.raises(ValueError, match="shape"):
         spread([[0, 0, 1.0]], [1.0], (4,), SIGMA)
+
+
+@pytest.mark.parametrize("sigma", [np.radians(2.0), np.radians(0.05), 1.2])
+def test_beams_made_at_once_are_those_made_one_by_one(sigma: float) -> None:
+    rng = np.random.default_rng(4)
+    directions = rng.normal(size=(12, 3))
+    directions[0], directions[1] = [0, 0, 1], [-1, 1e-9, 0]  # a pole, and the seam
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    together = unit_beams(directions, (30, 60), sigma)
+    for beam, direction in zip(together, directions, strict=True):
+        alone = spread(direction[None], np.ones(1), (30, 60), sigma)
+        assert np.allclose(beam, alone, rtol=1e-6, atol=1e-9)

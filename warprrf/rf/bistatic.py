@@ -31,7 +31,7 @@ from warprrf.rf.mirror_light import MirrorSight
 from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.paths import Paths
 from warprrf.rf.second_bounce import ElementLight, mirrored_scene, sent_power
-from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
+from warprrf.rf.spectrum import Spectrum, angles_from_directions, unit_beams
 from warprrf.rf.specular import SpecularPaths, specular_paths
 from warprrf.rf.surface import Surface
 from warprrf.rf.transport import check_receiver
@@ -294,9 +294,7 @@ class BistaticField(RadioField):
                 tree=self.mirror_tree(source),
                 device=self.device,
             )
-        beams = np.zeros((len(paths), *self.shape), np.float32)
-        for k, arrival in enumerate(paths.arrival):
-            beams[k] = spread(arrival[None], np.ones(1), self.shape, self.beam_sigma_rad, device=self.device)
+        beams = unit_beams(paths.arrival, self.shape, self.beam_sigma_rad)
         mirrored = None
         if self.terms.diffuse and self.terms.mirror_scatter:
             mirrored = self.element_light(source).mirrors.sight(receiver, met)

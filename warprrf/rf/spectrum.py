@@ -181,6 +181,30 @@ def spread_paths(
     return SpreadPaths(image.numpy(), np.where(index >= 0, lit[order][index], -1).astype(np.int32))
 
 
+def unit_beams(directions: np.ndarray, shape: tuple[int, int], sigma: float) -> np.ndarray:
+    """The beam of each unit vector ``directions`` (L, 3) by itself, shape ``(L, H, W)`` float32; each sums to one.
+
+    The same beams as :func:`spread`, all images at once: for tens of paths, not for thousands.
+    """
+    rows, columns = check_shape(shape)
+    out = np.zeros((len(directions), rows * columns), np.float32)
+    pixels = pixel_directions(shape).reshape(-1, 3)
+    solid_angle = np.repeat(pixel_solid_angles(shape), columns)
+    limit = 4.0 * np.sin(0.5 * _cutoff(shape, sigma)) ** 2 * (1.0 + 1e-12)
+    for k, d in enumerate(directions):
+        near = np.flatnonzero(pixels @ d >= 1.0 - 0.5 * limit - 1e-9)
+        chord = ((pixels[near] - d) ** 2).sum(axis=1)
+        near, chord = near[chord <= limit], chord[chord <= limit]
+        value = np.exp(-0.5 * (chord - chord.min()) / sigma**2) * solid_angle[near]
+        out[k, near] = value / value.sum()
+    return out.reshape(-1, rows, columns)
+
+
+def _cutoff(shape: tuple[int, int], sigma: float) -> float:
+    """Where a beam ends [rad]; one narrower than the grid still reaches the centre of the pixel it falls in."""
+    return float(min(max(BEAM_CUTOFF * sigma, np.hypot(np.pi / shape[0], 2.0 * np.pi / shape[1])), np.pi))
+
+
 class _BeamGrid(NamedTuple):
     pixels: wp.array
     solid_angles: wp.array
@@ -193,8 +217,7 @@ class _BeamGrid(NamedTuple):
 def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> _BeamGrid:
     """What both beam kernels need; ``half_widths[i, m]`` columns either side hold row i's share of paths in row m."""
     rows, columns = shape
-    # A beam narrower than the grid still reaches the centre of the pixel it falls in.
-    cutoff = min(max(BEAM_CUTOFF * sigma, np.hypot(np.pi / rows, 2.0 * np.pi / columns)), np.pi)
+    cutoff = _cutoff(shape, sigma)
     zenith = pixel_angles(shape)[0]
     edges = np.arange(rows + 1) * np.pi / rows
     gap = np.maximum(0.0, np.maximum(edges[None, :-1] - zenith[:, None], zenith[:, None] - edges[None, 1:]))
