@@ -1,8 +1,8 @@
 """Triangle mesh with ray queries: visibility, surface hits and closest points, in metres.
 
-The bounding volume hierarchy is Warp's, in float32 and about the mesh's own centre; it names the face that is hit.
-Distances and points are then recomputed in float64 from that face's plane, because at 300 GHz a wavelength is 1 mm
-and float32 alone errs by 5e-5 m at 5 m.
+The bounding volume hierarchy is Warp's, or Embree's for many rays on a CPU, in float32 and about the mesh's own
+centre; it names the face that is hit. Distances and points are then recomputed in float64 from that face's plane,
+because at 300 GHz a wavelength is 1 mm and float32 alone errs by 5e-5 m at 5 m.
 """
 
 from __future__ import annotations
@@ -15,38 +15,64 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.kernels.rays import cast_rays, closest_faces
+from warprrf.geometry import embree
+from warprrf.geometry.embree import EmbreeScene
+from warprrf.kernels.rays import AGAIN, BAD, cast_rays, closest_faces, pack_rays, place_hits
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
 
+BACKENDS = ("auto", "warp", "embree")
+"""What searches the mesh: ``"auto"`` takes Embree on a CPU where Open3D is installed and there are many rays."""
+
+# From this many rays on "auto" takes Embree; below, loading Open3D costs more than it saves.
+EMBREE_RAYS = 50_000
+# Rays that Embree gets at a time: their float32 copy stays in the cache.
+_EMBREE_CHUNK = 65_536
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4
-# Below this |normal . direction| the plane equation is worse than the float32 distance.
-_GRAZING = 1e-7
 
 
-@dataclass(frozen=True)
 class Hit:
-    """What rays met, one entry a ray.
+    """What rays met, one entry a ray. Normals and points are computed when first asked for.
 
     Attributes:
         t: Distance along the unit direction [m], shape ``(N,)``, float64; inf where nothing was met.
         face: Index of the face, shape ``(N,)``, int32; -1 where nothing was met.
-        normal: Unit face normal as wound (not turned towards the ray), shape ``(N, 3)``; NaN where nothing was met.
-        point: Point met [m], shape ``(N, 3)``, float64; NaN where nothing was met.
     """
 
-    t: np.ndarray
-    face: np.ndarray
-    normal: np.ndarray
-    point: np.ndarray
+    def __init__(
+        self, mesh: Mesh, origins: np.ndarray, directions: np.ndarray, t: np.ndarray, face: np.ndarray
+    ) -> None:
+        self.t = t
+        self.face = face
+        self._mesh = mesh
+        self._origins = origins
+        self._directions = directions
+
+    def __repr__(self) -> str:
+        return f"Hit({np.count_nonzero(self.valid)} of {len(self.t)} rays met a face)"
 
     @property
     def valid(self) -> np.ndarray:
         """Whether the ray met a face, shape ``(N,)``, bool."""
         return self.face >= 0
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Unit face normal as wound (not turned towards the ray), shape ``(N, 3)``; NaN where nothing was met."""
+        normal = self._mesh.face_normals[self.face]
+        normal[~self.valid] = np.nan
+        return normal
+
+    @cached_property
+    def point(self) -> np.ndarray:
+        """Point met [m], shape ``(N, 3)``, float64; NaN where nothing was met."""
+        t = np.where(self.valid, self.t, np.nan)[:, None]
+        return self._origins + t * (
+            self._directions / np.linalg.norm(self._directions, axis=1, keepdims=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -93,6 +119,7 @@ class Mesh:
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
         self._warp_meshes: dict[str, wp.Mesh] = {}
+        self._warp_planes: dict[str, wp.array] = {}
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -139,14 +166,26 @@ class Mesh:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether every edge, after welding, belongs to an even number of faces."""
-        edges = np.sort(self.welded_faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+        """Whether every edge, after welding, belongs to an even number of faces.
+
+        Faces whose corners fall together and repeats of a face (wound alike) are left out: they open nothing.
+        """
+        faces = self.welded_faces
+        first, second, third = faces.T
+        faces = faces[(first != second) & (second != third) & (third != first)]
+        lowest = faces.argmin(axis=1)[:, None]
+        faces = np.unique(np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1), axis=0)
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return len(edges) > 0 and bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
 
     @cached_property
     def center(self) -> np.ndarray:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
         return self.bounds.mean(axis=0)
+
+    @cached_property
+    def _radius(self) -> float:
+        return 0.5 * float(np.linalg.norm(np.ptp(self.bounds, axis=0)))
 
     def on_device(self, device: Any = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""
@@ -160,43 +199,51 @@ class Mesh:
             )
         return self._warp_meshes[str(where)]
 
-    def cast(self, origins: Any, directions: Any, *, device: Any = None) -> Hit:
-        """The nearest surface along rays.
+    def cast(self, origins: Any, directions: Any, *, device: Any = None, backend: str = "auto") -> Hit:
+        """The nearest surface along rays; one that passes through a ray's very start is not met.
 
         Args:
             origins: Ray starts [m], shape ``(N, 3)`` or ``(3,)`` for all.
             directions: Ray directions, any length but zero, shape ``(N, 3)`` or ``(3,)`` for all.
             device: Where the hierarchy is searched.
+            backend: One of :data:`BACKENDS`. Both agree on distances; on an edge they may name either face.
 
         Returns:
-            Hits in float64. On a closed mesh a ray that slips through between faces is cast again, turned by 1e-5 rad.
+            Hits in float64. On a closed mesh a ray from inside that slips through between faces is cast again, turned
+            by 1e-5 rad. Points are computed from the arrays given here when they are first asked for.
 
         Raises:
-            ValueError: on a wrong shape, NaN, or a direction of length zero.
+            ValueError: on a wrong shape, NaN, a direction of length zero, an unknown back end, or Embree on a GPU.
+            ImportError: if Embree is asked for and Open3D is not installed.
         """
-        start, toward, _ = _ray_arrays(origins, directions)
-        reach = np.full(len(start), np.inf)
-        face, near = self._nearest(start, toward, reach, device)
-        if self.is_closed:
+        o, d = _ray_arrays(origins, directions)
+        endless = np.full(1, np.inf)
+        t, face = self._search(o, d, endless, 0.0, device, backend)
+        if (face == BAD).any():
+            _check_rays(o, d)
+        missed = np.flatnonzero(face < 0)
+        if len(missed) and self.is_closed:
+            inside = (self.bounds[0] <= o) & (o <= self.bounds[1])
+            missed = missed[np.broadcast_to(inside.all(axis=1), face.shape)[missed]]
             rng = np.random.default_rng(0)
             for _ in range(_RECASTS):
-                missed = np.flatnonzero(face < 0)
                 if len(missed) == 0:
                     break
-                turned = toward[missed] + _JITTER * rng.standard_normal((len(missed), 3))
-                face[missed], near[missed] = self._nearest(start[missed], turned, reach[missed], device)
-        met = face >= 0
-        t = np.where(met, self._plane_distance(start, toward, face, near), np.inf)
-        nothing = ~met[:, None]
-        return Hit(
-            t=t,
-            face=face,
-            normal=np.where(nothing, np.nan, self.face_normals[face]),
-            point=np.where(nothing, np.nan, start + np.where(met, t, 0.0)[:, None] * toward),
-        )
+                start, toward = _rows(o, missed), _rows(d, missed)
+                toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+                turned = toward + _JITTER * rng.standard_normal((len(missed), 3))
+                t[missed], face[missed] = self._search(start, turned, endless, 0.0, device, backend)
+                missed = missed[face[missed] < 0]
+        return Hit(self, o, d, t, face)
 
     def visible(
-        self, a: Any, b: Any, *, device: Any = None, clearance: float = ENDPOINT_CLEARANCE
+        self,
+        a: Any,
+        b: Any,
+        *,
+        device: Any = None,
+        clearance: float = ENDPOINT_CLEARANCE,
+        backend: str = "auto",
     ) -> np.ndarray:
         """Whether nothing lies strictly between points.
 
@@ -205,6 +252,8 @@ class Mesh:
             b: Other ends [m], shape ``(N, 3)`` or ``(3,)`` for all.
             clearance: Surfaces nearer than this to either end, measured along the segment, don't block [m]: ends may
                 lie on surfaces. Distances are judged in float64, so it need not cover float32 errors.
+            device: Where the hierarchy is searched.
+            backend: One of :data:`BACKENDS`.
 
         Returns:
             Shape ``(N,)``, bool.
@@ -217,27 +266,18 @@ class Mesh:
             raise ValueError(
                 f"a, b: got {len(start)} and {len(end)} points, expected as many of each, or one of either"
             )
-        start, end = np.broadcast_arrays(start, end)
-        length = np.linalg.norm(end - start, axis=1)
-        toward = np.divide(end - start, length[:, None], out=np.zeros(start.shape), where=length[:, None] > 0)
-        free = np.ones(len(start), dtype=bool)
-        skip = np.full(len(start), clearance)
-        # A hit that float64 places inside the clearance is stepped over; the few rays that had one go again.
-        open_rays = np.flatnonzero(length > 2.0 * clearance)
-        for _ in range(8):
-            if len(open_rays) == 0:
-                return free
-            o, d, s = start[open_rays], toward[open_rays], skip[open_rays]
-            reach = length[open_rays] - s
-            face, near = self._nearest(o + s[:, None] * d, d, reach, device)
-            t = self._plane_distance(o, d, face, near + s)
-            hit = face >= 0
-            between = hit & (t > clearance) & (t < length[open_rays] - clearance)
-            free[open_rays[between]] = False
-            early = hit & (t <= clearance)
-            skip[open_rays] = s + near.clip(max=1e30) + clearance
-            again = early & (skip[open_rays] < length[open_rays] - clearance)
-            open_rays = open_rays[again]
+        way = end - start
+        length = np.linalg.norm(way, axis=1)
+        free = np.ones(len(way), dtype=bool)
+        long = np.flatnonzero(length > 2.0 * clearance)
+        if len(long) == 0:
+            return free
+        t, face = self._search(
+            _rows(start, long), way[long], length[long] - clearance, clearance, device, backend
+        )
+        if (face == BAD).any():
+            _check_rays(start, way)
+        free[long] = (face < 0) | (t >= length[long] - clearance)
         return free
 
     def closest(self, points: Any, *, device: Any = None) -> Closest:
@@ -282,46 +322,110 @@ class Mesh:
     def _local(self, points: np.ndarray, device: wp.Device) -> wp.array:
         return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)
 
-    def _nearest(
-        self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray, device: Any
+    @cached_property
+    def _planes(self) -> np.ndarray:
+        """Unit normal and offset from :attr:`center` [m] of each face's plane, shape ``(F, 4)``."""
+        offset = np.einsum("ni,ni->n", self.face_normals, self.triangles[:, 0] - self.center)
+        return np.column_stack([self.face_normals, offset])
+
+    @cached_property
+    def _embree(self) -> tuple[EmbreeScene, np.ndarray]:
+        """Embree's hierarchy of the faces that have an area, and which faces those are."""
+        names = np.flatnonzero(self.areas > 0).astype(np.int32)
+        return EmbreeScene((self.vertices - self.center).astype(np.float32), self.faces[names]), names
+
+    def _planes_on(self, device: wp.Device) -> wp.array:
+        if str(device) not in self._warp_planes:
+            self._warp_planes[str(device)] = wp.array(self._planes, dtype=wp.vec4d, device=device)
+        return self._warp_planes[str(device)]
+
+    def _search(
+        self, o: np.ndarray, d: np.ndarray, reach: np.ndarray, clearance: float, device: Any, backend: str
     ) -> tuple[np.ndarray, np.ndarray]:
+        """Distance (N,) [m], float64, and face (N,) of what rays meet beyond ``clearance``; see `kernels.rays`.
+
+        ``o`` and ``d`` hold one row or N, ``reach`` one number or N: how far it is worth looking.
+        """
         where = _device.resolve(device)
-        count = len(origins)
-        distance = wp.zeros(count, dtype=wp.float32, device=where)
-        face = wp.zeros(count, dtype=wp.int32, device=where)
+        count = max(len(o), len(d)) if min(len(o), len(d)) else 0
+        if _choose(backend, where, count) == "embree":
+            return self._search_embree(o, d, clearance, where)
+        t = wp.empty(count, dtype=wp.float64, device=where)
+        face = wp.empty(count, dtype=wp.int32, device=where)
         inputs = [
-            self.on_device(where).id,
-            self._local(origins, where),
-            wp.array(directions.astype(np.float32), dtype=wp.vec3, device=where),
-            wp.array(np.minimum(reach, 1e30).astype(np.float32), dtype=wp.float32, device=where),
-            distance,
-            face,
-        ]
+            self.on_device(where).id, wp.vec3d(*self.center), self._radius, self._planes_on(where), clearance,
+            _given(o, wp.vec3d, where), _given(d, wp.vec3d, where), _given(reach, wp.float64, where), t, face,
+        ]  # fmt: skip
         _device.launch(cast_rays, count, inputs, device=where)
-        return face.numpy().copy(), distance.numpy().astype(np.float64)
+        return t.numpy(), face.numpy()
 
-    def _plane_distance(self, o: np.ndarray, d: np.ndarray, face: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Distance to each face's plane in float64; the float32 ``near`` where the ray runs along the plane."""
-        normal = self.face_normals[face]
-        slope = np.einsum("ni,ni->n", normal, d)
-        height = np.einsum("ni,ni->n", normal, self.triangles[face, 0] - o)
-        steep = np.abs(slope) > _GRAZING
-        return np.where(steep, np.divide(height, slope, out=np.zeros_like(height), where=steep), near)
+    def _search_embree(
+        self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device, start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        scene, names = self._embree
+        count = max(len(o), len(d))
+        t, face = np.empty(count), np.empty(count, dtype=np.int32)
+        rays = wp.empty((min(count, _EMBREE_CHUNK), 6), dtype=wp.float32, device=cpu)
+        space = [wp.vec3d(*self.center), self._radius]
+        given = [
+            _given(o, wp.vec3d, cpu), _given(d, wp.vec3d, cpu),
+            _given(np.empty(0) if start is None else start, wp.float64, cpu),
+        ]  # fmt: skip
+        out = [_given(names, wp.int32, cpu), _given(t, wp.float64, cpu), _given(face, wp.int32, cpu)]
+        for first in range(0, count, _EMBREE_CHUNK):
+            size = min(_EMBREE_CHUNK, count - first)
+            _device.launch(pack_rays, size, [first, *space, clearance, *given, rays], device=cpu)
+            met_at, met_face = scene.cast(rays.numpy()[:size])
+            met = [_given(met_at, wp.float32, cpu), _given(met_face, wp.int32, cpu)]
+            inputs = [first, *space, self._planes_on(cpu), clearance, *given, out[0], *met, *out[1:]]
+            _device.launch(place_hits, size, inputs, device=cpu)
+        again = np.flatnonzero(face == AGAIN)
+        if len(again):
+            t[again], face[again] = self._search_embree(
+                _rows(o, again), _rows(d, again), clearance, cpu, t[again]
+            )
+        return t, face
 
 
-def _ray_arrays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    o = np.atleast_2d(_device.check_array("origins", origins))
-    d = np.atleast_2d(_device.check_array("directions", directions))
+def _given(array: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
+    """``array`` for a kernel, without a copy on a CPU."""
+    return wp.array(array, dtype=dtype, device=device, copy=False)
+
+
+def _rows(array: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Rows of rays that may hold one row for all."""
+    return array if len(array) == 1 else array[index]
+
+
+def _choose(backend: str, device: wp.Device, count: int) -> str:
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: got {backend!r}, expected one of {', '.join(BACKENDS)}")
+    if backend == "embree" and device.is_cuda:
+        raise ValueError(f'backend: got "embree" on {device}, expected "warp" there, or device="cpu"')
+    if backend != "auto" or count == 0:
+        return "warp" if count == 0 else backend
+    many = count >= EMBREE_RAYS and not device.is_cuda
+    return "embree" if many and embree.installed() else "warp"
+
+
+def _ray_arrays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
+    o = np.atleast_2d(_device.check_array("origins", origins, finite=False))
+    d = np.atleast_2d(_device.check_array("directions", directions, finite=False))
     for name, array in (("origins", o), ("directions", d)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
     if len(o) != len(d) and 1 not in (len(o), len(d)):
         raise ValueError(f"directions: got {len(d)} for {len(o)} origins, expected as many, or one of either")
-    length = np.linalg.norm(d, axis=1, keepdims=True)
-    if (length == 0).any():
+    return o, d
+
+
+def _check_rays(origins: np.ndarray, directions: np.ndarray) -> None:
+    """Say what is wrong with rays of which a kernel found some to be bad."""
+    for name, array in (("origins", origins), ("directions", directions)):
+        _device.check_array(name, array)
+    if (np.linalg.norm(directions, axis=1) == 0).any():
         raise ValueError("directions: got a vector of length zero, expected directions")
-    o, d = np.broadcast_arrays(o, d / length)
-    return np.ascontiguousarray(o), np.ascontiguousarray(d), length[:, 0]
+    raise ValueError("origins, directions: got numbers too large to square, expected metres")
 
 
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
