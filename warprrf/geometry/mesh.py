@@ -17,7 +17,7 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.geometry import embree
 from warprrf.geometry.embree import EmbreeScene
-from warprrf.kernels.rays import AGAIN, BAD, cast_rays, closest_faces, pack_rays, place_hits
+from warprrf.kernels.rays import AGAIN, BAD, GRAZING, cast_rays, closest_faces, pack_rays, place_hits
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -27,8 +27,8 @@ BACKENDS = ("auto", "warp", "embree")
 
 # From this many rays on "auto" takes Embree; below, loading Open3D costs more than it saves.
 EMBREE_RAYS = 50_000
-# Rays that Embree gets at a time: their float32 copy stays in the cache.
-_EMBREE_CHUNK = 65_536
+# Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
+_EMBREE_CHUNK = 262_144
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4
@@ -210,30 +210,23 @@ class Mesh:
 
         Returns:
             Hits in float64. On a closed mesh a ray from inside that slips through between faces is cast again, turned
-            by 1e-5 rad. Points are computed from the arrays given here when they are first asked for.
+            by 1e-5 rad.
 
         Raises:
             ValueError: on a wrong shape, NaN, a direction of length zero, an unknown back end, or Embree on a GPU.
             ImportError: if Embree is asked for and Open3D is not installed.
         """
         o, d = _ray_arrays(origins, directions)
-        endless = np.full(1, np.inf)
-        t, face = self._search(o, d, endless, 0.0, device, backend)
+        t, face = self._search(o, d, np.full(1, np.inf), 0.0, device, backend)
         if (face == BAD).any():
             _check_rays(o, d)
         missed = np.flatnonzero(face < 0)
         if len(missed) and self.is_closed:
-            inside = (self.bounds[0] <= o) & (o <= self.bounds[1])
-            missed = missed[np.broadcast_to(inside.all(axis=1), face.shape)[missed]]
-            rng = np.random.default_rng(0)
-            for _ in range(_RECASTS):
-                if len(missed) == 0:
-                    break
-                start, toward = _rows(o, missed), _rows(d, missed)
-                toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-                turned = toward + _JITTER * rng.standard_normal((len(missed), 3))
-                t[missed], face[missed] = self._search(start, turned, endless, 0.0, device, backend)
-                missed = missed[face[missed] < 0]
+            self._recast(o, d, t, face, missed, device, backend)
+        # Points may be asked for after the caller has changed its arrays.
+        o, d = (
+            x.copy() if np.may_share_memory(x, given) else x for x, given in ((o, origins), (d, directions))
+        )
         return Hit(self, o, d, t, face)
 
     def visible(
@@ -334,6 +327,30 @@ class Mesh:
         names = np.flatnonzero(self.areas > 0).astype(np.int32)
         return EmbreeScene((self.vertices - self.center).astype(np.float32), self.faces[names]), names
 
+    def _recast(
+        self, o: np.ndarray, d: np.ndarray, t: np.ndarray, face: np.ndarray, missed: np.ndarray, device: Any,
+        backend: str,
+    ) -> None:  # fmt: skip
+        """Cast the ``missed`` rays that start within the bounds again, a little turned; fills in ``t`` and ``face``."""
+        inside = ((self.bounds[0] <= o) & (o <= self.bounds[1])).all(axis=1)
+        missed = missed[np.broadcast_to(inside, face.shape)[missed]]
+        rng = np.random.default_rng(0)
+        for _ in range(_RECASTS):
+            if len(missed) == 0:
+                return
+            start, toward = _rows(o, missed), _rows(d, missed)
+            toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+            turned = toward + _JITTER * rng.standard_normal((len(missed), 3))
+            near, found = self._search(start, turned, np.full(1, np.inf), 0.0, device, backend)
+            # The distance is that of the ray asked for to the plane of the face found.
+            plane = self._planes[found]
+            slope = (plane[:, :3] * toward).sum(axis=1)
+            height = plane[:, 3] - (plane[:, :3] * (start - self.center)).sum(axis=1)
+            steep = (found >= 0) & (np.abs(slope) > GRAZING)
+            t[missed] = np.divide(height, slope, out=near, where=steep)
+            face[missed] = found
+            missed = missed[found < 0]
+
     def _planes_on(self, device: wp.Device) -> wp.array:
         if str(device) not in self._warp_planes:
             self._warp_planes[str(device)] = wp.array(self._planes, dtype=wp.vec4d, device=device)
@@ -365,20 +382,24 @@ class Mesh:
         scene, names = self._embree
         count = max(len(o), len(d))
         t, face = np.empty(count), np.empty(count, dtype=np.int32)
-        rays = wp.empty((min(count, _EMBREE_CHUNK), 6), dtype=wp.float32, device=cpu)
-        space = [wp.vec3d(*self.center), self._radius]
+        chunk = min(count, _EMBREE_CHUNK)
+        rays = wp.empty(2 * chunk, dtype=wp.vec3, device=cpu)
+        sizes = [wp.empty(chunk, dtype=wp.float64, device=cpu) for _ in range(2)]
+        center, planes, faces = wp.vec3d(*self.center), self._planes_on(cpu), _given(names, wp.int32, cpu)
         given = [
+            clearance, _given(np.empty(0) if start is None else start, wp.float64, cpu),
             _given(o, wp.vec3d, cpu), _given(d, wp.vec3d, cpu),
-            _given(np.empty(0) if start is None else start, wp.float64, cpu),
         ]  # fmt: skip
-        out = [_given(names, wp.int32, cpu), _given(t, wp.float64, cpu), _given(face, wp.int32, cpu)]
-        for first in range(0, count, _EMBREE_CHUNK):
-            size = min(_EMBREE_CHUNK, count - first)
-            _device.launch(pack_rays, size, [first, *space, clearance, *given, rays], device=cpu)
-            met_at, met_face = scene.cast(rays.numpy()[:size])
-            met = [_given(met_at, wp.float32, cpu), _given(met_face, wp.int32, cpu)]
-            inputs = [first, *space, self._planes_on(cpu), clearance, *given, out[0], *met, *out[1:]]
-            _device.launch(place_hits, size, inputs, device=cpu)
+        out = [_given(t, wp.float64, cpu), _given(face, wp.int32, cpu)]
+        pieces = _device.threads()
+        for first in range(0, count, chunk):
+            size = min(chunk, count - first)
+            inputs = [first, center, self._radius, *given, rays, *sizes]
+            _device.launch(pack_rays, size, inputs, device=cpu, pieces=pieces)
+            met_at, met = scene.cast(rays.numpy().reshape(-1, 6)[:size])
+            hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
+            inputs = [first, center, planes, faces, *given, *sizes, *hits, *out]
+            _device.launch(place_hits, size, inputs, device=cpu, pieces=pieces)
         again = np.flatnonzero(face == AGAIN)
         if len(again):
             t[again], face[again] = self._search_embree(

@@ -19,71 +19,52 @@ AGAIN = wp.constant(-3)
 _ROUNDING = wp.constant(wp.float64(2.4e-7))
 # A ray's start is on a plane if no further from it than this, over the largest coordinate: float64 rounding.
 _ON_PLANE = wp.constant(wp.float64(1e-12))
-# Below this |normal . direction| the plane equation is worse than the float32 distance.
-_GRAZING = wp.constant(wp.float64(1e-7))
+GRAZING = 1e-7
+"""Below this |normal . direction| the plane equation is worse than the float32 distance."""
+
+_GRAZING = wp.constant(wp.float64(GRAZING))
 _FAR = wp.constant(wp.float64(1e30))
 _STEPS = 8
 
 
-@wp.struct
-class Ray:
-    """A ray in float64 relative to the mesh's centre."""
-
-    origin: wp.vec3d
-    """Start [m]."""
-    direction: wp.vec3d
-    """Unit direction."""
-    scale: wp.float64
-    """Largest coordinate that rounding acts on [m]; NaN or infinite where the ray is bad."""
-
-
 @wp.func
-def ray_of(
-    i: int,
-    origins: wp.array(dtype=wp.vec3d),
-    directions: wp.array(dtype=wp.vec3d),
-    center: wp.vec3d,
-    radius: wp.float64,
-):
-    """Ray ``i``; one origin or one direction serves all."""
-    o = origins[wp.min(i, origins.shape[0] - 1)] - center
-    d = directions[wp.min(i, directions.shape[0] - 1)]
-    length = wp.length(d)
-    ray = Ray()
-    ray.origin = o
-    ray.direction = d / length
-    ray.scale = radius + wp.length(o) + wp.float64(0.0) * wp.length(ray.direction)
-    return ray
-
-
-@wp.func
-def begin_at(ray: Ray, distance: wp.float64):
-    """The point at ``distance`` along the ray, in float32."""
-    p = ray.origin + distance * ray.direction
+def narrow(p: wp.vec3d):
+    """A position or direction in float32."""
     return wp.vec3(wp.float32(p[0]), wp.float32(p[1]), wp.float32(p[2]))
 
 
 @wp.func
-def toward(ray: Ray):
-    """The ray's direction in float32."""
-    return wp.vec3(wp.float32(ray.direction[0]), wp.float32(ray.direction[1]), wp.float32(ray.direction[2]))
+def rounding_scale(origin: wp.vec3d, length: wp.float64, radius: wp.float64):
+    """Largest coordinate that rounding acts on [m]; not finite if the ray is not, or its direction is zero."""
+    nothing = wp.float64(0.0) * length / length
+    return radius + wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2]) + nothing
 
 
 @wp.func
-def plane_distance(ray: Ray, plane: wp.vec4d, near: wp.float64, clearance: wp.float64):
-    """Distance [m] to a plane (normal, offset) and whether it counts as met: not at the start, beyond ``clearance``.
+def plane_distance(
+    origin: wp.vec3d,
+    direction: wp.vec3d,
+    length: wp.float64,
+    scale: wp.float64,
+    plane: wp.vec4d,
+    near: wp.float64,
+    clearance: wp.float64,
+):
+    """Distance [m] to a plane (normal, offset) along ``direction`` of ``length``, or NaN if it does not count as met.
 
-    Along the plane the float32 distance ``near`` stands.
+    It counts beyond ``clearance``, unless the ray starts on it. Along the plane the float32 distance ``near`` stands.
     """
     normal = wp.vec3d(plane[0], plane[1], plane[2])
-    slope = wp.dot(normal, ray.direction)
-    height = plane[3] - wp.dot(normal, ray.origin)
+    slope = wp.dot(normal, direction)
+    height = plane[3] - wp.dot(normal, origin)
     t = near
-    met = near > clearance
-    if wp.abs(slope) > _GRAZING:
-        t = height / slope
-        met = t > clearance and wp.abs(height) > _ON_PLANE * ray.scale
-    return t, met
+    if wp.abs(slope) > _GRAZING * length:
+        t = height * length / slope
+        if wp.abs(height) <= _ON_PLANE * scale:
+            t = wp.float64(wp.nan)
+    if t <= clearance:
+        t = wp.float64(wp.nan)
+    return t
 
 
 @wp.kernel(enable_backward=False)
@@ -102,23 +83,29 @@ def cast_rays(
 ):
     """Nearest face along each ray beyond ``clearance`` and within ``reach`` [m], and its distance in float64."""
     i = offset + wp.tid()
-    ray = ray_of(i, origins, directions, center, radius)
-    if not wp.isfinite(ray.scale):
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    length = wp.length(direction)
+    scale = rounding_scale(origin, length, radius)
+    if not wp.isfinite(scale):
         distance[i] = wp.float64(wp.inf)
         face[i] = BAD
         return
-    step = _ROUNDING * ray.scale
+    unit = direction / length
+    step = _ROUNDING * scale
     start = clearance - step
     most = wp.min(reach[wp.min(i, reach.shape[0] - 1)], _FAR)
     found = wp.float64(wp.inf)
     name = MISS
     for _ in range(_STEPS):
-        query = wp.mesh_query_ray(mesh, begin_at(ray, start), toward(ray), wp.float32(most - start + step))
+        query = wp.mesh_query_ray(
+            mesh, narrow(origin + start * unit), narrow(unit), wp.float32(most - start + step)
+        )
         if not query.result:
             break
         near = start + wp.float64(query.t)
-        t, met = plane_distance(ray, planes[query.face], near, clearance)
-        if met:
+        t = plane_distance(origin, direction, length, scale, planes[query.face], near, clearance)
+        if not wp.isnan(t):
             found = t
             name = query.face
             break
@@ -136,26 +123,31 @@ def pack_rays(
     center: wp.vec3d,
     radius: wp.float64,
     clearance: wp.float64,
+    start: wp.array(dtype=wp.float64),
     origins: wp.array(dtype=wp.vec3d),
     directions: wp.array(dtype=wp.vec3d),
-    start: wp.array(dtype=wp.float64),
-    rays: wp.array2d(dtype=wp.float32),
+    rays: wp.array(dtype=wp.vec3),
+    lengths: wp.array(dtype=wp.float64),
+    scales: wp.array(dtype=wp.float64),
 ):
-    """Rays from ``first`` on as rows of float32 (start, direction); a bad one gets NaN.
+    """Rays from number ``first`` on as pairs (start, unit direction) in float32, with what `place_hits` needs of them.
 
     ``start`` holds the distance [m] at which each begins; if empty, all begin at ``clearance``, less the rounding.
     """
     k = offset + wp.tid()
     i = first + k
-    ray = ray_of(i, origins, directions, center, radius)
-    begin = clearance - _ROUNDING * ray.scale
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    length = wp.length(direction)
+    scale = rounding_scale(origin, length, radius)
+    begin = clearance - _ROUNDING * scale
     if start.shape[0] > 0:
         begin = start[i]
-    p = begin_at(ray, begin)
-    d = toward(ray)
-    for c in range(3):
-        rays[k, c] = p[c]
-        rays[k, 3 + c] = d[c]
+    unit = direction * (wp.float64(1.0) / length)
+    rays[2 * k] = narrow(origin + begin * unit)
+    rays[2 * k + 1] = narrow(unit)
+    lengths[k] = length
+    scales[k] = scale
 
 
 @wp.kernel(enable_backward=False)
@@ -163,39 +155,43 @@ def place_hits(
     offset: int,
     first: int,
     center: wp.vec3d,
-    radius: wp.float64,
     planes: wp.array(dtype=wp.vec4d),
+    names: wp.array(dtype=wp.int32),
     clearance: wp.float64,
+    start: wp.array(dtype=wp.float64),
     origins: wp.array(dtype=wp.vec3d),
     directions: wp.array(dtype=wp.vec3d),
-    start: wp.array(dtype=wp.float64),
-    names: wp.array(dtype=wp.int32),
+    lengths: wp.array(dtype=wp.float64),
+    scales: wp.array(dtype=wp.float64),
     met_at: wp.array(dtype=wp.float32),
-    met_face: wp.array(dtype=wp.int32),
+    met: wp.array(dtype=wp.int32),
     distance: wp.array(dtype=wp.float64),
     face: wp.array(dtype=wp.int32),
 ):
     """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's."""
     k = offset + wp.tid()
     i = first + k
-    ray = ray_of(i, origins, directions, center, radius)
-    found = wp.float64(wp.inf)
-    name = MISS
-    if not wp.isfinite(ray.scale):
-        name = BAD
-    elif met_face[k] >= 0:
-        step = _ROUNDING * ray.scale
-        begin = clearance - step
-        if start.shape[0] > 0:
-            begin = start[i]
-        near = begin + wp.float64(met_at[k])
-        name = names[met_face[k]]
-        t, met = plane_distance(ray, planes[name], near, clearance)
-        found = t
-        if not met:
-            found = near + step
-            name = AGAIN
-    distance[i] = found
+    scale = scales[k]
+    if not wp.isfinite(scale):
+        distance[i] = wp.float64(wp.inf)
+        face[i] = BAD
+        return
+    if met[k] < 0:
+        distance[i] = wp.float64(wp.inf)
+        face[i] = MISS
+        return
+    begin = clearance - _ROUNDING * scale
+    if start.shape[0] > 0:
+        begin = start[i]
+    near = begin + wp.float64(met_at[k])
+    name = names[met[k]]
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    t = plane_distance(origin, direction, lengths[k], scale, planes[name], near, clearance)
+    if wp.isnan(t):
+        t = near + _ROUNDING * scale
+        name = AGAIN
+    distance[i] = t
     face[i] = name
 
 
