@@ -1,11 +1,13 @@
 """Hard cases of ray queries, on both back ends, against answers known in closed form."""
 
 import importlib.util
+import sys
 
 import numpy as np
 import pytest
 
-from warprrf.geometry import mesh as mesh_module
+from warprrf.device import resolve
+from warprrf.geometry import raysearch
 from warprrf.geometry.mesh import Mesh
 
 ROOM = (np.array([-7.0, -6.0, 0.0]), np.array([8.0, 6.0, 4.0]))
@@ -82,7 +84,7 @@ def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(backend):
 
 def test_only_the_recast_stops_rays_at_vertices(monkeypatch):
     """Without it some escape, so the test above can fail."""
-    monkeypatch.setattr(mesh_module, "_RECASTS", 0)
+    monkeypatch.setattr(raysearch, "_RECASTS", 0)
     mesh, rng = sphere(), np.random.default_rng(1)
     vertex = mesh.vertices[rng.integers(len(mesh.vertices), size=60_000)]
     origin = rng.uniform(-0.05, 0.05, vertex.shape)
@@ -92,8 +94,12 @@ def test_only_the_recast_stops_rays_at_vertices(monkeypatch):
 def test_a_miss_from_outside_stays_a_miss(backend, monkeypatch):
     mesh = sphere()
     calls = []
-    search = Mesh._search
-    monkeypatch.setattr(Mesh, "_search", lambda self, *a: calls.append(len(a[1])) or search(self, *a))
+    nearest = raysearch.RaySearch.nearest
+    monkeypatch.setattr(
+        raysearch.RaySearch,
+        "nearest",
+        lambda self, o, d, **k: calls.append(len(d)) or nearest(self, o, d, **k),
+    )
     outward = directions(1000)
     hit = mesh.cast(20.0 * outward, outward, backend=backend, device="cpu")
     assert not hit.valid.any() and calls == [1000]
@@ -135,7 +141,7 @@ def test_degenerate_and_duplicate_triangles_change_nothing(backend):
         [clean.faces[some, 0], np.arange(count, count + 400), np.arange(count + 400, count + 800)]
     )
     vertices = np.concatenate([clean.vertices, middle, 0.5 * (middle + clean.triangles[some, 0])])
-    dirty = Mesh(vertices, np.concatenate([points, collinear[:0], clean.faces[some], clean.faces]))
+    dirty = Mesh(vertices, np.concatenate([points, clean.faces[some], clean.faces]))
     needles = Mesh(vertices, np.concatenate([collinear, points, clean.faces[some], clean.faces]))
     assert dirty.is_closed
     aimed = np.concatenate([directions(100_000), clean.vertices, middle])
@@ -213,13 +219,17 @@ def test_back_ends_agree():
     assert 0.1 < seen[0].mean() < 0.9 and (seen[0] != seen[1]).mean() < 1e-4
 
 
-def test_auto_takes_embree_for_many_rays_on_a_cpu_only(monkeypatch):
-    monkeypatch.setattr(mesh_module.embree, "installed", lambda: True)
-    cpu = mesh_module._device.resolve("cpu")
-    assert mesh_module._choose("auto", cpu, mesh_module.EMBREE_RAYS) == "embree"
-    assert mesh_module._choose("auto", cpu, mesh_module.EMBREE_RAYS - 1) == "warp"
-    monkeypatch.setattr(mesh_module.embree, "installed", lambda: False)
-    assert mesh_module._choose("auto", cpu, 10**7) == "warp"
+def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypatch):
+    cpu, choose = resolve("cpu"), raysearch.choose_backend
+    monkeypatch.setattr(raysearch.embree, "installed", lambda: True)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD) == "embree"
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD - 1) == "warp"
+    monkeypatch.setitem(sys.modules, "open3d", raysearch)
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS) == "embree"
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS - 1) == "warp"
+    monkeypatch.setattr(raysearch.embree, "installed", lambda: False)
+    assert choose("auto", cpu, 10**7) == "warp"
 
 
 def test_unknown_back_ends_are_refused():

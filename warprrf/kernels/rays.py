@@ -34,10 +34,15 @@ def narrow(p: wp.vec3d):
 
 
 @wp.func
-def rounding_scale(origin: wp.vec3d, length: wp.float64, radius: wp.float64):
-    """Largest coordinate that rounding acts on [m]; not finite if the ray is not, or its direction is zero."""
-    nothing = wp.float64(0.0) * length / length
-    return radius + wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2]) + nothing
+def rounding_scale(origin: wp.vec3d, radius: wp.float64):
+    """Largest coordinate that rounding acts on [m]."""
+    return radius + wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2])
+
+
+@wp.func
+def is_bad(scale: wp.float64, length: wp.float64):
+    """Whether a ray is not finite or its direction is of length zero."""
+    return not (wp.isfinite(scale) and wp.isfinite(length) and length > wp.float64(0.0))
 
 
 @wp.func
@@ -86,8 +91,8 @@ def cast_rays(
     origin = origins[wp.min(i, origins.shape[0] - 1)] - center
     direction = directions[wp.min(i, directions.shape[0] - 1)]
     length = wp.length(direction)
-    scale = rounding_scale(origin, length, radius)
-    if not wp.isfinite(scale):
+    scale = rounding_scale(origin, radius)
+    if is_bad(scale, length):
         distance[i] = wp.float64(wp.inf)
         face[i] = BAD
         return
@@ -127,10 +132,8 @@ def pack_rays(
     origins: wp.array(dtype=wp.vec3d),
     directions: wp.array(dtype=wp.vec3d),
     rays: wp.array(dtype=wp.vec3),
-    lengths: wp.array(dtype=wp.float64),
-    scales: wp.array(dtype=wp.float64),
 ):
-    """Rays from number ``first`` on as pairs (start, unit direction) in float32, with what `place_hits` needs of them.
+    """Rays from number ``first`` on as pairs (start, unit direction) in float32; a bad one meets nothing.
 
     ``start`` holds the distance [m] at which each begins; if empty, all begin at ``clearance``, less the rounding.
     """
@@ -139,15 +142,13 @@ def pack_rays(
     origin = origins[wp.min(i, origins.shape[0] - 1)] - center
     direction = directions[wp.min(i, directions.shape[0] - 1)]
     length = wp.length(direction)
-    scale = rounding_scale(origin, length, radius)
+    scale = rounding_scale(origin, radius)
     begin = clearance - _ROUNDING * scale
     if start.shape[0] > 0:
         begin = start[i]
     unit = direction * (wp.float64(1.0) / length)
     rays[2 * k] = narrow(origin + begin * unit)
     rays[2 * k + 1] = narrow(unit)
-    lengths[k] = length
-    scales[k] = scale
 
 
 @wp.kernel(enable_backward=False)
@@ -155,14 +156,13 @@ def place_hits(
     offset: int,
     first: int,
     center: wp.vec3d,
+    radius: wp.float64,
     planes: wp.array(dtype=wp.vec4d),
     names: wp.array(dtype=wp.int32),
     clearance: wp.float64,
     start: wp.array(dtype=wp.float64),
     origins: wp.array(dtype=wp.vec3d),
     directions: wp.array(dtype=wp.vec3d),
-    lengths: wp.array(dtype=wp.float64),
-    scales: wp.array(dtype=wp.float64),
     met_at: wp.array(dtype=wp.float32),
     met: wp.array(dtype=wp.int32),
     distance: wp.array(dtype=wp.float64),
@@ -171,23 +171,20 @@ def place_hits(
     """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's."""
     k = offset + wp.tid()
     i = first + k
-    scale = scales[k]
-    if not wp.isfinite(scale):
-        distance[i] = wp.float64(wp.inf)
-        face[i] = BAD
-        return
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    length = wp.length(direction)
+    scale = rounding_scale(origin, radius)
     if met[k] < 0:
         distance[i] = wp.float64(wp.inf)
-        face[i] = MISS
+        face[i] = wp.where(is_bad(scale, length), BAD, MISS)
         return
     begin = clearance - _ROUNDING * scale
     if start.shape[0] > 0:
         begin = start[i]
     near = begin + wp.float64(met_at[k])
     name = names[met[k]]
-    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
-    direction = directions[wp.min(i, directions.shape[0] - 1)]
-    t = plane_distance(origin, direction, lengths[k], scale, planes[name], near, clearance)
+    t = plane_distance(origin, direction, length, scale, planes[name], near, clearance)
     if wp.isnan(t):
         t = near + _ROUNDING * scale
         name = AGAIN
