@@ -6,19 +6,12 @@ as for Warp. Open3D keeps the interpreter lock while it casts, so one call runs 
 
 from __future__ import annotations
 
-import importlib.util
 import os
-from functools import cache
 
 import numpy as np
 
-from warprrf.device import require, threads
-
-
-@cache
-def installed() -> bool:
-    """Whether Open3D can be imported here (it is not imported to find out)."""
-    return importlib.util.find_spec("open3d") is not None
+from warprrf.device import threads
+from warprrf.geometry import o3d
 
 
 class EmbreeScene:
@@ -33,7 +26,7 @@ class EmbreeScene:
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
-        self._o3d = require("open3d", extra="photos")
+        self._o3d = o3d.load()
         self._threads = min(threads(), os.cpu_count() or 1)
         self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._threads)
         tensor = self._o3d.core.Tensor

@@ -6,7 +6,6 @@ Both answer in float32 which face a ray meets; distances [m] are then taken in f
 
 from __future__ import annotations
 
-import sys
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.geometry import embree
+from warprrf.geometry import embree, o3d
 from warprrf.kernels.rays import AGAIN, BAD, GRAZING, cast_rays, pack_rays, place_hits
 
 BACKENDS = ("auto", "warp", "embree")
@@ -225,8 +224,8 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
         raise ValueError(f'backend: got "embree" on {device}, expected "warp" there, or device="cpu"')
     if backend != "auto":
         return backend
-    least = EMBREE_RAYS if "open3d" in sys.modules else EMBREE_RAYS_TO_LOAD
-    return "embree" if count >= least and not device.is_cuda and embree.installed() else "warp"
+    least = EMBREE_RAYS if o3d.loaded() else EMBREE_RAYS_TO_LOAD
+    return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
 
 
 def rows(array: np.ndarray, index: np.ndarray) -> np.ndarray:

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, resolve, threads
-from warprrf.geometry.embree import EmbreeScene, installed
+from warprrf.geometry.embree import EmbreeScene
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.o3d import installed
 from warprrf.rf.scene import Scene
 
 
