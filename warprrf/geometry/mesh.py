@@ -1,8 +1,8 @@
 """Triangle mesh with ray queries: visibility, surface hits and closest points, in metres.
 
-The bounding volume hierarchy is Warp's, in float32 and about the mesh's own centre; it names the face that is hit.
-Distances and points are then recomputed in float64 from that face's plane, because at 300 GHz a wavelength is 1 mm
-and float32 alone errs by 5e-5 m at 5 m.
+The bounding volume hierarchy is Warp's, or Embree's for many rays on a CPU, in float32 and about the mesh's own
+centre; it names the face that is hit. Distances and points are then recomputed in float64 from that face's plane,
+because at 300 GHz a wavelength is 1 mm and float32 alone errs by 5e-5 m at 5 m.
 """
 
 from __future__ import annotations
@@ -15,38 +15,11 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.kernels.rays import cast_rays, closest_faces
+from warprrf.geometry.raysearch import Hit, RaySearch, ray_arrays, rows
+from warprrf.kernels.rays import closest_faces
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
-
-# A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
-_JITTER = 1e-5
-_RECASTS = 4
-# Below this |normal . direction| the plane equation is worse than the float32 distance.
-_GRAZING = 1e-7
-
-
-@dataclass(frozen=True)
-class Hit:
-    """What rays met, one entry a ray.
-
-    Attributes:
-        t: Distance along the unit direction [m], shape ``(N,)``, float64; inf where nothing was met.
-        face: Index of the face, shape ``(N,)``, int32; -1 where nothing was met.
-        normal: Unit face normal as wound (not turned towards the ray), shape ``(N, 3)``; NaN where nothing was met.
-        point: Point met [m], shape ``(N, 3)``, float64; NaN where nothing was met.
-    """
-
-    t: np.ndarray
-    face: np.ndarray
-    normal: np.ndarray
-    point: np.ndarray
-
-    @property
-    def valid(self) -> np.ndarray:
-        """Whether the ray met a face, shape ``(N,)``, bool."""
-        return self.face >= 0
 
 
 @dataclass(frozen=True)
@@ -92,7 +65,6 @@ class Mesh:
             )
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
-        self._warp_meshes: dict[str, wp.Mesh] = {}
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -139,64 +111,70 @@ class Mesh:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether every edge, after welding, belongs to an even number of faces."""
-        edges = np.sort(self.welded_faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+        """Whether every edge, after welding, belongs to an even number of faces.
+
+        Faces whose corners fall together and repeats of a face (wound alike) are left out: they open nothing.
+        """
+        faces = self.welded_faces
+        first, second, third = faces.T
+        faces = faces[(first != second) & (second != third) & (third != first)]
+        lowest = faces.argmin(axis=1)[:, None]
+        faces = np.unique(np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1), axis=0)
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return len(edges) > 0 and bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
 
     @cached_property
     def center(self) -> np.ndarray:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
         return self.bounds.mean(axis=0)
 
+    @cached_property
+    def _rays(self) -> RaySearch:
+        return RaySearch(self.triangles, self.face_normals, self.vertices, self.faces, self.bounds)
+
     def on_device(self, device: Any = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""
-        where = _device.resolve(device)
-        if str(where) not in self._warp_meshes:
-            self._warp_meshes[str(where)] = wp.Mesh(
-                points=wp.array(
-                    (self.vertices - self.center).astype(np.float32), dtype=wp.vec3, device=where
-                ),
-                indices=wp.array(self.faces.reshape(-1), dtype=wp.int32, device=where),
-            )
-        return self._warp_meshes[str(where)]
+        return self._rays.on_device(_device.resolve(device))
 
-    def cast(self, origins: Any, directions: Any, *, device: Any = None) -> Hit:
-        """The nearest surface along rays.
+    def cast(self, origins: Any, directions: Any, *, device: Any = None, backend: str = "auto") -> Hit:
+        """The nearest surface along rays; one that passes through a ray's very start is not met.
 
         Args:
             origins: Ray starts [m], shape ``(N, 3)`` or ``(3,)`` for all.
             directions: Ray directions, any length but zero, shape ``(N, 3)`` or ``(3,)`` for all.
             device: Where the hierarchy is searched.
+            backend: One of :data:`~warprrf.geometry.raysearch.BACKENDS`. All agree on distances; on an edge they may
+                name either face.
 
         Returns:
-            Hits in float64. On a closed mesh a ray that slips through between faces is cast again, turned by 1e-5 rad.
+            Hits in float64. On a closed mesh a ray from inside that slips through between faces is cast again, turned
+            by 1e-5 rad.
 
         Raises:
-            ValueError: on a wrong shape, NaN, or a direction of length zero.
+            ValueError: on a wrong shape, NaN, a direction of length zero, an unknown back end, or Embree on a GPU.
+            ImportError: if Embree is asked for and Open3D is not installed.
         """
-        start, toward, _ = _ray_arrays(origins, directions)
-        reach = np.full(len(start), np.inf)
-        face, near = self._nearest(start, toward, reach, device)
-        if self.is_closed:
-            rng = np.random.default_rng(0)
-            for _ in range(_RECASTS):
-                missed = np.flatnonzero(face < 0)
-                if len(missed) == 0:
-                    break
-                turned = toward[missed] + _JITTER * rng.standard_normal((len(missed), 3))
-                face[missed], near[missed] = self._nearest(start[missed], turned, reach[missed], device)
-        met = face >= 0
-        t = np.where(met, self._plane_distance(start, toward, face, near), np.inf)
-        nothing = ~met[:, None]
-        return Hit(
-            t=t,
-            face=face,
-            normal=np.where(nothing, np.nan, self.face_normals[face]),
-            point=np.where(nothing, np.nan, start + np.where(met, t, 0.0)[:, None] * toward),
+        o, d = ray_arrays(origins, directions)
+        t, face = self._rays.nearest(
+            o, d, reach=np.full(1, np.inf), clearance=0.0, device=device, backend=backend
         )
+        if (face < 0).any() and self.is_closed:
+            self._rays.recast(o, d, t, face, device=device, backend=backend)
+        # Points may be asked for after the caller has changed its arrays.
+        own = [
+            x if x.flags.owndata and x is not given else x.copy()
+            for x, given in ((o, origins), (d, directions))
+        ]
+        return Hit(t, face, self.face_normals, *own)
 
     def visible(
-        self, a: Any, b: Any, *, device: Any = None, clearance: float = ENDPOINT_CLEARANCE
+        self,
+        a: Any,
+        b: Any,
+        *,
+        device: Any = None,
+        clearance: float = ENDPOINT_CLEARANCE,
+        backend: str = "auto",
     ) -> np.ndarray:
         """Whether nothing lies strictly between points.
 
@@ -205,6 +183,8 @@ class Mesh:
             b: Other ends [m], shape ``(N, 3)`` or ``(3,)`` for all.
             clearance: Surfaces nearer than this to either end, measured along the segment, don't block [m]: ends may
                 lie on surfaces. Distances are judged in float64, so it need not cover float32 errors.
+            device: Where the hierarchy is searched.
+            backend: One of :data:`~warprrf.geometry.raysearch.BACKENDS`.
 
         Returns:
             Shape ``(N,)``, bool.
@@ -217,27 +197,21 @@ class Mesh:
             raise ValueError(
                 f"a, b: got {len(start)} and {len(end)} points, expected as many of each, or one of either"
             )
-        start, end = np.broadcast_arrays(start, end)
-        length = np.linalg.norm(end - start, axis=1)
-        toward = np.divide(end - start, length[:, None], out=np.zeros(start.shape), where=length[:, None] > 0)
-        free = np.ones(len(start), dtype=bool)
-        skip = np.full(len(start), clearance)
-        # A hit that float64 places inside the clearance is stepped over; the few rays that had one go again.
-        open_rays = np.flatnonzero(length > 2.0 * clearance)
-        for _ in range(8):
-            if len(open_rays) == 0:
-                return free
-            o, d, s = start[open_rays], toward[open_rays], skip[open_rays]
-            reach = length[open_rays] - s
-            face, near = self._nearest(o + s[:, None] * d, d, reach, device)
-            t = self._plane_distance(o, d, face, near + s)
-            hit = face >= 0
-            between = hit & (t > clearance) & (t < length[open_rays] - clearance)
-            free[open_rays[between]] = False
-            early = hit & (t <= clearance)
-            skip[open_rays] = s + near.clip(max=1e30) + clearance
-            again = early & (skip[open_rays] < length[open_rays] - clearance)
-            open_rays = open_rays[again]
+        way = end - start
+        length = np.linalg.norm(way, axis=1)
+        free = np.ones(len(way), dtype=bool)
+        long = np.flatnonzero(length > 2.0 * clearance)
+        if len(long) == 0:
+            return free
+        t, face = self._rays.nearest(
+            rows(start, long),
+            way[long],
+            reach=length[long] - clearance,
+            clearance=clearance,
+            device=device,
+            backend=backend,
+        )
+        free[long] = (face < 0) | (t >= length[long] - clearance)
         return free
 
     def closest(self, points: Any, *, device: Any = None) -> Closest:
@@ -281,47 +255,6 @@ class Mesh:
 
     def _local(self, points: np.ndarray, device: wp.Device) -> wp.array:
         return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)
-
-    def _nearest(
-        self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray, device: Any
-    ) -> tuple[np.ndarray, np.ndarray]:
-        where = _device.resolve(device)
-        count = len(origins)
-        distance = wp.zeros(count, dtype=wp.float32, device=where)
-        face = wp.zeros(count, dtype=wp.int32, device=where)
-        inputs = [
-            self.on_device(where).id,
-            self._local(origins, where),
-            wp.array(directions.astype(np.float32), dtype=wp.vec3, device=where),
-            wp.array(np.minimum(reach, 1e30).astype(np.float32), dtype=wp.float32, device=where),
-            distance,
-            face,
-        ]
-        _device.launch(cast_rays, count, inputs, device=where)
-        return face.numpy().copy(), distance.numpy().astype(np.float64)
-
-    def _plane_distance(self, o: np.ndarray, d: np.ndarray, face: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Distance to each face's plane in float64; the float32 ``near`` where the ray runs along the plane."""
-        normal = self.face_normals[face]
-        slope = np.einsum("ni,ni->n", normal, d)
-        height = np.einsum("ni,ni->n", normal, self.triangles[face, 0] - o)
-        steep = np.abs(slope) > _GRAZING
-        return np.where(steep, np.divide(height, slope, out=np.zeros_like(height), where=steep), near)
-
-
-def _ray_arrays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    o = np.atleast_2d(_device.check_array("origins", origins))
-    d = np.atleast_2d(_device.check_array("directions", directions))
-    for name, array in (("origins", o), ("directions", d)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
-    if len(o) != len(d) and 1 not in (len(o), len(d)):
-        raise ValueError(f"directions: got {len(d)} for {len(o)} origins, expected as many, or one of either")
-    length = np.linalg.norm(d, axis=1, keepdims=True)
-    if (length == 0).any():
-        raise ValueError("directions: got a vector of length zero, expected directions")
-    o, d = np.broadcast_arrays(o, d / length)
-    return np.ascontiguousarray(o), np.ascontiguousarray(d), length[:, 0]
 
 
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:

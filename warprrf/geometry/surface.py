@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import check_array, require
+from warprrf.device import check_array
+from warprrf.geometry import o3d as o3d_package
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.patches import PlanarPatch, flatten, planar_patches, simplify
@@ -47,7 +48,7 @@ def neighbours(
 
     Without ``queries``, of every point among the others (itself left out).
     """
-    o3d = require("open3d", extra="photos")
+    o3d = o3d_package.load()
     itself = 1 if queries is None else 0
     # Float32 inside: centre first, so that far-off world coordinates cost no digits.
     centre = points.mean(axis=0)
@@ -165,7 +166,7 @@ class Occluder:
     """A surface ready for many visibility queries (the bounding volume hierarchy is built once)."""
 
     def __init__(self, mesh: Mesh) -> None:
-        o3d = require("open3d", extra="photos")
+        o3d = o3d_package.load()
         self._tensor = o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
@@ -237,7 +238,7 @@ def fuse_depth(
         ValueError: when the numbers of maps and cameras differ, a camera is not a pinhole, a map has another shape
             than its camera, or no surface comes out.
     """
-    o3d = require("open3d", extra="photos")
+    o3d = o3d_package.load()
     if len(depths) != len(cameras) or not len(depths):
         raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
     if voxel_m <= 0:

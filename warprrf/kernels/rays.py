@@ -1,31 +1,195 @@
 """Ray and closest-point queries on a triangle mesh's bounding volume hierarchy.
 
-Warp keeps mesh geometry in float32, so these kernels answer *which* face; lengths that must be exact are recomputed
-in float64 from that face by :class:`warprrf.geometry.mesh.Mesh`.
+Hierarchies keep geometry in float32, so a query answers *which* face; its distance is then taken in float64 from that
+face's plane. Rays come in float64 and positions are made relative to the mesh's centre before they are rounded. A
+search starts a little before its ray, by what float32 may err, and steps over surfaces that float64 places at the
+ray's start or before it: so a ray from a point on a surface meets the next surface, whatever the rounding.
 """
 
 import warp as wp
 
+MISS = wp.constant(-1)
+"""Face of a ray that met nothing."""
+BAD = wp.constant(-2)
+"""Face of a ray that is not finite or has no direction."""
+AGAIN = wp.constant(-3)
+"""Face of a ray that met a surface at its start and goes on from the distance stored in its place."""
 
-@wp.kernel
+# What float32 may displace a surface along a ray, over the largest coordinate: four roundings of 2^-24.
+_ROUNDING = wp.constant(wp.float64(2.4e-7))
+# A ray's start is on a plane if no further from it than this, over the largest coordinate: float64 rounding.
+_ON_PLANE = wp.constant(wp.float64(1e-12))
+GRAZING = 1e-7
+"""Below this |normal . direction| the plane equation is worse than the float32 distance."""
+
+_GRAZING = wp.constant(wp.float64(GRAZING))
+_FAR = wp.constant(wp.float64(1e30))
+_STEPS = 8
+
+
+@wp.func
+def narrow(p: wp.vec3d):
+    """A position or direction in float32."""
+    return wp.vec3(wp.float32(p[0]), wp.float32(p[1]), wp.float32(p[2]))
+
+
+@wp.func
+def rounding_scale(origin: wp.vec3d, radius: wp.float64):
+    """Largest coordinate that rounding acts on [m]."""
+    return radius + wp.abs(origin[0]) + wp.abs(origin[1]) + wp.abs(origin[2])
+
+
+@wp.func
+def is_bad(scale: wp.float64, length: wp.float64):
+    """Whether a ray is not finite or its direction is of length zero."""
+    return not (wp.isfinite(scale) and wp.isfinite(length) and length > wp.float64(0.0))
+
+
+@wp.func
+def plane_distance(
+    origin: wp.vec3d,
+    direction: wp.vec3d,
+    length: wp.float64,
+    scale: wp.float64,
+    plane: wp.vec4d,
+    near: wp.float64,
+    clearance: wp.float64,
+):
+    """Distance [m] to a plane (normal, offset) along ``direction`` of ``length``, or NaN if it does not count as met.
+
+    It counts beyond ``clearance``, unless the ray starts on it. Along the plane the float32 distance ``near`` stands.
+    """
+    normal = wp.vec3d(plane[0], plane[1], plane[2])
+    slope = wp.dot(normal, direction)
+    height = plane[3] - wp.dot(normal, origin)
+    t = near
+    if wp.abs(slope) > _GRAZING * length:
+        t = height * length / slope
+        if wp.abs(height) <= _ON_PLANE * scale:
+            t = wp.float64(wp.nan)
+    if t <= clearance:
+        t = wp.float64(wp.nan)
+    return t
+
+
+@wp.kernel(enable_backward=False)
 def cast_rays(
     offset: int,
     mesh: wp.uint64,
-    origins: wp.array(dtype=wp.vec3),
-    directions: wp.array(dtype=wp.vec3),
-    reach: wp.array(dtype=wp.float32),
-    distance: wp.array(dtype=wp.float32),
+    center: wp.vec3d,
+    radius: wp.float64,
+    planes: wp.array(dtype=wp.vec4d),
+    clearance: wp.float64,
+    origins: wp.array(dtype=wp.vec3d),
+    directions: wp.array(dtype=wp.vec3d),
+    reach: wp.array(dtype=wp.float64),
+    distance: wp.array(dtype=wp.float64),
     face: wp.array(dtype=wp.int32),
 ):
-    """Nearest face along each ray within ``reach`` [m]; face -1 where there is none."""
+    """Nearest face along each ray beyond ``clearance`` and within ``reach`` [m], and its distance in float64."""
     i = offset + wp.tid()
-    query = wp.mesh_query_ray(mesh, origins[i], directions[i], reach[i])
-    if query.result:
-        distance[i] = query.t
-        face[i] = query.face
-    else:
-        distance[i] = wp.inf
-        face[i] = -1
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    length = wp.length(direction)
+    scale = rounding_scale(origin, radius)
+    if is_bad(scale, length):
+        distance[i] = wp.float64(wp.inf)
+        face[i] = BAD
+        return
+    unit = direction / length
+    step = _ROUNDING * scale
+    start = clearance - step
+    most = wp.min(reach[wp.min(i, reach.shape[0] - 1)], _FAR)
+    found = wp.float64(wp.inf)
+    name = MISS
+    for _ in range(_STEPS):
+        query = wp.mesh_query_ray(
+            mesh, narrow(origin + start * unit), narrow(unit), wp.float32(most - start + step)
+        )
+        if not query.result:
+            break
+        near = start + wp.float64(query.t)
+        t = plane_distance(origin, direction, length, scale, planes[query.face], near, clearance)
+        if not wp.isnan(t):
+            found = t
+            name = query.face
+            break
+        start = near + step
+        if start > most:
+            break
+    distance[i] = found
+    face[i] = name
+
+
+@wp.kernel(enable_backward=False)
+def pack_rays(
+    offset: int,
+    first: int,
+    center: wp.vec3d,
+    radius: wp.float64,
+    clearance: wp.float64,
+    start: wp.array(dtype=wp.float64),
+    origins: wp.array(dtype=wp.vec3d),
+    directions: wp.array(dtype=wp.vec3d),
+    rays: wp.array(dtype=wp.vec3),
+):
+    """Rays from number ``first`` on as pairs (start, unit direction) in float32; a bad one meets nothing.
+
+    ``start`` holds the distance [m] at which each begins; if empty, all begin at ``clearance``, less the rounding.
+    """
+    k = offset + wp.tid()
+    i = first + k
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    length = wp.length(direction)
+    scale = rounding_scale(origin, radius)
+    begin = clearance - _ROUNDING * scale
+    if start.shape[0] > 0:
+        begin = start[i]
+    unit = direction * (wp.float64(1.0) / length)
+    rays[2 * k] = narrow(origin + begin * unit)
+    rays[2 * k + 1] = narrow(unit)
+
+
+@wp.kernel(enable_backward=False)
+def place_hits(
+    offset: int,
+    first: int,
+    center: wp.vec3d,
+    radius: wp.float64,
+    planes: wp.array(dtype=wp.vec4d),
+    names: wp.array(dtype=wp.int32),
+    clearance: wp.float64,
+    start: wp.array(dtype=wp.float64),
+    origins: wp.array(dtype=wp.vec3d),
+    directions: wp.array(dtype=wp.vec3d),
+    met_at: wp.array(dtype=wp.float32),
+    met: wp.array(dtype=wp.int32),
+    distance: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.int32),
+):
+    """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's."""
+    k = offset + wp.tid()
+    i = first + k
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    length = wp.length(direction)
+    scale = rounding_scale(origin, radius)
+    if met[k] < 0:
+        distance[i] = wp.float64(wp.inf)
+        face[i] = wp.where(is_bad(scale, length), BAD, MISS)
+        return
+    begin = clearance - _ROUNDING * scale
+    if start.shape[0] > 0:
+        begin = start[i]
+    near = begin + wp.float64(met_at[k])
+    name = names[met[k]]
+    t = plane_distance(origin, direction, length, scale, planes[name], near, clearance)
+    if wp.isnan(t):
+        t = near + _ROUNDING * scale
+        name = AGAIN
+    distance[i] = t
+    face[i] = name
 
 
 @wp.kernel

@@ -1,0 +1,260 @@
+"""Hard cases of ray queries, on both back ends, against answers known in closed form."""
+
+import importlib.util
+import sys
+
+import numpy as np
+import pytest
+
+from warprrf.device import resolve
+from warprrf.geometry import raysearch
+from warprrf.geometry.mesh import Mesh
+
+ROOM = (np.array([-7.0, -6.0, 0.0]), np.array([8.0, 6.0, 4.0]))
+no_embree = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="needs open3d")
+
+
+@pytest.fixture(params=["warp", pytest.param("embree", marks=no_embree)])
+def backend(request):
+    return request.param
+
+
+def box(low, high):
+    """A closed box, normals outward."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    return np.asarray(low) + corners * (np.asarray(high) - low), np.array(faces)
+
+
+def sphere(rings=40, around=80, radius=5.0, bumps=0.3):
+    """A closed bumpy sphere about the origin: every vertex is seen from the middle."""
+    theta = np.linspace(0, np.pi, rings + 1)[1:-1]
+    phi = np.arange(around) * 2 * np.pi / around
+    th, ph = np.meshgrid(theta, phi, indexing="ij")
+    r = radius + bumps * np.sin(5 * th) * np.cos(7 * ph)
+    v = r[..., None] * np.stack([np.sin(th) * np.cos(ph), np.sin(th) * np.sin(ph), np.cos(th)], axis=-1)
+    vertices = np.concatenate([v.reshape(-1, 3), [[0, 0, radius], [0, 0, -radius]]])
+    j, k = np.arange(around), (np.arange(around) + 1) % around
+    north, south, last = len(vertices) - 2, len(vertices) - 1, (rings - 2) * around
+    faces = [
+        np.stack([np.full(around, north), j, k], 1),
+        np.stack([np.full(around, south), last + k, last + j], 1),
+    ]
+    for row in range(rings - 2):
+        a = row * around
+        faces += [
+            np.stack([a + j, a + around + j, a + around + k], 1),
+            np.stack([a + j, a + around + k, a + k], 1),
+        ]
+    return Mesh(vertices, np.concatenate(faces))
+
+
+def directions(n, seed=0):
+    d = np.random.default_rng(seed).standard_normal((n, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def box_exit(origin, d, low, high):
+    """Where rays from inside a box, or from on one of its faces inwards, leave it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(d > 0, (high - origin) / d, (low - origin) / d)
+    return np.where(d == 0, np.inf, t).min(axis=1)
+
+
+def rotation(seed):
+    q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
+    return q * np.sign(np.diag(r))
+
+
+def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(backend):
+    mesh, rng = sphere(), np.random.default_rng(1)
+    assert mesh.is_closed
+    vertex = mesh.vertices[rng.integers(len(mesh.vertices), size=60_000)]
+    face = mesh.triangles[rng.integers(len(mesh.faces), size=60_000)]
+    share = rng.uniform(size=(60_000, 1))
+    edge = share * face[:, 0] + (1 - share) * face[:, 1]
+    target = np.concatenate([vertex, edge, 10.0 * directions(80_000)])
+    origin = rng.uniform(-0.05, 0.05, (len(target), 3))
+    hit = mesh.cast(origin, target - origin, backend=backend, device="cpu")
+    assert hit.valid.all()
+    distance = np.linalg.norm(target - origin, axis=1)[:120_000]
+    np.testing.assert_allclose(hit.t[:120_000], distance, atol=5e-5)
+
+
+def test_only_the_recast_stops_rays_at_vertices(monkeypatch):
+    """Without it some escape, so the test above can fail."""
+    monkeypatch.setattr(raysearch, "_RECASTS", 0)
+    mesh, rng = sphere(), np.random.default_rng(1)
+    vertex = mesh.vertices[rng.integers(len(mesh.vertices), size=60_000)]
+    origin = rng.uniform(-0.05, 0.05, vertex.shape)
+    assert not mesh.cast(origin, vertex - origin, backend="warp", device="cpu").valid.all()
+
+
+def test_a_miss_from_outside_stays_a_miss(backend, monkeypatch):
+    mesh = sphere()
+    calls = []
+    nearest = raysearch.RaySearch.nearest
+    monkeypatch.setattr(
+        raysearch.RaySearch,
+        "nearest",
+        lambda self, o, d, **k: calls.append(len(d)) or nearest(self, o, d, **k),
+    )
+    outward = directions(1000)
+    hit = mesh.cast(20.0 * outward, outward, backend=backend, device="cpu")
+    assert not hit.valid.any() and calls == [1000]
+
+
+def test_an_open_mesh_is_not_recast(backend):
+    mesh = Mesh(sphere().vertices, sphere().faces[:-1])
+    assert not mesh.is_closed
+    hole = sphere().triangles[-1].mean(axis=0)
+    assert mesh.cast([0, 0, 0], hole, backend=backend, device="cpu").face[0] == -1
+
+
+@pytest.mark.parametrize("height", [1e-3, 1e-5])
+def test_grazing_rays_meet_floor_or_wall_where_they_should(backend, height):
+    rng = np.random.default_rng(2)
+    n = 20_000
+    origin = np.column_stack([rng.uniform(-6, 7, n), rng.uniform(-5, 5, n), np.full(n, height)])
+    azimuth = rng.uniform(-np.pi, np.pi, n)
+    slope = height * 10.0 ** rng.uniform(-2, 2, n)
+    d = np.column_stack([np.cos(azimuth), np.sin(azimuth), -slope])
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    hit = Mesh(*box(*ROOM)).cast(origin, d, backend=backend, device="cpu")
+    t = box_exit(origin, d, *ROOM)
+    # Float32 places the foot of the wall to 1e-6 m: there a ray may be given either face.
+    foot = np.abs(origin[:, 2] + d[:, 2] * box_exit(origin, d * [1, 1, 0], *ROOM)) < 4e-6
+    np.testing.assert_allclose(hit.t[~foot], t[~foot], rtol=1e-9)
+    assert foot.mean() < (0.01 if height == 1e-3 else 0.6)
+    assert hit.valid.all()
+
+
+def test_degenerate_and_duplicate_triangles_change_nothing(backend):
+    clean = sphere()
+    rng = np.random.default_rng(3)
+    some = rng.permutation(len(clean.faces))[:400]
+    middle = clean.triangles[some].mean(axis=1)
+    count = len(clean.vertices)
+    points = clean.faces[some][:, [0, 0, 1]]
+    collinear = np.column_stack(
+        [clean.faces[some, 0], np.arange(count, count + 400), np.arange(count + 400, count + 800)]
+    )
+    vertices = np.concatenate([clean.vertices, middle, 0.5 * (middle + clean.triangles[some, 0])])
+    dirty = Mesh(vertices, np.concatenate([points, clean.faces[some], clean.faces]))
+    needles = Mesh(vertices, np.concatenate([collinear, points, clean.faces[some], clean.faces]))
+    assert dirty.is_closed
+    aimed = np.concatenate([directions(100_000), clean.vertices, middle])
+    expected = clean.cast([0.01, 0.02, 0.03], aimed, backend=backend, device="cpu")
+    for mesh in (dirty, needles):
+        hit = mesh.cast([0.01, 0.02, 0.03], aimed, backend=backend, device="cpu")
+        np.testing.assert_allclose(hit.t, expected.t, atol=2e-6)
+        np.testing.assert_allclose(hit.t[:100_000], expected.t[:100_000], atol=1e-9)
+
+
+def test_a_receiver_on_a_surface_meets_the_next_surface(backend):
+    turn, n = rotation(4), 30_000
+    vertices, faces = box(*ROOM)
+    room = Mesh(vertices @ turn.T + [3.0, -2.0, 1.0], faces)
+    rng = np.random.default_rng(5)
+    p = rng.uniform(ROOM[0] + 0.1, ROOM[1] - 0.1, (n, 3))
+    axis, side = rng.integers(3, size=n), rng.integers(2, size=n)
+    p[np.arange(n), axis] = np.stack(ROOM)[side, axis]
+    d = directions(n, seed=6)
+    d[np.arange(n), axis] = np.abs(d[np.arange(n), axis]) * (1 - 2 * side)
+    steep = np.abs(d[np.arange(n), axis]) > 1e-3
+    t = box_exit(
+        p, d, *ROOM
+    )  # -0 and tiny distances to the own wall cannot arise: the ray leads away from it
+    hit = room.cast(p @ turn.T + [3.0, -2.0, 1.0], d @ turn.T, backend=backend, device="cpu")
+    np.testing.assert_allclose(hit.t[steep], t[steep], rtol=1e-9)
+
+
+def test_a_surface_just_before_the_receiver_is_met(backend):
+    rng = np.random.default_rng(7)
+    gap = 10.0 ** rng.uniform(-9, -3, 5000)
+    origin = np.column_stack([rng.uniform(-6, 7, 5000), rng.uniform(-5, 5, 5000), gap])
+    down = directions(5000, seed=8)
+    down[:, 2] = -np.abs(down[:, 2]) - 0.2
+    unit = down / np.linalg.norm(down, axis=1, keepdims=True)
+    hit = Mesh(*box(*ROOM)).cast(origin, down, backend=backend, device="cpu")
+    np.testing.assert_allclose(hit.t, -gap / unit[:, 2], rtol=1e-6)
+
+
+def test_a_kilometre_scene_far_from_the_origin_is_exact(backend):
+    low, high = np.array([431_000.0, 5_411_000.0, 200.0]), np.array([432_000.0, 5_412_000.0, 260.0])
+    mesh = Mesh(*box(low, high))
+    origin = np.random.default_rng(9).uniform(low + 1, high - 1, (50_000, 3))
+    d = directions(50_000, seed=10)
+    hit = mesh.cast(origin, d, backend=backend, device="cpu")
+    t = box_exit(origin, d, low, high)
+    exit_point = origin + t[:, None] * d
+    gap = np.sort(np.minimum(exit_point - low, high - exit_point), axis=1)[:, 1]
+    inner = gap > 1e-3  # not within float32's reach of an edge
+    np.testing.assert_allclose(hit.t[inner], t[inner], atol=5e-9)
+    assert hit.valid.all() and inner.mean() > 0.999
+    np.testing.assert_allclose(hit.t, t, atol=2e-2)
+
+
+def test_a_kilometre_scene_sees_from_floor_to_wall(backend):
+    mesh, rng = Mesh(*box([0, 0, 0], [1000.0, 1000, 30])), np.random.default_rng(11)
+    floor = np.column_stack([rng.uniform(1, 999, (2000, 2)), np.zeros(2000)])
+    wall = np.column_stack([np.full(2000, 1000.0), rng.uniform(1, 999, 2000), rng.uniform(1, 29, 2000)])
+    assert mesh.visible(floor, wall, backend=backend, device="cpu").all()
+    assert not mesh.visible(floor, wall + [0.01, 0, 0], backend=backend, device="cpu").any()
+
+
+@no_embree
+def test_back_ends_agree():
+    mesh = sphere(100, 200)
+    rng = np.random.default_rng(12)
+    origin, d = rng.uniform(-2, 2, (100_000, 3)), directions(100_000, seed=13)
+    warp, other = (mesh.cast(origin, d, backend=b, device="cpu") for b in ("warp", "embree"))
+    same = warp.face == other.face
+    assert same.mean() > 0.9999
+    np.testing.assert_array_equal(warp.t[same], other.t[same])
+    np.testing.assert_allclose(warp.t, other.t, atol=1e-5)
+    a, b = rng.uniform(-6, 6, (2, 50_000, 3))
+    seen = [mesh.visible(a, b, backend=k, device="cpu") for k in ("warp", "embree")]
+    assert 0.1 < seen[0].mean() < 0.9 and (seen[0] != seen[1]).mean() < 1e-4
+
+
+def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypatch):
+    cpu, choose = resolve("cpu"), raysearch.choose_backend
+    monkeypatch.setattr(raysearch.o3d, "installed", lambda: True)
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD) == "embree"
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD - 1) == "warp"
+    monkeypatch.setitem(sys.modules, "open3d", raysearch)
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS) == "embree"
+    assert choose("auto", cpu, raysearch.EMBREE_RAYS - 1) == "warp"
+    monkeypatch.setattr(raysearch.o3d, "installed", lambda: False)
+    assert choose("auto", cpu, 10**7) == "warp"
+
+
+def test_unknown_back_ends_are_refused():
+    with pytest.raises(ValueError, match="backend: got 'optix'.*warp"):
+        Mesh(*box(*ROOM)).cast([0, 0, 1], [0, 0, 1], backend="optix")
+
+
+def test_bad_rays_are_refused_by_both(backend):
+    mesh = Mesh(*box(*ROOM))
+    with pytest.raises(ValueError, match="directions.*zero"):
+        mesh.cast([0, 0, 1], [[1, 0, 0], [0, 0, 0]], backend=backend, device="cpu")
+    with pytest.raises(ValueError, match="directions.*NaN"):
+        mesh.cast([0, 0, 1], [[1, 0, 0], [0, np.inf, 0]], backend=backend, device="cpu")
+    with pytest.raises(ValueError, match="origins.*NaN"):
+        mesh.cast([[0, 0, 1], [0, 0, np.nan]], [1, 0, 0], backend=backend, device="cpu")
+    assert mesh.cast(np.zeros((0, 3)), np.zeros((0, 3)), backend=backend, device="cpu").t.shape == (0,)
+
+
+def test_points_and_normals_are_computed_when_asked_for(backend):
+    origin, d = np.array([0.5, 0.25, 1.5]), 3.0 * directions(500)
+    hit = Mesh(*box(*ROOM)).cast(origin, d, backend=backend, device="cpu")
+    assert not {"point", "normal"} & set(vars(hit))
+    t = box_exit(origin, d / 3.0, *ROOM)
+    unit = d / 3.0
+    d[:] = 0.0  # what the caller does with its arrays afterwards does not matter
+    np.testing.assert_allclose(hit.point, origin + t[:, None] * unit, atol=1e-12)
+    assert ((hit.normal * unit).sum(axis=1) > 0).all()
+    np.testing.assert_allclose(np.abs(hit.normal).max(axis=1), 1.0)

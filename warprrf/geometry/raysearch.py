@@ -1,0 +1,259 @@
+"""Search of a triangle mesh along rays: Warp's hierarchy on any device, or Embree's on a CPU.
+
+Both answer in float32 which face a ray meets; distances [m] are then taken in float64 from that face's plane (see
+`kernels.rays`), so the back ends agree. :class:`warprrf.geometry.mesh.Mesh` is the public side of it.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.geometry import embree, o3d
+from warprrf.kernels.rays import AGAIN, BAD, GRAZING, cast_rays, pack_rays, place_hits
+
+BACKENDS = ("auto", "warp", "embree")
+"""What searches the mesh: ``"auto"`` takes Embree on a CPU where Open3D is installed and there are many rays."""
+
+EMBREE_RAYS = 2_000
+"""From this many rays on ``"auto"`` takes Embree if Open3D is loaded: a call costs 0.3 ms more than Warp's."""
+
+EMBREE_RAYS_TO_LOAD = 200_000
+"""From this many rays on it is loaded for them: that takes one to three seconds, once a process."""
+
+# Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
+_EMBREE_CHUNK = 262_144
+# A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
+_JITTER = 1e-5
+_RECASTS = 4
+
+
+class Hit:
+    """What rays met, one entry a ray. Normals and points are computed when first asked for.
+
+    Attributes:
+        t: Distance along the unit direction [m], shape ``(N,)``, float64; inf where nothing was met.
+        face: Index of the face, shape ``(N,)``, int32; -1 where nothing was met.
+    """
+
+    def __init__(
+        self,
+        t: np.ndarray,
+        face: np.ndarray,
+        face_normals: np.ndarray,
+        origins: np.ndarray,
+        directions: np.ndarray,
+    ) -> None:
+        self.t = t
+        self.face = face
+        self._face_normals = face_normals
+        self._origins = origins
+        self._directions = directions
+
+    def __repr__(self) -> str:
+        return f"Hit({np.count_nonzero(self.valid)} of {len(self.t)} rays met a face)"
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Whether the ray met a face, shape ``(N,)``, bool."""
+        return self.face >= 0
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Unit face normal as wound (not turned towards the ray), shape ``(N, 3)``; NaN where nothing was met."""
+        normal = self._face_normals[self.face]
+        normal[~self.valid] = np.nan
+        return normal
+
+    @cached_property
+    def point(self) -> np.ndarray:
+        """Point met [m], shape ``(N, 3)``, float64; NaN where nothing was met."""
+        t = np.where(self.valid, self.t, np.nan)[:, None]
+        return self._origins + t * (
+            self._directions / np.linalg.norm(self._directions, axis=1, keepdims=True)
+        )
+
+
+class RaySearch:
+    """The hierarchies of one mesh, each built when first needed.
+
+    Args:
+        triangles: Corners [m], shape ``(F, 3, 3)``.
+        face_normals: Unit normals, shape ``(F, 3)``; zero for a face without area.
+        vertices: Positions [m], shape ``(V, 3)``.
+        faces: Vertex indices, shape ``(F, 3)``.
+        bounds: Lowest and highest corner [m], shape ``(2, 3)``.
+    """
+
+    def __init__(
+        self,
+        triangles: np.ndarray,
+        face_normals: np.ndarray,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        bounds: np.ndarray,
+    ) -> None:
+        self._bounds = bounds
+        self._center = bounds.mean(axis=0)
+        self._radius = 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
+        offset = np.einsum("ni,ni->n", face_normals, triangles[:, 0] - self._center)
+        self._planes = np.column_stack([face_normals, offset])
+        self._vertices = (vertices - self._center).astype(np.float32)
+        self._faces = faces
+        self._on_device: dict[str, tuple[wp.Mesh, wp.array]] = {}
+
+    def on_device(self, device: wp.Device) -> wp.Mesh:
+        """The Warp mesh on ``device`` with its vertices relative to the middle of the bounds."""
+        return self._built(device)[0]
+
+    def _built(self, device: wp.Device) -> tuple[wp.Mesh, wp.array]:
+        if str(device) not in self._on_device:
+            mesh = wp.Mesh(
+                points=wp.array(self._vertices, dtype=wp.vec3, device=device),
+                indices=wp.array(self._faces.reshape(-1), dtype=wp.int32, device=device),
+            )
+            self._on_device[str(device)] = mesh, wp.array(self._planes, dtype=wp.vec4d, device=device)
+        return self._on_device[str(device)]
+
+    @cached_property
+    def _embree(self) -> tuple[embree.EmbreeScene, np.ndarray]:
+        """Embree's hierarchy of the faces that have an area, and which faces those are."""
+        names = np.flatnonzero(self._planes[:, :3].any(axis=1)).astype(np.int32)
+        return embree.EmbreeScene(self._vertices, self._faces[names]), names
+
+    def nearest(
+        self, o: np.ndarray, d: np.ndarray, *, reach: np.ndarray, clearance: float, device: Any, backend: str
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Distance (N,) [m], float64, and face (N,) of what rays meet beyond ``clearance`` [m]; inf and -1 at a miss.
+
+        ``o`` and ``d`` hold one row or N, ``reach`` [m] one number or N: no need to look further.
+
+        Raises:
+            ValueError: if a ray is not finite or has no direction, or on an unknown back end, or Embree on a GPU.
+        """
+        where = _device.resolve(device)
+        count = max(len(o), len(d)) if min(len(o), len(d)) else 0
+        if choose_backend(backend, where, count) == "embree" and count:
+            t, face = self._nearest_embree(o, d, clearance, where)
+        else:
+            mesh, planes = self._built(where)
+            distance = wp.empty(count, dtype=wp.float64, device=where)
+            found = wp.empty(count, dtype=wp.int32, device=where)
+            inputs = [
+                mesh.id, wp.vec3d(*self._center), self._radius, planes, clearance, _given(o, wp.vec3d, where),
+                _given(d, wp.vec3d, where), _given(reach, wp.float64, where), distance, found,
+            ]  # fmt: skip
+            _device.launch(cast_rays, count, inputs, device=where)
+            t, face = distance.numpy(), found.numpy()
+        if (face == BAD).any():
+            _refuse(o, d)
+        return t, face
+
+    def _nearest_embree(
+        self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device, start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        scene, names = self._embree
+        count = max(len(o), len(d))
+        chunk = min(count, _EMBREE_CHUNK)
+        t, face = np.empty(count), np.empty(count, dtype=np.int32)
+        rays = wp.empty(2 * chunk, dtype=wp.vec3, device=cpu)
+        center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
+        given = [
+            clearance, _given(np.empty(0) if start is None else start, wp.float64, cpu),
+            _given(o, wp.vec3d, cpu), _given(d, wp.vec3d, cpu),
+        ]  # fmt: skip
+        out = [_given(t, wp.float64, cpu), _given(face, wp.int32, cpu)]
+        pieces = _device.threads()
+        for first in range(0, count, chunk):
+            size = min(chunk, count - first)
+            inputs = [first, center, self._radius, *given, rays]
+            _device.launch(pack_rays, size, inputs, device=cpu, pieces=pieces)
+            met_at, met = scene.cast(rays.numpy().reshape(-1, 6)[:size])
+            hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
+            inputs = [first, center, self._radius, planes, faces, *given, *hits, *out]
+            _device.launch(place_hits, size, inputs, device=cpu, pieces=pieces)
+        again = np.flatnonzero(face == AGAIN)
+        if len(again):
+            t[again], face[again] = self._nearest_embree(
+                rows(o, again), rows(d, again), clearance, cpu, t[again]
+            )
+        return t, face
+
+    def recast(
+        self, o: np.ndarray, d: np.ndarray, t: np.ndarray, face: np.ndarray, *, device: Any, backend: str
+    ) -> None:
+        """Cast rays that met nothing and start within the bounds again, a little turned; fills ``t`` and ``face``."""
+        missed = np.flatnonzero(face < 0)
+        if len(missed) == 0:
+            return
+        inside = ((self._bounds[0] <= o) & (o <= self._bounds[1])).all(axis=1)
+        missed = missed[np.broadcast_to(inside, face.shape)[missed]]
+        rng = np.random.default_rng(0)
+        for _ in range(_RECASTS):
+            if len(missed) == 0:
+                return
+            start, toward = rows(o, missed), rows(d, missed)
+            toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
+            turned = toward + _JITTER * rng.standard_normal((len(missed), 3))
+            near, found = self.nearest(
+                start, turned, reach=np.full(1, np.inf), clearance=0.0, device=device, backend=backend
+            )
+            # The distance is that of the ray asked for to the plane of the face found.
+            plane = self._planes[found]
+            slope = (plane[:, :3] * toward).sum(axis=1)
+            height = plane[:, 3] - (plane[:, :3] * (start - self._center)).sum(axis=1)
+            steep = (found >= 0) & (np.abs(slope) > GRAZING)
+            t[missed] = np.divide(height, slope, out=near, where=steep)
+            face[missed] = found
+            missed = missed[found < 0]
+
+
+def choose_backend(backend: str, device: wp.Device, count: int) -> str:
+    """``"warp"`` or ``"embree"`` for ``count`` rays on ``device``.
+
+    Raises:
+        ValueError: on an unknown name, or Embree on a GPU.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: got {backend!r}, expected one of {', '.join(BACKENDS)}")
+    if backend == "embree" and device.is_cuda:
+        raise ValueError(f'backend: got "embree" on {device}, expected "warp" there, or device="cpu"')
+    if backend != "auto":
+        return backend
+    least = EMBREE_RAYS if o3d.loaded() else EMBREE_RAYS_TO_LOAD
+    return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
+
+
+def rows(array: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Rows of rays that may hold one row for all."""
+    return array if len(array) == 1 else array[index]
+
+
+def _given(array: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
+    """``array`` for a kernel, without a copy on a CPU."""
+    return wp.array(array, dtype=dtype, device=device, copy=False)
+
+
+def ray_arrays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rays as float64 rows, one or N of each; :meth:`RaySearch.nearest` refuses numbers that are not finite."""
+    o = np.atleast_2d(_device.check_array("origins", origins, finite=False))
+    d = np.atleast_2d(_device.check_array("directions", directions, finite=False))
+    for name, array in (("origins", o), ("directions", d)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
+    if len(o) != len(d) and 1 not in (len(o), len(d)):
+        raise ValueError(f"directions: got {len(d)} for {len(o)} origins, expected as many, or one of either")
+    return o, d
+
+
+def _refuse(origins: np.ndarray, directions: np.ndarray) -> None:
+    """Say what is wrong with rays of which a kernel found some to be bad."""
+    for name, array in (("origins", origins), ("directions", directions)):
+        _device.check_array(name, array)
+    if (np.linalg.norm(directions, axis=1) == 0).any():
+        raise ValueError("directions: got a vector of length zero, expected directions")
+    raise ValueError("origins, directions: got numbers too large to square, expected metres")
