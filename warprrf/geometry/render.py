@@ -305,10 +305,15 @@ class Rasterizer:
         tape = _active_tape()
         image, left, back = self._blend(prepared, features, background, requires_grad=tape is not None)
         if tape is not None:
-            tape.record_func(
-                lambda: self.blend_adjoint(prepared, features, back, image, left),
-                [*prepared.inputs, features, back, image.features, image.alpha, image.depth],
-            )
+            outputs = (image.features, image.alpha, image.depth)
+
+            def backward() -> None:
+                self.blend_adjoint(prepared, features, back, image, left)
+                for array in outputs:  # as Warp's own adjoints do: a second backward adds the same again, not more
+                    if not array.retain_grad:
+                        array.grad.zero_()
+
+            tape.record_func(backward, [*prepared.inputs, features, back, *outputs])
         return image
 
     def blend_with_adjoint(

@@ -1,0 +1,1 @@
+"""Benchmarks of the engine: each kernel beside a peer measured in the same run."""
