@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from warprrf.device import require
+from warprrf.device import require, resolve
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.render import Blending, Rasterizer
 from warprrf.kernels.sh import COEFFICIENTS
@@ -119,7 +119,7 @@ def _functions() -> SimpleNamespace:
 
     def raster(tensor: torch.Tensor, blending: Blending | None = None) -> Rasterizer:
         real = wp.float64 if tensor.dtype == torch.float64 else wp.float32
-        return Rasterizer(device=wp.device_from_torch(tensor.device), blending=blending, real=real)
+        return Rasterizer(device=resolve(str(tensor.device)), blending=blending, real=real)
 
     def shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
         """The tensor's memory as a Warp array; its gradient is summed into memory of Warp's own."""

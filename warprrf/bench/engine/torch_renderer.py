@@ -212,7 +212,13 @@ def _spans(
         # An image line touches the ellipsoid where its plane's normal is on this dual cone.
         cone = axes @ axes.transpose(1, 2) - p[:, :, None] * p[:, None, :]
         one_side = ~inside & (cone[:, 2, 2] < 0)
-        visible &= ~one_side | (p[:, 2] > 0)
+        # Those that cross the camera plane: seen only if their cap reaches into the cone round the image.
+        corner = torch.tensor([max(cam.cx, cam.width - cam.cx) / cam.fx, max(cam.cy, cam.height - cam.cy) / cam.fy])
+        half_view = torch.atan(torch.linalg.vector_norm(corner))
+        reach = radius * size.amax(1) / distance.clamp(min=1e-300)
+        cap = torch.where(reach < 1, torch.asin(reach.clamp(max=1)), torch.pi)
+        off_axis = torch.acos((p[:, 2] / distance.clamp(min=1e-300)).clamp(-1, 1))
+        visible &= torch.where(one_side, p[:, 2] > 0, inside | (off_axis < cap + half_view))
         for axis, focal, centre in ((0, cam.fx, cam.cx), (1, cam.fy, cam.cy)):
             c13, c33 = cone[:, axis, 2], torch.where(one_side, cone[:, 2, 2], -1)
             root = (c13**2 - cone[:, axis, axis] * c33).clamp(min=0).sqrt()
