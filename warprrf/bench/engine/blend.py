@@ -44,6 +44,9 @@ def run_blend(
 ) -> dict[str, Any]:
     """Time ours and the torch renderer on a CPU in float32; the runs alternate and the fastest of each counts.
 
+    Both use as many threads as ours does (``WARPRRF_THREADS`` where set). On a busy machine compare one thread with one:
+    each tensor operation waits for all of torch's threads.
+
     Args:
         out: write the result to this JSON file.
         n: Gaussians.
@@ -68,6 +71,8 @@ def run_blend(
     def peer() -> torch.Tensor:
         return render_with_torch(*parameters, cam).features
 
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads())
     runs: dict[str, list[tuple[float, float]]] = {"ours": [], "torch": []}
     images: dict[str, Any] = {}
     gradients: dict[str, Any] = {}
@@ -78,11 +83,12 @@ def run_blend(
                 runs[name].append(seconds)
         if progress:
             progress("blend", k + 1, repeats + 1)
+    torch.set_num_threads(before)
     with torch.no_grad():
         counted = render_with_torch(*parameters, cam)
     result: dict[str, Any] = {
         "machine": machine("cpu"),
-        "torch": {"version": torch.__version__, "threads": torch.get_num_threads()},
+        "torch": {"version": torch.__version__},
         "threads": threads(),
         "gaussians": n,
         "shape": [height, width],
