@@ -251,7 +251,9 @@ class Rasterizer:
         )
         origin = self.colors_into(means, sh, cam, out)
         if tape is not None:
-            tape.record_func(lambda: self.colors_adjoint(means, sh, origin, out), [means, sh, out])
+            tape.record_func(
+                lambda: self.colors_adjoint(means, sh, origin, out), _with_gradients(means, sh, out)
+            )
         return out
 
     def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
@@ -313,7 +315,7 @@ class Rasterizer:
                     if not array.retain_grad:
                         array.grad.zero_()
 
-            tape.record_func(backward, [*prepared.inputs, features, back, *outputs])
+            tape.record_func(backward, _with_gradients(*prepared.inputs, features, back, *outputs))
         return image
 
     def blend_with_adjoint(
@@ -389,6 +391,11 @@ class Rasterizer:
 
 def _active_tape() -> wp.Tape | None:
     return wp._src.context.runtime.tape
+
+
+def _with_gradients(*arrays: wp.array) -> list[wp.array]:
+    """Those whose gradients the tape keeps; it refuses arrays that want none or are empty."""
+    return [array for array in arrays if array.requires_grad and array.size]
 
 
 def _gradient(array: wp.array) -> wp.array:
