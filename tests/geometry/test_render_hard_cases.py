@@ -202,7 +202,7 @@ def test_a_round_gaussian_at_a_pole_is_the_same_at_every_azimuth(side):
     cam = Camera.spherical(80, 40, position=ORIGIN)
     rows = (np.arange(40) + 0.5) * np.pi / 40
     sine = 3.0 * np.sin(rows)  # distance of the mean from the ray
-    raw = 0.8 * np.exp(-0.5 * (sine / 0.5) ** 2)
+    raw = np.float32(0.8) * np.exp(-0.5 * (sine / 0.5) ** 2)
     expected = np.where((np.cos(rows) * side > 0) & (raw > SMOOTH.alpha_min), raw, 0)
     for alpha, tolerance in ((ours32, 2e-6), (ours64, 1e-8)):
         assert np.abs(alpha(g, cam) - expected[:, None]).max() < tolerance
@@ -272,8 +272,10 @@ def test_gradients_at_opacity_zero_and_one_are_those_of_the_blend(rule):
         alpha = min(first, blending.alpha_max)
         left, slope = (1 - alpha, -1.0) if rule == "product" else (np.exp(-alpha), -np.exp(-alpha))
         clamped = first > blending.alpha_max
-        # Opacity 0 is below the cutoff and sees no gradient, a clamped one neither.
-        d_first = 0.0 if clamped or first == 0 else 1.0 + slope * 0.5 * 2.0
+        # Opacity 0 is below the cutoff and sees no gradient, a clamped one neither. An alpha of exactly one hides what
+        # is behind from its own gradient too, under the product rule: its weights are zero.
+        behind = 0.0 if left == 0 else slope * 0.5 * 2.0
+        d_first = 0.0 if clamped or first == 0 else 1.0 + behind
         assert inputs[3].grad.numpy() == pytest.approx([d_first, 2.0 * left], abs=1e-12)
         for array in inputs:
             assert np.isfinite(array.grad.numpy()).all()

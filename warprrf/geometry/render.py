@@ -31,7 +31,8 @@ class Blending:
 
     Attributes:
         alpha_min: a Gaussian contributes where ``opacity * response`` reaches this.
-        alpha_max: clamp of alpha, so that no layer is fully opaque.
+        alpha_max: clamp of alpha, so that no layer is fully opaque. With 1 allowed, a layer of alpha exactly one hides
+            what is behind it from its own gradient as well (``product``).
         transmittance_min: a pixel is finished when less light than this is left.
         rule: ``"product"`` of (1 - alpha), or ``"exp"`` of minus the sum of alphas (the paper's equation for T_k, which
             can blend to more than one).
