@@ -40,7 +40,9 @@ def both(values, cam, blending):
 
 def gradients(images, values, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    total = sum((torch.randn(i.shape, generator=generator, dtype=torch.float64).to(i) * i).sum() for i in images)
+    total = sum(
+        (torch.randn(i.shape, generator=generator, dtype=torch.float64).to(i) * i).sum() for i in images
+    )
     return torch.autograd.grad(total, values, retain_graph=True)
 
 

@@ -52,7 +52,9 @@ class WholePath:
             "background": rng.uniform(0.1, 1, CHANNELS),
         }
         self.camera = random_camera(rng, spherical=seed % 2 == 0)
-        self.blending = Blending(alpha_max=0.95, transmittance_min=0.02, rule=("product", "exp")[seed // 2 % 2])
+        self.blending = Blending(
+            alpha_max=0.95, transmittance_min=0.02, rule=("product", "exp")[seed // 2 % 2]
+        )
         self.target = rng.normal(size=(self.camera.height, self.camera.width, CHANNELS))
         self.spoil = spoil
         # Interior pixels: nothing of theirs is decided within a step. Decided once, so the loss stays one function.
@@ -76,7 +78,13 @@ class WholePath:
                 tape.record_func(lambda: wrong.grad.assign(wrong.grad.numpy() * (1 + 1e-4)), [wrong])
             colors = raster.colors(a["means"], a["sh"], self.camera)
             image = raster.rasterize(
-                a["means"], a["quaternions"], a["scales"], a["opacities"], colors, self.camera, a["background"]
+                a["means"],
+                a["quaternions"],
+                a["scales"],
+                a["opacities"],
+                colors,
+                self.camera,
+                a["background"],
             )
             wp.launch(
                 decibel_loss,
@@ -222,7 +230,13 @@ def test_gradients_handed_to_the_tape_can_be_used_again():
         with wp.Tape() as tape:
             colors = raster.colors(a["means"], a["sh"], path.camera)
             image = raster.rasterize(
-                a["means"], a["quaternions"], a["scales"], a["opacities"], colors, path.camera, a["background"]
+                a["means"],
+                a["quaternions"],
+                a["scales"],
+                a["opacities"],
+                colors,
+                path.camera,
+                a["background"],
             )
         tape.backward(grads={image.features: seed})
         found.append({k: v.grad.numpy().copy() for k, v in a.items()})

@@ -52,7 +52,9 @@ def alpha_of_one(g, cam, blending, dtype=np.longdouble):
     t = a @ b / np.sum(a * a, axis=-1)
     distance2 = np.sum((a * t[..., None] - b) ** 2, axis=-1)
     raw = dtype(g.opacities[0]) * np.exp(-distance2 / 2)
-    return np.where((raw > blending.alpha_min) & (t > 0), np.minimum(raw, blending.alpha_max), 0).astype(float)
+    return np.where((raw > blending.alpha_min) & (t > 0), np.minimum(raw, blending.alpha_max), 0).astype(
+        float
+    )
 
 
 def ours64(g, cam, blending=SMOOTH):

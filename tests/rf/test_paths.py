@@ -249,7 +249,7 @@ def test_paths_in_a_conference_room_agree_with_matlabs_image_method():
 
 
 def test_a_scene_of_a_kilometre_keeps_the_phase_at_a_millimetre_wavelength():
-    """Two rays over a plane: lengths sqrt(D^2 + (h1 -+ h2)^2), a million wavelengths, phases to a thousandth of a radian."""
+    """Two rays over a plane: lengths sqrt(D^2 + (h1 -+ h2)^2), phases to a thousandth of a radian."""
     ground = Mesh(*square(1024.0))
     transmitter = np.array([-500.0, 3.0, 12.3456789])
     points = np.stack([np.linspace(400, 500, 7), np.full(7, -2.0), np.linspace(1.5, 30, 7)], axis=1)

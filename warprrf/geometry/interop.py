@@ -142,7 +142,9 @@ def _functions() -> SimpleNamespace:
             r = raster(tensors[0], blending)
             types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
             inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
-            image, ctx.adjoint = r.blend_with_adjoint(r.prepare(*inputs[:4], cam), *inputs[4:])
+            image, ctx.adjoint = r.blend_with_adjoint(
+                r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam), inputs[4], inputs[5]
+            )
             ctx.inputs, ctx.outputs = inputs, (image.features, image.alpha, image.depth)
             ctx.save_for_backward(*tensors)
             return tuple(wp.to_torch(array, requires_grad=False).clone() for array in ctx.outputs)

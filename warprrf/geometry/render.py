@@ -312,7 +312,9 @@ class Rasterizer:
 
             def backward() -> None:
                 self.blend_adjoint(prepared, features, back, image, left)
-                for array in outputs:  # as Warp's own adjoints do: a second backward adds the same again, not more
+                for (
+                    array
+                ) in outputs:  # as Warp's own adjoints do: a second backward adds the same again, not more
                     if not array.retain_grad:
                         array.grad.zero_()
 

@@ -7,8 +7,9 @@ distance is
 
     q = |m|^2 (A1 u1^2 + A2 u2^2) / |g|^2,   A1 = |b1 x a|^2, A2 = |b2 x a|^2,
 
-with ``e1, e2`` turned about ``mh`` until ``(b1 x a).(b2 x a) = 0``: a sum of squares loses no digits, which needles need.
-The response is ``exp(-q/2)``, the peak at range ``t = |m| (a.g)/|g|^2``, visible where ``a.g > 0``. This is exact for
+with ``e1, e2`` turned about ``mh`` until ``(b1 x a).(b2 x a) = 0``: a sum of squares loses no digits,
+which needles need. The response is ``exp(-q/2)``,
+the peak at range ``t = |m| (a.g)/|g|^2``, visible where ``a.g > 0``. This is exact for
 every direction, with no projection to differentiate; projection serves binning only. Coefficients are computed in
 float64.
 """

@@ -1,7 +1,7 @@
 """Blending, forward and backward: our rasteriser beside the vectorised torch renderer, measured in one run.
 
-The scene is a room of flat Gaussians, 18 x 12 x 4 m, seen by a pinhole camera inside: what photos are refined with. Both
-get the same tensors and the same loss, a fixed weighted sum of the image, and both are called through torch's autograd;
+The scene is a room of flat Gaussians, 18 x 12 x 4 m, seen by a pinhole camera inside: what photos are refined with.
+Both get the same tensors and the same loss, a fixed weighted sum of the image, and both are called through torch's autograd;
 times cover projection, binning, blending and the gradients of means, quaternions, scales, opacities and features.
 """
 
@@ -53,8 +53,8 @@ def run_blend(
         repeats: timed runs of each, after one that warms up.
 
     Returns:
-        Seconds forward, backward and in all of both (``ours``, ``torch``), ``speedup`` (torch over ours, in all), pairs of
-        pixel and Gaussian that contribute, nanoseconds per such pair, and the largest and 99.9 % difference of the
+        Seconds forward, backward and in all of both (``ours``, ``torch``), ``speedup`` (torch over ours, in all), pairs
+        of pixel and Gaussian that contribute, nanoseconds per such pair, and the largest and 99.9 % difference of the
         images and the relative difference of the gradients.
 
     Raises:
@@ -62,14 +62,15 @@ def run_blend(
     """
     torch = require("torch", "baselines")
     parameters = [torch.tensor(v, requires_grad=True) for v in room(n, seed)]
+    means, quaternions, scales, opacities, colors = parameters
     cam = photo(width, height)
     weights = torch.from_numpy(np.random.default_rng(seed).normal(size=(height, width, 3)).astype(np.float32))
 
-    def ours() -> torch.Tensor:
-        return interop.rasterize(*parameters, cam)[0]
+    def ours() -> Any:
+        return interop.rasterize(means, quaternions, scales, opacities, colors, cam)[0]
 
-    def peer() -> torch.Tensor:
-        return render_with_torch(*parameters, cam).features
+    def peer() -> Any:
+        return render_with_torch(means, quaternions, scales, opacities, colors, cam).features
 
     before = torch.get_num_threads()
     torch.set_num_threads(threads())
@@ -85,7 +86,7 @@ def run_blend(
             progress("blend", k + 1, repeats + 1)
     torch.set_num_threads(before)
     with torch.no_grad():
-        counted = render_with_torch(*parameters, cam)
+        counted = render_with_torch(means, quaternions, scales, opacities, colors, cam)
     result: dict[str, Any] = {
         "machine": machine("cpu"),
         "torch": {"version": torch.__version__},

@@ -1,7 +1,8 @@
 """The rasteriser's definition in plain tensor operations: the peer that our kernels are measured against.
 
 Same images as :class:`warprrf.geometry.render.Rasterizer` (exact response on every ray, both cameras, both
-transmittance rules, order by range, same cutoffs and early exit), differentiated by torch's autograd. Nothing loops over
+transmittance rules, order by range, same cutoffs and early exit),
+differentiated by torch's autograd. Nothing loops over
 Gaussians or pixels: tiles of 8 x 8 pixels are padded to lists of similar length and processed in bulk.
 
 The response is written independently of the kernels. With whitening ``M = diag(1/s) R^T`` and mean ``m`` seen from the
@@ -63,8 +64,8 @@ def render_with_torch(
     """Blend Gaussians front to back along every pixel's ray; differentiable in every tensor.
 
     Args:
-        means, quaternions, scales, opacities, features: shapes ``(N, 3)``, ``(N, 4)`` wxyz of any length, ``(N, 3)`` [m],
-            ``(N,)``, ``(N, C)``, one floating type; it is the precision of the image.
+        means, quaternions, scales, opacities, features: shapes ``(N, 3)``, ``(N, 4)`` wxyz of any length, ``(N, 3)``
+            [m], ``(N,)``, ``(N, C)``, one floating type; it is the precision of the image.
         background: shape ``(C,)``; default: zero.
         chunk: pairs of pixel and Gaussian processed at once.
     """
@@ -72,7 +73,10 @@ def render_with_torch(
 
     blending = blending or Blending()
     real, device = features.dtype, features.device
-    rotation, m = _rotations(quaternions.double()), means.double() - torch.as_tensor(cam.position, device=device)
+    rotation, m = (
+        _rotations(quaternions.double()),
+        means.double() - torch.as_tensor(cam.position, device=device),
+    )
     size, distance = scales.double(), torch.linalg.vector_norm(m, dim=1)
     with torch.no_grad():
         cut = 2 * torch.log(opacities.double() / blending.alpha_min)
@@ -81,7 +85,9 @@ def render_with_torch(
     ray_matrices, leading = _ray_matrices(rotation, m, size)
     # One row more, of opacity zero, pads the lists.
     pad = torch.nn.functional.pad
-    unseen = torch.eye(7, 3, dtype=real, device=device)[None]  # a finite response, which its cut of zero refuses
+    unseen = torch.eye(7, 3, dtype=real, device=device)[
+        None
+    ]  # a finite response, which its cut of zero refuses
     matrices = torch.cat([ray_matrices.to(real), unseen])
     leading = pad(leading.to(real), (0, 1))
     opacity, color = pad(opacities.to(real), (0, 1)), pad(features, (0, 0, 0, 1))
@@ -125,8 +131,8 @@ def _blend(
     background: torch.Tensor,
     blending: Blending,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Tiles in bulk: ``(tiles, K, ...)`` Gaussians near to far on ``(tiles, P, 3)`` rays; columns features, alpha, sum of
-    weight times range, shape ``(tiles, P, C + 2)``; and how many contributed, ``(tiles, P, 1)``."""
+    """Tiles in bulk: ``(tiles, K, ...)`` Gaussians near to far on ``(tiles, P, 3)`` rays; columns features, alpha, sum
+    of weight times range, shape ``(tiles, P, C + 2)``; and how many contributed, ``(tiles, P, 1)``."""
     import torch
 
     tiles, longest = opacity.shape
@@ -157,8 +163,8 @@ def _blend(
 def _ray_matrices(
     rotation: torch.Tensor, m: torch.Tensor, size: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """``(N, 7, 3)``: what a ray ``d`` is multiplied with for ``M d``, ``cof(M) (d x m)`` and ``M m . M d``; and the factor
-    that makes the last a range. M is scaled by the smallest scale, which keeps float32 in range."""
+    """``(N, 7, 3)``: what a ray ``d`` is multiplied with for ``M d``, ``cof(M) (d x m)`` and ``M m . M d``; and the
+    factor that makes the last a range. M is scaled by the smallest scale, which keeps float32 in range."""
     import torch
 
     smallest = size.amin(1, keepdim=True)
@@ -197,8 +203,8 @@ def _spans(
     distance: torch.Tensor,
     cut: torch.Tensor,
 ) -> torch.Tensor:
-    """Pixels that a Gaussian can touch, ``(N, 4)``: first column, columns, first row, rows. Columns run on over the seam
-    of a panorama; zero columns where nothing is seen."""
+    """Pixels that a Gaussian can touch, ``(N, 4)``: first column, columns, first row, rows. Columns run on over the
+    seam of a panorama; zero columns where nothing is seen."""
     import torch
 
     radius = cut.clamp(min=0).sqrt()
@@ -215,7 +221,9 @@ def _spans(
         cone = axes @ axes.transpose(1, 2) - p[:, :, None] * p[:, None, :]
         one_side = ~inside & (cone[:, 2, 2] < 0)
         # Those that cross the camera plane: seen only if their cap reaches into the cone round the image.
-        corner = torch.tensor([max(cam.cx, cam.width - cam.cx) / cam.fx, max(cam.cy, cam.height - cam.cy) / cam.fy])
+        corner = torch.tensor(
+            [max(cam.cx, cam.width - cam.cx) / cam.fx, max(cam.cy, cam.height - cam.cy) / cam.fy]
+        )
         half_view = torch.atan(torch.linalg.vector_norm(corner))
         reach = radius * size.amax(1) / distance.clamp(min=1e-300)
         cap = torch.where(reach < 1, torch.asin(reach.clamp(max=1)), torch.pi)
