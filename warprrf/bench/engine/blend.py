@@ -1,8 +1,9 @@
 """Blending, forward and backward: our rasteriser beside the vectorised torch renderer, measured in one run.
 
 The scene is a room of flat Gaussians, 18 x 12 x 4 m, seen by a pinhole camera inside: what photos are refined with.
-Both get the same tensors and the same loss, a fixed weighted sum of the image, and both are called through torch's autograd;
-times cover projection, binning, blending and the gradients of means, quaternions, scales, opacities and features.
+Both get the same tensors and the same loss, a fixed weighted sum of the image, and both are called through torch's
+autograd; times cover projection, binning, blending and the gradients of means, quaternions, scales, opacities and
+features.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ def run_blend(
 ) -> dict[str, Any]:
     """Time ours and the torch renderer on a CPU in float32; the runs alternate and the fastest of each counts.
 
-    Both use as many threads as ours does (``WARPRRF_THREADS`` where set). On a busy machine compare one thread with one:
-    each tensor operation waits for all of torch's threads.
+    Both use as many threads as ours does (``WARPRRF_THREADS`` where set). On a busy machine compare one thread with
+    one: each tensor operation waits for all of torch's threads.
 
     Args:
         out: write the result to this JSON file.
