@@ -31,7 +31,8 @@ class Blending:
 
     Attributes:
         alpha_min: a Gaussian contributes where ``opacity * response`` reaches this.
-        alpha_max: clamp of alpha, so that no layer is fully opaque.
+        alpha_max: clamp of alpha, so that no layer is fully opaque. With 1 allowed, a layer of alpha exactly one hides
+            what is behind it from its own gradient as well (``product``).
         transmittance_min: a pixel is finished when less light than this is left.
         rule: ``"product"`` of (1 - alpha), or ``"exp"`` of minus the sum of alphas (the paper's equation for T_k, which
             can blend to more than one).
@@ -251,7 +252,9 @@ class Rasterizer:
         )
         origin = self.colors_into(means, sh, cam, out)
         if tape is not None:
-            tape.record_func(lambda: self.colors_adjoint(means, sh, origin, out), [means, sh, out])
+            tape.record_func(
+                lambda: self.colors_adjoint(means, sh, origin, out), _with_gradients(means, sh, out)
+            )
         return out
 
     def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
@@ -305,10 +308,17 @@ class Rasterizer:
         tape = _active_tape()
         image, left, back = self._blend(prepared, features, background, requires_grad=tape is not None)
         if tape is not None:
-            tape.record_func(
-                lambda: self.blend_adjoint(prepared, features, back, image, left),
-                [*prepared.inputs, features, back, image.features, image.alpha, image.depth],
-            )
+            outputs = (image.features, image.alpha, image.depth)
+
+            def backward() -> None:
+                self.blend_adjoint(prepared, features, back, image, left)
+                for (
+                    array
+                ) in outputs:  # as Warp's own adjoints do: a second backward adds the same again, not more
+                    if not array.retain_grad:
+                        array.grad.zero_()
+
+            tape.record_func(backward, _with_gradients(*prepared.inputs, features, back, *outputs))
         return image
 
     def blend_with_adjoint(
@@ -384,6 +394,11 @@ class Rasterizer:
 
 def _active_tape() -> wp.Tape | None:
     return wp._src.context.runtime.tape
+
+
+def _with_gradients(*arrays: wp.array) -> list[wp.array]:
+    """Those whose gradients the tape keeps; it refuses arrays that want none or are empty."""
+    return [array for array in arrays if array.requires_grad and array.size]
 
 
 def _gradient(array: wp.array) -> wp.array:

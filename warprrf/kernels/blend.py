@@ -115,8 +115,7 @@ def build(real: Any) -> SimpleNamespace:
     @wp.func
     def quadratics(rows: wp.array(dtype=real, ndim=2), k: int, w: strip, u1: strip, u2: strip):
         """Numerator of q, a.g and |g|^2."""
-        n = wp.cw_mul(u1, rows[k, GRAM] * u1 + (real(2.0) * rows[k, GRAM + 1]) * u2)
-        n += rows[k, GRAM + 2] * wp.cw_mul(u2, u2)
+        n = rows[k, GRAM] * wp.cw_mul(u1, u1) + rows[k, GRAM + 1] * wp.cw_mul(u2, u2)
         p = rows[k, AB1] * u1 + rows[k, AB2] * u2
         ag = rows[k, AA] * w + p
         h1 = rows[k, AB1] * w + rows[k, BB11] * u1 + rows[k, BB12] * u2
@@ -420,7 +419,7 @@ def build(real: Any) -> SimpleNamespace:
             u1 = rows[k, E1] * dx + rows[k, E1 + 1] * dy + rows[k, E1 + 2] * dz
             u2 = rows[k, E2] * dx + rows[k, E2 + 1] * dy + rows[k, E2 + 2] * dz
             w = rows[k, MH] * dx + rows[k, MH + 1] * dy + rows[k, MH + 2] * dz
-            n = u1 * (rows[k, GRAM] * u1 + real(2.0) * rows[k, GRAM + 1] * u2) + rows[k, GRAM + 2] * u2 * u2
+            n = rows[k, GRAM] * u1 * u1 + rows[k, GRAM + 1] * u2 * u2
             ag = rows[k, AA] * w + rows[k, AB1] * u1 + rows[k, AB2] * u2
             gg = w * ag + u1 * (rows[k, AB1] * w + rows[k, BB11] * u1 + rows[k, BB12] * u2)
             gg = wp.max(

@@ -5,9 +5,11 @@ from the ray origin, let ``mh = m/|m|``, ``e1, e2`` perpendicular to it, ``a = M
 ``b2 = M e2``. A ray ``d = w mh + u1 e1 + u2 e2`` has ``g = M d = w a + u1 b1 + u2 b2``; its squared Mahalanobis
 distance is
 
-    q = |m|^2 u^T A u / |g|^2,   A the Gram matrix of (b1 x a, b2 x a),
+    q = |m|^2 (A1 u1^2 + A2 u2^2) / |g|^2,   A1 = |b1 x a|^2, A2 = |b2 x a|^2,
 
-the response ``exp(-q/2)``, the peak at range ``t = |m| (a.g)/|g|^2``, visible where ``a.g > 0``. This is exact for
+with ``e1, e2`` turned about ``mh`` until ``(b1 x a).(b2 x a) = 0``: a sum of squares loses no digits,
+which needles need. The response is ``exp(-q/2)``,
+the peak at range ``t = |m| (a.g)/|g|^2``, visible where ``a.g > 0``. This is exact for
 every direction, with no projection to differentiate; projection serves binning only. Coefficients are computed in
 float64.
 """
@@ -23,13 +25,13 @@ STRIP = 16
 CHANNELS = 4  # feature channels blended by one launch
 # What a row of coefficients holds, one row per Gaussian and view; M is scaled by the smallest scale throughout.
 E1, E2, MH = 0, 3, 6  # the Gaussian's frame as seen from the ray origin
-GRAM = 9  # |m|^2 A: 11, 12, 22
-AA, AB1, AB2, BB11, BB12, BB22 = 12, 13, 14, 15, 16, 17  # dot products of a, b1, b2
-RANGE, OPACITY, CUT = 18, 19, 20  # |m| [m], opacity, q at which alpha falls below alpha_min
-A, B1, B2 = 21, 24, 27
-INVERSE, SMALLEST = 30, 31  # 1 / s_min, s_min [m]
-FIRST_ROW, LAST_ROW = 32, 33  # of pixels
-ROW = 34
+GRAM = 9  # |m|^2 A1, |m|^2 A2
+AA, AB1, AB2, BB11, BB12, BB22 = 11, 12, 13, 14, 15, 16  # dot products of a, b1, b2
+RANGE, OPACITY, CUT = 17, 18, 19  # |m| [m], opacity, q at which alpha falls below alpha_min
+A, B1, B2 = 20, 23, 26
+INVERSE, SMALLEST = 29, 30  # 1 / s_min, s_min [m]
+FIRST_ROW, LAST_ROW = 31, 32  # of pixels
+ROW = 33
 GRADIENTS = (
     15  # numbers per Gaussian that `blend_adjoint` sums: Y1 3, Y2 6, opacity, features 4, blending weight
 )
@@ -250,6 +252,8 @@ def build(real: Any) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     total = wp.types.vector(GRADIENTS, wp.float64)
+    # Stays finite where scales are near the smallest number: zero offset times infinity would be NaN.
+    largest = 1.0e30 if real is wp.float32 else 1.0e250
 
     @wp.kernel(module="unique", enable_backward=False)
     def project(
@@ -298,6 +302,16 @@ def build(real: Any) -> SimpleNamespace:
         b2 = wp.cw_mul(scaling, rt * e2)
         c1 = wp.cross(b1, a)
         c2 = wp.cross(b2, a)
+        turn = wp.float64(0.5) * wp.atan2(wp.float64(2.0) * wp.dot(c1, c2), wp.dot(c1, c1) - wp.dot(c2, c2))
+        cosine = wp.cos(turn)
+        sine = wp.sin(turn)
+        f1 = cosine * e1 + sine * e2
+        e2 = cosine * e2 - sine * e1
+        e1 = f1
+        b1 = wp.cw_mul(scaling, rt * e1)
+        b2 = wp.cw_mul(scaling, rt * e2)
+        c1 = wp.cross(b1, a)
+        c2 = wp.cross(b2, a)
         gain = (range_ / smin) * (range_ / smin)
         inside = wp.dot(a, a) * gain <= cut
         cov = wp.mat33d()
@@ -314,9 +328,8 @@ def build(real: Any) -> SimpleNamespace:
             rows[i, A + k] = real(a[k])
             rows[i, B1 + k] = real(b1[k])
             rows[i, B2 + k] = real(b2[k])
-        rows[i, GRAM] = real(wp.dot(c1, c1) * gain)
-        rows[i, GRAM + 1] = real(wp.dot(c1, c2) * gain)
-        rows[i, GRAM + 2] = real(wp.dot(c2, c2) * gain)
+        rows[i, GRAM] = real(wp.min(wp.dot(c1, c1) * gain, wp.float64(wp.static(largest))))
+        rows[i, GRAM + 1] = real(wp.min(wp.dot(c2, c2) * gain, wp.float64(wp.static(largest))))
         rows[i, AA] = real(wp.dot(a, a))
         rows[i, AB1] = real(wp.dot(a, b1))
         rows[i, AB2] = real(wp.dot(a, b2))

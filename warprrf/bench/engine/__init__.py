@@ -1,1 +1,1 @@
-"""Speed of the engine against its peers."""
+"""Benchmarks of the engine: each kernel beside a peer measured in the same run."""

@@ -1,0 +1,184 @@
+"""The rasteriser inside torch: functions of tensors that autograd differentiates, computed by our Warp kernels.
+
+The only module of the geometry that knows torch; it is imported when a function is called
+(``pip install "warprrf[baselines]"``). Work runs on the tensors' own device in their own precision, float32 or float64.
+Derivatives are of first order; asking for a second one raises torch's error instead of returning zeros.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warprrf.device import require, resolve
+from warprrf.geometry.camera import Camera
+from warprrf.geometry.render import Blending, Rasterizer
+from warprrf.kernels.sh import COEFFICIENTS
+
+if TYPE_CHECKING:
+    import torch
+
+
+def rasterize(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    features: torch.Tensor,
+    cam: Camera,
+    background: torch.Tensor | None = None,
+    *,
+    blending: Blending | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Blend Gaussians front to back, as :func:`warprrf.render` does; differentiable in every tensor.
+
+    Args:
+        means: centres [m], shape ``(N, 3)``.
+        quaternions: wxyz of any length but zero, shape ``(N, 4)``.
+        scales: standard deviations [m], shape ``(N, 3)``.
+        opacities: in [0, 1], shape ``(N,)``.
+        features: shape ``(N, C)``.
+        background: shape ``(C,)``; default: zero.
+
+    Returns:
+        Features ``(H, W, C)``, alpha ``(H, W)`` and depth ``(H, W)``: the blended mean range [m], 0 where alpha is 0.
+
+    Raises:
+        ImportError: without torch.
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    if not isinstance(cam, Camera):
+        raise TypeError(f"cam: got {type(cam).__name__}, expected warprrf.Camera")
+    torch = require("torch", "baselines")
+    _check("means", means, (None, 3), None)
+    n = len(means)
+    for name, tensor, shape in (
+        ("quaternions", quaternions, (n, 4)), ("scales", scales, (n, 3)), ("opacities", opacities, (n,)),
+        ("features", features, (n, None)),
+    ):  # fmt: skip
+        _check(name, tensor, shape, means)
+    if background is None:
+        background = torch.zeros(features.shape[1], dtype=means.dtype, device=means.device)
+    _check("background", background, (features.shape[1],), means)
+    for name, fits, expected in (
+        ("quaternions", quaternions.detach().abs().amax(1) > 0, "wxyz rotations of a length above zero"),
+        ("scales", scales.detach() >= torch.finfo(torch.float32).tiny, "positive metres, not denormal"),
+        ("opacities", (opacities.detach() >= 0) & (opacities.detach() <= 1), "values in [0, 1]"),
+    ):
+        if not bool(fits.all()):
+            raise ValueError(f"{name}: got {int((~fits).sum())} values that do not fit, expected {expected}")
+    return _functions().rasterize.apply(
+        cam, blending, means, quaternions, scales, opacities, features, background
+    )
+
+
+def colors(means: torch.Tensor, sh: torch.Tensor, cam: Camera) -> torch.Tensor:
+    """Colours ``max(0, SH + 0.5)`` that harmonics ``(N, K, C)`` show towards the camera, shape ``(N, C)``;
+    differentiable in both tensors.
+
+    Raises:
+        ImportError: without torch.
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    if not isinstance(cam, Camera):
+        raise TypeError(f"cam: got {type(cam).__name__}, expected warprrf.Camera")
+    _check("means", means, (None, 3), None)
+    _check("sh", sh, (len(means), None, None), means)
+    if sh.shape[1] not in COEFFICIENTS.values():
+        raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
+    return _functions().colors.apply(cam, means, sh)
+
+
+def _check(name: str, tensor: Any, shape: tuple[int | None, ...], like: torch.Tensor | None) -> None:
+    torch = require("torch", "baselines")
+    if not isinstance(tensor, torch.Tensor):
+        raise TypeError(f"{name}: got {type(tensor).__name__}, expected a torch.Tensor")
+    if tensor.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"{name}: got {tensor.dtype}, expected torch.float32 or torch.float64")
+    if like is not None and (tensor.dtype != like.dtype or tensor.device != like.device):
+        raise ValueError(
+            f"{name}: got {tensor.dtype} on {tensor.device}, expected {like.dtype} on {like.device}, as means"
+        )
+    if tensor.ndim != len(shape) or any(
+        s is not None and s != n for s, n in zip(shape, tensor.shape, strict=True)
+    ):
+        wanted = ", ".join("any" if s is None else str(s) for s in shape)
+        raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected ({wanted})")
+    if not bool(torch.isfinite(tensor.detach()).all()):
+        raise ValueError(f"{name}: got values that are NaN or infinite, expected finite numbers")
+
+
+@cache
+def _functions() -> SimpleNamespace:
+    """The ``torch.autograd.Function`` classes; made when first used, because torch is imported then."""
+    import torch
+    from torch.autograd.function import once_differentiable
+
+    def raster(tensor: torch.Tensor, blending: Blending | None = None) -> Rasterizer:
+        real = wp.float64 if tensor.dtype == torch.float64 else wp.float32
+        return Rasterizer(device=resolve(str(tensor.device)), blending=blending, real=real)
+
+    def shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
+        """The tensor's memory as a Warp array; its gradient is summed into memory of Warp's own."""
+        array = wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+        array.requires_grad = True
+        return array
+
+    def gradients(arrays: tuple[wp.array, ...]) -> list[torch.Tensor]:
+        """Copies: the next backward sums into the same arrays again."""
+        return [wp.to_torch(array.grad).clone() for array in arrays]
+
+    def seed(arrays: tuple[wp.array, ...], incoming: tuple[torch.Tensor, ...]) -> None:
+        """Copy torch's gradients in: a tensor that the caller may use again is never written."""
+        for array, gradient in zip(arrays, incoming, strict=True):
+            array.grad.assign(wp.from_torch(gradient.detach().contiguous(), requires_grad=False))
+
+    class Rasterize(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, cam: Camera, blending: Blending | None, *tensors: torch.Tensor) -> Any:
+            r = raster(tensors[0], blending)
+            types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
+            inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
+            image, ctx.adjoint = r.blend_with_adjoint(
+                r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam), inputs[4], inputs[5]
+            )
+            ctx.inputs, ctx.outputs = inputs, (image.features, image.alpha, image.depth)
+            ctx.save_for_backward(*tensors)
+            return tuple(wp.to_torch(array, requires_grad=False).clone() for array in ctx.outputs)
+
+        @staticmethod
+        @once_differentiable
+        def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
+            _ = ctx.saved_tensors  # raises if an input was changed in place since forward
+            for array in ctx.inputs:
+                array.grad.zero_()
+            seed(ctx.outputs, incoming)
+            ctx.adjoint()
+            return None, None, *gradients(ctx.inputs)
+
+    class Colors(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
+            r = raster(means)
+            inputs = (shared(means, r.vector(3)), shared(sh, r.real))
+            out = wp.zeros((len(means), sh.shape[2]), dtype=r.real, device=r.device, requires_grad=True)
+            origin = r.colors_into(*inputs, cam, out)
+            ctx.inputs, ctx.out = inputs, out
+            ctx.adjoint = lambda: r.colors_adjoint(*inputs, origin, out)
+            ctx.save_for_backward(means, sh)
+            return wp.to_torch(out, requires_grad=False).clone()
+
+        @staticmethod
+        @once_differentiable
+        def backward(ctx: Any, incoming: torch.Tensor) -> Any:
+            _ = ctx.saved_tensors  # raises if an input was changed in place since forward
+            for array in ctx.inputs:
+                array.grad.zero_()
+            seed((ctx.out,), (incoming,))
+            ctx.adjoint()
+            return None, *gradients(ctx.inputs)
+
+    return SimpleNamespace(rasterize=Rasterize, colors=Colors)
