@@ -266,9 +266,15 @@ class _Training:
         best = self._held_error(terms, fit)
         self.log.append({"term": "single bounces", "kept": True, "held_out_rmse_db": float(np.sqrt(best))})
         bounces = [
-            (name, value) for name, value in MORE if name in free and (terms.diffuse or "order" in name)
+            (name, value)
+            for name, value in MORE
+            if name in free and (terms.diffuse or name == "mirror_order")
         ]
         for name, value in bounces:
+            if "order" in name and getattr(terms, name) < value - 1:
+                continue  # the order below it did not help
+            if name == "scatter_mirror" and not (terms.further or terms.mirror_scatter):
+                continue  # the same bounces the other way round
             terms, fit, best = self._tried(name, value, terms, fit, best)
         if np.isfinite(self.surface.look).all() and self.material.max() > 0:
             fit, best = self._regroup(terms, fit, best)
