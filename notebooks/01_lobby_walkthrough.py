@@ -241,16 +241,26 @@ plt.show()
 # change while the radio part is learned, so it is computed once; the fit then works on a sparse matrix, with no
 # rendering inside the loop.
 #
-# RF-3DGS+ learns how strongly each Gaussian radiates in each direction (spherical harmonics) and takes the decay with
-# distance from the path length transmitter - surface - receiver. That is what it has over RF-3DGS, and delays and
-# departure angles follow from the same geometry instead of being learned. (The loss goes up and down because every
-# step sees another batch of receivers.)
+# Two models. **RF-3DGS+** learns how strongly each Gaussian radiates in each direction (spherical harmonics) and takes
+# the decay with distance from the path length transmitter - surface - receiver. That is what it has over RF-3DGS, and
+# delays and departure angles follow from the same geometry instead of being learned. (Its loss goes up and down because
+# every step sees another batch of receivers.) The **bistatic** model, the default, obeys what scattering does: line of
+# sight and mirrors by the image method, and for every surface a mix of scattering lobes that depend on where the light
+# comes from and where it goes. Its few parameters belong to materials, so a handful of spectra suffices, and it tries on
+# receivers held out of the training set which further bounces are worth having.
 
 # %%
 start = time.perf_counter()
-field = wr.RadioField.fit(rec, train, model="rf3dgs+", iterations=pipeline.REDUCED.steps, seed=0)
-print(f"{time.perf_counter() - start:.1f} s for {len(train.receivers)} receivers")
-losses = field.report["losses"]["gain"]
+harmonic = wr.RadioField.fit(rec, train, model="rf3dgs+", iterations=pipeline.REDUCED.steps, seed=0)
+print(f"RF-3DGS+: {time.perf_counter() - start:.1f} s for {len(train.receivers)} receivers")
+start = time.perf_counter()
+field = wr.RadioField.fit(rec, train, model="bistatic", seed=0)
+print(f"bistatic: {time.perf_counter() - start:.1f} s, {field.report['materials']} materials")
+for choice in field.report["choices"]:
+    print(
+        f"  {choice['term']:<28}{choice['held_out_rmse_db']:6.2f} dB  {'kept' if choice['kept'] else 'left out'}"
+    )
+losses = harmonic.report["losses"]["gain"]
 figure, ax = plt.subplots(figsize=(6, 2.6))
 ax.plot(losses, color="#0b6e99")
 ax.set_xlabel("step"), ax.set_ylabel("0.8 L1 + 0.2 (1 - SSIM)"), ax.grid(alpha=0.3)
@@ -266,13 +276,19 @@ plt.show()
 
 # %%
 for index in (open_view, blocked):
-    truth, guess = test[index], field.spectrum(test.receivers[index])
+    truth, receiver = test[index], test.receivers[index]
     low, high = test.range_db
-    figure = report.spectrum_rows(truth.path_gain_db, {"RF-3DGS+": guess.path_gain_db}, low, high)
+    guesses = {
+        "bistatic": field.spectrum(receiver).path_gain_db,
+        "RF-3DGS+": harmonic.spectrum(receiver).path_gain_db,
+    }
+    figure = report.spectrum_rows(truth.path_gain_db, guesses, low, high)
     display(figure)  # noqa: F821
 
 # %%
-methods = {"rf3dgs+": field.spectrum} | {name: build(train) for name, build in pipeline.LOOKUPS.items()}
+methods = {"bistatic": field.spectrum, "rf3dgs+": harmonic.spectrum} | {
+    name: build(train) for name, build in pipeline.LOOKUPS.items()
+}
 print(f"{'method':<10}{'PSNR dB':>9}{'direction deg':>15}{'within 3 deg':>14}{'beam loss dB':>14}")
 for name, predict in methods.items():
     figures = wr.evaluate(test, predict)
@@ -284,7 +300,8 @@ for name, predict in methods.items():
 # %% [markdown]
 # Few photos, few steps, few receivers: look at `make lobby` for figures that count. The structure of the errors is
 # already visible, though. Spherical harmonics are smooth, so they cannot draw a line of sight or a mirror reflection as
-# sharp as it is; that is the limit of this family of models, not of the geometry.
+# sharp as it is; that is the limit of this family of models, not of the geometry. What is left of the bistatic model's
+# error is mostly the mesh's: shadows and edges that this quick reconstruction puts in the wrong place.
 #
 # <a id="paths"></a>
 # ## 9. Paths

@@ -143,7 +143,7 @@ def _page(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> str:
         _figure(
             psnr_curves(figures["methods"]),
             "Left: PSNR of every test receiver, sorted, one curve a method. Right: against the distance to the "
-            "nearest training receiver, RF-3DGS+ and the nearest-receiver lookup.",
+            "nearest training receiver, for the bistatic field, RF-3DGS+ and the nearest-receiver lookup.",
             "PSNR per receiver",
         )
     )
@@ -154,7 +154,7 @@ def _page(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> str:
         predictions = {
             name: pictures[f"spectrum_{key}"][index]
             for key, (name, _) in METHODS.items()
-            if f"spectrum_{key}" in pictures and key in ("rf3dgs+", "rf3dgs", "nearest")
+            if f"spectrum_{key}" in pictures and key in ("bistatic", "rf3dgs+", "nearest")
         }
         parts.append(
             _figure(
@@ -331,7 +331,7 @@ def psnr_curves(methods: dict[str, dict[str, Any]]) -> Any:
             )
     axes[0].set_xlabel("test receivers, sorted for each method")
     axes[0].set_ylim(top=axes[0].get_ylim()[1] + 9.0)  # room for the legend
-    for key in ("nearest", "rf3dgs+"):
+    for key in ("nearest", "rf3dgs+", "bistatic"):
         if key in methods and "distance_to_training_m" in methods[key]["per_receiver"]:
             row = methods[key]["per_receiver"]
             axes[1].scatter(
