@@ -33,6 +33,9 @@ FEW_RECEIVERS = 20  # up to which errors are learned from every receiver, held o
 MOST_TO_CHOOSE = 12  # receivers that fits which only decide about a term learn from
 SHORT_STEPS = 6  # of a fit that only decides about a term
 BETTER = 0.995  # a term must lower the held-out mean square error at least to this share
+CLEARLY_BETTER = (
+    0.95  # and the residual to this share: it has thousands of unknowns and blurs the strongest paths
+)
 MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_scatter", True),
     ("diffuse_order", 2),
@@ -289,7 +292,7 @@ class _Training:
             error = self._image_error(
                 replace(base, terms=replace(terms, residual=True), residual=found_residual)
             )
-            keep = terms.residual or error < BETTER * best
+            keep = terms.residual or error < CLEARLY_BETTER * best
             self.log.append(
                 {"term": "residual", "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))}
             )
