@@ -46,11 +46,14 @@ RAY_METHODS = ("bistatic", "zero")
 
 # Files of one model alone: changing them leaves the other's rows as they are.
 _BISTATIC = (
-    "bistatic", "bistatic_fit", "bistatic_training", "bounces", "residuals", "second_bounce", "specular", "surface",
-    "uncertainty",
+    "bistatic", "bistatic_fit", "bistatic_training", "bounces", "grouping", "mirror_light", "mirror_tree", "residuals",
+    "second_bounce", "specular", "surface", "uncertainty",
 )  # fmt: skip
 _HARMONIC = ("harmonic", "fitting", "field_paths", "field_targets", "single_bounce", "transport")
-_NEITHER = ("newrf", "antenna", "mitsuba_photos", "mirror_chains", "reflections", "sionna_engine", "llvm")
+_NEITHER = (
+    "absorption", "antenna", "blockage", "llvm", "mirror_chains", "mitsuba_photos", "newrf", "reflections",
+    "relevance", "relevance_choice", "relevance_model", "sionna_engine", "twin",
+)  # fmt: skip
 
 
 def source_of(method: str) -> str:
