@@ -14,16 +14,15 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 import warprrf as wr
 from warprrf.bench.stages import write_atomically, write_json
+from warprrf.cli_bars import Bars
+from warprrf.cli_bench import add_benches
 from warprrf.cli_help import (
-    HELP_BENCH,
-    HELP_BENCH_BISTATIC,
     HELP_DATA,
     HELP_EVALUATE,
     HELP_FIT,
@@ -48,42 +47,6 @@ a walk through, in a checkout:
 
 Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
 """
-
-
-class Bars:
-    """One tqdm bar per stage, as a progress callback `(stage, done, total)`; silent when `quiet`."""
-
-    def __init__(self, quiet: bool = False) -> None:
-        self._quiet = quiet
-        self._bar: Any = None
-        self._stage: str | None = None
-
-    def __enter__(self) -> Bars:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close()
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        """Draw that `done` of `total` steps of `stage` are behind us."""
-        if self._quiet:
-            return
-        if stage != self._stage:
-            from tqdm import tqdm
-
-            self._close()
-            # On a terminal the bar moves often; in a log every line stays, so a new one every half minute is enough.
-            self._bar = tqdm(total=total, desc=stage, mininterval=0.2 if sys.stderr.isatty() else 30.0)
-            self._stage = stage
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-        self._bar = self._stage = None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -125,7 +88,7 @@ def _lobby(args: argparse.Namespace, bars: Bars) -> None:
         reduced=args.reduced,
         fresh=args.fresh,
     )
-    bars._close()
+    bars.close()
     print(pipeline.summary(report))
     for truth, key in (("exact", "methods"), ("Sionna RT", "methods_sionna")):
         print(f"\nheld-out receivers, truth: {truth}\n{table(report[key])}")
@@ -221,7 +184,7 @@ def _relevance(args: argparse.Namespace, bars: Bars) -> None:
         device=args.device,
         **given,
     )
-    bars._close()
+    bars.close()
     print(found.table())
     if args.out:
         found.save(args.out)
@@ -268,7 +231,7 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
         bars("evaluate", count, len(methods))
         figures[name] = metrics.evaluate(test, predictor)
     bars("evaluate", len(methods), len(methods))
-    bars._close()
+    bars.close()
     print(table(figures))
     if args.out:
         write_json(args.out, figures)
@@ -296,63 +259,6 @@ def _twin(args: argparse.Namespace, bars: Bars) -> None:
     )
     for line in twin.left_out:
         print(f"left out: {line}")
-
-
-def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
-    from warprrf.bench import newrf
-
-    report = newrf.run(args.out or "runs/newrf", args.data or newrf.DATA, device=args.device, progress=bars)
-    bars._close()
-    print(newrf.summary_text(report))
-
-
-def _bench_bistatic(args: argparse.Namespace, bars: Bars) -> None:
-    from warprrf.bench import bistatic
-
-    out = args.out or "runs/bistatic"
-    given = {
-        "data": args.data and (args.data if len(args.data) > 1 else args.data[0]),
-        "geometry": args.geometry,
-        "scene": args.scene,
-        "second": args.second,
-        "counts": args.counts,
-        "truths": args.truths,
-    }
-    report = bistatic.run(
-        out,
-        every=args.every,
-        repeat=args.repeat,
-        seed=args.seed,
-        fresh=args.fresh,
-        device=args.device,
-        progress=bars,
-        **{name: value for name, value in given.items() if value is not None},
-    )
-    bars._close()
-    print(bistatic.summary_text(report))
-    print(f"\n{Path(out) / 'bistatic.md'}: the tables with pictures; bistatic.json: every figure")
-
-
-def _bench_relevance(args: argparse.Namespace, bars: Bars) -> None:
-    from warprrf.bench import relevance
-
-    report = relevance.run(
-        args.out or "runs/relevance", args.data or relevance.DATA, device=args.device, progress=bars
-    )
-    bars._close()
-    print(relevance.summary_text(report))
-
-
-BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
-    "newrf": _bench_newrf,
-    "bistatic": _bench_bistatic,
-    "relevance": _bench_relevance,
-}
-"""Benchmarks by name: what `warprrf bench NAME` runs."""
-
-
-def _bench(args: argparse.Namespace, bars: Bars) -> None:
-    BENCHES[args.name](args, bars)
 
 
 def table(methods: dict[str, dict[str, Any]]) -> str:
@@ -631,31 +537,7 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--out", required=True, help="folder of the twin: new, empty or an earlier twin's"
     )
 
-    bench = add("bench", _bench, "one table of figures, from one command", HELP_BENCH, options=False)
-    tables = bench.add_subparsers(title="tables", metavar="TABLE", dest="name", required=True)
-    newrf = add("newrf", _bench, "rays and channels of NeWRF's conference room", HELP_BENCH, tables)
-    newrf.add_argument("--out", help="folder of the results (default runs/newrf)")
-    newrf.add_argument("--data", help="folder of its files")
-    worth = add(
-        "relevance", _bench, "what each effect is worth, at two bands and roughnesses", HELP_BENCH, tables
-    )
-    worth.add_argument("--out", help="folder of the results (default runs/relevance)")
-    worth.add_argument("--data", help="folder of the scene (default data/lobby)")
-    ours = add("bistatic", _bench, "the bistatic field beside other systems", HELP_BENCH_BISTATIC, tables)
-    ours.add_argument("--out", help="folder of the results (default runs/bistatic)")
-    ours.add_argument(
-        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
-    )
-    ours.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
-    ours.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
-    ours.add_argument("--second", metavar="FILE", help="spectra under another transmitter (default: made)")
-    ours.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (10 50 400)")
-    ours.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
-    ours.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
-    ours.add_argument(
-        "--repeat", type=int, default=10, metavar="N", help="receivers of Sionna's second solve (10; 0: none)"
-    )
-    ours.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+    add_benches(add)
 
     data = add("data", _data, "regenerate data/lobby/ from nothing (hours; resumable)", HELP_DATA)
     data.add_argument("--data", default="data/lobby", help="folder to write (default data/lobby)")

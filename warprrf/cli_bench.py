@@ -1,0 +1,98 @@
+"""`warprrf bench TABLE`: the commands that make the README's tables and pictures."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from warprrf.cli_bars import Bars
+from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BISTATIC
+
+Add = Callable[..., argparse.ArgumentParser]
+
+
+def add_benches(add: Add) -> None:
+    """Define `bench` and its tables with ``add``, which makes one command."""
+    bench = add("bench", _bench, "one table of figures, from one command", HELP_BENCH, options=False)
+    tables = bench.add_subparsers(title="tables", metavar="TABLE", dest="name", required=True)
+    newrf = add("newrf", _bench, "rays and channels of NeWRF's conference room", HELP_BENCH, tables)
+    newrf.add_argument("--out", help="folder of the results (default runs/newrf)")
+    newrf.add_argument("--data", help="folder of its files")
+    worth = add(
+        "relevance", _bench, "what each effect is worth, at two bands and roughnesses", HELP_BENCH, tables
+    )
+    worth.add_argument("--out", help="folder of the results (default runs/relevance)")
+    worth.add_argument("--data", help="folder of the scene (default data/lobby)")
+    ours = add("bistatic", _bench, "the bistatic field beside other systems", HELP_BENCH_BISTATIC, tables)
+    ours.add_argument("--out", help="folder of the results (default runs/bistatic)")
+    ours.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    ours.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    ours.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    ours.add_argument("--second", metavar="FILE", help="spectra under another transmitter (default: made)")
+    ours.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (10 50 400)")
+    ours.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
+    ours.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
+    ours.add_argument(
+        "--repeat", type=int, default=10, metavar="N", help="receivers of Sionna's second solve (10; 0: none)"
+    )
+    ours.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+
+
+def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import newrf
+
+    report = newrf.run(args.out or "runs/newrf", args.data or newrf.DATA, device=args.device, progress=bars)
+    bars.close()
+    print(newrf.summary_text(report))
+
+
+def _bench_bistatic(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import bistatic
+
+    out = args.out or "runs/bistatic"
+    given = {
+        "data": args.data and (args.data if len(args.data) > 1 else args.data[0]),
+        "geometry": args.geometry,
+        "scene": args.scene,
+        "second": args.second,
+        "counts": args.counts,
+        "truths": args.truths,
+    }
+    report = bistatic.run(
+        out,
+        every=args.every,
+        repeat=args.repeat,
+        seed=args.seed,
+        fresh=args.fresh,
+        device=args.device,
+        progress=bars,
+        **{name: value for name, value in given.items() if value is not None},
+    )
+    bars.close()
+    print(bistatic.summary_text(report))
+    print(f"\n{Path(out) / 'bistatic.md'}: the tables with pictures; bistatic.json: every figure")
+
+
+def _bench_relevance(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import relevance
+
+    report = relevance.run(
+        args.out or "runs/relevance", args.data or relevance.DATA, device=args.device, progress=bars
+    )
+    bars.close()
+    print(relevance.summary_text(report))
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
+    "newrf": _bench_newrf,
+    "bistatic": _bench_bistatic,
+    "relevance": _bench_relevance,
+}
+"""Benchmarks by name: what `warprrf bench NAME` runs."""
+
+
+def _bench(args: argparse.Namespace, bars: Bars) -> None:
+    BENCHES[args.name](args, bars)
