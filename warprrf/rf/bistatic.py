@@ -30,7 +30,7 @@ from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.mirror_light import MirrorSight
 from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.paths import Paths
-from warprrf.rf.second_bounce import ElementLight, mirrored_scene, sent_power
+from warprrf.rf.second_bounce import ElementLight, SeenElements, mirrored_scene
 from warprrf.rf.spectrum import Spectrum, angles_from_directions, unit_beams
 from warprrf.rf.specular import SpecularPaths, specular_paths
 from warprrf.rf.surface import Surface
@@ -98,6 +98,7 @@ class Sight:
         lit: how the transmitter lights that.
         paths: its line of sight and mirror paths.
         beams: unit beam of each, shape ``(L, H, W)`` float32.
+        elements: surface elements that its rays meet.
         mirrored: what its rays see of mirrored light; None if that is not modelled.
     """
 
@@ -107,6 +108,7 @@ class Sight:
     lit: Lit
     paths: SpecularPaths
     beams: np.ndarray
+    elements: SeenElements
     mirrored: MirrorSight | None = None
 
 
@@ -298,7 +300,8 @@ class BistaticField(RadioField):
         mirrored = None
         if self.terms.diffuse and self.terms.mirror_scatter:
             mirrored = self.element_light(source).mirrors.sight(receiver, met)
-        return Sight(receiver, source, met, lit, paths, beams, mirrored)
+        elements = SeenElements.of(self.tracer, met)
+        return Sight(receiver, source, met, lit, paths, beams, elements, mirrored)
 
     def compose(self, sight: Sight) -> Composed:
         """The spectrum of what is seen, by its parts."""
@@ -343,15 +346,15 @@ class BistaticField(RadioField):
         parts = []
         sent = self._sent(sight.transmitter)
         if sent is not None:
-            power = sent_power(self.tracer, sight.met, sent, self.wavelength_m)
-            ray = np.flatnonzero(power > 0)
-            group = self.surface.group[sight.met.face.numpy()[ray]]
-            parts.append((ray // self.tracer.sub_pixels**2, group, power[ray]))
+            seen = sight.elements
+            power = seen.power(sent, self.wavelength_m)
+            lit = power > 0
+            parts.append((seen.pixel[lit], self.surface.element_group[seen.element[lit]], power[lit]))
         if self.terms.diffuse and self.terms.mirror_scatter and sight.mirrored is not None:
             light = self.element_light(sight.transmitter).mirrors
-            seen = sight.mirrored
-            power = light.power(seen, self.parameters, self.wavelength_m)
-            parts.append((seen.pixel, self.surface.group[seen.face.numpy()], power))
+            mirrored = sight.mirrored
+            power = light.power(mirrored, self.parameters, self.wavelength_m)
+            parts.append((mirrored.pixel, self.surface.group[mirrored.face.numpy()], power))
         return parts
 
     def _mirrored_scene(self, sight: Sight) -> np.ndarray:

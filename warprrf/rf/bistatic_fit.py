@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve
+from scipy.linalg.blas import ssyrk
 
 from warprrf.rf.bounces import fresnel_curves
 
@@ -231,9 +233,13 @@ def jacobian(view: View, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.
     to_excess = np.einsum(
         "nalm,alm->na", view.basis, (weight[:, :, None] * slope[:, None, :]).astype(np.float32), optimize=True
     )
+    lobes = np.arange(layout.lobes)
     first = layout.stride * view.groups
-    indices = [(first[:, None] + np.arange(layout.lobes)).ravel(), first + layout.lobes]
-    columns = [per_lobe.reshape(len(per_lobe), -1), to_excess]
+    # No index stands twice within a block, so that blocks can be added to a table column by column.
+    blocks = [
+        ((first[:, None] + lobes).ravel(), per_lobe.reshape(len(per_lobe), -1)),
+        (first + layout.lobes, to_excess),
+    ]
     power = np.maximum(per_lobe.sum(axis=(1, 2)), 0.0) + view.extra
     if len(view.again_group):
         own = p.take(view.again_group)
@@ -242,15 +248,14 @@ def jacobian(view: View, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.
         again = view.again[:, :, None] * share.astype(np.float32)
         power = power + again.sum(axis=(1, 2))
         first = layout.stride * view.again_group
-        indices += [(first[:, None] + np.arange(layout.lobes)).ravel(), first + layout.lobes]
-        columns += [
-            again.reshape(len(power), -1), view.again * (own.weight.sum(axis=1) * rise).astype(np.float32)
-        ]  # fmt: skip
+        blocks += [
+            ((first[:, None] + lobes).ravel(), again.reshape(len(power), -1)),
+            (first + layout.lobes, view.again * (own.weight.sum(axis=1) * rise).astype(np.float32)),
+        ]
     if layout.indirect:
         dark = view.dark * np.exp(p.log_indirect[view.seen]).astype(np.float32)
         power = power + dark.sum(axis=1)
-        indices.append(layout.stride * view.seen + layout.lobes + 2)
-        columns.append(dark)
+        blocks.append((layout.stride * view.seen + layout.lobes + 2, dark))
     strength, to_mirror, rise = specular_power(view.gain, view.path_group, view.cosine, p)
     power = power + strength.astype(np.float32) @ view.beam
     met = np.unique(view.path_group[view.path_group >= 0])
@@ -263,14 +268,19 @@ def jacobian(view: View, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.
             mirror[row, k] += strength[k] * to_mirror[k, b]
             excess[row, k] += strength[k] * rise[k, b]
         both = np.concatenate([mirror, excess]).astype(np.float32) @ view.beam
-        indices += [layout.stride * met + layout.lobes + 1, layout.stride * met + layout.lobes]
-        columns += [both[: len(met)].T, both[len(met) :].T]
+        blocks += [
+            (layout.stride * met + layout.lobes + 1, both[: len(met)].T),
+            (layout.stride * met + layout.lobes, both[len(met) :].T),
+        ]
     scale = np.exp(p.log_gain)
     power = scale * power
-    table, index = np.concatenate(columns, axis=1) * np.float32(scale), np.concatenate(indices)
     if layout.gain:
-        table, index = np.column_stack([table, power.astype(np.float32)]), np.append(index, layout.size - 1)
-    return power, table, index
+        blocks.append((np.array([layout.size - 1]), power[:, None] / scale))
+    index = np.unique(np.concatenate([where for where, _ in blocks]))
+    table = np.zeros((len(power), len(index)), np.float32)
+    for where, columns in blocks:
+        table[:, np.searchsorted(index, where)] += columns
+    return power, table * np.float32(scale), index
 
 
 def _priors(
@@ -371,7 +381,7 @@ def fit_groups(
         gradient += j.T @ r
         improved = False
         for _ in range(8):
-            move = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), -gradient)
+            move = solve(hessian + damping * np.diag(np.diag(hessian)), -gradient, assume_a="pos")
             move = np.clip(move, -1.5, 1.5)
             value = total(vector + move)
             if value < current:
@@ -401,13 +411,11 @@ def normal_equations(
         power, table, index = jacobian(view, p, layout)
         residual = NEPER * np.log1p(power) - view.target_db
         robust = weight * huber(residual)[1]
-        table *= (NEPER / (1.0 + power))[:, None].astype(np.float32)
-        weighted = table * robust[:, None].astype(np.float32)
-        place = index[:, None] * layout.size + index[None, :]  # an index may stand twice
-        own = np.bincount(place.ravel(), (weighted.T @ table).ravel(), minlength=layout.size**2)
-        hessian += own.reshape(layout.size, layout.size)
-        gradient += np.bincount(index, weighted.T.astype(np.float64) @ residual, minlength=layout.size)
-    return hessian, gradient
+        root = np.sqrt(robust)
+        table *= (root * NEPER / (1.0 + power))[:, None].astype(np.float32)
+        hessian[np.ix_(index, index)] += ssyrk(1.0, table.T)  # its upper triangle
+        gradient[index] += table.T @ (root * residual).astype(np.float32)
+    return np.triu(hessian) + np.triu(hessian, 1).T, gradient
 
 
 def fit_groups_adam(
@@ -439,7 +447,7 @@ def fit_groups_adam(
             loss += float(value.sum())
             pull = weight * robust * residual * NEPER / (1.0 + power)
             pull = pull.astype(np.float32)
-            gradient += np.bincount(index, table.T @ pull, minlength=layout.size)
+            gradient[index] += table.T @ pull
         r, j = _priors(p, start, layout, sd, area)
         gradient += j.T @ r
         losses.append((loss + float((r**2).sum()) / weight) / count)

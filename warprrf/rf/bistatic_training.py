@@ -289,9 +289,7 @@ class _Training:
             base = self._field(terms, fit, None)
             found_residual = self._residual(base, self.kept)
             best = self._image_error(base)
-            error = self._image_error(
-                replace(base, terms=replace(terms, residual=True), residual=found_residual)
-            )
+            error = self._image_error(self._field(replace(terms, residual=True), fit, found_residual))
             keep = terms.residual or error < CLEARLY_BETTER * best
             self.log.append(
                 {"term": "residual", "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))}
@@ -319,7 +317,8 @@ class _Training:
             self.material, start = regroup(
                 views, trial.parameters, self.material, self.surface.look, self.area
             )
-            trial = self._groups(terms, start, chosen, SHORT_STEPS, rounds=1)
+            # What surfaces get of each other changes little with who is of which material: the same views serve.
+            trial = self._fitted(views, terms, start, SHORT_STEPS)
         error = self._held_error(terms, trial)
         keep = error < best
         name = f"{before.max() + 1} materials as {self.material.max() + 1}"
@@ -381,12 +380,17 @@ class _Training:
         )
         for k in range(rounds if further else 1):
             views = self._views(terms, fit, chosen, self.material.max() < FEW_MATERIALS)
-            tied = [v.tied(self.material) for v in views]
-            fit = _fit.fit_groups(
-                tied, fit.parameters if k else start, np.bincount(self.material, self.area),
-                indirect=terms.indirect, gain=self.gain, steps=max(steps // rounds, 1) if further else steps,
-            )  # fmt: skip
+            fit = self._fitted(
+                views, terms, fit.parameters if k else start, max(steps // rounds, 1) if further else steps
+            )
         return fit
+
+    def _fitted(self, views: list[View], terms: Terms, start: Parameters, steps: int) -> Fit:
+        """Materials' parameters on views by groups."""
+        return _fit.fit_groups(
+            [v.tied(self.material) for v in views], start, np.bincount(self.material, self.area),
+            indirect=terms.indirect, gain=self.gain, steps=steps,
+        )  # fmt: skip
 
     def _views(self, terms: Terms, fit: Fit, chosen: np.ndarray, follow: bool) -> list[View]:
         """Views of the receivers ``chosen`` by groups, under ``terms``; light that reaches surfaces from others held

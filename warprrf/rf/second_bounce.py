@@ -7,12 +7,12 @@ Irradiance is in units in which the transmitter gives cos(theta_i) / d1^2 [1/m^2
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from warprrf.rf.bistatic_fit import Parameters, scattered_share
-from warprrf.rf.bounces import BounceTracer, fresnel_curves
+from warprrf.rf.bounces import BounceTracer, Met, fresnel_curves
 from warprrf.rf.mirror_light import MirrorLight
 from warprrf.rf.surface import Surface
 
@@ -107,11 +107,29 @@ def mirrored_scene(
     return out.reshape(*tracer.shape, -1).sum(axis=-1)
 
 
-def sent_power(tracer: BounceTracer, met: Any, sent: np.ndarray, wavelength_m: float) -> np.ndarray:
-    """Path gain of each ray (K,) of the radiance (E,) that elements send on evenly."""
-    face = met.face.numpy()
-    radiance = np.where(face >= 0, sent[tracer.surface.element[np.maximum(face, 0)]], 0.0)
-    return (wavelength_m / (4.0 * np.pi)) ** 2 * tracer.solid_angle * radiance
+@dataclass(frozen=True)
+class SeenElements:
+    """Elements that a grid's rays meet: of each pixel and element the solid angle [sr], all shapes ``(K,)``."""
+
+    pixel: np.ndarray
+    element: np.ndarray
+    solid_angle: np.ndarray
+
+    @classmethod
+    def of(cls, tracer: BounceTracer, met: Met) -> SeenElements:
+        """Those of the rays that met ``met``."""
+        face = met.face.numpy()
+        ray = np.flatnonzero(face >= 0)
+        pixel = ray // tracer.sub_pixels**2
+        elements = len(tracer.surface.element_area)
+        key = pixel * elements + tracer.surface.element[face[ray]]
+        pairs, place = np.unique(key, return_inverse=True)
+        solid_angle = np.bincount(place.ravel(), tracer.solid_angle[ray], minlength=len(pairs))
+        return cls(pairs // elements, pairs % elements, solid_angle)
+
+    def power(self, sent: np.ndarray, wavelength_m: float) -> np.ndarray:
+        """Path gain of each (K,) of the radiance (E,) that elements send on evenly."""
+        return (wavelength_m / (4.0 * np.pi)) ** 2 * self.solid_angle * sent[self.element]
 
 
 def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
