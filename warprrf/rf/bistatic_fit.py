@@ -21,6 +21,7 @@ from warprrf.rf.bounces import fresnel_curves
 NEPER = 10.0 / np.log(10.0)
 HUBER_DB = 3.0  # larger residuals count linearly: shadows that the geometry puts in the wrong place
 MAX_STEPS = 40
+LONGEST = 1.5  # change of a logarithm in one step
 TOLERANCE = 1e-3  # relative fall of the objective that ends the fit
 
 
@@ -382,7 +383,7 @@ def fit_groups(
         improved = False
         for _ in range(8):
             move = solve(hessian + damping * np.diag(np.diag(hessian)), -gradient, assume_a="pos")
-            move = np.clip(move, -1.5, 1.5)
+            move = np.clip(move, -LONGEST, LONGEST)
             value = total(vector + move)
             if value < current:
                 improved = True
@@ -393,11 +394,14 @@ def fit_groups(
             progress("fit", taken, steps)
         if not improved:
             break
+        # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived.
+        expected = -float(move @ (2.0 * gradient + hessian @ move))
+        honest = current - value > 0.5 * expected
         fall = (current - value) / current
         vector, current = vector + move, value
-        damping = max(damping * 0.3, 1e-6)
+        damping = max(damping * 0.3, 1e-6) if honest else damping * 3.0
         losses.append(current / weight / count)
-        if fall < TOLERANCE:
+        if fall < TOLERANCE and honest and (np.abs(move) < LONGEST).all():
             break
     return Fit(layout.unpack(vector), np.linalg.inv(hessian), layout, losses, taken)
 

@@ -31,11 +31,12 @@ LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so 
 MOST_HELD_OUT = 10
 FEW_RECEIVERS = 20  # up to which errors are learned from every receiver, held out in turn
 MOST_TO_CHOOSE = 12  # receivers that fits which only decide about a term learn from
-SHORT_STEPS = 6  # of a fit that only decides about a term
+SHORT_STEPS = 10  # of a fit that only decides about a term
 BETTER = 0.995  # a term must lower the held-out mean square error at least to this share
 CLEARLY_BETTER = (
     0.95  # and the residual to this share: it has thousands of unknowns and blurs the strongest paths
 )
+NOT_MUCH_WORSE = 1.5  # share to which it may rise where fewer materials fit the training receivers better
 MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_scatter", True),
     ("diffuse_order", 2),
@@ -320,7 +321,10 @@ class _Training:
             # What surfaces get of each other changes little with who is of which material: the same views serve.
             trial = self._fitted(views, terms, start, SHORT_STEPS)
         error = self._held_error(terms, trial)
-        keep = error < best
+        # Few receivers held out say little, fewer materials that describe the others better say much.
+        same = len(self.kept) <= MOST_TO_CHOOSE  # receivers of both fits
+        simpler = same and trial.losses[-1:] < fit.losses[-1:] and error < NOT_MUCH_WORSE * best
+        keep = error < best or simpler
         name = f"{before.max() + 1} materials as {self.material.max() + 1}"
         self.log.append({"term": name, "kept": bool(keep), "held_out_rmse_db": float(np.sqrt(error))})
         if not keep:

@@ -134,14 +134,15 @@ class BeamOperator:
             (np.concatenate(value), (np.concatenate(out), np.concatenate(own))), shape=(pixels, pixels)
         )
         self._narrow = self.matrix.astype(np.float32)
-        self._transposed = self.matrix.T.tocsr()
+        self._transposed = self._narrow.T.tocsr()
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
-        """Spread ``images`` (H, W, ...)."""
-        return (self.matrix @ images.reshape(self.matrix.shape[1], -1)).reshape(images.shape)
+        """Spread ``images`` (H, W, ...), in their precision."""
+        matrix = self._narrow if images.dtype == np.float32 else self.matrix
+        return (matrix @ images.reshape(matrix.shape[1], -1)).reshape(images.shape)
 
     def adjoint(self, images: np.ndarray) -> np.ndarray:
-        """The transposed map of ``images`` (H, W, ...)."""
+        """The transposed map of ``images`` (H, W, ...) float32."""
         return (self._transposed @ images.reshape(self.matrix.shape[0], -1)).reshape(images.shape)
 
     def at(self, pixels: np.ndarray, images: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from warprrf.rf.bistatic_fit import NEPER, Parameters, View, huber, predict, scattered_share, specular_power
 from warprrf.rf.bounces import fresnel_curves
 
-LOOK_COST = 1.0  # what one unit of difference in look, squared, counts as in the objective
+LOOK_COST = 3.0  # what one unit of difference in look, squared, counts as in the objective
 MOST_LOOK = 9.0
 JOIN = 30.0  # rise of the objective that a material of its own must be worth
 MOVE = -4.0  # fall of the objective that a group must bring to go over

@@ -74,11 +74,17 @@ def fit_residual(
     rows, columns = beam.shape
 
     def spread(values: np.ndarray) -> np.ndarray:
-        image = np.bincount(pixel, values, minlength=count * pixels).reshape(count, pixels).T
+        image = (
+            np.bincount(pixel, values, minlength=count * pixels).astype(np.float32).reshape(count, pixels).T
+        )
         return beam(image.reshape(rows, columns, count)).reshape(pixels, count)
 
     def gather(image: np.ndarray) -> np.ndarray:
-        back = beam.adjoint(image.reshape(rows, columns, count)).reshape(pixels, count).T.ravel()
+        back = (
+            beam.adjoint(image.astype(np.float32).reshape(rows, columns, count))
+            .reshape(pixels, count)
+            .T.ravel()
+        )
         return back[pixel]
 
     r = np.zeros(elements)
