@@ -237,7 +237,9 @@ class _Training:
             terms, fit, residual = self._choose(terms, free, fit)
             errors = self._errors(terms, fit, residual)
             start = fit.parameters
-        fit = self._groups(terms, start, np.arange(self.count), self.steps)
+        # Chosen terms come with a fit to most receivers, under which light that goes on is settled: one round is left.
+        rounds = 1 if len(self.held) else OUTER
+        fit = self._groups(terms, start, np.arange(self.count), self.steps, rounds=rounds)
         residual = (
             self._residual(self._field(terms, fit, None), np.arange(self.count)) if terms.residual else None
         )
@@ -312,8 +314,8 @@ class _Training:
     def _regroup(self, terms: Terms, fit: Fit, best: float) -> tuple[Fit, float]:
         """Materials by what the spectra say, if that lowers the held-out error."""
         before, trial = self.material, fit
-        for k in range(REGROUPED):
-            chosen = self.kept if k == REGROUPED - 1 else self.kept[: 2 * MOST_TO_CHOOSE]
+        chosen = self.kept[: 2 * MOST_TO_CHOOSE]
+        for _ in range(REGROUPED):
             views = self._views(terms, trial, chosen, True)
             self.material, start = regroup(
                 views, trial.parameters, self.material, self.surface.look, self.area
