@@ -34,7 +34,7 @@ from warprrf.kernels import gaussian_rays as kernels
 from warprrf.kernels.project import Rules
 
 ORDERS = {"peak": kernels.BY_PEAK, "range": kernels.BY_RANGE}
-"""Of hits: by the peak's distance along the ray, or by the mean's distance from the origin, as the rasteriser blends."""
+"""Of hits: by the peak's distance along the ray, or by the mean's from the origin, as the rasteriser blends."""
 
 
 @dataclass(frozen=True)

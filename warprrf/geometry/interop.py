@@ -99,7 +99,7 @@ def ray_transmittance(
         TypeError, ValueError: naming the argument that does not fit.
     """
     _check_gaussians(means, quaternions, scales, opacities)
-    query = ("transmit_with_adjoint", (a, b), {}, blending)
+    query: Any = ("transmit_with_adjoint", (a, b), {}, blending)
     return _functions().rays.apply(query, means, quaternions, scales, opacities)[0]
 
 
@@ -123,7 +123,7 @@ def ray_hits(
         TypeError, ValueError: naming the argument that does not fit.
     """
     _check_gaussians(means, quaternions, scales, opacities)
-    query = ("trace_with_adjoint", (origins, directions, k), {"order": order}, blending)
+    query: Any = ("trace_with_adjoint", (origins, directions, k), {"order": order}, blending)
     t, alpha, weight, left, index = _functions().rays.apply(query, means, quaternions, scales, opacities)
     return index, t, alpha, weight, left
 
