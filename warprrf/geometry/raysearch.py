@@ -121,9 +121,10 @@ class RaySearch:
 
     @cached_property
     def _embree(self) -> tuple[embree.EmbreeScene, np.ndarray]:
-        """Embree's hierarchy of the faces that have an area, and which faces those are."""
+        """Embree's hierarchy of the faces that have an area, and which faces those are; empty if all of them."""
         names = np.flatnonzero(self._planes[:, :3].any(axis=1)).astype(np.int32)
-        return embree.EmbreeScene(self._vertices, self._faces[names]), names
+        scene = embree.EmbreeScene(self._vertices, self._faces[names])
+        return scene, names if len(names) < len(self._faces) else names[:0]
 
     def nearest(
         self, o: np.ndarray, d: np.ndarray, *, reach: np.ndarray, clearance: float, device: Any, backend: str

@@ -15,8 +15,8 @@ BAD = wp.constant(-2)
 AGAIN = wp.constant(-3)
 """Face of a ray that met a surface at its start and goes on from the distance stored in its place."""
 
-# What float32 may displace a surface along a ray, over the largest coordinate: four roundings of 2^-24.
-_ROUNDING = wp.constant(wp.float64(2.4e-7))
+# What float32 may displace a surface along a ray, over the largest coordinate: six roundings of 2^-24.
+_ROUNDING = wp.constant(wp.float64(3.6e-7))
 # A ray's start is on a plane if no further from it than this, over the largest coordinate: float64 rounding.
 _ON_PLANE = wp.constant(wp.float64(1e-12))
 GRAZING = 1e-7
@@ -24,6 +24,12 @@ GRAZING = 1e-7
 
 _GRAZING = wp.constant(wp.float64(GRAZING))
 _FAR = wp.constant(wp.float64(1e30))
+# Beyond these a hit is neither grazing nor at the ray's start, without a closer look.
+_STEEP_SQUARE = wp.constant(wp.float64(1e-12))
+_CLEAR = wp.constant(wp.float64(1e-9))
+# Squares between these neither overflow nor lose digits in float32.
+_LEAST_SQUARE = wp.constant(wp.float32(1e-30))
+_MOST_SQUARE = wp.constant(wp.float32(1e30))
 _STEPS = 8
 
 
@@ -31,6 +37,16 @@ _STEPS = 8
 def narrow(p: wp.vec3d):
     """A position or direction in float32."""
     return wp.vec3(wp.float32(p[0]), wp.float32(p[1]), wp.float32(p[2]))
+
+
+@wp.func
+def unit_narrow(direction: wp.vec3d):
+    """A direction in float32, of length one to rounding; NaN if it has none. Normalised in float32, which is faster."""
+    d = narrow(direction)
+    square = wp.dot(d, d)
+    if square > _LEAST_SQUARE and square < _MOST_SQUARE:
+        return d * (wp.float32(1.0) / wp.sqrt(square))
+    return narrow(direction * (wp.float64(1.0) / wp.length(direction)))
 
 
 @wp.func
@@ -141,14 +157,15 @@ def pack_rays(
     i = first + k
     origin = origins[wp.min(i, origins.shape[0] - 1)] - center
     direction = directions[wp.min(i, directions.shape[0] - 1)]
-    length = wp.length(direction)
-    scale = rounding_scale(origin, radius)
-    begin = clearance - _ROUNDING * scale
+    near = narrow(origin)
+    begin = wp.float32(clearance) - wp.float32(_ROUNDING) * (
+        wp.float32(radius) + wp.abs(near[0]) + wp.abs(near[1]) + wp.abs(near[2])
+    )
     if start.shape[0] > 0:
-        begin = start[i]
-    unit = direction * (wp.float64(1.0) / length)
-    rays[2 * k] = narrow(origin + begin * unit)
-    rays[2 * k + 1] = narrow(unit)
+        begin = wp.float32(start[i])
+    unit = unit_narrow(direction)
+    rays[2 * k] = near + begin * unit
+    rays[2 * k + 1] = unit
 
 
 @wp.kernel(enable_backward=False)
@@ -168,14 +185,30 @@ def place_hits(
     distance: wp.array(dtype=wp.float64),
     face: wp.array(dtype=wp.int32),
 ):
-    """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's."""
+    """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's, empty
+    if it holds all."""
     k = offset + wp.tid()
     i = first + k
     origin = origins[wp.min(i, origins.shape[0] - 1)] - center
     direction = directions[wp.min(i, directions.shape[0] - 1)]
+    name = met[k]
+    if name >= 0:
+        if names.shape[0] > 0:
+            name = names[name]
+        plane = planes[name]
+        normal = wp.vec3d(plane[0], plane[1], plane[2])
+        square = wp.dot(direction, direction)
+        slope = wp.dot(normal, direction)
+        height = plane[3] - wp.dot(normal, origin)
+        if slope * slope > _STEEP_SQUARE * square and wp.abs(height) > _CLEAR * rounding_scale(origin, radius):
+            t = height * wp.sqrt(square) / slope
+            if t > clearance:  # nearly every ray: nothing is left to decide
+                distance[i] = t
+                face[i] = name
+                return
     length = wp.length(direction)
     scale = rounding_scale(origin, radius)
-    if met[k] < 0:
+    if name < 0:
         distance[i] = wp.float64(wp.inf)
         face[i] = wp.where(is_bad(scale, length), BAD, MISS)
         return
@@ -183,7 +216,6 @@ def place_hits(
     if start.shape[0] > 0:
         begin = start[i]
     near = begin + wp.float64(met_at[k])
-    name = names[met[k]]
     t = plane_distance(origin, direction, length, scale, planes[name], near, clearance)
     if wp.isnan(t):
         t = near + _ROUNDING * scale
