@@ -14,6 +14,10 @@ BAD = wp.constant(-2)
 """Face of a ray that is not finite or has no direction."""
 AGAIN = wp.constant(-3)
 """Face of a ray that met a surface at its start and goes on from the distance stored in its place."""
+FREE = wp.constant(0)
+"""Segment that nothing blocks."""
+BLOCKED = wp.constant(1)
+"""Segment that a surface blocks."""
 
 # What float32 may displace a surface along a ray, over the largest coordinate: six roundings of 2^-24.
 _ROUNDING = wp.constant(wp.float64(3.6e-7))
@@ -88,6 +92,42 @@ def plane_distance(
     return t
 
 
+@wp.func
+def search(
+    mesh: wp.uint64,
+    planes: wp.array(dtype=wp.vec4d),
+    origin: wp.vec3d,
+    direction: wp.vec3d,
+    length: wp.float64,
+    scale: wp.float64,
+    clearance: wp.float64,
+    reach: wp.float64,
+):
+    """Distance [m] and face of what a ray meets beyond ``clearance`` and within ``reach``; inf and MISS if nothing."""
+    unit = direction / length
+    step = _ROUNDING * scale
+    start = clearance - step
+    most = wp.min(reach, _FAR)
+    found = wp.float64(wp.inf)
+    name = MISS
+    for _ in range(_STEPS):
+        query = wp.mesh_query_ray(
+            mesh, narrow(origin + start * unit), narrow(unit), wp.float32(most - start + step)
+        )
+        if not query.result:
+            break
+        near = start + wp.float64(query.t)
+        t = plane_distance(origin, direction, length, scale, planes[query.face], near, clearance)
+        if not wp.isnan(t):
+            found = t
+            name = query.face
+            break
+        start = near + step
+        if start > most:
+            break
+    return found, name
+
+
 @wp.kernel(enable_backward=False)
 def cast_rays(
     offset: int,
@@ -112,29 +152,109 @@ def cast_rays(
         distance[i] = wp.float64(wp.inf)
         face[i] = BAD
         return
-    unit = direction / length
-    step = _ROUNDING * scale
-    start = clearance - step
-    most = wp.min(reach[wp.min(i, reach.shape[0] - 1)], _FAR)
-    found = wp.float64(wp.inf)
-    name = MISS
-    for _ in range(_STEPS):
-        query = wp.mesh_query_ray(
-            mesh, narrow(origin + start * unit), narrow(unit), wp.float32(most - start + step)
-        )
-        if not query.result:
-            break
-        near = start + wp.float64(query.t)
-        t = plane_distance(origin, direction, length, scale, planes[query.face], near, clearance)
-        if not wp.isnan(t):
-            found = t
-            name = query.face
-            break
-        start = near + step
-        if start > most:
-            break
+    most = reach[wp.min(i, reach.shape[0] - 1)]
+    found, name = search(mesh, planes, origin, direction, length, scale, clearance, most)
     distance[i] = found
     face[i] = name
+
+
+@wp.kernel(enable_backward=False)
+def look(
+    offset: int,
+    mesh: wp.uint64,
+    center: wp.vec3d,
+    radius: wp.float64,
+    planes: wp.array(dtype=wp.vec4d),
+    clearance: wp.float64,
+    starts: wp.array(dtype=wp.vec3d),
+    ends: wp.array(dtype=wp.vec3d),
+    sight: wp.array(dtype=wp.int32),
+):
+    """Whether each segment is FREE but for ``clearance`` at its ends, or BLOCKED."""
+    i = offset + wp.tid()
+    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
+    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+    length = wp.length(way)
+    scale = rounding_scale(origin, radius)
+    if not (wp.isfinite(scale) and wp.isfinite(length)):
+        sight[i] = BAD
+        return
+    if length <= wp.float64(2.0) * clearance:
+        sight[i] = FREE
+        return
+    t, name = search(mesh, planes, origin, way, length, scale, clearance, length - clearance)
+    sight[i] = wp.where(name >= 0 and t < length - clearance, BLOCKED, FREE)
+
+
+@wp.kernel(enable_backward=False)
+def pack_segments(
+    offset: int,
+    first: int,
+    center: wp.vec3d,
+    radius: wp.float64,
+    clearance: wp.float64,
+    starts: wp.array(dtype=wp.vec3d),
+    ends: wp.array(dtype=wp.vec3d),
+    rays: wp.array(dtype=wp.vec3),
+):
+    """Segments from number ``first`` on as pairs (start, way) in float32, from ``clearance`` to ``clearance`` before
+    the end, longer by the rounding; a bad one or one that short meets nothing."""
+    k = offset + wp.tid()
+    i = first + k
+    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
+    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+    length = wp.length(way)
+    unit = way * (wp.float64(1.0) / length)
+    step = _ROUNDING * rounding_scale(origin, radius)
+    rays[2 * k] = narrow(origin + (clearance - step) * unit)
+    inner = length - wp.float64(2.0) * clearance
+    rays[2 * k + 1] = narrow(
+        wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan)) * unit
+    )
+
+
+@wp.kernel(enable_backward=False)
+def judge_segments(
+    offset: int,
+    first: int,
+    which: wp.array(dtype=wp.int32),
+    center: wp.vec3d,
+    radius: wp.float64,
+    planes: wp.array(dtype=wp.vec4d),
+    names: wp.array(dtype=wp.int32),
+    clearance: wp.float64,
+    starts: wp.array(dtype=wp.vec3d),
+    ends: wp.array(dtype=wp.vec3d),
+    met: wp.array(dtype=wp.int32),
+    sight: wp.array(dtype=wp.int32),
+):
+    """What the first hits of :func:`pack_segments` say in float64: FREE, BLOCKED, or AGAIN if it takes a closer look.
+
+    ``which`` names the segments, empty if all; ``names`` the faces of the hierarchy's, empty if it holds all.
+    """
+    k = offset + wp.tid()
+    i = first + k
+    if which.shape[0] > 0:
+        i = first + which[k]
+    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
+    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+    length = wp.length(way)
+    scale = rounding_scale(origin, radius)
+    name = met[k]
+    if name < 0:
+        sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
+        return
+    if names.shape[0] > 0:
+        name = names[name]
+    plane = planes[name]
+    normal = wp.vec3d(plane[0], plane[1], plane[2])
+    slope = wp.dot(normal, way)
+    height = plane[3] - wp.dot(normal, origin)
+    sight[i] = AGAIN
+    if slope * slope > _STEEP_SQUARE * length * length:
+        t = height * length / slope
+        if t > clearance and wp.abs(height) > _CLEAR * scale:
+            sight[i] = wp.where(t < length - clearance, BLOCKED, FREE)
 
 
 @wp.kernel(enable_backward=False)
@@ -200,7 +320,9 @@ def place_hits(
         square = wp.dot(direction, direction)
         slope = wp.dot(normal, direction)
         height = plane[3] - wp.dot(normal, origin)
-        if slope * slope > _STEEP_SQUARE * square and wp.abs(height) > _CLEAR * rounding_scale(origin, radius):
+        if slope * slope > _STEEP_SQUARE * square and wp.abs(height) > _CLEAR * rounding_scale(
+            origin, radius
+        ):
             t = height * wp.sqrt(square) / slope
             if t > clearance:  # nearly every ray: nothing is left to decide
                 distance[i] = t
