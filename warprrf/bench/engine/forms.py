@@ -1,7 +1,7 @@
 """Ways to evaluate a Gaussian's exact response on a ray, and the exponential in it: time and error in float32.
 
-All response forms are exact in exact arithmetic; they differ in what cancels. ``M = diag(1/s) R^T``, ``m`` the mean from
-the ray origin, ``g = M d``, ``o = -M m``, response ``G = exp(-q/2)``:
+All response forms are exact in exact arithmetic; they differ in what cancels. ``M = diag(1/s) R^T``, ``m`` the mean
+from the ray origin, ``g = M d``, ``o = -M m``, response ``G = exp(-q/2)``:
 
 - ``textbook``: ``q = |o|^2 - (o.g)^2/|g|^2``.
 - ``offset first``: ``p = (m.d) d - m``, ``q = |(g/|g|) x M p|^2``.
@@ -18,17 +18,30 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warprrf.bench.engine.form_kernels import (
+    COEFFICIENTS,
+    GRAM,
+    OFFSET_FIRST,
+    QUADRATIC,
+    STRIP,
+    TEXTBOOK,
+    TURNED,
+    double_precision,
+    exponential_kernel,
+    form_kernel,
+    library,
+    limit,
+    taylor3,
+    taylor6,
+)
 from warprrf.device import launch, resolve
 from warprrf.geometry.gaussians import rotations_of
-from warprrf.kernels.project import STRIP
 
-TEXTBOOK, OFFSET_FIRST, GRAM, TURNED, QUADRATIC = range(5)
 FORMS = {
     "textbook": TEXTBOOK,
     "offset first": OFFSET_FIRST,
@@ -43,70 +56,6 @@ REGIMES = {
 }
 """Distance of the means [m], smallest and largest scale [m], and how many times longer one axis is."""
 RAYS = 32  # to each Gaussian, aimed at points drawn from it
-COEFFICIENTS = 24
-
-vec_strip = wp.types.vector(STRIP, wp.float32)
-
-
-@wp.func
-def _squared_distance(form: int, c: wp.array(dtype=wp.float32, ndim=2), i: int, d: wp.vec3) -> float:  # type: ignore[valid-type]
-    if form == wp.static(TEXTBOOK) or form == wp.static(OFFSET_FIRST):
-        g = wp.vec3(
-            c[i, 0] * d[0] + c[i, 1] * d[1] + c[i, 2] * d[2],
-            c[i, 3] * d[0] + c[i, 4] * d[1] + c[i, 5] * d[2],
-            c[i, 6] * d[0] + c[i, 7] * d[1] + c[i, 8] * d[2],
-        )
-        if form == wp.static(TEXTBOOK):
-            o = wp.vec3(c[i, 9], c[i, 10], c[i, 11])
-            along = wp.dot(o, g)
-            return c[i, 12] - along * along / wp.dot(g, g)
-        m = wp.vec3(c[i, 9], c[i, 10], c[i, 11])
-        p = wp.dot(m, d) * d - m
-        h = wp.vec3(
-            c[i, 0] * p[0] + c[i, 1] * p[1] + c[i, 2] * p[2],
-            c[i, 3] * p[0] + c[i, 4] * p[1] + c[i, 5] * p[2],
-            c[i, 6] * p[0] + c[i, 7] * p[1] + c[i, 8] * p[2],
-        )
-        x = wp.cross(g, h)
-        return wp.dot(x, x) / wp.dot(g, g)
-    if form == wp.static(QUADRATIC):
-        xx = d[0] * d[0]
-        yy = d[1] * d[1]
-        zz = d[2] * d[2]
-        xy = d[0] * d[1]
-        xz = d[0] * d[2]
-        yz = d[1] * d[2]
-        top = c[i, 0] * xx + c[i, 1] * yy + c[i, 2] * zz + c[i, 3] * xy + c[i, 4] * xz + c[i, 5] * yz
-        return top / (
-            c[i, 6] * xx + c[i, 7] * yy + c[i, 8] * zz + c[i, 9] * xy + c[i, 10] * xz + c[i, 11] * yz
-        )
-    u1 = c[i, 0] * d[0] + c[i, 1] * d[1] + c[i, 2] * d[2]
-    u2 = c[i, 3] * d[0] + c[i, 4] * d[1] + c[i, 5] * d[2]
-    w = c[i, 6] * d[0] + c[i, 7] * d[1] + c[i, 8] * d[2]
-    n = c[i, 9] * u1 * u1 + c[i, 10] * u2 * u2
-    if form == wp.static(GRAM):
-        n = n + c[i, 17] * u1 * u2
-    gg = w * (c[i, 11] * w + 2.0 * (c[i, 12] * u1 + c[i, 13] * u2))
-    gg = gg + u1 * (c[i, 14] * u1 + 2.0 * c[i, 15] * u2) + c[i, 16] * u2 * u2
-    return n / gg
-
-
-@cache
-def _form_kernel(form: int) -> Any:
-    """One form alone: the others are not even compiled."""
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def respond(
-        offset: int,
-        coefficients: wp.array(dtype=wp.float32, ndim=2),  # type: ignore[valid-type]
-        directions: wp.array(dtype=wp.vec3, ndim=2),  # type: ignore[valid-type]
-        q: wp.array(dtype=wp.float32, ndim=2),  # type: ignore[valid-type]
-    ) -> None:
-        i = offset + wp.tid()
-        for k in range(directions.shape[1]):
-            q[i, k] = _squared_distance(wp.static(form), coefficients, i, directions[i, k])
-
-    return respond
 
 
 def response_forms(
@@ -128,7 +77,7 @@ def response_forms(
         for name, form in FORMS.items():
             table = wp.array(_coefficients(form, whiten, mean), dtype=wp.float32, device=on)
             results[name] = wp.zeros(toward.shape[:2], dtype=wp.float32, device=on)
-            runners[name] = _runner(_form_kernel(form), gaussians, [table, directions, results[name]], on)
+            runners[name] = _runner(form_kernel(form), gaussians, [table, directions, results[name]], on)
         seconds = best_seconds(runners, repeats)
         for name, q in results.items():
             found = q.numpy().astype(np.float64)
@@ -146,92 +95,15 @@ def response_forms(
     return rows
 
 
-@wp.func
-def _taylor6(h: vec_strip) -> vec_strip:
-    """The rasteriser's: (Taylor of exp(-h/16), degree 6)^16."""
-    one = vec_strip(1.0)
-    x = wp.min(h, vec_strip(80.0)) * -0.0625
-    p = one + x * 0.16666667
-    p = one + wp.cw_mul(x, p) * 0.2
-    p = one + wp.cw_mul(x, p) * 0.25
-    p = one + wp.cw_mul(x, p) * 0.33333333
-    p = one + wp.cw_mul(x, p) * 0.5
-    p = wp.max(one + wp.cw_mul(x, p), vec_strip())
-    p = wp.cw_mul(p, p)
-    p = wp.cw_mul(p, p)
-    p = wp.cw_mul(p, p)
-    return wp.cw_mul(p, p)
-
-
-@wp.func
-def _taylor3(h: vec_strip) -> vec_strip:
-    """(Taylor of exp(-h/64), degree 3)^64."""
-    one = vec_strip(1.0)
-    x = wp.min(h, vec_strip(80.0)) * -0.015625
-    p = one + x * 0.33333333
-    p = one + wp.cw_mul(x, p) * 0.5
-    p = wp.max(one + wp.cw_mul(x, p), vec_strip())
-    for _ in range(6):
-        p = wp.cw_mul(p, p)
-    return p
-
-
-@wp.func
-def _limit(h: vec_strip) -> vec_strip:
-    """(1 - h/256)^256."""
-    p = wp.max(vec_strip(1.0) - h * 0.00390625, vec_strip())
-    for _ in range(8):
-        p = wp.cw_mul(p, p)
-    return p
-
-
-@wp.func
-def _library(h: vec_strip) -> vec_strip:
-    out = vec_strip()
-    for k in range(wp.static(STRIP)):
-        out[k] = wp.exp(-h[k])
-    return out
-
-
-@wp.func
-def _double(h: vec_strip) -> vec_strip:
-    out = vec_strip()
-    for k in range(wp.static(STRIP)):
-        out[k] = wp.float32(wp.exp(-wp.float64(h[k])))
-    return out
-
-
 EXPONENTIALS: dict[str, Any] = {
-    "library, float32": _library,
-    "Taylor 6, 4 squarings": _taylor6,
-    "Taylor 3, 6 squarings": _taylor3,
-    "(1 - h/256)^256": _limit,
-    "library, float64": _double,
+    "library, float32": library,
+    "Taylor 6, 4 squarings": taylor6,
+    "Taylor 3, 6 squarings": taylor3,
+    "(1 - h/256)^256": limit,
+    "library, float64": double_precision,
 }
 RASTERISER = "Taylor 6, 4 squarings"
 """What the rasteriser computes in float32."""
-
-
-@cache
-def _exponential_kernel(function: Any) -> Any:
-    @wp.kernel(module="unique", enable_backward=False)
-    def exponentiate(
-        offset: int,
-        rounds: int,
-        h: wp.array(dtype=wp.float32, ndim=2),  # type: ignore[valid-type]
-        out: wp.array(dtype=wp.float32, ndim=2),  # type: ignore[valid-type]
-    ) -> None:
-        i = offset + wp.tid()
-        x = vec_strip()
-        for k in range(wp.static(STRIP)):
-            x[k] = h[i, k]
-        total = vec_strip()
-        for j in range(rounds):
-            total += function(x + vec_strip(wp.float32(j)))
-        for k in range(wp.static(STRIP)):
-            out[i, k] = total[k]
-
-    return exponentiate
 
 
 def exponential_forms(
@@ -250,7 +122,7 @@ def exponential_forms(
     exact = np.exp(-h.astype(np.float64))
     given, runners, results = wp.array(h, dtype=wp.float32, device=on), {}, {}
     for name, function in EXPONENTIALS.items():
-        kernel, out = _exponential_kernel(function), wp.zeros(h.shape, dtype=wp.float32, device=on)
+        kernel, out = exponential_kernel(function), wp.zeros(h.shape, dtype=wp.float32, device=on)
         launch(kernel, strips, [1, given, out], device=on)
         results[name] = out.numpy().astype(np.float64)
         runners[name] = _runner(kernel, strips, [rounds, given, out], on)
