@@ -24,6 +24,7 @@ from warprrf.bench.stages import write_atomically, write_json
 from warprrf.cli_help import (
     HELP_BENCH,
     HELP_BENCH_BISTATIC,
+    HELP_BENCH_ENGINE,
     HELP_DATA,
     HELP_EVALUATE,
     HELP_FIT,
@@ -343,10 +344,30 @@ def _bench_relevance(args: argparse.Namespace, bars: Bars) -> None:
     print(relevance.summary_text(report))
 
 
+def _bench_engine(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import engine
+
+    out = args.out or "runs/engine"
+    sizes = engine.QUICK if args.quick else engine.Sizes()
+    report = engine.run_engine(
+        out,
+        scene=args.scene,
+        sizes=sizes,
+        seed=args.seed,
+        device=args.device,
+        fresh=args.fresh,
+        progress=bars,
+    )
+    bars._close()
+    print(engine.summary_text(report))
+    print(f"\n{Path(out) / 'engine.md'}: the tables with pictures; engine.json: every figure")
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "newrf": _bench_newrf,
     "bistatic": _bench_bistatic,
     "relevance": _bench_relevance,
+    "engine": _bench_engine,
 }
 """Benchmarks by name: what `warprrf bench NAME` runs."""
 
@@ -656,6 +677,12 @@ def _parser() -> argparse.ArgumentParser:
         "--repeat", type=int, default=10, metavar="N", help="receivers of Sionna's second solve (10; 0: none)"
     )
     ours.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+
+    engine = add("engine", _bench, "the engine's speed against error", HELP_BENCH_ENGINE, tables)
+    engine.add_argument("--out", help="folder of the results (default runs/engine)")
+    engine.add_argument("--scene", default="data/lobby/scene.xml", help="scene that rays are cast at (XML)")
+    engine.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, in a minute")
+    engine.add_argument("--fresh", action="store_true", help="start over instead of continuing")
 
     data = add("data", _data, "regenerate data/lobby/ from nothing (hours; resumable)", HELP_DATA)
     data.add_argument("--data", default="data/lobby", help="folder to write (default data/lobby)")

@@ -16,7 +16,7 @@ so that times tell the forms apart, not how the rasteriser runs them.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,7 +138,7 @@ def exponential_forms(
     ]
 
 
-def best_seconds(runners: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+def best_seconds(runners: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
     """Shortest run of each [s], run in turn after one that doesn't count."""
     best = dict.fromkeys(runners, np.inf)
     for turn in range(repeats + 1):

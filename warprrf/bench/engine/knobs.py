@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -125,11 +126,10 @@ def error_of(image: np.ndarray, reference: np.ndarray) -> Row:
 
 def cutoff_rows(scene: Scene, knob: str, values: Sequence[float], *, repeats: int = 5) -> list[Row]:
     """One row a value of the cutoff ``knob`` of :class:`Blending`, the others as for radio: error and seconds."""
-    others = {"alpha_min": RADIO.alpha_min, "alpha_max": RADIO.alpha_max}
-    runners = {}
-    for value in values:
-        options = {**others, knob: value}
-        runners[f"{value!r}"] = scene.renderer(Blending(transmittance_min=RADIO.transmittance_min, **options))
+    runners = {
+        f"{value!r}": scene.renderer(replace(RADIO, **{knob: value}))  # type: ignore[arg-type]
+        for value in values
+    }
     seconds, reference = best_seconds(runners, repeats), scene.reference()
     return [
         {"value": value, "seconds": seconds[f"{value!r}"], **error_of(runners[f"{value!r}"](), reference)}

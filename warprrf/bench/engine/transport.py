@@ -51,7 +51,8 @@ def run_transport(
         ``seconds_per_receiver`` and, for all, ``hours_to_store``; ``bytes_per_receiver``, ``bytes_per_pair``,
         ``pairs_per_pixel`` and ``disk_gb`` of all receivers, with and without the fit's sorted batches
         (``batches_gb``); ``store_peak_gb`` and ``fit_peak_gb`` of memory; ``first_pass_s`` to sort the batches and
-        ``seconds_per_step`` afterwards; ``dropped_max``, ``dropped_mean``: blending weight a pixel that top-K leaves
+        ``seconds_per_step`` afterwards; ``gaussians_seen`` by the measured receivers, which are what the fit learns;
+        ``dropped_max``, ``dropped_mean``: blending weight a pixel that top-K leaves
         out; ``weight_error``: largest relative error of a stored weight.
 
     Raises:
@@ -90,6 +91,7 @@ def run_transport(
             "pairs_per_pixel": store.pairs / (measured * shape[0] * shape[1]),
             "disk_gb": per_receiver * receivers / 1e9,
             "batches_gb": batches / 1e9,
+            "gaussians_seen": fitted["gaussians_seen"],
             "store_peak_gb": stored["peak_gb"],
             "fit_peak_gb": fitted["peak_gb"],
             "first_pass_s": fitted["first_s"],
@@ -172,11 +174,12 @@ def _fit(folder: Path, gaussians: int, steps: int, seed: int, device: Any) -> di
     )
     marks: list[float] = []
     start = time.perf_counter()
-    HarmonicField.fit(
+    field = HarmonicField.fit(
         cover(gaussians, seed), spectra, "rf3dgs+", transport=store, iterations=steps, batch=BATCH, seed=seed,  # type: ignore[arg-type]
         device=device, progress=lambda *_: marks.append(time.perf_counter()),
     )  # fmt: skip
     return {
+        "gaussians_seen": field.report["gaussians_seen"],
         "first_s": marks[0] - start,
         "seconds_per_step": float(np.mean(np.diff(marks))) if len(marks) > 1 else float("nan"),
     }
