@@ -1,8 +1,8 @@
-"""Pictures of the engine's evaluation: time against error of each knob, and how cost grows."""
+"""Pictures of the engine's evaluation: time and error of each knob, and how cost grows."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,37 +12,71 @@ from warprrf.device import require
 
 Row = dict[str, Any]
 COLOUR, MARKED = "#0b6e99", "#b3123c"
-LEAST_DB = 1e-6
-"""Errors below this are drawn here: no error at all has no logarithm."""
+LEAST = 1e-9  # where no setting errs at all
 
 
-def time_against_error(
-    panels: dict[str, list[Row]], labels: dict[str, Callable[[Any], str]], chosen: dict[str, Any]
-) -> Any:
-    """A panel a knob: rms error [dB] over milliseconds, each setting named, the one chosen in red."""
-    columns = 3
+@dataclass(frozen=True)
+class Panel:
+    """Settings of one knob.
+
+    Attributes:
+        title: name of the knob.
+        labels: name of each setting.
+        errors, error_label: what each errs by, drawn on a logarithmic axis.
+        costs, cost_label: what each costs.
+        chosen: index of the setting that is picked, or None.
+        ordered: whether the settings follow one another, so that a line between them means something.
+    """
+
+    title: str
+    labels: list[str]
+    errors: list[float]
+    error_label: str
+    costs: list[float]
+    cost_label: str
+    chosen: int | None = None
+    ordered: bool = True
+
+
+def panels(shown: list[Panel], columns: int = 3) -> Any:
+    """A panel a knob: bars for cost on the right axis, points for error on the left; the setting picked in red."""
+    rows = -(-len(shown) // columns)
     figure = require("matplotlib.figure", extra="plots").Figure(
-        figsize=(15.0, 4.4 * -(-len(panels) // columns)), layout="constrained"
+        figsize=(5.2 * columns, 3.9 * rows), layout="constrained"
     )
-    axes = figure.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
-    for ax, (name, rows) in zip(axes, panels.items(), strict=False):
-        x = np.array([1e3 * row["seconds"] for row in rows])
-        y = np.array([max(row["error_rms_db"], LEAST_DB) for row in rows])
-        ax.plot(x, y, color=COLOUR, linewidth=0.9, alpha=0.5)
-        for k, row in enumerate(rows):
-            picked = row["value"] == chosen.get(name)
-            ax.plot(x[k], y[k], marker="o", markersize=9 if picked else 5, color=MARKED if picked else COLOUR)
-            ax.annotate(
-                labels[name](row["value"]), (x[k], y[k]), xytext=(5, 5 if k % 2 == 0 else -12),
-                textcoords="offset points", fontsize=8, fontweight="bold" if picked else "normal",
-            )  # fmt: skip
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, panel in zip(axes, shown, strict=False):
+        place = np.arange(len(panel.labels))
+        picked = [MARKED if k == panel.chosen else COLOUR for k in place]
+        cost = ax.twinx()
+        bars = cost.bar(place, panel.costs, width=0.62, color=picked, alpha=0.25)
+        cost.bar_label(bars, [f"{c:.3g}" for c in panel.costs], fontsize=7, color="#555555")
+        cost.set_ylim(0, 1.25 * max(panel.costs))
+        cost.set_ylabel(panel.cost_label + " (bars)", color="#555555")
+        least = min([e for e in panel.errors if e > 0], default=LEAST) / 10
+        errors = [max(e, least) for e in panel.errors]
+        if panel.ordered:
+            ax.plot(place, errors, color="black", linewidth=0.9, alpha=0.5)
+        ax.scatter(place, errors, c=picked, s=34, zorder=3)
+        for k, error in enumerate(panel.errors):
+            if error <= 0:
+                ax.annotate(
+                    "none",
+                    (place[k], least),
+                    xytext=(0, 6),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=7,
+                )
         ax.set_yscale("log")
-        ax.margins(x=0.18, y=0.12)
-        ax.set_title(name)
-        ax.set_xlabel("milliseconds a receiver")
-        ax.set_ylabel("rms error [dB]")
-        ax.grid(alpha=0.3, which="both")
-    for ax in axes[len(panels) :]:
+        ax.margins(y=0.12)
+        ax.set_zorder(cost.get_zorder() + 1)
+        ax.patch.set_visible(False)
+        ax.set_xticks(place, panel.labels, fontsize=8, rotation=30, ha="right", rotation_mode="anchor")
+        ax.set_title(panel.title, fontsize=11)
+        ax.set_ylabel(panel.error_label + " (points)")
+        ax.grid(alpha=0.3, axis="y")
+    for ax in axes[len(shown) :]:
         ax.axis("off")
     return figure
 
@@ -78,32 +112,6 @@ def counts(rows: list[Row]) -> Any:
     return figure
 
 
-def forms(responses: list[Row], exponentials: list[Row]) -> Any:
-    """Mean error of the response over nanoseconds a pair, a panel a regime; last the exponentials, largest error."""
-    regimes = list(dict.fromkeys(row["regime"] for row in responses))
-    figure, axes = figure_of(len(regimes) + 1, size=(4.6 * (len(regimes) + 1), 4.4))
-    groups: list[tuple[str, list[Row], str, str]] = [
-        (regime, [r for r in responses if r["regime"] == regime], "error_mean", "ns_per_pair")
-        for regime in regimes
-    ]
-    groups.append(("exp(-h), strips of 16", exponentials, "error_max", "ns_per_value"))
-    for ax, (title, rows, error, cost) in zip(axes, groups, strict=True):
-        for k, row in enumerate(rows):
-            ax.plot(row[cost], max(row[error], 1e-9), marker="o", color=COLOUR, linestyle="none")
-            ax.annotate(
-                row["form"], (row[cost], max(row[error], 1e-9)), xytext=(5, 6 if k % 2 == 0 else -12),
-                textcoords="offset points", fontsize=8,
-            )  # fmt: skip
-        ax.set_yscale("log")
-        ax.set_xlim(left=0)
-        ax.margins(x=0.3, y=0.15)
-        ax.set_title(title, fontsize=10)
-        ax.set_xlabel("nanoseconds a pair" if cost == "ns_per_pair" else "nanoseconds a value")
-        ax.set_ylabel("mean error of the response" if error == "error_mean" else "largest error")
-        ax.grid(alpha=0.3, which="both")
-    return figure
-
-
 def rays(rows: list[Row], asked: dict[str, float]) -> Any:
     """Speed over bare Embree, a group a mesh and kind of rays."""
     figure, (ax,) = figure_of(1, size=(11.0, 4.4))
@@ -120,6 +128,6 @@ def rays(rows: list[Row], asked: dict[str, float]) -> Any:
         )
     ax.set_xticks(place, [f"{row['mesh']}\n{row['kind']}" for row in shown], fontsize=8)
     ax.set_ylabel("rays per second over bare Embree's")
-    ax.legend(fontsize=9, ncols=2)
-    ax.set_ylim(0, 1.25 * max([1.0, *(row[r]["over_bare"] for row in shown for r in ("chosen", "warp"))]))
+    ax.legend(fontsize=9, ncols=2, loc="upper right")
+    ax.set_ylim(0, 1.35 * max([1.0, *(row[r]["over_bare"] for row in shown for r in ("chosen", "warp"))]))
     return figure

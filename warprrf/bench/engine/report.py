@@ -26,6 +26,8 @@ Row = dict[str, Any]
 TOLERANCE_DB, WORST_DB = 0.05, 2.0
 """A setting will do if its rms error and its worst pixel stay within these: a tenth of the errors of the best fits."""
 POINT_TOLERANCE_M = 1e-3  # a wavelength at 300 GHz
+FORM_TOLERANCE = 1e-3  # mean error of a response in every regime: a step of alpha that no cutoff of ours sees
+EXPONENTIAL_TOLERANCE = 1e-6  # what the deepest image, 60 dB, can show
 ASKED_RAYS = {"chosen": 0.9, "warp": 0.25}
 ASKED_SPECTRUM_S = {"gaussians": 100_000, "seconds": 0.150}
 
@@ -53,11 +55,7 @@ def write(folder: str | os.PathLike[str]) -> Path:
     found = json.loads((folder / "engine.json").read_text())
     picks = {row["knob"]: row["value"] for row in choices(found)}
     pictures = {
-        "knobs.png": plots.time_against_error(
-            {NAMES[k]: found[k] for k in NAMES},
-            {NAMES[k]: label for k, label in LABELS.items()},
-            {NAMES[k]: value for k, value in picks.items() if k in NAMES},
-        ),
+        "knobs.png": plots.panels(_knob_panels(found, picks)),
         "counts.png": plots.counts(found["counts"]),
         "growth.png": plots.growth(
             {
@@ -66,17 +64,17 @@ def write(folder: str | os.PathLike[str]) -> Path:
                 "receivers": ("receivers", [(r["receivers"], r["seconds"]) for r in found["receivers"]]),
             }
         ),
-        "forms.png": plots.forms(found["responses"], found["exponentials"]),
+        "forms.png": plots.panels(_form_panels(found, picks), columns=2),
     }
     if any("embree bare" in row for row in found["rays"]):
         pictures["rays.png"] = plots.rays(found["rays"], ASKED_RAYS)
     for name, figure in pictures.items():
         write_atomically(folder / name, lambda file, figure=figure: figure.savefig(file, dpi=100))  # type: ignore[misc]
     captions = {
-        "knobs.png": "rms error of the dB image over time, a point a setting; red: the cheapest that will do.",
+        "knobs.png": "Error and time of each setting; red: the cheapest that will do.",
         "counts.png": "Discs on the room's mesh against rays cast at it.",
         "growth.png": "Seconds of a spectrum over Gaussians and pixels, of blending weights over receivers.",
-        "forms.png": "Forms of the exact response (mean error over regimes of scale and range) and of exp.",
+        "forms.png": "Forms of the exact response in three regimes and of exp; red: the cheapest that will do.",
         "rays.png": "Mesh rays and lines of sight over Embree called bare.",
     }
     parts = [summary_text(found)]
@@ -84,6 +82,66 @@ def write(folder: str | os.PathLike[str]) -> Path:
     path = folder / "engine.md"
     write_atomically(path, lambda file: Path(file).write_text("\n\n".join(parts) + "\n", encoding="utf-8"))
     return path
+
+
+def _knob_panels(found: Row, picks: Row) -> list[plots.Panel]:
+    shown = []
+    for key, name in NAMES.items():
+        rows, values = found[key], [row["value"] for row in found[key]]
+        shown.append(
+            plots.Panel(
+                name,
+                [_shown(key, value) for value in values],
+                [row["error_rms_db"] for row in rows],
+                "rms error [dB]",
+                [1e3 * row["seconds"] for row in rows],
+                "ms a receiver",
+                values.index(picks[key]) if picks.get(key) in values else None,
+                ordered=key != "precision",
+            )
+        )
+    kinds = [row["interaction_point"] for row in found["points"]]
+    points = plots.Panel(
+        "interaction point",
+        kinds,
+        [1e3 * row["length_error_median_m"] for row in found["points"]],
+        "median length error [mm]",
+        [row["milliseconds_per_receiver"] for row in found["points"]],
+        "ms a receiver, blending apart",
+        kinds.index(picks["points"]) if picks.get("points") in kinds else None,
+        ordered=False,
+    )
+    return [*shown, points]
+
+
+def _form_panels(found: Row, picks: Row) -> list[plots.Panel]:
+    shown = []
+    for regime in dict.fromkeys(row["regime"] for row in found["responses"]):
+        rows = [row for row in found["responses"] if row["regime"] == regime]
+        shown.append(
+            plots.Panel(
+                f"response, {regime}",
+                [row["form"] for row in rows],
+                [row["error_mean"] for row in rows],
+                "mean error of the response",
+                [row["ns_per_pair"] for row in rows],
+                "ns a pair",
+                next((k for k, row in enumerate(rows) if row["form"] == picks.get("responses")), None),
+                ordered=False,
+            )
+        )
+    rows = found["exponentials"]
+    exponential = plots.Panel(
+        f"exp(-h), strips of {STRIP}",
+        [row["form"] for row in rows],
+        [row["error_max"] for row in rows],
+        "largest error",
+        [row["ns_per_value"] for row in rows],
+        "ns a value",
+        next((k for k, row in enumerate(rows) if row["form"] == picks.get("exponentials")), None),
+        ordered=False,
+    )
+    return [*shown, exponential]
 
 
 def summary_text(found: Row) -> str:
@@ -208,7 +266,26 @@ def choices(found: Row) -> list[Row]:
                 f"beside {row['weights_milliseconds_per_receiver']:.3g} ms of blending",
             }
         )
+    responses: dict[str, list[Row]] = {}
+    for r in found["responses"]:
+        responses.setdefault(r["form"], []).append(r)
+    worst = {form: max(r["error_mean"] for r in own) for form, own in responses.items()}
+    cost = {form: float(np.mean([r["ns_per_pair"] for r in own])) for form, own in responses.items()}
+    _add_cheapest(rows, "responses", "form of the response", "Gram, turned", worst, cost, FORM_TOLERANCE)
+    worst = {r["form"]: r["error_max"] for r in found["exponentials"]}
+    cost = {r["form"]: r["ns_per_value"] for r in found["exponentials"]}
+    _add_cheapest(rows, "exponentials", "exponential", RASTERISER, worst, cost, EXPONENTIAL_TOLERANCE)
     return rows
+
+
+def _add_cheapest(
+    rows: list[Row], knob: str, name: str, library: str, error: Row, cost: Row, tolerance: float
+) -> None:
+    good = [form for form in error if error[form] <= tolerance]
+    if good:
+        form = min(good, key=lambda f: cost[f])
+        why = f"errs by {error[form]:.1e}, at most {tolerance:g} wanted; {cost[form]:.2f} ns"
+        rows.append({"knob": knob, "name": name, "value": form, "library": library, "why": why})
 
 
 LABELS: dict[str, Callable[[Any], str]] = {
