@@ -33,6 +33,9 @@ from warprrf.geometry.render import (
 from warprrf.kernels import gaussian_rays as kernels
 from warprrf.kernels.project import Rules
 
+LARGEST = 1e15
+"""Of coordinates and directions: squares and products of them stay finite, also in float32."""
+
 ORDERS = {"peak": kernels.BY_PEAK, "range": kernels.BY_RANGE}
 """Of hits: by the peak's distance along the ray, or by the mean's from the origin, as the rasteriser blends."""
 
@@ -284,6 +287,8 @@ def _pairs(first_name: str, first: Any, second_name: str, second: Any) -> tuple[
     for name, array in ((first_name, one), (second_name, other)):
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
+        if np.abs(array).max(initial=0.0) > LARGEST:
+            raise ValueError(f"{name}: got numbers above {LARGEST:g}, expected metres")
     if len(one) != len(other) and 1 not in (len(one), len(other)):
         raise ValueError(
             f"{second_name}: got {len(other)} for {len(one)} {first_name}, expected as many, or one of either"
