@@ -249,8 +249,8 @@ def choices(found: Row) -> list[Row]:
                 "name": NAMES[knob],
                 "value": row["value"],
                 "library": library,
-                "why": f"{row['error_rms_db']:.2g} dB rms, {row['error_worst_db']:.2g} dB at worst, "
-                f"{1e3 * row['seconds']:.3g} ms",
+                "why": _figures(row)
+                + _beside(found[knob], {"alpha_min": ALPHA_MIN, "top_k": TOP_K}.get(knob), row),
             }
         )
     near = [r for r in found["points"] if r["length_error_median_m"] <= POINT_TOLERANCE_M]
@@ -276,6 +276,16 @@ def choices(found: Row) -> list[Row]:
     cost = {r["form"]: r["ns_per_value"] for r in found["exponentials"]}
     _add_cheapest(rows, "exponentials", "exponential", RASTERISER, worst, cost, EXPONENTIAL_TOLERANCE)
     return rows
+
+
+def _figures(row: Row) -> str:
+    return f"{row['error_rms_db']:.2g} dB rms, {row['error_worst_db']:.2g} dB at worst, {1e3 * row['seconds']:.3g} ms"
+
+
+def _beside(rows: list[Row], default: Any, picked: Row) -> str:
+    """The figures of the library's own setting, where it was measured and is another."""
+    own = next((row for row in rows if row["value"] == default and row is not picked), None)
+    return "" if own is None else f"; the library's: {_figures(own)}"
 
 
 def _add_cheapest(
