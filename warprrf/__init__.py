@@ -22,6 +22,7 @@ _HOMES = {
     "Blending": "geometry.render",
     "BlendWeights": "geometry.render",
     "Camera": "geometry.camera",
+    "GaussianRays": "geometry.gaussian_rays",
     "Gaussians": "geometry.gaussians",
     "Material": "rf.materials",
     "Mesh": "geometry.mesh",
@@ -51,6 +52,7 @@ __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
     from warprrf.geometry.camera import Camera as Camera
+    from warprrf.geometry.gaussian_rays import GaussianRays as GaussianRays
     from warprrf.geometry.gaussians import Gaussians as Gaussians
     from warprrf.geometry.mesh import Mesh as Mesh
     from warprrf.geometry.reconstruction import Reconstruction as Reconstruction

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from warprrf.cli_bars import Bars
-from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BISTATIC
+from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BISTATIC, HELP_BENCH_ENGINE
 
 Add = Callable[..., argparse.ArgumentParser]
 
@@ -39,6 +39,24 @@ def add_benches(add: Add) -> None:
         "--repeat", type=int, default=10, metavar="N", help="receivers of Sionna's second solve (10; 0: none)"
     )
     ours.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+    engine = add("engine", _bench, "the engine's speed against error", HELP_BENCH_ENGINE, tables)
+    engine.add_argument("--out", help="folder of the results (default runs/engine)")
+    engine.add_argument("--scene", default="data/lobby/scene.xml", help="scene that rays are cast at (XML)")
+    engine.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, in a minute")
+    engine.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+    radio = add(
+        "channel",
+        _bench,
+        "channels: closed forms, Sionna RT, wide responses, the near field",
+        HELP_BENCH,
+        tables,
+    )
+    radio.add_argument("--out", help="folder of the results (default runs/channel)")
+    radio.add_argument("--scene", metavar="XML", help="scene compared with Sionna RT (default the lobby)")
+    radio.add_argument(
+        "--small", action="store_true", help="leave out 1e5 paths between 1024 and 16 elements"
+    )
+    radio.add_argument("--no-sionna", action="store_true", help="leave out the comparison with Sionna RT")
 
 
 def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
@@ -86,10 +104,46 @@ def _bench_relevance(args: argparse.Namespace, bars: Bars) -> None:
     print(relevance.summary_text(report))
 
 
+def _bench_engine(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import engine
+
+    out = args.out or "runs/engine"
+    sizes = engine.QUICK if args.quick else engine.Sizes()
+    report = engine.run_engine(
+        out,
+        scene=args.scene,
+        sizes=sizes,
+        seed=args.seed,
+        device=args.device,
+        fresh=args.fresh,
+        progress=bars,
+    )
+    bars.close()
+    print(engine.summary_text(report))
+    print(f"\n{Path(out) / 'engine.md'}: the tables with pictures; engine.json: every figure")
+
+
+def _bench_channel(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import channel
+
+    report = channel.run_channel(
+        args.out or "runs/channel",
+        scene=args.scene or channel.SCENE,
+        large=not args.small,
+        sionna=not args.no_sionna,
+        device=args.device,
+        progress=bars,
+    )
+    bars.close()
+    print(channel.table(report))
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "newrf": _bench_newrf,
     "bistatic": _bench_bistatic,
     "relevance": _bench_relevance,
+    "engine": _bench_engine,
+    "channel": _bench_channel,
 }
 """Benchmarks by name: what `warprrf bench NAME` runs."""
 

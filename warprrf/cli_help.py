@@ -88,6 +88,7 @@ examples:
   warprrf bench newrf
   warprrf bench newrf --data external/newrf --out runs/newrf
   warprrf bench bistatic --truths exact --counts 10 50
+  warprrf bench engine
 """
 
 HELP_BENCH_BISTATIC = """\
@@ -99,6 +100,17 @@ examples:
   warprrf bench bistatic
   warprrf bench bistatic --truths exact --counts 10 --every 4 --out runs/quick     a first look, in minutes
   warprrf bench bistatic --data spectra_full.nc spectra_sionna_full.nc --geometry room
+"""
+
+HELP_BENCH_ENGINE = """\
+Turns each knob of the rasteriser (cutoff, clamp, top K, precision, resolution, number of Gaussians, interaction point,
+form of the response and of the exponential) and writes its time and its error as tables and pictures, with the settings
+that follow; then growth, mesh rays against Embree, blending against torch, and the transport of 800 receivers on disk.
+Each measurement is kept: a killed run loses one. For figures worth quoting leave the machine alone meanwhile.
+
+examples:
+  warprrf bench engine
+  warprrf bench engine --quick --out runs/engine-quick
 """
 
 HELP_DATA = """\

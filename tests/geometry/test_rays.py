@@ -219,6 +219,36 @@ def test_back_ends_agree():
     assert 0.1 < seen[0].mean() < 0.9 and (seen[0] != seen[1]).mean() < 1e-4
 
 
+@no_embree
+@pytest.mark.parametrize("blockers", [2, 60])
+def test_sight_in_many_chunks_is_that_of_single_rays(blockers, monkeypatch):
+    """Mostly free segments are first searched for any hit, mostly blocked ones are not: the answer is the same."""
+    rng = np.random.default_rng(14)
+    parts = [box(c - 0.2, c + 0.2) for c in rng.uniform(-1.5, 1.5, (blockers, 3))]
+    vertices = np.concatenate([v for v, _ in parts])
+    mesh = Mesh(vertices, np.concatenate([f + 8 * k for k, (_, f) in enumerate(parts)]))
+    a, b = rng.uniform(-2, 2, (2, 40_000, 3))
+    b[:500] = a[:500] + 1e-5  # too short for anything to lie between
+    a[500:1500] = mesh.triangles[rng.integers(len(mesh.faces), size=1000)].mean(axis=1)  # starts on surfaces
+    calls = []
+    blocked = raysearch.embree.EmbreeScene.blocked
+    monkeypatch.setattr(
+        raysearch.embree.EmbreeScene, "blocked", lambda self, r: calls.append(len(r)) or blocked(self, r)
+    )
+    seen = mesh.visible(a, b, backend="embree", device="cpu")
+    assert seen[:500].all() and (seen.mean() > 0.5) == (blockers == 2) and bool(calls) == (blockers == 2)
+    expected = mesh.visible(a, b, backend="warp", device="cpu")
+    assert (seen != expected).mean() < 1e-4
+    length = np.linalg.norm(b - a, axis=1)
+    hit = mesh.cast(a[1500:], (b - a)[1500:], backend="warp", device="cpu")
+    assert (
+        expected[1500:] != (hit.t >= length[1500:] - 1e-4)
+    ).mean() < 1e-3  # but for surfaces at the very ends
+    a[30_000, 1] = np.nan
+    with pytest.raises(ValueError, match="a: got 1 values that are NaN"):
+        mesh.visible(a, b, backend="embree", device="cpu")
+
+
 def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypatch):
     cpu, choose = resolve("cpu"), raysearch.choose_backend
     monkeypatch.setattr(raysearch.o3d, "installed", lambda: True)

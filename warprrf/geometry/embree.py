@@ -40,3 +40,11 @@ class EmbreeScene:
         hit = self._scene.cast_rays(self._o3d.core.Tensor.from_numpy(rays), nthreads=self._threads)
         # Open3D's id of a miss is the largest uint32, which reads as -1.
         return hit["t_hit"].numpy(), hit["primitive_ids"].numpy().view(np.int32)
+
+    def blocked(self, rays: np.ndarray) -> np.ndarray:
+        """Whether rays (N, 6), float32, meet anything within the length of their direction, shape (N,), bool."""
+        met = self._scene.test_occlusions(
+            self._o3d.core.Tensor.from_numpy(rays), tnear=0.0, tfar=1.0, nthreads=self._threads
+        )
+        hit: np.ndarray = met.numpy()
+        return hit

@@ -1,4 +1,4 @@
-"""The rasteriser inside torch: functions of tensors that autograd differentiates, computed by our Warp kernels.
+"""Rasteriser and rays inside torch: functions of tensors that autograd differentiates, computed by our Warp kernels.
 
 The only module of the geometry that knows torch; it is imported when a function is called
 (``pip install "warprrf[baselines]"``). Work runs on the tensors' own device in their own precision, float32 or float64.
@@ -15,6 +15,7 @@ import warp as wp
 
 from warprrf.device import require, resolve
 from warprrf.geometry.camera import Camera
+from warprrf.geometry.gaussian_rays import GaussianRays
 from warprrf.geometry.render import Blending, Rasterizer
 from warprrf.kernels.sh import COEFFICIENTS
 
@@ -53,23 +54,11 @@ def rasterize(
     if not isinstance(cam, Camera):
         raise TypeError(f"cam: got {type(cam).__name__}, expected warprrf.Camera")
     torch = require("torch", "baselines")
-    _check("means", means, (None, 3), None)
-    n = len(means)
-    for name, tensor, shape in (
-        ("quaternions", quaternions, (n, 4)), ("scales", scales, (n, 3)), ("opacities", opacities, (n,)),
-        ("features", features, (n, None)),
-    ):  # fmt: skip
-        _check(name, tensor, shape, means)
+    _check_gaussians(means, quaternions, scales, opacities)
+    _check("features", features, (len(means), None), means)
     if background is None:
         background = torch.zeros(features.shape[1], dtype=means.dtype, device=means.device)
     _check("background", background, (features.shape[1],), means)
-    for name, fits, expected in (
-        ("quaternions", quaternions.detach().abs().amax(1) > 0, "wxyz rotations of a length above zero"),
-        ("scales", scales.detach() >= torch.finfo(torch.float32).tiny, "positive metres, not denormal"),
-        ("opacities", (opacities.detach() >= 0) & (opacities.detach() <= 1), "values in [0, 1]"),
-    ):
-        if not bool(fits.all()):
-            raise ValueError(f"{name}: got {int((~fits).sum())} values that do not fit, expected {expected}")
     return _functions().rasterize.apply(
         cam, blending, means, quaternions, scales, opacities, features, background
     )
@@ -90,6 +79,70 @@ def colors(means: torch.Tensor, sh: torch.Tensor, cam: Camera) -> torch.Tensor:
     if sh.shape[1] not in COEFFICIENTS.values():
         raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
     return _functions().colors.apply(cam, means, sh)
+
+
+def ray_transmittance(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    a: Any,
+    b: Any,
+    *,
+    blending: Blending | None = None,
+) -> torch.Tensor:
+    """Share of light that passes from ``a`` to ``b`` (N, 3) or (3,) [m], shape ``(N,)``: see
+    :meth:`warprrf.GaussianRays.transmittance`; differentiable in the four tensors, not in the points.
+
+    Raises:
+        ImportError: without torch.
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    _check_gaussians(means, quaternions, scales, opacities)
+    query: Any = ("transmit_with_adjoint", (a, b), {}, blending)
+    return _functions().rays.apply(query, means, quaternions, scales, opacities)[0]
+
+
+def ray_hits(
+    means: torch.Tensor,
+    quaternions: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    origins: Any,
+    directions: Any,
+    k: int = 16,
+    *,
+    order: str = "peak",
+    blending: Blending | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """The first ``k`` Gaussians along each ray: index, t, alpha, weight (N, K) and left (N,), see
+    :meth:`warprrf.GaussianRays.hits`; all but the index differentiable in the four tensors, not in the rays.
+
+    Raises:
+        ImportError: without torch.
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    _check_gaussians(means, quaternions, scales, opacities)
+    query: Any = ("trace_with_adjoint", (origins, directions, k), {"order": order}, blending)
+    t, alpha, weight, left, index = _functions().rays.apply(query, means, quaternions, scales, opacities)
+    return index, t, alpha, weight, left
+
+
+def _check_gaussians(means: Any, quaternions: Any, scales: Any, opacities: Any) -> None:
+    torch = require("torch", "baselines")
+    _check("means", means, (None, 3), None)
+    n = len(means)
+    for name, tensor, shape in (
+        ("quaternions", quaternions, (n, 4)), ("scales", scales, (n, 3)), ("opacities", opacities, (n,)),
+    ):  # fmt: skip
+        _check(name, tensor, shape, means)
+    for name, fits, expected in (
+        ("quaternions", quaternions.detach().abs().amax(1) > 0, "wxyz rotations of a length above zero"),
+        ("scales", scales.detach() >= torch.finfo(torch.float32).tiny, "positive metres, not denormal"),
+        ("opacities", (opacities.detach() >= 0) & (opacities.detach() <= 1), "values in [0, 1]"),
+    ):
+        if not bool(fits.all()):
+            raise ValueError(f"{name}: got {int((~fits).sum())} values that do not fit, expected {expected}")
 
 
 def _check(name: str, tensor: Any, shape: tuple[int | None, ...], like: torch.Tensor | None) -> None:
@@ -181,4 +234,33 @@ def _functions() -> SimpleNamespace:
             ctx.adjoint()
             return None, *gradients(ctx.inputs)
 
-    return SimpleNamespace(rasterize=Rasterize, colors=Colors)
+    class Rays(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, query: tuple[str, tuple[Any, ...], Any, Any], *tensors: torch.Tensor) -> Any:
+            method, arguments, options, blending = query
+            r = raster(tensors[0])
+            types = (r.vector(3), r.vector(4), r.vector(3), r.real)
+            ctx.inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
+            rays = GaussianRays(ctx.inputs, blending=blending)
+            found, ctx.adjoint = getattr(rays, method)(*arguments, **options)
+            hits = not isinstance(found, wp.array)
+            ctx.outputs = found.outputs if hits else (found,)
+            ctx.save_for_backward(*tensors)
+            kind = tensors[0].dtype
+            out = [wp.to_torch(a, requires_grad=False).to(kind, copy=True) for a in ctx.outputs]
+            if hits:
+                out.append(wp.to_torch(found.index).clone())
+                ctx.mark_non_differentiable(out[-1])
+            return tuple(out)
+
+        @staticmethod
+        @once_differentiable
+        def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
+            _ = ctx.saved_tensors  # raises if an input was changed in place since forward
+            for array in ctx.inputs:
+                array.grad.zero_()
+            seed(ctx.outputs, tuple(g.double() for g in incoming[: len(ctx.outputs)]))
+            ctx.adjoint()
+            return None, *gradients(ctx.inputs)
+
+    return SimpleNamespace(rasterize=Rasterize, colors=Colors, rays=Rays)

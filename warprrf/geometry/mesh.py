@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.geometry.raysearch import Hit, RaySearch, ray_arrays, rows
+from warprrf.geometry.raysearch import Hit, RaySearch, ray_arrays
 from warprrf.kernels.rays import closest_faces
 
 ENDPOINT_CLEARANCE = 1e-4
@@ -189,30 +189,15 @@ class Mesh:
         Returns:
             Shape ``(N,)``, bool.
         """
-        start = np.atleast_2d(_device.check_array("a", a))
-        end = np.atleast_2d(_device.check_array("b", b))
+        start = np.atleast_2d(_device.check_array("a", a, finite=False))
+        end = np.atleast_2d(_device.check_array("b", b, finite=False))
         if start.ndim != 2 or start.shape[1] != 3 or end.ndim != 2 or end.shape[1] != 3:
             raise ValueError(f"a, b: got shapes {np.shape(a)} and {np.shape(b)}, expected (N, 3) or (3,)")
         if len(start) != len(end) and 1 not in (len(start), len(end)):
             raise ValueError(
                 f"a, b: got {len(start)} and {len(end)} points, expected as many of each, or one of either"
             )
-        way = end - start
-        length = np.linalg.norm(way, axis=1)
-        free = np.ones(len(way), dtype=bool)
-        long = np.flatnonzero(length > 2.0 * clearance)
-        if len(long) == 0:
-            return free
-        t, face = self._rays.nearest(
-            rows(start, long),
-            way[long],
-            reach=length[long] - clearance,
-            clearance=clearance,
-            device=device,
-            backend=backend,
-        )
-        free[long] = (face < 0) | (t >= length[long] - clearance)
-        return free
+        return self._rays.free(start, end, clearance=clearance, device=device, backend=backend)
 
     def closest(self, points: Any, *, device: Any = None) -> Closest:
         """The nearest point of the surface to each of ``points`` (N, 3) [m], in float64 once the face is known."""

@@ -14,7 +14,19 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.geometry import embree, o3d
-from warprrf.kernels.rays import AGAIN, BAD, GRAZING, cast_rays, pack_rays, place_hits
+from warprrf.kernels.rays import (
+    AGAIN,
+    BAD,
+    BLOCKED,
+    FREE,
+    GRAZING,
+    cast_rays,
+    judge_segments,
+    look,
+    pack_rays,
+    pack_segments,
+    place_hits,
+)
 
 BACKENDS = ("auto", "warp", "embree")
 """What searches the mesh: ``"auto"`` takes Embree on a CPU where Open3D is installed and there are many rays."""
@@ -27,6 +39,10 @@ EMBREE_RAYS_TO_LOAD = 200_000
 
 # Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
 _EMBREE_CHUNK = 262_144
+# Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
+# long, and blocked segments need both.
+_FREE_SHARE = 0.5
+_PROBE = 8_192
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4
@@ -121,9 +137,10 @@ class RaySearch:
 
     @cached_property
     def _embree(self) -> tuple[embree.EmbreeScene, np.ndarray]:
-        """Embree's hierarchy of the faces that have an area, and which faces those are."""
+        """Embree's hierarchy of the faces that have an area, and which faces those are; empty if all of them."""
         names = np.flatnonzero(self._planes[:, :3].any(axis=1)).astype(np.int32)
-        return embree.EmbreeScene(self._vertices, self._faces[names]), names
+        scene = embree.EmbreeScene(self._vertices, self._faces[names])
+        return scene, names if len(names) < len(self._faces) else names[:0]
 
     def nearest(
         self, o: np.ndarray, d: np.ndarray, *, reach: np.ndarray, clearance: float, device: Any, backend: str
@@ -182,6 +199,87 @@ class RaySearch:
                 rows(o, again), rows(d, again), clearance, cpu, t[again]
             )
         return t, face
+
+    def free(
+        self, a: np.ndarray, b: np.ndarray, *, clearance: float, device: Any, backend: str
+    ) -> np.ndarray:
+        """Whether nothing lies between ``a`` and ``b`` but within ``clearance`` [m] of an end, shape (N,), bool.
+
+        Both hold one row or N.
+
+        Raises:
+            ValueError: if a point is not finite, or on an unknown back end, or Embree on a GPU.
+        """
+        where = _device.resolve(device)
+        count = max(len(a), len(b)) if min(len(a), len(b)) else 0
+        sight = np.empty(count, dtype=np.int32)
+        if choose_backend(backend, where, count) == "embree" and count:
+            self._free_embree(a, b, sight, clearance, where)
+        else:
+            mesh, planes = self._built(where)
+            found = _given(sight, wp.int32, where)
+            ends = [_given(a, wp.vec3d, where), _given(b, wp.vec3d, where)]
+            inputs = [mesh.id, wp.vec3d(*self._center), self._radius, planes, clearance, *ends, found]
+            _device.launch(look, count, inputs, device=where)
+            sight = found.numpy()
+        if (sight == BAD).any():
+            _refuse(a, b, names=("a", "b"))
+        return sight == FREE
+
+    def _free_embree(
+        self, a: np.ndarray, b: np.ndarray, sight: np.ndarray, clearance: float, cpu: wp.Device
+    ) -> None:
+        """Fill ``sight`` with FREE, BLOCKED and BAD.
+
+        The first hit names a face, whose plane judges in float64. Where enough segments of the chunk before were
+        free, they are sorted out by a search for any hit at all, which is cheaper; what it finds is still judged.
+        """
+        scene, names = self._embree
+        count, pieces = len(sight), _device.threads()
+        chunk = min(count, _EMBREE_CHUNK)
+        rays = wp.empty(2 * chunk, dtype=wp.vec3, device=cpu)
+        center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
+        given = [clearance, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu)]
+        out = _given(sight, wp.int32, cpu)
+        starts = [
+            0,
+            *range(min(_PROBE, chunk), count, chunk),
+        ]  # a short first chunk says how the others will be
+        mostly_free = False
+        for first, end in zip(starts, [*starts[1:], count], strict=True):
+            size = end - first
+            inputs = [first, center, self._radius, *given, rays]
+            _device.launch(pack_segments, size, inputs, device=cpu, pieces=pieces)
+            packed, which = rays.numpy().reshape(-1, 6)[:size], np.empty(0, dtype=np.int32)
+            if mostly_free:
+                blocked = scene.blocked(packed)
+                # A segment that is not finite meets nothing: leave it to the kernel.
+                blocked |= ~np.isfinite(packed[:, 3])
+                sight[first:end] = FREE
+                which = np.flatnonzero(blocked).astype(np.int32)
+                packed = packed[which]
+            if len(packed):
+                met = _given(scene.cast(packed)[1], wp.int32, cpu)
+                inputs = [
+                    first,
+                    _given(which, wp.int32, cpu),
+                    center,
+                    self._radius,
+                    planes,
+                    faces,
+                    *given,
+                    met,
+                    out,
+                ]
+                _device.launch(judge_segments, len(packed), inputs, device=cpu, pieces=pieces)
+            mostly_free = np.count_nonzero(sight[first:end] == FREE) > _FREE_SHARE * size
+        again = np.flatnonzero(sight == AGAIN)
+        if len(again):
+            start = rows(a, again)
+            way = rows(b, again) - start
+            inner = np.linalg.norm(way, axis=1) - clearance
+            t, face = self._nearest_embree(start, way, clearance, cpu)
+            sight[again] = np.where((face < 0) | (t >= inner), FREE, BLOCKED)
 
     def recast(
         self, o: np.ndarray, d: np.ndarray, t: np.ndarray, face: np.ndarray, *, device: Any, backend: str
@@ -250,10 +348,12 @@ def ray_arrays(origins: Any, directions: Any) -> tuple[np.ndarray, np.ndarray]:
     return o, d
 
 
-def _refuse(origins: np.ndarray, directions: np.ndarray) -> None:
-    """Say what is wrong with rays of which a kernel found some to be bad."""
-    for name, array in (("origins", origins), ("directions", directions)):
+def _refuse(
+    origins: np.ndarray, directions: np.ndarray, names: tuple[str, str] = ("origins", "directions")
+) -> None:
+    """Say what is wrong with rays, or with segments, of which a kernel found some to be bad."""
+    for name, array in zip(names, (origins, directions), strict=True):
         _device.check_array(name, array)
-    if (np.linalg.norm(directions, axis=1) == 0).any():
+    if names[1] == "directions" and (np.linalg.norm(directions, axis=1) == 0).any():
         raise ValueError("directions: got a vector of length zero, expected directions")
-    raise ValueError("origins, directions: got numbers too large to square, expected metres")
+    raise ValueError(f"{', '.join(names)}: got numbers too large to square, expected metres")

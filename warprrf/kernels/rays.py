@@ -14,9 +14,13 @@ BAD = wp.constant(-2)
 """Face of a ray that is not finite or has no direction."""
 AGAIN = wp.constant(-3)
 """Face of a ray that met a surface at its start and goes on from the distance stored in its place."""
+FREE = wp.constant(0)
+"""Segment that nothing blocks."""
+BLOCKED = wp.constant(1)
+"""Segment that a surface blocks."""
 
-# What float32 may displace a surface along a ray, over the largest coordinate: four roundings of 2^-24.
-_ROUNDING = wp.constant(wp.float64(2.4e-7))
+# What float32 may displace a surface along a ray, over the largest coordinate: six roundings of 2^-24.
+_ROUNDING = wp.constant(wp.float64(3.6e-7))
 # A ray's start is on a plane if no further from it than this, over the largest coordinate: float64 rounding.
 _ON_PLANE = wp.constant(wp.float64(1e-12))
 GRAZING = 1e-7
@@ -24,6 +28,12 @@ GRAZING = 1e-7
 
 _GRAZING = wp.constant(wp.float64(GRAZING))
 _FAR = wp.constant(wp.float64(1e30))
+# Beyond these a hit is neither grazing nor at the ray's start, without a closer look.
+_STEEP_SQUARE = wp.constant(wp.float64(1e-12))
+_CLEAR = wp.constant(wp.float64(1e-9))
+# Squares between these neither overflow nor lose digits in float32.
+_LEAST_SQUARE = wp.constant(wp.float32(1e-30))
+_MOST_SQUARE = wp.constant(wp.float32(1e30))
 _STEPS = 8
 
 
@@ -31,6 +41,16 @@ _STEPS = 8
 def narrow(p: wp.vec3d):
     """A position or direction in float32."""
     return wp.vec3(wp.float32(p[0]), wp.float32(p[1]), wp.float32(p[2]))
+
+
+@wp.func
+def unit_narrow(direction: wp.vec3d):
+    """A direction in float32, of length one to rounding; NaN if it has none. Normalised in float32, which is faster."""
+    d = narrow(direction)
+    square = wp.dot(d, d)
+    if square > _LEAST_SQUARE and square < _MOST_SQUARE:
+        return d * (wp.float32(1.0) / wp.sqrt(square))
+    return narrow(direction * (wp.float64(1.0) / wp.length(direction)))
 
 
 @wp.func
@@ -72,6 +92,42 @@ def plane_distance(
     return t
 
 
+@wp.func
+def search(
+    mesh: wp.uint64,
+    planes: wp.array(dtype=wp.vec4d),
+    origin: wp.vec3d,
+    direction: wp.vec3d,
+    length: wp.float64,
+    scale: wp.float64,
+    clearance: wp.float64,
+    reach: wp.float64,
+):
+    """Distance [m] and face of what a ray meets beyond ``clearance`` and within ``reach``; inf and MISS if nothing."""
+    unit = direction / length
+    step = _ROUNDING * scale
+    start = clearance - step
+    most = wp.min(reach, _FAR)
+    found = wp.float64(wp.inf)
+    name = MISS
+    for _ in range(_STEPS):
+        query = wp.mesh_query_ray(
+            mesh, narrow(origin + start * unit), narrow(unit), wp.float32(most - start + step)
+        )
+        if not query.result:
+            break
+        near = start + wp.float64(query.t)
+        t = plane_distance(origin, direction, length, scale, planes[query.face], near, clearance)
+        if not wp.isnan(t):
+            found = t
+            name = query.face
+            break
+        start = near + step
+        if start > most:
+            break
+    return found, name
+
+
 @wp.kernel(enable_backward=False)
 def cast_rays(
     offset: int,
@@ -96,29 +152,109 @@ def cast_rays(
         distance[i] = wp.float64(wp.inf)
         face[i] = BAD
         return
-    unit = direction / length
-    step = _ROUNDING * scale
-    start = clearance - step
-    most = wp.min(reach[wp.min(i, reach.shape[0] - 1)], _FAR)
-    found = wp.float64(wp.inf)
-    name = MISS
-    for _ in range(_STEPS):
-        query = wp.mesh_query_ray(
-            mesh, narrow(origin + start * unit), narrow(unit), wp.float32(most - start + step)
-        )
-        if not query.result:
-            break
-        near = start + wp.float64(query.t)
-        t = plane_distance(origin, direction, length, scale, planes[query.face], near, clearance)
-        if not wp.isnan(t):
-            found = t
-            name = query.face
-            break
-        start = near + step
-        if start > most:
-            break
+    most = reach[wp.min(i, reach.shape[0] - 1)]
+    found, name = search(mesh, planes, origin, direction, length, scale, clearance, most)
     distance[i] = found
     face[i] = name
+
+
+@wp.kernel(enable_backward=False)
+def look(
+    offset: int,
+    mesh: wp.uint64,
+    center: wp.vec3d,
+    radius: wp.float64,
+    planes: wp.array(dtype=wp.vec4d),
+    clearance: wp.float64,
+    starts: wp.array(dtype=wp.vec3d),
+    ends: wp.array(dtype=wp.vec3d),
+    sight: wp.array(dtype=wp.int32),
+):
+    """Whether each segment is FREE but for ``clearance`` at its ends, or BLOCKED."""
+    i = offset + wp.tid()
+    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
+    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+    length = wp.length(way)
+    scale = rounding_scale(origin, radius)
+    if not (wp.isfinite(scale) and wp.isfinite(length)):
+        sight[i] = BAD
+        return
+    if length <= wp.float64(2.0) * clearance:
+        sight[i] = FREE
+        return
+    t, name = search(mesh, planes, origin, way, length, scale, clearance, length - clearance)
+    sight[i] = wp.where(name >= 0 and t < length - clearance, BLOCKED, FREE)
+
+
+@wp.kernel(enable_backward=False)
+def pack_segments(
+    offset: int,
+    first: int,
+    center: wp.vec3d,
+    radius: wp.float64,
+    clearance: wp.float64,
+    starts: wp.array(dtype=wp.vec3d),
+    ends: wp.array(dtype=wp.vec3d),
+    rays: wp.array(dtype=wp.vec3),
+):
+    """Segments from number ``first`` on as pairs (start, way) in float32, from ``clearance`` to ``clearance`` before
+    the end, longer by the rounding; a bad one or one that short meets nothing."""
+    k = offset + wp.tid()
+    i = first + k
+    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
+    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+    length = wp.length(way)
+    unit = way * (wp.float64(1.0) / length)
+    step = _ROUNDING * rounding_scale(origin, radius)
+    rays[2 * k] = narrow(origin + (clearance - step) * unit)
+    inner = length - wp.float64(2.0) * clearance
+    rays[2 * k + 1] = narrow(
+        wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan)) * unit
+    )
+
+
+@wp.kernel(enable_backward=False)
+def judge_segments(
+    offset: int,
+    first: int,
+    which: wp.array(dtype=wp.int32),
+    center: wp.vec3d,
+    radius: wp.float64,
+    planes: wp.array(dtype=wp.vec4d),
+    names: wp.array(dtype=wp.int32),
+    clearance: wp.float64,
+    starts: wp.array(dtype=wp.vec3d),
+    ends: wp.array(dtype=wp.vec3d),
+    met: wp.array(dtype=wp.int32),
+    sight: wp.array(dtype=wp.int32),
+):
+    """What the first hits of :func:`pack_segments` say in float64: FREE, BLOCKED, or AGAIN if it takes a closer look.
+
+    ``which`` names the segments, empty if all; ``names`` the faces of the hierarchy's, empty if it holds all.
+    """
+    k = offset + wp.tid()
+    i = first + k
+    if which.shape[0] > 0:
+        i = first + which[k]
+    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
+    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+    length = wp.length(way)
+    scale = rounding_scale(origin, radius)
+    name = met[k]
+    if name < 0:
+        sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
+        return
+    if names.shape[0] > 0:
+        name = names[name]
+    plane = planes[name]
+    normal = wp.vec3d(plane[0], plane[1], plane[2])
+    slope = wp.dot(normal, way)
+    height = plane[3] - wp.dot(normal, origin)
+    sight[i] = AGAIN
+    if slope * slope > _STEEP_SQUARE * length * length:
+        t = height * length / slope
+        if t > clearance and wp.abs(height) > _CLEAR * scale:
+            sight[i] = wp.where(t < length - clearance, BLOCKED, FREE)
 
 
 @wp.kernel(enable_backward=False)
@@ -141,14 +277,15 @@ def pack_rays(
     i = first + k
     origin = origins[wp.min(i, origins.shape[0] - 1)] - center
     direction = directions[wp.min(i, directions.shape[0] - 1)]
-    length = wp.length(direction)
-    scale = rounding_scale(origin, radius)
-    begin = clearance - _ROUNDING * scale
+    near = narrow(origin)
+    begin = wp.float32(clearance) - wp.float32(_ROUNDING) * (
+        wp.float32(radius) + wp.abs(near[0]) + wp.abs(near[1]) + wp.abs(near[2])
+    )
     if start.shape[0] > 0:
-        begin = start[i]
-    unit = direction * (wp.float64(1.0) / length)
-    rays[2 * k] = narrow(origin + begin * unit)
-    rays[2 * k + 1] = narrow(unit)
+        begin = wp.float32(start[i])
+    unit = unit_narrow(direction)
+    rays[2 * k] = near + begin * unit
+    rays[2 * k + 1] = unit
 
 
 @wp.kernel(enable_backward=False)
@@ -168,14 +305,32 @@ def place_hits(
     distance: wp.array(dtype=wp.float64),
     face: wp.array(dtype=wp.int32),
 ):
-    """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's."""
+    """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's, empty
+    if it holds all."""
     k = offset + wp.tid()
     i = first + k
     origin = origins[wp.min(i, origins.shape[0] - 1)] - center
     direction = directions[wp.min(i, directions.shape[0] - 1)]
+    name = met[k]
+    if name >= 0:
+        if names.shape[0] > 0:
+            name = names[name]
+        plane = planes[name]
+        normal = wp.vec3d(plane[0], plane[1], plane[2])
+        square = wp.dot(direction, direction)
+        slope = wp.dot(normal, direction)
+        height = plane[3] - wp.dot(normal, origin)
+        if slope * slope > _STEEP_SQUARE * square and wp.abs(height) > _CLEAR * rounding_scale(
+            origin, radius
+        ):
+            t = height * wp.sqrt(square) / slope
+            if t > clearance:  # nearly every ray: nothing is left to decide
+                distance[i] = t
+                face[i] = name
+                return
     length = wp.length(direction)
     scale = rounding_scale(origin, radius)
-    if met[k] < 0:
+    if name < 0:
         distance[i] = wp.float64(wp.inf)
         face[i] = wp.where(is_bad(scale, length), BAD, MISS)
         return
@@ -183,7 +338,6 @@ def place_hits(
     if start.shape[0] > 0:
         begin = start[i]
     near = begin + wp.float64(met_at[k])
-    name = names[met[k]]
     t = plane_distance(origin, direction, length, scale, planes[name], near, clearance)
     if wp.isnan(t):
         t = near + _ROUNDING * scale

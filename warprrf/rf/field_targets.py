@@ -14,6 +14,7 @@ from warprrf.rf.transport import Transport
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
+    from warprrf.rf.transport_store import StoredTransport
 
 Y00 = 0.28209479177387814  # harmonic of degree 0
 DARK = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
@@ -36,7 +37,9 @@ class Targets:
     delay_unit: float
 
 
-def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Transport) -> Targets:
+def targets(
+    law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Transport | StoredTransport
+) -> Targets:
     """What to fit the spectra ``images`` (R, H, W) of ``ds`` with.
 
     Raises:

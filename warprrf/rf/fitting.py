@@ -3,25 +3,34 @@
 A :class:`Problem` holds the weights of the training receivers, sorted once into fixed batches; :func:`fit_layer` fits
 one set of 16 coefficients per Gaussian (a *layer*): the gain against dB images, or a plainly blended channel (delay,
 angle of departure) against its own images. No rasteriser runs here. Each sum has one owner, so the result depends on
-the seed and not on the number of threads.
+the seed and not on the number of threads. Weights on disk are fitted from disk: their batches are sorted into files
+beside them and mapped into memory one at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import warp as wp
 
 from warprrf import device as _device
 from warprrf.device import Progress
+from warprrf.geometry.gaussians import replacing
 from warprrf.kernels import field as _kernels
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.transport import Transport
 
+if TYPE_CHECKING:
+    from warprrf.rf.transport_store import StoredTransport
+
+_BATCH_ARRAYS = (
+    "row_gaussian", "row_start", "pair_pixel", "pair_direction", "pair_weight", "pixel_start", "pair_of_pixel",
+)  # fmt: skip
 KINDS = {"exp": _kernels.EXPONENTIAL, "linear": _kernels.CLAMPED, "signed": _kernels.SIGNED}
 ADAM = (0.9, 0.999, 1e-15)  # decays and epsilon as RF-3DGS publishes them
 FINAL_RATE = 0.05  # the learning rate falls exponentially to this share of its first value
@@ -114,7 +123,7 @@ class Problem:
     """Blending weights of the training receivers, in batches on the device.
 
     Args:
-        transport: weights of the training receivers.
+        transport: weights of the training receivers, in memory or stored.
         batch: receivers per optimiser step.
         seed: deals receivers into batches and orders them.
         device: where to fit.
@@ -123,7 +132,7 @@ class Problem:
 
     def __init__(
         self,
-        transport: Transport,
+        transport: Transport | StoredTransport,
         *,
         batch: int = 10,
         seed: int = 0,
@@ -139,12 +148,17 @@ class Problem:
         self.real = wp.float64 if self.precision == np.float64 else wp.float32
         self.kernels = _kernels.build(self.real)
         self.ssim = _ssim.build(self.real)
-        self.seen = np.unique(transport.gaussian)
+        self.seen = transport.seen
         self.pixels = transport.shape[0] * transport.shape[1]
         count = len(transport.receivers)
         order = np.random.default_rng([self.seed, 0]).permutation(count)
-        parts = np.array_split(order, max(1, round(count / batch)))
-        self.batches = [self._batch(np.sort(part)) for part in parts]
+        parts = [np.sort(part) for part in np.array_split(order, max(1, round(count / batch)))]
+        self.batches: Sequence[Batch]
+        if isinstance(transport, Transport):
+            self.batches = [self._uploaded(part, self._sorted(part)) for part in parts]
+        else:
+            name = f"batches_{self.seed}_{len(parts)}_{self.precision.name}"
+            self.batches = _MappedBatches(self, transport.folder / name, parts)
         self.basis = harmonics(transport.shape, self.real, self.device)
 
     def upload(self, values: np.ndarray, dtype: Any = None) -> wp.array:
@@ -162,7 +176,8 @@ class Problem:
         epoch, place = divmod(step, len(self.batches))
         return int(np.random.default_rng([self.seed, 1, epoch]).permutation(len(self.batches))[place])
 
-    def _batch(self, receivers: np.ndarray) -> Batch:
+    def _sorted(self, receivers: np.ndarray) -> dict[str, np.ndarray]:
+        """The arrays of a :class:`Batch`."""
         part = self.transport.subset(receivers)
         pixel = np.repeat(np.arange(len(part.start) - 1, dtype=np.int32), np.diff(part.start))
         order = np.argsort(part.gaussian, kind="stable")
@@ -172,37 +187,81 @@ class Problem:
         )
         place = np.empty(len(order), dtype=np.int32)
         place[order] = np.arange(len(order), dtype=np.int32)
+        rows = np.searchsorted(self.seen, gaussian[first]) if len(gaussian) else np.empty(0)
+        return {
+            "row_gaussian": rows.astype(np.int32),
+            "row_start": np.array([*first, len(gaussian)], dtype=np.int32),
+            "pair_pixel": pixel[order],
+            "pair_direction": pixel[order] % np.int32(self.pixels),
+            "pair_weight": part.weight[order].astype(self.precision),
+            "pixel_start": part.start.astype(np.int32),
+            "pair_of_pixel": place,
+        }
 
-        def integers(values: Any) -> wp.array:
-            return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=self.device)
+    def _uploaded(self, receivers: np.ndarray, arrays: dict[str, np.ndarray], *, copy: bool = True) -> Batch:
+        types = {"pair_weight": self.real}
+        on_device = {
+            name: wp.array(values, dtype=types.get(name, int), device=self.device, copy=copy)
+            for name, values in arrays.items()
+        }
+        return Batch(receivers=receivers, rows=len(arrays["row_gaussian"]), **on_device)
 
-        return Batch(
-            receivers=receivers,
-            rows=len(first) if len(gaussian) else 0,
-            row_gaussian=integers(np.searchsorted(self.seen, gaussian[first]) if len(gaussian) else []),
-            row_start=integers([*first, len(gaussian)]),
-            pair_pixel=integers(pixel[order]),
-            pair_direction=integers(pixel[order] % self.pixels),
-            pair_weight=self.upload(part.weight[order]),
-            pixel_start=integers(part.start),
-            pair_of_pixel=integers(place),
-        )
+
+class _MappedBatches(Sequence[Batch]):
+    """Batches in files, one of them mapped into memory at a time; sorted and written when first asked for.
+
+    Files depend on nothing but their folder's name and the store that it lies in, so another fit finds them again.
+    """
+
+    def __init__(self, problem: Problem, folder: Path, parts: list[np.ndarray]) -> None:
+        self._problem, self._folder, self._parts = problem, folder, parts
+        self._kept: tuple[int, Batch] | None = None
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    @overload
+    def __getitem__(self, index: int) -> Batch: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Batch]: ...
+    def __getitem__(self, index: int | slice) -> Batch | Sequence[Batch]:
+        if isinstance(index, slice):
+            return [self[k] for k in range(*index.indices(len(self)))]
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        if self._kept is None or self._kept[0] != index:
+            self._kept = None
+            self._kept = index, self._mapped(index)
+        return self._kept[1]
+
+    def _mapped(self, index: int) -> Batch:
+        files = {name: self._folder / f"{index:05d}_{name}.npy" for name in _BATCH_ARRAYS}
+        if not all(file.exists() for file in files.values()):
+            for name, values in self._problem._sorted(self._parts[index]).items():
+                with replacing(files[name]) as temporary:
+                    np.save(temporary, values)
+        arrays = {name: np.load(file, mmap_mode="r") for name, file in files.items()}
+        on_cpu = self._problem.device.is_cpu
+        return self._problem._uploaded(self._parts[index], arrays, copy=not on_cpu)
 
 
 def weighted_means(
-    transport: Transport, values: np.ndarray, where: np.ndarray
+    transport: Transport | StoredTransport, values: np.ndarray, where: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Per Gaussian seen by ``transport``: its index, and the mean of ``values`` over the pixels ``where`` that see it.
 
     Both images have shape ``(R, H, W)``; the mean is weighted by blending weight, NaN if it is seen in none of them.
     """
-    seen, local = np.unique(transport.gaussian, return_inverse=True)
-    pixel = np.repeat(np.arange(where.size), np.diff(transport.start))
-    weight = transport.weight * where.ravel()[pixel]
-    total = np.bincount(local, weights=weight, minlength=len(seen))
-    summed = np.bincount(
-        local, weights=weight * np.where(where, values, 0.0).ravel()[pixel], minlength=len(seen)
-    )
+    seen = transport.seen
+    total, summed = np.zeros(len(seen)), np.zeros(len(seen))
+    for chosen, part in transport.parts():
+        local = np.searchsorted(seen, part.gaussian)
+        pixel = np.repeat(np.arange(len(part.start) - 1), np.diff(part.start))
+        met = where[chosen].ravel()
+        weight = part.weight * met[pixel]
+        total += np.bincount(local, weights=weight, minlength=len(seen))
+        value = np.where(met, values[chosen].ravel(), 0.0)[pixel]
+        summed += np.bincount(local, weights=weight * value, minlength=len(seen))
     return seen, np.divide(summed, total, out=np.full(len(seen), np.nan), where=total > 0)
 
 
@@ -245,19 +304,16 @@ class Layer:
         self.problem, self.target, self.kind = problem, target, KINDS[kind]
         p, k = problem, problem.kernels
         shape = (len(p.transport.receivers), p.pixels)
-        self.weights = [batch.pair_weight for batch in p.batches]
-        if target.unit is not None:
-            self.weights = [
-                p.upload(batch.pair_weight.numpy() * target.unit[batch.pair_owner()]) for batch in p.batches
-            ]
+        self._scaled: dict[int, wp.array] = {}
         self.images = np.asarray(target.image, p.precision).reshape(shape)
         ones, zeros = np.ones(shape, p.precision), np.zeros(shape, p.precision)
         factor = ones if target.factor is None else np.asarray(target.factor, p.precision).reshape(shape)
         extra = zeros if target.extra is None else np.asarray(target.extra, p.precision).reshape(shape)
         mask = None if target.mask is None else np.asarray(target.mask, p.precision).reshape(shape)
         self.data: list[BatchTarget] = []
+        pairs = 0
         for batch in p.batches:
-            pick = batch.receivers
+            pick, pairs = batch.receivers, max(pairs, len(batch.pair_pixel))
             image = p.upload(self.images[pick].ravel())
             moments = wp.zeros(len(image), dtype=k.vec3, device=p.device)
             if mask is None:
@@ -275,7 +331,6 @@ class Layer:
                 )
             )
         largest = max(len(d.image) for d in self.data)
-        pairs = max(len(b.pair_pixel) for b in p.batches)
         self.contribution = wp.zeros(pairs, dtype=p.real, device=p.device)
         self.scalars = [wp.zeros(largest, dtype=p.real, device=p.device) for _ in range(5)]
         self.vectors = [wp.zeros(largest, dtype=k.vec3, device=p.device) for _ in range(3)]
@@ -290,14 +345,27 @@ class Layer:
         p.launch(p.ssim.filter_columns, size, height, width, between, out)
         return out
 
+    def weights(self, index: int) -> wp.array:
+        """The weights of batch ``index`` in the target's unit; kept where all batches are in memory."""
+        batch, unit = self.problem.batches[index], self.target.unit
+        if unit is None:
+            return batch.pair_weight
+        if index not in self._scaled:
+            if isinstance(self.problem.batches, _MappedBatches):
+                self._scaled.clear()
+            scaled = batch.pair_weight.numpy() * unit[batch.pair_owner()]
+            self._scaled[index] = self.problem.upload(scaled)
+        return self._scaled[index]
+
     def step(self, index: int, coefficients: wp.array, *, need_loss: bool = True) -> float:
         """Loss of batch ``index``; leaves its gradient in ``self.gradient`` (zero for Gaussians it does not see)."""
         p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
+        weights = self.weights(index)
         target, size = self.target, len(data.image)
         total, image, absolute, score, adjoint = self.scalars
         p.launch(
             k.contributions, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_direction,
-            self.weights[index], p.basis, coefficients, self.contribution,
+            weights, p.basis, coefficients, self.contribution,
         )  # fmt: skip
         p.launch(k.pixel_sums, size, batch.pixel_start, batch.pair_of_pixel, self.contribution, total)
         if data.mask is not None:
@@ -317,7 +385,7 @@ class Layer:
             )  # fmt: skip
         p.launch(
             k.coefficient_adjoint, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_pixel,
-            batch.pair_direction, self.weights[index], p.basis, self.contribution, adjoint, self.gradient,
+            batch.pair_direction, weights, p.basis, self.contribution, adjoint, self.gradient,
         )  # fmt: skip
         if not need_loss:
             return float("nan")

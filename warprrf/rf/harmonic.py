@@ -43,6 +43,7 @@ from warprrf.rf.transport import Transport
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
+    from warprrf.rf.transport_store import StoredTransport
 
 STEPS = 300  # optimiser steps; twice as many change the test PSNR by less than 0.1 dB
 CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that are nearly right
@@ -105,7 +106,7 @@ class HarmonicField(RadioField):
         iterations: int = STEPS,
         batch: int = 10,
         rates: Rates | None = None,
-        transport: Transport | None = None,
+        transport: Transport | StoredTransport | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
         seed: int = 0,
         device: Any = None,
@@ -129,7 +130,8 @@ class HarmonicField(RadioField):
             iterations: optimiser steps of the gain layer, ``batch`` receivers each.
             batch: receivers per step.
             rates: learning rates and ridge.
-            transport: blending weights of ``ds.receivers``, if they were computed before.
+            transport: blending weights of ``ds.receivers``, if they were computed before; stored ones are fitted from
+                disk (:func:`warprrf.rf.transport_store.store_transport`).
             checkpoint: file to save progress to and go on from; removed when the fit is done.
             seed: of the batches.
             device: where to compute.
@@ -209,7 +211,7 @@ class HarmonicField(RadioField):
                 "receivers": len(images),
                 "transport_time_s": 0.0 if transport is not None else ready - started,
                 "fit_time_s": time.perf_counter() - ready,
-                "pairs_per_pixel": len(seen.gaussian) / (len(images) * shape[0] * shape[1]),
+                "pairs_per_pixel": seen.pairs / (len(images) * shape[0] * shape[1]),
                 "weight_dropped_mean": seen.dropped[1],
                 "gaussians": len(gaussians),
                 "gaussians_seen": len(problem.seen),
@@ -421,7 +423,9 @@ def _geometry(geometry: Any) -> tuple[Gaussians, Mesh | None]:
     return gaussians, mesh
 
 
-def _check_transport(seen: Transport, receivers: np.ndarray, shape: tuple[int, int], rule: str) -> None:
+def _check_transport(
+    seen: Transport | StoredTransport, receivers: np.ndarray, shape: tuple[int, int], rule: str
+) -> None:
     if seen.shape != shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
         raise ValueError(
             f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "

@@ -7,7 +7,7 @@ solid angle alone for ``rf3dgs``. Line of sight comes from the mesh, with Friis 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from warprrf.rf import transport as _transport
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.spectrum import pixel_solid_angles, spread
 from warprrf.rf.transport import Lengths, Transport
+
+if TYPE_CHECKING:
+    from warprrf.rf.transport_store import StoredTransport
 
 MODELS = ("rf3dgs+", "rf3dgs")
 GAINS = ("exp", "linear")
@@ -85,7 +88,7 @@ class SingleBounce:
             loss = (self.wavelength_m / (4 * np.pi * lengths.total)) ** 2
         return np.where(np.isfinite(loss), solid_angle * loss, 0.0)
 
-    def lengths(self, seen: Transport, transmitter: np.ndarray) -> Lengths:
+    def lengths(self, seen: Transport | StoredTransport, transmitter: np.ndarray) -> Lengths:
         """Path lengths of every pixel of ``seen`` by the interaction point that the options name."""
         points = _transport.interaction_points(
             seen, self.gaussians, self.options.interaction_point, mesh=self.mesh, device=self.device

@@ -8,18 +8,23 @@ data set's range.
 An interaction point stands for the whole ray, as in the paper: the centre of the Gaussian that contributes most
 (``"centre"``), the peak of that Gaussian's response on the ray (``"peak"``), the blended mean of all peaks
 (``"expected"``), or the mesh hit (``"mesh"``). Lengths are float64 metres: at 300 GHz a wavelength is 1 mm.
+
+:func:`transport` keeps the weights in memory; :mod:`warprrf.rf.transport_store` keeps them on disk, a file a receiver,
+for as many receivers as the disk holds. Whoever fits takes either.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warprrf.device import Progress, check_array
 from warprrf.geometry.camera import Camera
+from warprrf.geometry.gaussians import rotations_of
 from warprrf.geometry.render import Blending, blend_weights
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.spectrum import check_shape, pixel_directions
@@ -27,6 +32,7 @@ from warprrf.rf.spectrum import check_shape, pixel_directions
 if TYPE_CHECKING:
     from warprrf.geometry.gaussians import Gaussians
     from warprrf.geometry.mesh import Mesh
+    from warprrf.rf.transport_store import StoredTransport
 
 INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
 TRANSMITTANCE = ("product", "exp")
@@ -94,6 +100,20 @@ class Transport:
                 f"receiver: got {position.tolist()}, which is none of the {len(self.receivers)} here"
             )
         return self.subset(found[:1])
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of pixel and Gaussian in all."""
+        return len(self.gaussian)
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Gaussians that any receiver sees, ascending."""
+        return np.unique(self.gaussian)
+
+    def parts(self) -> Iterator[tuple[np.ndarray, Transport]]:
+        """The receivers in portions that fit into memory, with their indices: here all at once."""
+        yield np.arange(len(self.receivers)), self
 
     @property
     def pixel_weight(self) -> np.ndarray:
@@ -188,62 +208,124 @@ def transport(
     Raises:
         ValueError: for positions that are not finite, an unknown rule, or a ``top_k`` below 1.
     """
-    rows, columns = check_shape(shape)
+    view, positions = viewing(gaussians, receivers, shape, range_db, rule, top_k, device)
+    pieces = []
+    for i in range(len(positions)):
+        pieces.append(view(i))
+        if progress is not None:
+            progress("transport", i + 1, len(positions))
+    return joined(positions, view.shape, rule, pieces)
+
+
+@dataclass(frozen=True)
+class View:
+    """What one receiver sees: the arrays of :class:`Transport` for it alone.
+
+    Attributes:
+        counts: pairs of each pixel, shape ``(H * W,)``.
+        gaussian, weight: of each pair, shape ``(E,)`` int32 and float32.
+        dominant, expected_range: shape ``(H, W)`` int32 and float32.
+        dropped: weight that top-K left out, shape ``(H, W)`` float32.
+    """
+
+    counts: np.ndarray
+    gaussian: np.ndarray
+    weight: np.ndarray
+    dominant: np.ndarray
+    expected_range: np.ndarray
+    dropped: np.ndarray
+
+
+@dataclass(frozen=True)
+class Viewing:
+    """Computes the :class:`View` of each of some receivers; see :func:`transport` for what goes in."""
+
+    gaussians: Gaussians
+    positions: np.ndarray
+    shape: tuple[int, int]
+    blending: Blending
+    top_k: int
+    device: Any
+
+    def __call__(self, receiver: int) -> View:
+        """The view of receiver number ``receiver``."""
+        rows, columns = self.shape
+        seen = blend_weights(
+            self.gaussians,
+            Camera.spherical(columns, rows, position=self.positions[receiver]),
+            top_k=self.top_k,
+            blending=self.blending,
+            device=self.device,
+        )
+        weight = np.asarray(seen.weight, dtype=np.float64)
+        index = np.asarray(seen.index)
+        listed = (index >= 0) & (weight > 0)
+        total = np.sum(weight, axis=-1, where=listed, initial=0.0)
+        dropped = np.asarray(seen.dropped, dtype=np.float64)
+        keep = listed & (weight > MIN_WEIGHT * total[..., None])
+        kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
+        scale = np.divide(total + dropped, kept, out=np.zeros_like(kept), where=kept > 0)
+        expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
+        return View(
+            counts=np.count_nonzero(keep, axis=-1).ravel(),
+            gaussian=index[keep].astype(np.int32),
+            weight=(weight * scale[..., None])[keep].astype(np.float32),
+            dominant=np.where(kept > 0, np.asarray(seen.dominant), -1).astype(np.int32),
+            expected_range=np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0).astype(
+                np.float32
+            ),
+            dropped=dropped.astype(np.float32),
+        )
+
+
+def viewing(
+    gaussians: Gaussians,
+    receivers: Any,
+    shape: tuple[int, int],
+    range_db: Any,
+    rule: str,
+    top_k: int,
+    device: Any,
+) -> tuple[Viewing, np.ndarray]:
+    """The checked arguments of :func:`transport`, and the receivers' positions.
+
+    Raises:
+        ValueError: naming the argument that does not fit.
+    """
     positions = check_array("receivers", receivers, (None, 3))
+    if len(positions) == 0:
+        raise ValueError("receivers: got none, expected at least one position")
     if rule not in TRANSMITTANCE:
         raise ValueError(f"rule: got {rule!r}, expected one of {', '.join(TRANSMITTANCE)}")
     if not isinstance(top_k, int | np.integer) or top_k < 1:
         raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
     blending = cutoffs(range_db, rule)
-    pieces: list[tuple[np.ndarray, ...]] = []
-    worst, mean = 0.0, 0.0
-    for i, position in enumerate(positions):
-        view = blend_weights(
-            gaussians,
-            Camera.spherical(columns, rows, position=position),
-            top_k=int(top_k),
-            blending=blending,
-            device=device,
-        )
-        weight = np.asarray(view.weight, dtype=np.float64)
-        index = np.asarray(view.index)
-        listed = (index >= 0) & (weight > 0)
-        total = np.sum(weight, axis=-1, where=listed, initial=0.0)
-        dropped = np.asarray(view.dropped, dtype=np.float64)
-        keep = listed & (weight > MIN_WEIGHT * total[..., None])
-        kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
-        scale = np.divide(total + dropped, kept, out=np.zeros_like(kept), where=kept > 0)
-        expected = np.sum(weight * np.asarray(view.range), axis=-1, where=keep, initial=0.0)
-        pieces.append(
-            (
-                np.count_nonzero(keep, axis=-1).ravel(),
-                index[keep],
-                (weight * scale[..., None])[keep].astype(np.float32),
-                np.where(kept > 0, np.asarray(view.dominant), -1).astype(np.int32),
-                np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0).astype(np.float32),
-            )
-        )
-        worst, mean = max(worst, float(dropped.max())), mean + float(dropped.mean()) / len(positions)
-        if progress is not None:
-            progress("transport", i + 1, len(positions))
-    if not pieces:
-        raise ValueError("receivers: got none, expected at least one position")
-    counts, gaussian, weights, dominant, expected_range = zip(*pieces, strict=True)
+    return Viewing(gaussians, positions, check_shape(shape), blending, int(top_k), device), positions
+
+
+def joined(receivers: np.ndarray, shape: tuple[int, int], rule: str, views: Sequence[View]) -> Transport:
+    """The views of ``receivers`` (R, 3) as one :class:`Transport`."""
+    dropped = [(float(v.dropped.max()), float(v.dropped.mean(dtype=np.float64))) for v in views]
     return Transport(
-        shape=(rows, columns),
-        receivers=positions,
-        start=np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64),
-        gaussian=np.concatenate(gaussian).astype(np.int32),
-        weight=np.concatenate(weights),
-        dominant=np.stack(dominant),
-        expected_range=np.stack(expected_range),
+        shape=shape,
+        receivers=receivers,
+        start=np.concatenate([[0], np.cumsum(np.concatenate([v.counts for v in views]))]).astype(np.int64),
+        gaussian=np.concatenate([v.gaussian for v in views]),
+        weight=np.concatenate([v.weight for v in views]),
+        dominant=np.stack([v.dominant for v in views]),
+        expected_range=np.stack([v.expected_range for v in views]),
         rule=rule,
-        dropped=(worst, mean),
+        dropped=(max(d[0] for d in dropped), float(np.mean([d[1] for d in dropped]))),
     )
 
 
 def interaction_points(
-    seen: Transport, gaussians: Gaussians, kind: str, *, mesh: Mesh | None = None, device: Any = None
+    seen: Transport | StoredTransport,
+    gaussians: Gaussians,
+    kind: str,
+    *,
+    mesh: Mesh | None = None,
+    device: Any = None,
 ) -> np.ndarray:
     """Where each pixel's ray is taken to interact [m], shape ``(R, H, W, 3)`` float64; NaN where it meets nothing.
 
@@ -256,30 +338,27 @@ def interaction_points(
     """
     if kind not in INTERACTION_POINTS:
         raise ValueError(f"interaction_point: got {kind!r}, expected one of {', '.join(INTERACTION_POINTS)}")
+    if kind == "mesh" and mesh is None:
+        raise ValueError('interaction_point: got "mesh", but the geometry has no mesh; use "peak"')
     directions = pixel_directions(seen.shape)
-    origins = seen.receivers[:, None, None, :]
-    empty = seen.dominant < 0
     means = np.asarray(gaussians.means, dtype=np.float64)
-    if kind == "centre":
-        points = means[seen.dominant]
-    elif kind == "expected":
-        points = origins + seen.expected_range.astype(np.float64)[..., None] * directions
-    else:
-        distance = _peak_range(gaussians, seen.dominant, origins, directions)
-        if kind == "mesh":
-            if mesh is None:
-                raise ValueError('interaction_point: got "mesh", but the geometry has no mesh; use "peak"')
-            shape = (len(seen.receivers), *seen.shape, 3)
-            hit = mesh.cast(
-                np.broadcast_to(origins, shape).reshape(-1, 3),
-                np.broadcast_to(directions, shape).reshape(-1, 3),
-                device=device,
-            )
-            met = np.isfinite(hit.t).reshape(shape[:3])
-            distance = np.where(met, hit.t.reshape(shape[:3]), distance)
-            empty = empty & ~met
-        points = origins + distance[..., None] * directions
-    return np.where(empty[..., None], np.nan, points)
+    dominant, expected = seen.dominant, seen.expected_range if kind == "expected" else None
+    points = np.empty((*dominant.shape, 3))
+    for r, origin in enumerate(seen.receivers):  # one at a time: what lies between is ten times the result
+        empty = dominant[r] < 0
+        if kind == "centre":
+            points[r] = means[dominant[r]]
+        elif expected is not None:
+            points[r] = origin + expected[r].astype(np.float64)[..., None] * directions
+        else:
+            distance = _peak_range(gaussians, dominant[r], origin, directions)
+            if mesh is not None and kind == "mesh":
+                t = mesh.cast(origin, directions.reshape(-1, 3), device=device).t.reshape(seen.shape)
+                distance = np.where(np.isfinite(t), t, distance)
+                empty = empty & ~np.isfinite(t)
+            points[r] = origin + distance[..., None] * directions
+        points[r][empty] = np.nan
+    return points
 
 
 def path_lengths(points: np.ndarray, transmitter: np.ndarray, receivers: np.ndarray) -> Lengths:
@@ -292,12 +371,12 @@ def path_lengths(points: np.ndarray, transmitter: np.ndarray, receivers: np.ndar
 
 
 def _peak_range(
-    gaussians: Gaussians, dominant: np.ndarray, origins: np.ndarray, directions: np.ndarray
+    gaussians: Gaussians, dominant: np.ndarray, origin: np.ndarray, directions: np.ndarray
 ) -> np.ndarray:
     """Range [m] at which the dominant Gaussian's response peaks on the ray: t* = -(o.g) / (g.g), in float64."""
-    scales = np.asarray(gaussians.scales, dtype=np.float64)[dominant]
-    rotations = gaussians.rotations[dominant]
-    means = np.asarray(gaussians.means, dtype=np.float64)[dominant]
+    scales = np.asarray(gaussians.scales[dominant], dtype=np.float64)
+    rotations = rotations_of(gaussians.quaternions[dominant].reshape(-1, 4)).reshape(*dominant.shape, 3, 3)
+    means = np.asarray(gaussians.means[dominant], dtype=np.float64)
     g = np.einsum("...ji,...j->...i", rotations, np.broadcast_to(directions, means.shape)) / scales
-    o = np.einsum("...ji,...j->...i", rotations, np.broadcast_to(origins, means.shape) - means) / scales
+    o = np.einsum("...ji,...j->...i", rotations, origin - means) / scales
     return -np.einsum("...i,...i->...", o, g) / np.einsum("...i,...i->...", g, g)

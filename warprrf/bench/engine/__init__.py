@@ -1,1 +1,6 @@
-"""Benchmarks of the engine: each kernel beside a peer measured in the same run."""
+"""The engine's benchmarks: each knob's speed against error, growth, mesh rays, blending, transport on disk."""
+
+from warprrf.bench.engine.report import summary_text, write
+from warprrf.bench.engine.table import QUICK, Sizes, run_engine
+
+__all__ = ["QUICK", "Sizes", "run_engine", "summary_text", "write"]

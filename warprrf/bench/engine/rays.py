@@ -1,10 +1,11 @@
-"""Mesh rays per second: Warp's hierarchy, Embree's, and what ``Mesh.cast`` chooses, against Embree called bare.
+"""Mesh rays per second: Warp's hierarchy, Embree's, and what ``Mesh`` chooses, against Embree called bare.
 
 Two yardsticks, both Embree through Open3D on the same threads: ``embree bare`` gets rays that are already packed in
 float32 and returns float32 distances; ``embree from arrays`` starts, as :meth:`Mesh.cast` does, from float64 origins
 and directions of any length, and so packs and normalises them in NumPy first. ``Mesh.cast`` returns float64 distances
-besides. All of one row are run in turn in one process, and the best of the repeats counts: by the clock, and by
-processor time, which other work on the machine disturbs less.
+besides. ``Mesh.visible`` is compared with Embree's search for any hit, which judges the ends of a segment in float32.
+All of one row are run in turn in one process, and the best of the repeats counts: by the clock, and by processor time,
+which other work on the machine disturbs less.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ def run_rays(
 
     Returns:
         One row a mesh and kind of rays (``panorama``: one origin, neighbours in order; ``incoherent``: origins and
-        directions at random): ``mesh, faces, kind, rays, threads``, and for each runner ``rays_per_s``,
+        directions at random; ``sight, free`` and ``sight, blocked``: segments between points in the bounds, for
+        ``Mesh.visible``): ``mesh, faces, kind, rays, threads``, and for each runner ``rays_per_s``,
         ``rays_per_cpu_s`` and, over both yardsticks, ``over_bare`` and ``over_arrays`` (by processor time on a CPU,
         else by the clock); ``t_difference_m``, the largest between Warp and Embree, and ``other_faces``, the share of
         rays for which they name different faces. Without Open3D the Embree entries are absent.
@@ -61,13 +63,24 @@ def run_rays(
     meshes = {"scene": Scene.load(scene).mesh, "bumpy sphere": bumpy_sphere(triangles)}
     rng, rows = np.random.default_rng(seed), []
     for name, mesh in meshes.items():
+        figures: dict[str, Any]
         for kind in ("panorama", "incoherent"):
             origins, directions = _rays(mesh, kind, rays, rng)
             figures, agreement = _measure(mesh, origins, directions, repeats, on)
             about = {"mesh": name, "faces": len(mesh.faces), "kind": kind, "rays": len(directions)}
             rows.append({**about, "threads": threads(), "device": str(on), **figures, **agreement})
             if progress is not None:
-                progress("rays", len(rows), 2 * len(meshes))
+                progress("rays", len(rows), 4 * len(meshes))
+        a, b = rng.uniform(mesh.bounds[0], mesh.bounds[1], (2, rays, 3))
+        free = mesh.visible(a, b, device=on)
+        for kind, chosen in (("sight, free", free), ("sight, blocked", ~free)):
+            if chosen.any():
+                pick = np.resize(np.flatnonzero(chosen), rays)
+                figures, agreement = _measure_sight(mesh, a[pick], b[pick], repeats, on)
+                about = {"mesh": name, "faces": len(mesh.faces), "kind": kind, "rays": rays}
+                rows.append({**about, "threads": threads(), "device": str(on), **figures, **agreement})
+            if progress is not None:
+                progress("rays", len(rows), 4 * len(meshes))
     return rows
 
 
@@ -132,18 +145,40 @@ def _measure(
             "t_difference_m": float(np.abs(ours.t[both] - other.t[both]).max(initial=0.0)),
             "other_faces": float((ours.face != other.face).mean()),
         }
+    return _figures(runners, len(directions), repeats, device), agreement
+
+
+def _measure_sight(
+    mesh: Mesh, a: np.ndarray, b: np.ndarray, repeats: int, device: Any
+) -> tuple[dict[str, Any], dict[str, float]]:
+    runners: dict[str, Callable[[], Any]] = {
+        "warp": lambda: mesh.visible(a, b, device=device, backend="warp"),
+        "chosen": lambda: mesh.visible(a, b, device=device),
+    }
+    agreement = {}
+    if installed():
+        scene = EmbreeScene(mesh.vertices - mesh.center, mesh.faces)
+        packed = np.column_stack([a - mesh.center, b - a]).astype(np.float32)
+        runners["embree bare"] = lambda: scene.blocked(packed)
+        runners["embree from arrays"] = lambda: scene.blocked(
+            np.column_stack([a - mesh.center, b - a]).astype(np.float32)
+        )
+        runners["embree"] = lambda: mesh.visible(a, b, device="cpu", backend="embree")
+        agreement = {"other_sight": float((runners["warp"]() != runners["embree"]()).mean())}
+    return _figures(runners, len(a), repeats, device), agreement
+
+
+def _figures(runners: dict[str, Callable[[], Any]], rays: int, repeats: int, device: Any) -> dict[str, Any]:
+    """Rays per second of each runner and its speed over the yardsticks."""
     clock, processor = _best_times(runners, repeats)
     figures: dict[str, Any] = {}
     yard = processor if device.is_cpu else clock
     for name in runners:
-        figures[name] = {
-            "rays_per_s": len(directions) / clock[name],
-            "rays_per_cpu_s": len(directions) / processor[name],
-        }
+        figures[name] = {"rays_per_s": rays / clock[name], "rays_per_cpu_s": rays / processor[name]}
         if "embree bare" in runners:
             figures[name]["over_bare"] = yard["embree bare"] / yard[name]
             figures[name]["over_arrays"] = yard["embree from arrays"] / yard[name]
-    return figures, agreement
+    return figures
 
 
 def _pack(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
