@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.rf.antenna import _gains, _sampled
+from warprrf.rf.antenna import _sampled
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.path_set import transverse_basis
 from warprrf.rf.spectrum import angles_from_directions
@@ -144,9 +144,7 @@ class PlanarArray:
             [size[..., None] * (turn @ np.array([np.cos(zeta), np.sin(zeta)])) for zeta in slants]
         )
 
-    def response(
-        self, directions: Any, wavelength_m: float, frequency_hz: float | None = None
-    ) -> np.ndarray:
+    def response(self, directions: Any, wavelength_m: float, frequency_hz: float | None = None) -> np.ndarray:
         """Plane-wave response exp(j 2 pi f / c d . u) of elements at d to world ``directions`` u (..., 3).
 
         Args:
@@ -176,10 +174,6 @@ class PlanarArray:
         longer = ((place**2).sum(axis=-1) - 2.0 * (source * place).sum(axis=-1)) / (each + far)
         number = 1.0 / wavelength_m if frequency_hz is None else frequency_hz / SPEED_OF_LIGHT
         return far / each * np.exp(-2j * np.pi * number * longer)
-
-
-ISOTROPIC = PlanarArray(1, 1)
-"""One isotropic element without polarisation."""
 
 
 def rotation_matrix(orientation: Any) -> np.ndarray:
@@ -262,7 +256,10 @@ def _pattern_gain(pattern: Any, local: np.ndarray) -> np.ndarray:
     """Power gain [linear] of ``pattern`` towards ``local`` unit directions (..., 3)."""
     if not isinstance(pattern, str):
         angle = np.arctan2(np.hypot(local[..., 1], local[..., 2]), local[..., 0])
-        return _gains(_sampled(pattern, angle), None) if angle.size else np.zeros(angle.shape)
+        gain = _sampled(pattern, angle)
+        if not np.isfinite(gain).all() or (gain < 0).any():
+            raise ValueError("pattern: got negative, NaN or infinite gains, expected linear power gains")
+        return gain
     zenith, azimuth = angles_from_directions(local)
     if pattern == "isotropic":
         return np.ones(zenith.shape)
@@ -271,10 +268,15 @@ def _pattern_gain(pattern: Any, local: np.ndarray) -> np.ndarray:
     if pattern == "half_wave_dipole":
         sine = np.sin(zenith)
         steep = sine > 1e-9  # the limit along the axis is zero
-        return 1.643 * np.where(
-            steep, np.cos(0.5 * np.pi * np.cos(zenith)) / np.where(steep, sine, 1.0), 0.0
-        ) ** 2
+        return (
+            1.643
+            * np.where(steep, np.cos(0.5 * np.pi * np.cos(zenith)) / np.where(steep, sine, 1.0), 0.0) ** 2
+        )
     width = np.deg2rad(65.0)  # TR 38.901, table 7.3-1
     vertical = -np.minimum(12.0 * ((zenith - 0.5 * np.pi) / width) ** 2, 30.0)
     horizontal = -np.minimum(12.0 * (azimuth / width) ** 2, 30.0)
     return 10.0 ** (0.1 * (8.0 - np.minimum(-(vertical + horizontal), 30.0)))
+
+
+ISOTROPIC = PlanarArray(1, 1)
+"""One isotropic element without polarisation."""

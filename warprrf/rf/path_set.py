@@ -103,9 +103,7 @@ class Paths:
         if not self.batched:
             raise TypeError("paths of one receiver cannot be indexed by receiver; expected paths of several")
         here = self.valid[receiver]
-        one = {
-            n: (None if getattr(self, n) is None else getattr(self, n)[receiver][here]) for n in _PER_PATH
-        }
+        one = {n: (None if getattr(self, n) is None else getattr(self, n)[receiver][here]) for n in _PER_PATH}
         point = None if self.receiver is None else self.receiver[receiver]
         return replace(self, **one, receiver=point)
 
@@ -123,7 +121,9 @@ class Paths:
             TypeError: for paths of several receivers.
         """
         if self.batched:
-            raise TypeError("paths of several receivers cannot be selected from at once; index a receiver first")
+            raise TypeError(
+                "paths of several receivers cannot be selected from at once; index a receiver first"
+            )
         return replace(
             self,
             **{n: (None if getattr(self, n) is None else getattr(self, n)[chosen]) for n in _PER_PATH},
@@ -355,5 +355,7 @@ def _common(parts: Sequence[Paths]) -> dict[str, Any]:
         if p.transmitter is not None and first.transmitter is not None:
             same &= bool(np.array_equal(p.transmitter, first.transmitter))
         if not same:
-            raise ValueError("parts: got paths of another carrier, transmitter or air, expected the same for all")
+            raise ValueError(
+                "parts: got paths of another carrier, transmitter or air, expected the same for all"
+            )
     return {"frequency_hz": first.frequency_hz, "transmitter": first.transmitter, "air": first.air}

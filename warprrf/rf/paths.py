@@ -240,9 +240,7 @@ class MirrorTracer:
         )
         found, hit = found[free], hit[free]
         length = np.linalg.norm(point - self._image[found], axis=1)
-        return self._paths(
-            point, hit[:, None], *self._reflect(found[:, None], hit[:, None], point, length)
-        )
+        return self._paths(point, hit[:, None], *self._reflect(found[:, None], hit[:, None], point, length))
 
     def _mirror_twice(self, point: np.ndarray) -> Paths:
         p, none = self.patches, np.zeros((0, 2, 3))
@@ -267,9 +265,7 @@ class MirrorTracer:
             seconds.append(np.full(int(keep.sum()), second))
             hits.append(np.stack([start[keep], last[keep]], axis=1))
         if not hits:
-            return self._paths(
-                point, none, *self._reflect(np.zeros((0, 2), int), none, point, np.zeros(0))
-            )
+            return self._paths(point, none, *self._reflect(np.zeros((0, 2), int), none, point, np.zeros(0)))
         patch = np.column_stack([np.concatenate(firsts), np.concatenate(seconds)])
         hit = np.concatenate([none, *hits])
         ends = np.broadcast_to(self.transmitter, (len(hit), 3)), np.broadcast_to(point, (len(hit), 3))
