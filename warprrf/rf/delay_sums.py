@@ -341,7 +341,7 @@ def _window(x: np.ndarray) -> np.ndarray:
 
 
 def _window_polynomials() -> np.ndarray:
-    """Window of tap j over the first tap's place in [0, 1]: coefficients ``(DEGREE + 1, TAPS)``, highest power first."""
+    """Windows of the taps over the first one's place in [0, 1]: coefficients ``(DEGREE + 1, TAPS)``, highest first."""
     nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(4 * DEGREE) + 0.5) / (4 * DEGREE))
     columns = [
         np.polynomial.Chebyshev.fit(nodes, _window(nodes - TAPS / 2 + j), DEGREE, domain=[0, 1])

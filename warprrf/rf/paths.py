@@ -309,7 +309,7 @@ class MirrorTracer:
     def _reflect(
         self, patch: np.ndarray, hit: np.ndarray, point: np.ndarray, length: np.ndarray
     ) -> tuple[np.ndarray, str, np.ndarray | None]:
-        """Amplitudes of paths reflected at ``patch`` (N, bounces), met at ``hit`` (N, bounces, 3), ``length`` (N,) long.
+        """Amplitudes of paths of ``length`` (N,) reflected at ``patch`` (N, bounces), met at ``hit`` (N, bounces, 3).
 
         Returns:
             Complex amplitude ``(N,)`` (modulus: root of half the squared Frobenius norm of the Jones matrix; phase:
