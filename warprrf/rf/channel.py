@@ -455,22 +455,7 @@ def _links(
         return [_Link(paths, tx, rx, wave, squint, turns, normalize_delays)]
     links = []
     for k in range(len(paths.gain)):
-        row = {
-            n: None if getattr(paths, n) is None else getattr(paths, n)[k]
-            for n in (
-                "gain",
-                "tau",
-                "theta_r",
-                "phi_r",
-                "theta_t",
-                "phi_t",
-                "vertices",
-                "kind",
-                "valid",
-                "jones",
-            )
-        }
-        one = replace(paths, **row, receiver=None if paths.receiver is None else paths.receiver[k])
+        one = paths.row(k)
         links.append(_Link(one, tx, rx, wave, squint, _turns(one, diffuse, seed, k), normalize_delays))
     return links
 

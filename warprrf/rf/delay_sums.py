@@ -15,7 +15,7 @@ shape, and errs by about 1e-7 of the root of the paths' total power.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -96,6 +96,13 @@ class Sum:
         """Numbers of receiving and of transmitting elements."""
         return len(self.lengths.place), len(self.lengths.extra)
 
+    def columns(self, n: slice) -> Sum:
+        """The sum for transmitting elements ``n`` alone."""
+        own = self.lengths
+        if own.spherical:
+            own = replace(own, target=own.target[n], scale=own.scale[n])
+        return replace(self, lengths=replace(own, extra=own.extra[n]))
+
 
 def dense_sum(job: Sum, basis: Callable[[np.ndarray, slice], np.ndarray], count: int) -> np.ndarray:
     """The sum for ``count`` values of ``basis``, shape ``(M, N, count)``.
@@ -132,15 +139,18 @@ def _common_delays(job: Sum, basis: np.ndarray) -> np.ndarray:
             carried = job.amplitude * ratio * _turn(job.carrier_hz / SPEED_OF_LIGHT * longer)
             out[k : k + step] = carried @ basis
         return out
-    left, right = _plane_factors(job, job.carrier_hz)
-    right = right * job.amplitude
-    if count < min(rows, columns):
-        return np.stack([(left * basis[:, j]) @ right.T for j in range(count)], axis=-1)
+    right = _transmit_phases(job, job.carrier_hz) * job.amplitude
+    few = count < min(rows, columns)
     out = np.empty((rows, columns, count), dtype=complex)
-    step = max(1, _BLOCK // max(1, columns * paths))
+    step = max(1, _BLOCK // max(1, paths * (1 if few else columns)))
     for k in range(0, rows, step):
-        pairs = left[k : k + step, None] * right
-        out[k : k + step] = (pairs.reshape(-1, paths) @ basis).reshape(-1, columns, count)
+        left = _receive_phases(job.lengths.place[k : k + step], job.lengths.target[0], job.carrier_hz)
+        if few:
+            for j in range(count):
+                out[k : k + step, :, j] = (left * basis[:, j]) @ right.T
+        else:
+            pairs = (left[:, None] * right).reshape(-1, paths)
+            out[k : k + step] = (pairs @ basis).reshape(-1, columns, count)
     return out
 
 
@@ -150,18 +160,25 @@ def plane_squint_sum(job: Sum, frequencies_hz: np.ndarray, factor: np.ndarray | 
     ``factor`` (P, F) multiplies the amplitudes.
     """
     out = np.empty((*job.shape, len(frequencies_hz)), dtype=complex)
+    step = max(1, _BLOCK // max(1, len(job.tau)))
     for j, f in enumerate(frequencies_hz):
-        left, right = _plane_factors(job, f)
         weight = job.amplitude * _turn((f - job.carrier_hz) * job.tau)
         if factor is not None:
             weight = weight * factor[:, j]
-        out[:, :, j] = left @ (right * weight).T
+        right = (_transmit_phases(job, f) * weight).T
+        for k in range(0, job.shape[0], step):
+            m = slice(k, k + step)
+            out[m, :, j] = _receive_phases(job.lengths.place[m], job.lengths.target[0], f) @ right
     return out
 
 
 def gridded_sum(job: Sum, frequencies_hz: np.ndarray, device: Any = None) -> np.ndarray:
     """The sum at equally spaced frequencies, at least :data:`LEAST_FREQUENCIES`, shape ``(M, N, F)``."""
     count = len(frequencies_hz)
+    most = max(1, 4 * _BLOCK // len(job.tau))  # transmitting elements whose tables are held at once
+    if job.shape[1] > most:
+        pieces = [job.columns(slice(k, k + most)) for k in range(0, job.shape[1], most)]
+        return np.concatenate([gridded_sum(piece, frequencies_hz, device) for piece in pieces], axis=1)
     middle = count // 2
     step_hz = (frequencies_hz[-1] - frequencies_hz[0]) / (count - 1)
     middle_hz = frequencies_hz[middle]
@@ -319,11 +336,6 @@ def _receive_phases(place: np.ndarray, arrival: np.ndarray, frequency_hz: float)
 def _transmit_phases(job: Sum, frequency_hz: float) -> np.ndarray:
     """Phases of plane waves from transmitting elements, shape ``(N, P)``."""
     return _turn(frequency_hz / SPEED_OF_LIGHT * job.lengths.extra)
-
-
-def _plane_factors(job: Sum, frequency_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    left = _receive_phases(job.lengths.place, job.lengths.target[0], frequency_hz)
-    return left, _transmit_phases(job, frequency_hz)
 
 
 def _turn(turns: np.ndarray) -> np.ndarray:

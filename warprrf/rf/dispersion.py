@@ -65,14 +65,15 @@ def dispersion(paths: Paths) -> Dispersion:
     direct = np.where(paths.kind == "los", paths.power, 0.0).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         k_factor = np.where(total > 0, direct / (total - direct), np.nan)
-    angles = (paths.phi_r, paths.theta_r, paths.phi_t, paths.theta_t)
-    spreads = [angular_spread(paths.power, angle) for angle in angles]
     return Dispersion(
-        total,
-        mean,
-        spread,
-        k_factor,
-        *spreads,
+        path_gain=total,
+        mean_delay_s=mean,
+        delay_spread_s=spread,
+        k_factor=k_factor,
+        azimuth_spread_arrival_rad=angular_spread(paths.power, paths.phi_r),
+        zenith_spread_arrival_rad=angular_spread(paths.power, paths.theta_r),
+        azimuth_spread_departure_rad=angular_spread(paths.power, paths.phi_t),
+        zenith_spread_departure_rad=angular_spread(paths.power, paths.theta_t),
         coherence_bandwidth_hz=coherence_bandwidth(paths.power, paths.tau),
     )
 

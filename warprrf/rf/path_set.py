@@ -100,12 +100,24 @@ class Paths:
         Raises:
             TypeError: for paths of one receiver.
         """
+        one = self.row(receiver)
+        return one.select(np.flatnonzero(one.valid))
+
+    def row(self, receiver: int) -> Paths:
+        """The paths of one of several receivers, padded as they are.
+
+        Raises:
+            TypeError: for paths of one receiver.
+        """
         if not self.batched:
             raise TypeError("paths of one receiver cannot be indexed by receiver; expected paths of several")
-        here = self.valid[receiver]
-        one = {n: (None if getattr(self, n) is None else getattr(self, n)[receiver][here]) for n in _PER_PATH}
         point = None if self.receiver is None else self.receiver[receiver]
-        return replace(self, **one, receiver=point)
+        return replace(self._taken(receiver), receiver=point)
+
+    def _taken(self, index: Any) -> Paths:
+        """Every array at ``index``."""
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _PER_PATH}
+        return replace(self, **{name: None if v is None else v[index] for name, v in arrays.items()})
 
     def each(self) -> Iterator[Paths]:
         """The paths of one receiver after another, without padding."""
@@ -124,10 +136,7 @@ class Paths:
             raise TypeError(
                 "paths of several receivers cannot be selected from at once; index a receiver first"
             )
-        return replace(
-            self,
-            **{n: (None if getattr(self, n) is None else getattr(self, n)[chosen]) for n in _PER_PATH},
-        )
+        return self._taken(chosen)
 
     def with_gas(self, gas: Any = True) -> Paths:
         """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
@@ -189,6 +198,12 @@ class Paths:
         from warprrf.rf.channel import channel_taps
 
         return channel_taps(self, bandwidth_hz, l_min, l_max, **options)
+
+    def diffuse_power(self, **options: Any) -> np.ndarray:
+        """Mean power that diffuse paths add to any pair of elements; see :func:`warprrf.rf.channel.diffuse_power`."""
+        from warprrf.rf.channel import diffuse_power
+
+        return diffuse_power(self, **options)
 
     def dispersion(self) -> Dispersion:
         """Delay and angular spreads, K-factor and coherence bandwidth; see :func:`warprrf.rf.dispersion.dispersion`."""
@@ -278,7 +293,7 @@ class Paths:
         """All paths of one receiver."""
         depth = max(p.vertices.shape[1] for p in parts)
         names = [n for n in _PER_PATH if n not in ("vertices", "jones")]
-        joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         jones = None
         if any(p.jones is not None for p in parts):
             jones = np.concatenate([_polarised(p) for p in parts])
@@ -302,7 +317,9 @@ class Paths:
 
         fills = {"gain": 0.0, "kind": "", "valid": False}
         names = [n for n in _PER_PATH if n not in ("vertices", "jones")]
-        stacked = {n: np.stack([pad(getattr(p, n), fills.get(n, np.nan)) for p in parts]) for n in names}
+        stacked: dict[str, Any] = {
+            n: np.stack([pad(getattr(p, n), fills.get(n, np.nan)) for p in parts]) for n in names
+        }
         jones, receiver = None, None
         if any(p.jones is not None for p in parts):
             jones = np.stack([pad(_polarised(p), 0.0) for p in parts])

@@ -132,7 +132,7 @@ def to_sionna(
         ValueError: as there.
     """
     several = paths if paths.batched else Paths.stack([paths])
-    options = {"tx_array": tx_array, "rx_array": rx_array, "diffuse": diffuse, "seed": seed}
+    options: dict[str, Any] = {"tx_array": tx_array, "rx_array": rx_array, "diffuse": diffuse, "seed": seed}
     coefficient, tau = impulse_response(several, **options)
     valid = several.valid & np.isfinite(tau)
     if diffuse == "power":
