@@ -110,6 +110,8 @@ def dense_sum(job: Sum, basis: Callable[[np.ndarray, slice], np.ndarray], count:
     ``basis(delay, which)`` returns B at ``delay`` (..., P) [s], shape ``(..., P, values)``, of the values ``which``.
     """
     rows, columns = job.shape
+    if len(job.tau) == 0:
+        return np.zeros((rows, columns, count), dtype=complex)
     if not job.squint or not job.lengths.place.any() and columns == 1:
         return _common_delays(job, basis(job.tau, slice(0, count)))
     out = np.empty((rows, columns, count), dtype=complex)

@@ -117,7 +117,8 @@ class Paths:
     def _taken(self, index: Any) -> Paths:
         """Every array at ``index``."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _PER_PATH}
-        return replace(self, **{name: None if v is None else v[index] for name, v in arrays.items()})
+        taken: dict[str, Any] = {name: None if v is None else v[index] for name, v in arrays.items()}
+        return replace(self, **taken)
 
     def each(self) -> Iterator[Paths]:
         """The paths of one receiver after another, without padding."""
