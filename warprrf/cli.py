@@ -343,9 +343,25 @@ def _bench_relevance(args: argparse.Namespace, bars: Bars) -> None:
     print(relevance.summary_text(report))
 
 
+def _bench_channel(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import channel
+
+    report = channel.run_channel(
+        args.out or "runs/channel",
+        scene=args.scene or channel.SCENE,
+        large=not args.small,
+        sionna=not args.no_sionna,
+        device=args.device,
+        progress=bars,
+    )
+    bars._close()
+    print(channel.table(report))
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "newrf": _bench_newrf,
     "bistatic": _bench_bistatic,
+    "channel": _bench_channel,
     "relevance": _bench_relevance,
 }
 """Benchmarks by name: what `warprrf bench NAME` runs."""
@@ -641,6 +657,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     worth.add_argument("--out", help="folder of the results (default runs/relevance)")
     worth.add_argument("--data", help="folder of the scene (default data/lobby)")
+    radio = add(
+        "channel",
+        _bench,
+        "channels: closed forms, Sionna RT, wide responses, the near field",
+        HELP_BENCH,
+        tables,
+    )
+    radio.add_argument("--out", help="folder of the results (default runs/channel)")
+    radio.add_argument("--scene", metavar="XML", help="scene compared with Sionna RT (default the lobby)")
+    radio.add_argument(
+        "--small", action="store_true", help="leave out 1e5 paths between 1024 and 16 elements"
+    )
+    radio.add_argument("--no-sionna", action="store_true", help="leave out the comparison with Sionna RT")
     ours = add("bistatic", _bench, "the bistatic field beside other systems", HELP_BENCH_BISTATIC, tables)
     ours.add_argument("--out", help="folder of the results (default runs/bistatic)")
     ours.add_argument(

@@ -40,7 +40,7 @@ def solve(rt, scene, tx_array, rx_array, depth=2, diffuse=False):
     for k, point in enumerate(RECEIVERS):
         loaded.add(rt.Receiver(f"rx{k}", position=point.tolist()))
     return rt.PathSolver(deterministic=True)(
-        loaded, max_depth=depth, samples_per_src=20_000, synthetic_array=True, diffuse_reflection=diffuse,
+        loaded, max_depth=depth, samples_per_src=200_000, synthetic_array=True, diffuse_reflection=diffuse,
         refraction=False, seed=1,
     )  # fmt: skip
 
@@ -138,7 +138,10 @@ def test_channels_are_theirs(rt, solved):
     np.testing.assert_allclose(h, g, atol=2e-2 * np.abs(g).max())
     t, u = ours.taps(1e9, -2, 20), solved.taps(1e9, -2, 20, out_type="numpy")
     assert t.shape == u.shape
-    np.testing.assert_allclose(t, u, atol=2e-2 * np.abs(u).max())
+    # Sionna's taps are NaN for receivers with padded paths, whose delay is -1 s.
+    whole = solved.valid.numpy().all(axis=(1, 2))
+    assert whole.any() and np.isfinite(t).all()
+    np.testing.assert_allclose(t[whole], u[whole], atol=2e-2 * np.abs(u[whole]).max())
     a, tau = ours.cir(num_time_steps=3)
     b, other = solved.cir(num_time_steps=3, out_type="numpy")
     assert a.shape == b.shape and tau.shape == other.shape
