@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -333,3 +334,18 @@ def test_bad_requests_are_named(arguments, name):
         replace(random_paths(3), frequency_hz=None).cfr([3e11])
     with pytest.raises(ValueError, match="delay"):
         replace(random_paths(3), tau=np.array([1e-9, np.nan, 2e-9])).cfr([3e11])
+
+
+def test_relevance_decides_on_gas():
+    p = random_paths(4)
+    assert p.with_gas(SimpleNamespace(kept=("line_of_sight",))) is p
+    np.testing.assert_array_equal(p.with_gas(SimpleNamespace(kept=("gas",))).gain, p.with_gas(True).gain)
+
+
+def test_traced_paths_take_gas():
+    scene = far_square(METAL)
+    place = {"transmitter": [0, 0, 2], "receivers": [[5, 1, 1], [90, -2, 3]], "frequency_hz": F}
+    dry, wet = trace_paths(scene, **place), trace_paths(scene, gas=True, **place)
+    loss = gas_attenuation_db_per_m(F) * dry.length_m
+    np.testing.assert_allclose(10 * np.log10(dry.power / wet.power), loss, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(wet.jones / dry.jones)[0, 0, 0, 0], 10 ** (-loss[0, 0] / 20), rtol=1e-9)
