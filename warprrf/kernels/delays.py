@@ -72,7 +72,7 @@ def add_to_cell(
 
 
 @wp.kernel
-def spread_plane_delays(
+def spread_separable_delays(
     offset: int,
     columns: int,
     left: wp.array2d(dtype=wp.vec2d),
@@ -82,7 +82,7 @@ def spread_plane_delays(
     window: wp.array(dtype=taps_vector),
     grid: wp.array2d(dtype=taps_vector),
 ):
-    """Plane waves with own delays: phases left[m, p] right[n, p], places cell_left[m, p] + cell_right[n, p]."""
+    """Separable delays: factors left[m, p] right[n, p], places cell_left[m, p] + cell_right[n, p]."""
     pair = offset + wp.tid()
     m = pair / columns
     n = pair - m * columns
@@ -95,7 +95,7 @@ def spread_plane_delays(
 
 
 @wp.kernel
-def spread_spherical_delays(
+def spread_pair_delays(
     offset: int,
     columns: int,
     place: wp.array(dtype=wp.vec3d),
@@ -109,7 +109,7 @@ def spread_spherical_delays(
     window: wp.array(dtype=taps_vector),
     grid: wp.array2d(dtype=taps_vector),
 ):
-    """Spherical waves: path p is longer by extra[n, p] + |target[n, p] - place[m]| between elements m and n.
+    """Spherical waves of mirrored arrays: path p is longer by extra[n, p] + |target[n, p] - place[m]|.
 
     Its amplitude is scaled by scale[n, p] / |target - place|; its phase turns by ``turns_per_m`` of the length, its
     delay moves by ``cells_per_m``.

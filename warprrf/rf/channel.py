@@ -25,7 +25,7 @@ isotropic antennas. Absorption that is in the gains (:meth:`Paths.with_gas`) fol
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -39,7 +39,7 @@ from warprrf.rf.delay_sums import (
     Sum,
     dense_sum,
     gridded_sum,
-    plane_squint_sum,
+    squint_sum,
 )
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.path_set import Paths, carrier_phase
@@ -104,7 +104,9 @@ def frequency_response(
     def one(link: _Link) -> np.ndarray:
         terms = link.terms * len(f)
         gridded = method == "grid" or (method == "auto" and even and terms > DENSE_TERMS)
-        h = link.each_port(lambda job: _response(job, f, link, gridded, device))
+        h = np.zeros((*link.ports, len(f)), dtype=complex)
+        for index, ports, job in link.jobs():
+            h[ports] += _response(job, f, link, link.length_m[index], gridded, device)
         if amplitude == "friis":
             h = h * (link.carrier_hz / f)
         return h if link.shift_s == 0.0 else h * carrier_phase(-f, link.shift_s)
@@ -160,7 +162,9 @@ def channel_taps(
             pulse = np.sinc(lags[which] - bandwidth_hz * since[..., None])
             return pulse if offset == 0.0 else pulse * carrier_phase(offset, delay)[..., None]
 
-        h = link.each_port(lambda job: dense_sum(job, basis, len(lags)))
+        h = np.zeros((*link.ports, len(lags)), dtype=complex)
+        for _, ports, job in link.jobs():
+            h[ports] += dense_sum(job, basis, len(lags))
         return h * carrier_phase(-(link.carrier_hz + offset), link.shift_s)
 
     return _each_receiver(paths, one, tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays)
@@ -193,16 +197,19 @@ def impulse_response(
 
     def one(link: _Link) -> tuple[np.ndarray, np.ndarray]:
         a = np.zeros((*link.ports, count), dtype=complex)
-        a[..., link.index] = link.each_port(_coefficients) * carrier_phase(-link.carrier_hz, link.shift_s)
+        each = np.full((*link.ports, count), np.nan)
+        for index, (received, sent), job in link.jobs():
+            longer, ratio = job.lengths.longer(slice(None))
+            delay = longer / SPEED_OF_LIGHT
+            place = received, sent, link.index[index]
+            turned = carrier_phase(link.carrier_hz, delay) * carrier_phase(-link.carrier_hz, link.shift_s)
+            a[place] = job.amplitude * ratio * turned
+            each[place] = delay + job.tau - link.shift_s
+        if wave == "spherical":
+            return a, each
         tau = np.full(count, np.nan)
         tau[link.index] = link.tau - link.shift_s
-        if wave == "plane":
-            return a, tau
-        longer = link.lengths.longer(slice(None))[0]
-        repeats = link.ports[0] // longer.shape[0], link.ports[1] // longer.shape[1], 1
-        each = np.full((*link.ports, count), np.nan)
-        each[..., link.index] = np.tile(longer / SPEED_OF_LIGHT, repeats) + tau[link.index]
-        return a, each
+        return a, tau
 
     _choice("wave", wave, ("plane", "spherical"))
     links = _links(paths, tx_array, rx_array, wave, False, diffuse, seed, normalize_delays)
@@ -263,8 +270,18 @@ class _Link:
         if turn is not None:
             self.amplitude = self.amplitude * turn[self.index]
         self.shift_s = float(self.tau.min()) if normalize_delays and len(self.tau) else 0.0
-        lengths = _spherical_lengths if wave == "spherical" else _plane_lengths
-        self.lengths = lengths(chosen, tx.positions(self.wavelength_m), rx.positions(self.wavelength_m))
+        places = tx.positions(self.wavelength_m), rx.positions(self.wavelength_m)
+        self.groups: list[tuple[np.ndarray, PairLengths]] = []
+        if wave == "plane":
+            self.groups.append((np.arange(len(self.tau)), _plane_lengths(chosen, *places)))
+        else:
+            scattered = chosen.kind == "diffuse"
+            for index, lengths in (
+                (np.flatnonzero(~scattered), _spherical_lengths),
+                (np.flatnonzero(scattered), _scattered_lengths),
+            ):
+                if len(index):
+                    self.groups.append((index, lengths(chosen.select(index), *places)))
         self.ports = (rx.ports, tx.ports)
 
     @property
@@ -272,13 +289,15 @@ class _Link:
         """Pairs of ports times paths."""
         return float(self.ports[0] * self.ports[1]) * len(self.tau)
 
-    def each_port(self, value: Callable[[Sum], np.ndarray]) -> np.ndarray:
-        """``value`` (M, N, ...) of every pair of polarisations, shape ``(ports, ports, ...)``."""
-        rows = []
-        for received in self.amplitude:
-            row = [value(Sum(a, self.tau, self.lengths, self.carrier_hz, self.squint)) for a in received]
-            rows.append(np.concatenate(row, axis=1) if len(row) > 1 else row[0])
-        return np.concatenate(rows) if len(rows) > 1 else rows[0]
+    def jobs(self) -> Iterator[tuple[np.ndarray, tuple[slice, slice], Sum]]:
+        """Sums to add up: the paths that they are over, the ports that they belong to."""
+        for index, lengths in self.groups:
+            rows, columns = len(lengths.place), len(lengths.extra)
+            for a, received in enumerate(self.amplitude):
+                for b, amplitude in enumerate(received):
+                    ports = slice(a * rows, (a + 1) * rows), slice(b * columns, (b + 1) * columns)
+                    job = Sum(amplitude[index], self.tau[index], lengths, self.carrier_hz, self.squint)
+                    yield index, ports, job
 
     def absorption(self, f: np.ndarray) -> np.ndarray | None:
         """Loss per metre over that at the carrier [neper/m], shape ``(F,)``; None without air."""
@@ -288,18 +307,19 @@ class _Link:
         return np.log(10.0) / 20.0 * change
 
 
-def _response(job: Sum, f: np.ndarray, link: _Link, gridded: bool, device: Any) -> np.ndarray:
+def _response(
+    job: Sum, f: np.ndarray, link: _Link, length_m: np.ndarray, gridded: bool, device: Any
+) -> np.ndarray:
     if len(job.tau) == 0:
         return np.zeros((*job.shape, len(f)), dtype=complex)
     loss = link.absorption(f)
     if gridded:
         if loss is None:
             return gridded_sum(job, f, device)
-        return _gridded_with_air(job, f, loss, link.length_m, device)
-    factor = None if loss is None else np.exp(-loss * link.length_m[:, None])
-    many = max(job.shape) > 1
-    if job.squint and many and not job.lengths.spherical:
-        return plane_squint_sum(job, f, factor)
+        return _gridded_with_air(job, f, loss, length_m, device)
+    factor = None if loss is None else np.exp(-loss * length_m[:, None])
+    if job.squint and job.lengths.separable and not job.lengths.alone:
+        return squint_sum(job, f, factor)
 
     def basis(delay: np.ndarray, which: slice) -> np.ndarray:
         waves = carrier_phase(f[which] - job.carrier_hz, delay[..., None])
@@ -327,12 +347,6 @@ def _gridded_with_air(
 
 def _factorial(k: int) -> float:
     return float(np.prod(np.arange(1.0, k + 1)))
-
-
-def _coefficients(job: Sum) -> np.ndarray:
-    """Amplitudes of pairs at the carrier, shape ``(M, N, P)``."""
-    longer, ratio = job.lengths.longer(slice(None))
-    return job.amplitude * ratio * carrier_phase(job.carrier_hz, longer / SPEED_OF_LIGHT)
 
 
 def _amplitudes(paths: Paths, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
@@ -364,35 +378,41 @@ def _plane_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> 
 
 
 def _spherical_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
-    """Line of sight and mirrors: distances from the transmitting elements' images; else from the last point."""
+    """Line of sight and mirrors: distances from the transmitting elements' images."""
+    tx, rx, bounces = _ends(paths)
+    each, some = np.arange(len(bounces)), bounces > 0
+    last = np.where(some[:, None], paths.vertices[each, np.maximum(bounces - 1, 0)], tx)
+    toward = (last - rx) / np.linalg.norm(last - rx, axis=1, keepdims=True)
+    points = np.concatenate([np.broadcast_to(tx, (len(each), 1, 3)), paths.vertices], axis=1)
+    step = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    length = np.where(np.isfinite(step), step, 0.0).sum(axis=1) + np.linalg.norm(rx - last, axis=1)
+    # The image lies ``length`` away along the arrival; its array is mirrored by every bounce.
+    mirrored = np.einsum("pij,nj->npi", _mirrorings(tx, rx, paths.vertices, bounces), sending)
+    target = length[:, None] * toward + mirrored
+    far = np.linalg.norm(target, axis=2)
+    return PairLengths(receiving, target, extra=far - length, scale=length / far, spherical=True)
+
+
+def _scattered_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
+    """Diffuse paths: distances to the first interaction point and from the last."""
+    tx, rx, bounces = _ends(paths)
+    first = paths.vertices[:, 0] - tx
+    last = paths.vertices[np.arange(len(bounces)), bounces - 1] - rx
+    near = np.linalg.norm(first, axis=1)
+    each = np.linalg.norm(first - sending[:, None], axis=2)
+    return PairLengths(receiving, last[None], extra=each - near, scale=near / each, spherical=True)
+
+
+def _ends(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Transmitter, receiver and numbers of interactions, which spherical waves need."""
     if paths.transmitter is None or paths.receiver is None:
         raise ValueError("paths: got ones without transmitter and receiver, which spherical waves need")
-    tx, rx, vertices = paths.transmitter, paths.receiver, paths.vertices
-    count, bounces = len(paths.tau), np.isfinite(paths.vertices[..., 0]).sum(axis=1)
-    diffuse = paths.kind == "diffuse"
+    bounces = np.isfinite(paths.vertices[..., 0]).sum(axis=1)
     if (bounces[paths.kind != "los"] == 0).any():
         raise ValueError(
             "paths: got mirror or diffuse paths without interaction points, which spherical waves need"
         )
-    each = np.arange(count)
-    some = bounces > 0
-    first = np.where(some[:, None], vertices[:, 0], rx)
-    last = np.where(some[:, None], vertices[each, np.maximum(bounces - 1, 0)], tx)
-    step = np.linalg.norm(np.diff(vertices, axis=1), axis=2)
-    between = np.where(np.isfinite(step), step, 0.0).sum(axis=1)
-    begin, end = np.linalg.norm(first - tx, axis=1), np.linalg.norm(rx - last, axis=1)
-    length = np.where(some, begin + between + end, begin)
-    # Images: the transmitter's lies ``length`` away along the arrival, its array is mirrored by every bounce.
-    toward = (last - rx) / end[:, None]
-    mirrored = np.einsum("pij,nj->npi", _mirrorings(tx, rx, vertices, bounces), sending)
-    from_last = np.linalg.norm(first - tx - sending[:, None], axis=2)
-    return PairLengths(
-        place=receiving,
-        target=np.where(diffuse[:, None], (last - rx)[None], length[:, None] * toward + mirrored),
-        extra=np.where(diffuse, from_last - begin - end, -length),
-        scale=np.where(diffuse, begin / from_last * end, length),
-        spherical=True,
-    )
+    return paths.transmitter, paths.receiver, bounces
 
 
 def _mirrorings(tx: np.ndarray, rx: np.ndarray, vertices: np.ndarray, bounces: np.ndarray) -> np.ndarray:

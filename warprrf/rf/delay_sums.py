@@ -5,6 +5,9 @@ sum over p of A_p exp(-j 2 pi f_c x_mnp / c) r_mnp B(tau_p + x_mnp / c), with x 
 to the path and r the change of its amplitude (1 for plane waves). Without beam squint B is taken at tau_p: elements
 then differ by a carrier phase alone.
 
+Lengths are separable, a receiving element's plus a transmitting one's, for plane waves and for spherical ones about an
+interaction point; they are not for spherical waves of a mirrored array.
+
 Dense sums cost pairs x paths x frequencies. The gridded one, for equally spaced frequencies, costs pairs x (8 paths +
 grid log grid): each path is spread to 8 cells of a twice oversampled grid of delays by a Kaiser-Bessel window, a fast
 Fourier transform follows, and the window's transform is divided out (Dutt and Rokhlin, SIAM J. Sci. Comput. 14, 1993;
@@ -29,8 +32,8 @@ from warprrf.kernels.delays import (
     TAPS,
     join_cells,
     spread_common_delays,
-    spread_plane_delays,
-    spread_spherical_delays,
+    spread_pair_delays,
+    spread_separable_delays,
     taps_vector,
 )
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
@@ -47,14 +50,15 @@ _BLOCK = 8_000_000  # complex numbers that an intermediate array may hold, about
 
 @dataclass(frozen=True)
 class PairLengths:
-    """Lengths that the places of elements add to paths.
+    """Lengths that the places of elements add to paths, and what they make of amplitudes.
 
     Attributes:
         place: Receiving elements about their centre [m], shape ``(M, 3)``.
-        target: Spherical: the source that each receiving element sees, from the receiver [m], shape ``(N, P, 3)``;
-            plane: unit directions of arrival, shape ``(1, P, 3)``.
-        extra: Length to add to the distance from ``target`` (to -arrival . place) [m], shape ``(N, P)``.
-        scale: Spherical: amplitude times that distance, shape ``(N, P)``; plane: of no meaning, shape ``(1, 1)``.
+        target: Plane waves: unit directions of arrival, shape ``(1, P, 3)``. Spherical waves: the source that the
+            receiving elements see, from their centre [m], shape ``(1, P, 3)``, or ``(N, P, 3)`` if every transmitting
+            element is a source of its own.
+        extra: Length to add for transmitting elements [m], shape ``(N, P)``.
+        scale: Factor of amplitudes for transmitting elements, shape ``(N, P)``, or ``(1, 1)`` for one.
         spherical: Whether waves are.
     """
 
@@ -64,13 +68,39 @@ class PairLengths:
     scale: np.ndarray
     spherical: bool
 
-    def longer(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Added length [m] and ratio of amplitudes for receiving elements ``m``, each ``(m, N, P)``."""
+    @property
+    def separable(self) -> bool:
+        """Whether a length is that of a receiving element plus that of a transmitting one."""
+        return len(self.target) == 1
+
+    @property
+    def alone(self) -> bool:
+        """Whether there is one element at either end, at the centre."""
+        return len(self.place) == 1 and len(self.extra) == 1
+
+    def received(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Of separable ones: length [m] that receiving elements ``m`` add, ``(m, P)``, and factor of amplitudes."""
         if not self.spherical:
-            added = self.extra - np.einsum("npi,mi->mnp", self.target, self.place[m])
-            return added, np.ones(())
-        reach = np.linalg.norm(self.target - self.place[m][:, None, None], axis=-1)
-        return self.extra + reach, self.scale / reach
+            return -(self.place[m] @ self.target[0].T), np.ones((1, 1))
+        source = self.target[0]
+        reach = np.linalg.norm(source - self.place[m][:, None], axis=-1)
+        far = np.linalg.norm(source, axis=-1)
+        return reach - far, far / reach
+
+    def longer(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Added length [m] and factor of amplitudes for receiving elements ``m``, each ``(m, N, P)``."""
+        if self.separable:
+            added, ratio = self.received(m)
+            return added[:, None] + self.extra, ratio[:, None] * self.scale
+        source = self.target
+        reach = np.linalg.norm(source - self.place[m][:, None, None], axis=-1)
+        far = np.linalg.norm(source, axis=-1)
+        return self.extra + (reach - far), self.scale * (far / reach)
+
+    def taken(self, order: np.ndarray) -> PairLengths:
+        """Those of paths ``order``."""
+        scale = self.scale if self.scale.shape[1] == 1 else self.scale[:, order]
+        return replace(self, target=self.target[:, order], extra=self.extra[:, order], scale=scale)
 
 
 @dataclass(frozen=True)
@@ -96,12 +126,21 @@ class Sum:
         """Numbers of receiving and of transmitting elements."""
         return len(self.lengths.place), len(self.lengths.extra)
 
+    def received(self, m: slice, frequency_hz: float) -> np.ndarray:
+        """Of separable lengths: factors of receiving elements ``m`` at a frequency, shape ``(m, P)``."""
+        added, ratio = self.lengths.received(m)
+        return ratio * _turn(frequency_hz / SPEED_OF_LIGHT * added)
+
+    def sent(self, frequency_hz: float) -> np.ndarray:
+        """Of separable lengths: factors of transmitting elements at a frequency, shape ``(N, P)``."""
+        return self.lengths.scale * _turn(frequency_hz / SPEED_OF_LIGHT * self.lengths.extra)
+
     def columns(self, n: slice) -> Sum:
         """The sum for transmitting elements ``n`` alone."""
         own = self.lengths
-        if own.spherical:
-            own = replace(own, target=own.target[n], scale=own.scale[n])
-        return replace(self, lengths=replace(own, extra=own.extra[n]))
+        target = own.target if own.separable else own.target[n]
+        scale = own.scale if len(own.scale) == 1 else own.scale[n]
+        return replace(self, lengths=replace(own, target=target, extra=own.extra[n], scale=scale))
 
 
 def dense_sum(job: Sum, basis: Callable[[np.ndarray, slice], np.ndarray], count: int) -> np.ndarray:
@@ -110,67 +149,65 @@ def dense_sum(job: Sum, basis: Callable[[np.ndarray, slice], np.ndarray], count:
     ``basis(delay, which)`` returns B at ``delay`` (..., P) [s], shape ``(..., P, values)``, of the values ``which``.
     """
     rows, columns = job.shape
-    if len(job.tau) == 0:
-        return np.zeros((rows, columns, count), dtype=complex)
-    if not job.squint or not job.lengths.place.any() and columns == 1:
-        return _common_delays(job, basis(job.tau, slice(0, count)))
-    out = np.empty((rows, columns, count), dtype=complex)
     paths = len(job.tau)
-    step = max(1, _BLOCK // max(1, columns * paths))
+    out = np.zeros((rows, columns, count), dtype=complex)
+    if paths == 0:
+        return out
+    own = job.squint and not job.lengths.alone
+    if job.lengths.separable and not own:
+        return _separable(job, basis(job.tau, slice(0, count)))
+    step = max(1, _BLOCK // (columns * paths))
     for k in range(0, rows, step):
         m = slice(k, min(k + step, rows))
         longer, ratio = job.lengths.longer(m)
         carried = job.amplitude * ratio * _turn(job.carrier_hz / SPEED_OF_LIGHT * longer)
+        if not own:
+            out[m] = carried @ basis(job.tau, slice(0, count))
+            continue
         delay = job.tau + longer / SPEED_OF_LIGHT
-        each = max(1, _BLOCK // max(1, delay.size))
+        each = max(1, _BLOCK // delay.size)
         for j in range(0, count, each):
             which = slice(j, min(j + each, count))
             out[m, :, which] = np.einsum("mnp,mnpj->mnj", carried, basis(delay, which))
     return out
 
 
-def _common_delays(job: Sum, basis: np.ndarray) -> np.ndarray:
+def _separable(job: Sum, basis: np.ndarray) -> np.ndarray:
     """Sum with the same delays for all elements; ``basis`` is ``(P, count)``."""
     rows, columns = job.shape
     paths, count = basis.shape
-    if job.lengths.spherical:
-        out = np.empty((rows, columns, count), dtype=complex)
-        step = max(1, _BLOCK // max(1, columns * paths))
-        for k in range(0, rows, step):
-            longer, ratio = job.lengths.longer(slice(k, k + step))
-            carried = job.amplitude * ratio * _turn(job.carrier_hz / SPEED_OF_LIGHT * longer)
-            out[k : k + step] = carried @ basis
-        return out
-    right = _transmit_phases(job, job.carrier_hz) * job.amplitude
+    right = job.sent(job.carrier_hz) * job.amplitude
     few = count < min(rows, columns)
     out = np.empty((rows, columns, count), dtype=complex)
-    step = max(1, _BLOCK // max(1, paths * (1 if few else columns)))
+    step = max(1, _BLOCK // (paths * (1 if few else columns)))
     for k in range(0, rows, step):
-        left = _receive_phases(job.lengths.place[k : k + step], job.lengths.target[0], job.carrier_hz)
+        m = slice(k, k + step)
+        left = job.received(m, job.carrier_hz)
         if few:
             for j in range(count):
-                out[k : k + step, :, j] = (left * basis[:, j]) @ right.T
+                out[m, :, j] = (left * basis[:, j]) @ right.T
         else:
-            pairs = (left[:, None] * right).reshape(-1, paths)
-            out[k : k + step] = (pairs @ basis).reshape(-1, columns, count)
+            out[m] = ((left[:, None] * right).reshape(-1, paths) @ basis).reshape(-1, columns, count)
     return out
 
 
-def plane_squint_sum(job: Sum, frequencies_hz: np.ndarray, factor: np.ndarray | None) -> np.ndarray:
-    """Plane waves with beam squint at any frequencies, shape ``(M, N, F)``: a matrix product for each.
+def squint_sum(job: Sum, frequencies_hz: np.ndarray, factor: np.ndarray | None) -> np.ndarray:
+    """Separable lengths with beam squint at any frequencies, shape ``(M, N, F)``: a matrix product for each.
 
     ``factor`` (P, F) multiplies the amplitudes.
     """
-    out = np.empty((*job.shape, len(frequencies_hz)), dtype=complex)
-    step = max(1, _BLOCK // max(1, len(job.tau)))
+    out = np.zeros((*job.shape, len(frequencies_hz)), dtype=complex)
+    if len(job.tau) == 0:
+        return out
+    step = max(1, _BLOCK // len(job.tau))
     for j, f in enumerate(frequencies_hz):
         weight = job.amplitude * _turn((f - job.carrier_hz) * job.tau)
         if factor is not None:
             weight = weight * factor[:, j]
-        right = (_transmit_phases(job, f) * weight).T
+        right = (job.sent(f) * weight).T
         for k in range(0, job.shape[0], step):
             m = slice(k, k + step)
-            out[m, :, j] = _receive_phases(job.lengths.place[m], job.lengths.target[0], f) @ right
+            out[m, :, j] = job.received(m, f) @ right
     return out
 
 
@@ -192,8 +229,8 @@ def gridded_sum(job: Sum, frequencies_hz: np.ndarray, device: Any = None) -> np.
     root = np.sqrt(_BETA**2 - (np.pi * TAPS * harmonic / cells) ** 2)
     correction = i0(_BETA) * root / (TAPS * np.sinh(root))
     setup = (job, amplitude, cell, cells, step_hz, middle_hz, _device.resolve(device))
-    own = job.squint or job.lengths.spherical
-    fill = _own_delays(*setup) if own else _common_delays_grid(*setup)
+    own = job.squint or not job.lengths.separable
+    fill = _own_delays(*setup) if own else _common_delays(*setup)
     rows, columns = job.shape
     out = np.empty((rows, columns, count), dtype=complex)
     each = columns * cells * (TAPS if own else 1)
@@ -209,7 +246,7 @@ Filler = Callable[[slice], np.ndarray]
 """Makes the grids of receiving elements ``m``, shape ``(m N, cells)``, complex."""
 
 
-def _common_delays_grid(
+def _common_delays(
     job: Sum,
     amplitude: np.ndarray,
     cell: np.ndarray,
@@ -218,14 +255,14 @@ def _common_delays_grid(
     middle_hz: float,
     where: Any,
 ) -> Filler:
-    """Plane waves without squint."""
+    """Separable lengths without squint."""
     start = np.ceil(cell - TAPS / 2)
     order = np.argsort(start, kind="stable")
     at = (start + TAPS // 2).astype(np.int64)[order]
     window = _window((start[order] - cell[order])[:, None] + np.arange(TAPS))
     first = np.searchsorted(at, np.arange(cells + 2)).astype(np.int32)
-    right = _transmit_phases(job, job.carrier_hz)[:, order] * amplitude[order]
-    arrival = job.lengths.target[0, order]
+    job = replace(job, lengths=job.lengths.taken(order))
+    right = job.sent(job.carrier_hz) * amplitude[order]
     shared = [
         wp.array(_pairs_of_reals(right), dtype=wp.vec2d, device=where),
         wp.array(window, dtype=taps_vector, device=where),
@@ -233,7 +270,7 @@ def _common_delays_grid(
     ]
 
     def fill(m: slice) -> np.ndarray:
-        left = _receive_phases(job.lengths.place[m], arrival, job.carrier_hz)
+        left = job.received(m, job.carrier_hz)
         block = wp.array(_pairs_of_reals(left), dtype=wp.vec2d, device=where)
         pairs = len(left) * len(right)
         real = wp.zeros((pairs, cells + TAPS), dtype=wp.float64, device=where)
@@ -257,14 +294,15 @@ def _own_delays(
     middle_hz: float,
     where: Any,
 ) -> Filler:
-    """Pairs with delays of their own: plane waves with squint, spherical waves."""
-    lengths = job.lengths
+    """Pairs with delays of their own: beam squint, lengths that are not separable."""
     number_hz = middle_hz if job.squint else job.carrier_hz
     per_m = abs(step_hz) * cells / SPEED_OF_LIGHT if job.squint else 0.0
     order = np.argsort(cell, kind="stable")  # neighbours in the grid follow each other
     cell, amplitude = cell[order], amplitude[order]
+    lengths = job.lengths.taken(order)
+    job = replace(job, lengths=lengths)
     # Cells that elements' places move a path by, at most: the grid reaches so far past its ends.
-    reach = np.linalg.norm(lengths.place, axis=1).max() + _sending_reach(lengths)
+    reach = np.linalg.norm(lengths.place, axis=1).max() + np.abs(lengths.extra).max() + _moved(lengths)
     margin = int(np.ceil(reach * per_m)) + 1
     width = cells + 2 * margin
     window = wp.array(_window_polynomials(), dtype=taps_vector, device=where)
@@ -281,63 +319,48 @@ def _own_delays(
         _device.launch(join_cells, pairs, [cells, shift, grid, real, imag], device=where)
         return _complex(real, imag)
 
-    if lengths.spherical:
+    if not lengths.separable:
+        far = np.linalg.norm(lengths.target, axis=2)
         shared = [
-            wp.array(np.ascontiguousarray(lengths.target[:, order]), dtype=wp.vec3d, device=where),
-            wp.array(np.ascontiguousarray(lengths.extra[:, order]), dtype=wp.float64, device=where),
-            wp.array(np.ascontiguousarray(lengths.scale[:, order]), dtype=wp.float64, device=where),
+            wp.array(np.ascontiguousarray(lengths.target), dtype=wp.vec3d, device=where),
+            wp.array(lengths.extra - far, dtype=wp.float64, device=where),
+            wp.array(lengths.scale * far, dtype=wp.float64, device=where),
             wp.array(_pairs_of_reals(amplitude), dtype=wp.vec2d, device=where),
             wp.array(cell + margin, dtype=wp.float64, device=where),
             wp.float64(number_hz / SPEED_OF_LIGHT),
             wp.float64(sign * per_m),
         ]
 
-        def fill_spherical(m: slice) -> np.ndarray:
+        def fill_pairs(m: slice) -> np.ndarray:
             place = wp.array(np.ascontiguousarray(lengths.place[m]), dtype=wp.vec3d, device=where)
-            return join(spread_spherical_delays, len(place), [place, *shared])
+            return join(spread_pair_delays, len(place), [place, *shared])
 
-        return fill_spherical
+        return fill_pairs
 
-    arrival = lengths.target[0, order]
-    right = _transmit_phases(job, number_hz)[:, order] * amplitude
-    moved = cell + margin + sign * per_m * lengths.extra[:, order]
     sent = [
-        wp.array(_pairs_of_reals(right), dtype=wp.vec2d, device=where),
-        wp.array(moved, dtype=wp.float64, device=where),
+        wp.array(_pairs_of_reals(job.sent(number_hz) * amplitude), dtype=wp.vec2d, device=where),
+        wp.array(cell + margin + sign * per_m * lengths.extra, dtype=wp.float64, device=where),
     ]
 
     def fill(m: slice) -> np.ndarray:
-        along = lengths.place[m] @ arrival.T
-        left = wp.array(
-            _pairs_of_reals(_turn(-number_hz / SPEED_OF_LIGHT * along)), dtype=wp.vec2d, device=where
-        )
-        nearer = wp.array(-sign * per_m * along, dtype=wp.float64, device=where)
-        return join(spread_plane_delays, len(along), [left, nearer, *sent])
+        added, ratio = lengths.received(m)
+        factors = ratio * _turn(number_hz / SPEED_OF_LIGHT * added)
+        left = wp.array(_pairs_of_reals(factors), dtype=wp.vec2d, device=where)
+        later = wp.array(sign * per_m * added, dtype=wp.float64, device=where)
+        return join(spread_separable_delays, len(added), [left, later, *sent])
 
     return fill
 
 
-def _sending_reach(lengths: PairLengths) -> float:
-    """Most that the transmitting elements' places change a length by [m], receiving elements at their centre."""
-    if lengths.spherical:
-        return float(np.abs(lengths.extra + np.linalg.norm(lengths.target, axis=2)).max())
-    return float(np.abs(lengths.extra).max())
+def _moved(lengths: PairLengths) -> float:
+    """Most that sources of transmitting elements of their own differ in distance [m]; see ``extra`` for the rest."""
+    return 0.0 if lengths.separable else float(np.ptp(np.linalg.norm(lengths.target, axis=2), axis=0).max())
 
 
 def _complex(real: wp.array, imag: wp.array) -> np.ndarray:
     both = np.empty(real.shape, dtype=complex)
     both.real, both.imag = real.numpy(), imag.numpy()
     return both
-
-
-def _receive_phases(place: np.ndarray, arrival: np.ndarray, frequency_hz: float) -> np.ndarray:
-    """Phases of plane waves at receiving elements, shape ``(M, P)``."""
-    return _turn(-frequency_hz / SPEED_OF_LIGHT * (place @ arrival.T))
-
-
-def _transmit_phases(job: Sum, frequency_hz: float) -> np.ndarray:
-    """Phases of plane waves from transmitting elements, shape ``(N, P)``."""
-    return _turn(frequency_hz / SPEED_OF_LIGHT * job.lengths.extra)
 
 
 def _turn(turns: np.ndarray) -> np.ndarray:
