@@ -37,7 +37,7 @@ SAME_M = 5e-3  # paths of the two tracers are one if lengths and unit directions
 SHORT_LEG_M = 0.2
 """Sionna's interaction points are right to 1e-4 m (float32): a leg between two of them that is shorter than this turns
 by half a milliradian, which moves reflection coefficients. Such paths are counted apart."""
-SIDES = (4, 8, 16, 32, 64)
+SIDES = (4, 8, 16, 32, 64, 128)
 DISTANCES_M = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 ENTRIES = 400
 """Entries of the large response that are summed densely to check it: half at random, half among the largest."""

@@ -35,11 +35,16 @@ from warprrf import device as _device
 from warprrf.rf.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
 from warprrf.rf.delay_sums import (
     LEAST_FREQUENCIES,
-    PairLengths,
     Sum,
     dense_sum,
     gridded_sum,
     squint_sum,
+)
+from warprrf.rf.element_lengths import (
+    PairLengths,
+    plane_lengths,
+    scattered_lengths,
+    spherical_lengths,
 )
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.path_set import Paths, carrier_phase
@@ -273,12 +278,12 @@ class _Link:
         places = tx.positions(self.wavelength_m), rx.positions(self.wavelength_m)
         self.groups: list[tuple[np.ndarray, PairLengths]] = []
         if wave == "plane":
-            self.groups.append((np.arange(len(self.tau)), _plane_lengths(chosen, *places)))
+            self.groups.append((np.arange(len(self.tau)), plane_lengths(chosen, *places)))
         else:
             scattered = chosen.kind == "diffuse"
             for index, lengths in (
-                (np.flatnonzero(~scattered), _spherical_lengths),
-                (np.flatnonzero(scattered), _scattered_lengths),
+                (np.flatnonzero(~scattered), spherical_lengths),
+                (np.flatnonzero(scattered), scattered_lengths),
             ):
                 if len(index):
                     self.groups.append((index, lengths(chosen.select(index), *places)))
@@ -365,73 +370,6 @@ def _amplitudes(paths: Paths, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
         )
     received, sent = rx.field(paths.arrival), tx.field(paths.departure)
     return np.einsum("apx,pxy,bpy->abp", received, paths.jones, sent)
-
-
-def _plane_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
-    return PairLengths(
-        place=receiving,
-        target=np.ascontiguousarray(paths.arrival)[None],
-        extra=-(sending @ paths.departure.T),
-        scale=np.ones((1, 1)),
-        spherical=False,
-    )
-
-
-def _spherical_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
-    """Line of sight and mirrors: distances from the transmitting elements' images."""
-    tx, rx, bounces = _ends(paths)
-    each, some = np.arange(len(bounces)), bounces > 0
-    last = np.where(some[:, None], paths.vertices[each, np.maximum(bounces - 1, 0)], tx)
-    toward = (last - rx) / np.linalg.norm(last - rx, axis=1, keepdims=True)
-    points = np.concatenate([np.broadcast_to(tx, (len(each), 1, 3)), paths.vertices], axis=1)
-    step = np.linalg.norm(np.diff(points, axis=1), axis=2)
-    length = np.where(np.isfinite(step), step, 0.0).sum(axis=1) + np.linalg.norm(rx - last, axis=1)
-    # The image lies ``length`` away along the arrival; its array is mirrored by every bounce.
-    mirrored = np.einsum("pij,nj->npi", _mirrorings(tx, rx, paths.vertices, bounces), sending)
-    target = length[:, None] * toward + mirrored
-    far = np.linalg.norm(target, axis=2)
-    return PairLengths(receiving, target, extra=far - length, scale=length / far, spherical=True)
-
-
-def _scattered_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
-    """Diffuse paths: distances to the first interaction point and from the last."""
-    tx, rx, bounces = _ends(paths)
-    first = paths.vertices[:, 0] - tx
-    last = paths.vertices[np.arange(len(bounces)), bounces - 1] - rx
-    near = np.linalg.norm(first, axis=1)
-    each = np.linalg.norm(first - sending[:, None], axis=2)
-    return PairLengths(receiving, last[None], extra=each - near, scale=near / each, spherical=True)
-
-
-def _ends(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transmitter, receiver and numbers of interactions, which spherical waves need."""
-    if paths.transmitter is None or paths.receiver is None:
-        raise ValueError("paths: got ones without transmitter and receiver, which spherical waves need")
-    bounces = np.isfinite(paths.vertices[..., 0]).sum(axis=1)
-    if (bounces[paths.kind != "los"] == 0).any():
-        raise ValueError(
-            "paths: got mirror or diffuse paths without interaction points, which spherical waves need"
-        )
-    return paths.transmitter, paths.receiver, bounces
-
-
-def _mirrorings(tx: np.ndarray, rx: np.ndarray, vertices: np.ndarray, bounces: np.ndarray) -> np.ndarray:
-    """What the bounces do to directions, shape ``(P, 3, 3)``: a product of reflections."""
-    count, depth = vertices.shape[:2]
-    each = np.arange(count)
-    points = np.concatenate([np.broadcast_to(tx, (count, 1, 3)), vertices, np.zeros((count, 1, 3))], axis=1)
-    points[each, bounces + 1] = rx
-    legs = np.diff(points, axis=1)
-    legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
-    turned = np.broadcast_to(np.eye(3), (count, 3, 3))
-    for k in range(depth):
-        normal = legs[:, k + 1] - legs[:, k]
-        there = (k < bounces) & (np.linalg.norm(np.nan_to_num(normal), axis=1) > 1e-9)
-        unit = np.where(there[:, None], normal, 1.0)
-        unit = unit / np.linalg.norm(unit, axis=1, keepdims=True)
-        mirror = np.eye(3) - 2.0 * np.where(there[:, None, None], unit[:, :, None] * unit[:, None, :], 0.0)
-        turned = mirror @ turned
-    return turned
 
 
 def _each_receiver(

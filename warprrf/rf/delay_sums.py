@@ -36,6 +36,7 @@ from warprrf.kernels.delays import (
     spread_separable_delays,
     taps_vector,
 )
+from warprrf.rf.element_lengths import PairLengths
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 
 OVERSAMPLING = 2
@@ -46,61 +47,6 @@ _BETA = np.pi * np.sqrt(
     (TAPS / OVERSAMPLING) ** 2 * (OVERSAMPLING - 0.5) ** 2 - 0.8
 )  # Beatty et al., eq. (5)
 _BLOCK = 8_000_000  # complex numbers that an intermediate array may hold, about
-
-
-@dataclass(frozen=True)
-class PairLengths:
-    """Lengths that the places of elements add to paths, and what they make of amplitudes.
-
-    Attributes:
-        place: Receiving elements about their centre [m], shape ``(M, 3)``.
-        target: Plane waves: unit directions of arrival, shape ``(1, P, 3)``. Spherical waves: the source that the
-            receiving elements see, from their centre [m], shape ``(1, P, 3)``, or ``(N, P, 3)`` if every transmitting
-            element is a source of its own.
-        extra: Length to add for transmitting elements [m], shape ``(N, P)``.
-        scale: Factor of amplitudes for transmitting elements, shape ``(N, P)``, or ``(1, 1)`` for one.
-        spherical: Whether waves are.
-    """
-
-    place: np.ndarray
-    target: np.ndarray
-    extra: np.ndarray
-    scale: np.ndarray
-    spherical: bool
-
-    @property
-    def separable(self) -> bool:
-        """Whether a length is that of a receiving element plus that of a transmitting one."""
-        return len(self.target) == 1
-
-    @property
-    def alone(self) -> bool:
-        """Whether there is one element at either end, at the centre."""
-        return len(self.place) == 1 and len(self.extra) == 1
-
-    def received(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Of separable ones: length [m] that receiving elements ``m`` add, ``(m, P)``, and factor of amplitudes."""
-        if not self.spherical:
-            return -(self.place[m] @ self.target[0].T), np.ones((1, 1))
-        source = self.target[0]
-        reach = np.linalg.norm(source - self.place[m][:, None], axis=-1)
-        far = np.linalg.norm(source, axis=-1)
-        return reach - far, far / reach
-
-    def longer(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Added length [m] and factor of amplitudes for receiving elements ``m``, each ``(m, N, P)``."""
-        if self.separable:
-            added, ratio = self.received(m)
-            return added[:, None] + self.extra, ratio[:, None] * self.scale
-        source = self.target
-        reach = np.linalg.norm(source - self.place[m][:, None, None], axis=-1)
-        far = np.linalg.norm(source, axis=-1)
-        return self.extra + (reach - far), self.scale * (far / reach)
-
-    def taken(self, order: np.ndarray) -> PairLengths:
-        """Those of paths ``order``."""
-        scale = self.scale if self.scale.shape[1] == 1 else self.scale[:, order]
-        return replace(self, target=self.target[:, order], extra=self.extra[:, order], scale=scale)
 
 
 @dataclass(frozen=True)
@@ -302,7 +248,7 @@ def _own_delays(
     lengths = job.lengths.taken(order)
     job = replace(job, lengths=lengths)
     # Cells that elements' places move a path by, at most: the grid reaches so far past its ends.
-    reach = np.linalg.norm(lengths.place, axis=1).max() + np.abs(lengths.extra).max() + _moved(lengths)
+    reach = np.linalg.norm(lengths.place, axis=1).max() + np.abs(lengths.extra).max()
     margin = int(np.ceil(reach * per_m)) + 1
     width = cells + 2 * margin
     window = wp.array(_window_polynomials(), dtype=taps_vector, device=where)
@@ -350,11 +296,6 @@ def _own_delays(
         return join(spread_separable_delays, len(added), [left, later, *sent])
 
     return fill
-
-
-def _moved(lengths: PairLengths) -> float:
-    """Most that sources of transmitting elements of their own differ in distance [m]; see ``extra`` for the rest."""
-    return 0.0 if lengths.separable else float(np.ptp(np.linalg.norm(lengths.target, axis=2), axis=0).max())
 
 
 def _complex(real: wp.array, imag: wp.array) -> np.ndarray:
