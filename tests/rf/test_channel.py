@@ -13,6 +13,7 @@ from path_makers import CARRIER, random_paths  # noqa: E402
 from radio_scenes import METAL, RadioScene, SlabMaterial  # noqa: E402
 
 from warprrf.geometry.mesh import Mesh  # noqa: E402
+from warprrf.rf import delay_sums  # noqa: E402
 from warprrf.rf.absorption import Air, gas_attenuation_db_per_m  # noqa: E402
 from warprrf.rf.arrays import PlanarArray  # noqa: E402
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, slab_reflection  # noqa: E402
@@ -349,3 +350,25 @@ def test_traced_paths_take_gas():
     loss = gas_attenuation_db_per_m(F) * dry.length_m
     np.testing.assert_allclose(10 * np.log10(dry.power / wet.power), loss, rtol=1e-9)
     np.testing.assert_allclose(np.abs(wet.jones / dry.jones)[0, 0, 0, 0], 10 ** (-loss[0, 0] / 20), rtol=1e-9)
+
+
+@pytest.mark.parametrize("wave", ["plane", "spherical"])
+@pytest.mark.parametrize("squint", [False, True])
+@pytest.mark.parametrize("method", ["dense", "grid"])
+def test_small_blocks_change_nothing(monkeypatch, wave, squint, method):
+    floor = Mesh([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]])
+    p = trace_paths(floor, transmitter=[0, 0, 2], receivers=[3.0, 1, 1], frequency_hz=F)
+    points = np.random.default_rng(0).uniform(-1, 1, (7, 1, 3)) * [4, 4, 0]
+    many = Paths.from_points(p.transmitter, p.receiver, points, np.full(7, 1e-5), np.full(7, "diffuse"), F)
+    p = Paths.concatenate([p, many])
+    f = F + np.linspace(-1e9, 1e9, 20)
+    ask = {"tx_array": PlanarArray(3, 2), "rx_array": PlanarArray(2, 5), "diffuse": "given", "wave": wave}
+    whole = p.cfr(f, squint=squint, method=method, **ask)
+    taps = p.taps(1e9, 0, 20, squint=squint, **ask)
+    monkeypatch.setattr(delay_sums, "_BLOCK", 10)
+    np.testing.assert_allclose(
+        p.cfr(f, squint=squint, method=method, **ask), whole, atol=1e-12 * np.abs(whole).max()
+    )
+    np.testing.assert_allclose(
+        p.taps(1e9, 0, 20, squint=squint, **ask), taps, atol=1e-12 * np.abs(taps).max()
+    )
