@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Air": "rf.absorption",
     "Blending": "geometry.render",
     "BlendWeights": "geometry.render",
     "Camera": "geometry.camera",
@@ -27,6 +28,7 @@ _HOMES = {
     "Material": "rf.materials",
     "Mesh": "geometry.mesh",
     "Paths": "rf.paths",
+    "PlanarArray": "rf.arrays",
     "RadioField": "rf.field",
     "Rasterizer": "geometry.render",
     "Relevance": "rf.relevance",
@@ -34,17 +36,22 @@ _HOMES = {
     "Scene": "rf.scene",
     "Spectrum": "rf.spectrum",
     "SpectrumDataset": "rf.dataset",
+    "THZ_CHANNELS": "rf.thz_channels",
     "blend_weights": "geometry.render",
     "evaluate": "rf.metrics",
     "fit_reflections": "rf.reflections",
     "gas_attenuation_db_per_m": "rf.absorption",
     "load_newrf": "rf.newrf",
     "load_sionna_scene": "rf.sionna_engine",
+    "orientation_towards": "rf.arrays",
+    "plane_wave_error": "rf.arrays",
     "reconstruct": "geometry.reconstruction",
     "relevance": "rf.relevance",
     "render": "geometry.render",
     "simulate": "rf.simulate",
+    "thz_channel": "rf.thz_channels",
     "trace_paths": "rf.paths",
+    "write_deepmimo": "rf.deepmimo",
     "write_twin": "rf.twin",
 }
 
@@ -62,8 +69,13 @@ if TYPE_CHECKING:
     from warprrf.geometry.render import Rasterizer as Rasterizer
     from warprrf.geometry.render import blend_weights as blend_weights
     from warprrf.geometry.render import render as render
+    from warprrf.rf.absorption import Air as Air
     from warprrf.rf.absorption import gas_attenuation_db_per_m as gas_attenuation_db_per_m
+    from warprrf.rf.arrays import PlanarArray as PlanarArray
+    from warprrf.rf.arrays import orientation_towards as orientation_towards
+    from warprrf.rf.arrays import plane_wave_error as plane_wave_error
     from warprrf.rf.dataset import SpectrumDataset as SpectrumDataset
+    from warprrf.rf.deepmimo import write_deepmimo as write_deepmimo
     from warprrf.rf.field import RadioField as RadioField
     from warprrf.rf.materials import Material as Material
     from warprrf.rf.metrics import evaluate as evaluate
@@ -77,6 +89,8 @@ if TYPE_CHECKING:
     from warprrf.rf.simulate import simulate as simulate
     from warprrf.rf.sionna_engine import load_sionna_scene as load_sionna_scene
     from warprrf.rf.spectrum import Spectrum as Spectrum
+    from warprrf.rf.thz_channels import THZ_CHANNELS as THZ_CHANNELS
+    from warprrf.rf.thz_channels import thz_channel as thz_channel
     from warprrf.rf.twin import write_twin as write_twin
 
 

@@ -84,6 +84,7 @@ HELP_BENCH = """\
 Prints a table and writes it as JSON and Markdown.
 
 examples:
+  warprrf bench channel
   warprrf bench relevance
   warprrf bench newrf
   warprrf bench newrf --data external/newrf --out runs/newrf

@@ -6,6 +6,7 @@ Doppler broadening, and the dry continuum. No line data is fetched: both tables 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,48 @@ LOW_HZ, HIGH_HZ = 1e9, 1000e9
 TEMPERATURE_K = 288.15  # ITU-R P.835, mean annual global reference atmosphere at sea level
 PRESSURE_HPA = 1013.25
 WATER_VAPOUR_G_M3 = 7.5
+
+
+@dataclass(frozen=True)
+class Air:
+    """A state of the air; the defaults are the standard atmosphere at sea level (ITU-R P.835).
+
+    Attributes:
+        temperature_k: temperature [K].
+        pressure_hpa: pressure of the dry air [hPa].
+        water_vapour_g_m3: density of water vapour [g/m^3].
+    """
+
+    temperature_k: float = TEMPERATURE_K
+    pressure_hpa: float = PRESSURE_HPA
+    water_vapour_g_m3: float = WATER_VAPOUR_G_M3
+
+    def attenuation_db_per_m(self, frequency_hz: Any) -> Any:
+        """Specific attenuation [dB/m], shape as ``frequency_hz``; see :func:`gas_attenuation_db_per_m`."""
+        return gas_attenuation_db_per_m(
+            frequency_hz,
+            temperature_k=self.temperature_k,
+            pressure_hpa=self.pressure_hpa,
+            water_vapour_g_m3=self.water_vapour_g_m3,
+        )
+
+
+def air_of(gas: Any) -> Air | None:
+    """The air to reckon with: None for False, the standard atmosphere for True, :class:`Air` as it is.
+
+    A :class:`~warprrf.rf.relevance.Relevance` decides by whether it kept the effect "gas".
+
+    Raises:
+        TypeError: for anything else.
+    """
+    if gas is None or isinstance(gas, Air):
+        return gas
+    if isinstance(gas, bool | np.bool_):
+        return Air() if gas else None
+    kept = getattr(gas, "kept", None)
+    if isinstance(kept, tuple):
+        return Air() if "gas" in kept else None
+    raise TypeError(f"gas: got {type(gas).__name__}, expected True, False, an Air or a Relevance")
 
 
 def gas_attenuation_db_per_m(

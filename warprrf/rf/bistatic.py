@@ -595,7 +595,7 @@ class BistaticField(RadioField):
             self.frequency_hz,
         )
         order = np.argsort(-np.abs(found.gain), kind="stable")[:max_paths]
-        return Paths(**{name: getattr(found, name)[order] for name in Paths.__dataclass_fields__})
+        return found.select(order)
 
     def _anything(self, sight: Sight, parts: Composed) -> np.ndarray:
         """A trace of power for every ray that meets something, so that a pixel lit by further bounces has a point."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def paths_of(view: View, *, beam_sigma_rad: float, frequency_hz: float, max_path
         )
     everything = Paths.concatenate(parts)
     order = np.argsort(-np.abs(everything.gain), kind="stable")[:max_paths]
-    return Paths(**{name: getattr(everything, name)[order] for name in Paths.__dataclass_fields__})
+    return replace(everything.select(order), transmitter=view.transmitter, receiver=view.receiver)
 
 
 def near_line_of_sight(
@@ -110,4 +110,5 @@ def _single(
         vertices=points[:, None, :],
         kind=np.full(len(power), kind, dtype="<U7"),
         valid=np.ones(len(power), dtype=bool),
+        frequency_hz=float(frequency_hz),
     )

@@ -1,4 +1,4 @@
-"""Propagation paths of one receiver or several, and the exact ones among them: line of sight and mirror reflections.
+"""The exact paths among all: line of sight and mirror reflections.
 
 Mirror reflections follow the image method on planar patches (adjacent coplanar faces of one material), in float64:
 lengths are exact to rounding. Angles: arrival points from the receiver to the last interaction, departure from the
@@ -7,7 +7,6 @@ transmitter to the first.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, SurfaceTable, as_mesh, slab_reflection, surface_table
-from warprrf.rf.spectrum import angles_from_directions, directions_from_angles
+from warprrf.rf.path_set import Paths, transverse_basis
 
 # Faces belong to one patch if they share an edge, their normals agree to 1.4e-3 rad and their corners lie this close to
 # the common plane [m]: float32 STL files need it.
@@ -24,110 +23,6 @@ _COPLANAR_COSINE = 1.0 - 1e-6
 _COPLANAR_M = 1e-5
 # A mirror point may lie this far outside its patch, in barycentric units: faces of a patch leave no seam between them.
 _EDGE_TOLERANCE = 1e-9
-
-
-@dataclass(frozen=True)
-class Paths:
-    """Paths of one receiver, arrays ``(L,)``, or of several, arrays ``(R, L)`` padded where ``valid`` is False.
-
-    Attributes:
-        gain: Complex gain between isotropic antennas, exp(-j 2 pi f tau) included; |gain|^2 is path gain averaged over
-            vertical and horizontal transmit polarisation and summed over both receive polarisations. 0 where padded.
-        tau: Delay [s]; NaN where padded, as the angles are.
-        theta_r: Zenith of arrival [rad].
-        phi_r: Azimuth of arrival [rad].
-        theta_t: Zenith of departure [rad].
-        phi_t: Azimuth of departure [rad].
-        vertices: Interaction points from the transmitter on [m], shape ``(..., depth, 3)``; NaN past the last.
-        kind: "los", "mirror" or "diffuse"; "" where padded.
-        valid: Whether there is a path.
-    """
-
-    gain: np.ndarray
-    tau: np.ndarray
-    theta_r: np.ndarray
-    phi_r: np.ndarray
-    theta_t: np.ndarray
-    phi_t: np.ndarray
-    vertices: np.ndarray
-    kind: np.ndarray
-    valid: np.ndarray
-
-    @property
-    def power(self) -> np.ndarray:
-        """Path gain |gain|^2 [linear], shape as ``gain``; 0 where padded."""
-        return np.abs(self.gain) ** 2
-
-    @property
-    def length_m(self) -> np.ndarray:
-        """Unfolded length [m]; NaN where padded."""
-        return self.tau * SPEED_OF_LIGHT
-
-    @property
-    def arrival(self) -> np.ndarray:
-        """Unit vectors from the receiver to the last interaction, shape ``(..., 3)``."""
-        return directions_from_angles(self.theta_r, self.phi_r)
-
-    @property
-    def departure(self) -> np.ndarray:
-        """Unit vectors from the transmitter to the first interaction, shape ``(..., 3)``."""
-        return directions_from_angles(self.theta_t, self.phi_t)
-
-    @staticmethod
-    def from_points(
-        transmitter: np.ndarray,
-        receiver: np.ndarray,
-        vertices: np.ndarray,
-        amplitude: np.ndarray,
-        kind: np.ndarray,
-        frequency_hz: float,
-    ) -> Paths:
-        """Paths of one receiver from their interaction points ``(L, depth, 3)``, NaN past the last.
-
-        Args:
-            amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
-        """
-        count, depth = vertices.shape[:2]
-        bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
-        points = np.concatenate(
-            [np.broadcast_to(transmitter, (count, 1, 3)), vertices, np.zeros((count, 1, 3))], 1
-        )
-        each = np.arange(count)
-        points[each, bounces + 1] = receiver
-        steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
-        tau = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1) / SPEED_OF_LIGHT
-        theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
-        theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
-        # Whole turns are dropped before the exponential: f tau reaches 1e4 and more.
-        gain = amplitude * np.exp(-2j * np.pi * np.mod(frequency_hz * tau, 1.0))
-        return Paths(gain, tau, theta_r, phi_r, theta_t, phi_t, vertices, kind, np.ones(count, dtype=bool))
-
-    @staticmethod
-    def concatenate(parts: Sequence[Paths]) -> Paths:
-        """All paths of one receiver."""
-        depth = max(p.vertices.shape[1] for p in parts)
-        names = ("gain", "tau", "theta_r", "phi_r", "theta_t", "phi_t", "kind", "valid")
-        joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-        return Paths(vertices=np.concatenate([_deepen(p.vertices, depth) for p in parts]), **joined)
-
-    @staticmethod
-    def stack(parts: Sequence[Paths]) -> Paths:
-        """Paths of several receivers, padded to the longest list: arrays ``(R, L)``."""
-        length = max((len(p.gain) for p in parts), default=0)
-        depth = max((p.vertices.shape[1] for p in parts), default=1)
-
-        def pad(array: np.ndarray, fill: Any) -> np.ndarray:
-            widths = [(0, length - len(array))] + [(0, 0)] * (array.ndim - 1)
-            return np.pad(array, widths, constant_values=fill)
-
-        fills = {"gain": 0.0, "kind": "", "valid": False}
-        names = ("gain", "tau", "theta_r", "phi_r", "theta_t", "phi_t", "kind", "valid")
-        stacked = {n: np.stack([pad(getattr(p, n), fills.get(n, np.nan)) for p in parts]) for n in names}
-        return Paths(vertices=np.stack([pad(_deepen(p.vertices, depth), np.nan) for p in parts]), **stacked)
-
-
-def _deepen(vertices: np.ndarray, depth: int) -> np.ndarray:
-    return np.pad(vertices, [(0, 0), (0, depth - vertices.shape[1]), (0, 0)], constant_values=np.nan)
 
 
 @dataclass(frozen=True)
@@ -227,6 +122,7 @@ def trace_paths(
     receivers: Any,
     frequency_hz: float,
     mirror_order: int = 1,
+    gas: Any = False,
     device: Any = None,
 ) -> Paths:
     """Line of sight and mirror reflections by the image method, in float64.
@@ -234,7 +130,8 @@ def trace_paths(
     A bare mesh reflects perfectly and without a sign change. A scene's surfaces reflect as ITU-R P.2040 slabs, less
     sqrt(1 - S^2) for what scatters. |gain|^2 is then the power averaged over both transmit and summed over both receive
     polarisations (half the squared Frobenius norm of the Jones matrix); its phase is -2 pi f tau plus the phase of
-    the TE coefficient of each reflection (-1 for a conductor), because one number cannot carry both polarisations.
+    the TE coefficient of each reflection (-1 for a conductor), because one number cannot carry both polarisations;
+    ``jones`` carries them. A bare mesh says nothing of polarisation: its paths have no ``jones``.
 
     Args:
         mesh_or_scene: A :class:`Mesh`, or a scene with ``mesh``, ``face_material`` and ``materials``.
@@ -242,6 +139,7 @@ def trace_paths(
         receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
         frequency_hz: Carrier frequency [Hz].
         mirror_order: Most reflections on one path: 0, 1 or 2. Order 2 tries all pairs of patches.
+        gas: Absorption of the air in every gain: see :meth:`Paths.with_gas`.
 
     Returns:
         Arrays ``(L,)`` for one receiver, ``(R, L)`` for several; line of sight first, then by order, then by delay.
@@ -254,8 +152,8 @@ def trace_paths(
     if points.ndim not in (1, 2) or points.shape[-1] != 3:
         raise ValueError(f"receivers: got shape {points.shape}, expected (3,) or (R, 3)")
     if points.ndim == 1:
-        return tracer.trace(points, mirror_order)
-    return Paths.stack([tracer.trace(p, mirror_order) for p in points])
+        return tracer.trace(points, mirror_order).with_gas(gas)
+    return Paths.stack([tracer.trace(p, mirror_order) for p in points]).with_gas(gas)
 
 
 class MirrorTracer:
@@ -308,13 +206,27 @@ class MirrorTracer:
         seen = bool(self.mesh.visible(self.transmitter, point, device=self.device)[0])
         amplitude = np.full(int(seen), self.wavelength_m / (4.0 * np.pi * distance), dtype=complex)
         nothing = np.full((int(seen), depth, 3), np.nan)
-        return self._paths(point, nothing, amplitude, "los")
+        jones = None
+        if self.table is not None:
+            way = point - self.transmitter
+            across = transverse_basis(-way) @ transverse_basis(way).T
+            jones = amplitude[:, None, None] * across
+        return self._paths(point, nothing, amplitude, "los", jones)
 
-    def _paths(self, point: np.ndarray, vertices: np.ndarray, amplitude: np.ndarray, kind: str) -> Paths:
+    def _paths(
+        self,
+        point: np.ndarray,
+        vertices: np.ndarray,
+        amplitude: np.ndarray,
+        kind: str,
+        jones: np.ndarray | None,
+    ) -> Paths:
         kinds = np.full(len(vertices), kind, dtype="<U7")
-        paths = Paths.from_points(self.transmitter, point, vertices, amplitude, kinds, self.frequency_hz)
+        paths = Paths.from_points(
+            self.transmitter, point, vertices, amplitude, kinds, self.frequency_hz, jones
+        )
         by_delay = np.argsort(paths.tau, kind="stable")
-        return Paths(**{name: getattr(paths, name)[by_delay] for name in Paths.__dataclass_fields__})
+        return paths.select(by_delay)
 
     def _mirror_once(self, point: np.ndarray) -> Paths:
         p = self.patches
@@ -328,10 +240,7 @@ class MirrorTracer:
         )
         found, hit = found[free], hit[free]
         length = np.linalg.norm(point - self._image[found], axis=1)
-        amplitude = (
-            self.wavelength_m / (4.0 * np.pi * length) * self._reflect(found[:, None], hit[:, None], point)
-        )
-        return self._paths(point, hit[:, None], amplitude, "mirror")
+        return self._paths(point, hit[:, None], *self._reflect(found[:, None], hit[:, None], point, length))
 
     def _mirror_twice(self, point: np.ndarray) -> Paths:
         p, none = self.patches, np.zeros((0, 2, 3))
@@ -356,7 +265,7 @@ class MirrorTracer:
             seconds.append(np.full(int(keep.sum()), second))
             hits.append(np.stack([start[keep], last[keep]], axis=1))
         if not hits:
-            return self._paths(point, none, np.zeros(0, complex), "mirror")
+            return self._paths(point, none, *self._reflect(np.zeros((0, 2), int), none, point, np.zeros(0)))
         patch = np.column_stack([np.concatenate(firsts), np.concatenate(seconds)])
         hit = np.concatenate([none, *hits])
         ends = np.broadcast_to(self.transmitter, (len(hit), 3)), np.broadcast_to(point, (len(hit), 3))
@@ -367,8 +276,7 @@ class MirrorTracer:
             + np.linalg.norm(hit[:, 1] - hit[:, 0], axis=1)
             + np.linalg.norm(point - hit[:, 1], axis=1)
         )
-        amplitude = self.wavelength_m / (4.0 * np.pi * length) * self._reflect(patch, hit, point)
-        return self._paths(point, hit, amplitude, "mirror")
+        return self._paths(point, hit, *self._reflect(patch, hit, point, length))
 
     def _free(self, chain: np.ndarray) -> np.ndarray:
         """Whether every leg of the polylines ``(legs + 1, N, 3)`` is unobstructed, shape ``(N,)``."""
@@ -398,13 +306,19 @@ class MirrorTracer:
         inside[near] = np.bincount(which, weights=met, minlength=len(near)) > 0
         return inside
 
-    def _reflect(self, patch: np.ndarray, hit: np.ndarray, point: np.ndarray) -> np.ndarray:
-        """Complex amplitude ``(N,)`` of the reflections at ``patch`` (N, bounces), met at ``hit`` (N, bounces, 3).
+    def _reflect(
+        self, patch: np.ndarray, hit: np.ndarray, point: np.ndarray, length: np.ndarray
+    ) -> tuple[np.ndarray, str, np.ndarray | None]:
+        """Amplitudes of paths of ``length`` (N,) reflected at ``patch`` (N, bounces), met at ``hit`` (N, bounces, 3).
 
-        Modulus: root of half the squared Frobenius norm of the Jones matrix; phase: that of the TE coefficients.
+        Returns:
+            Complex amplitude ``(N,)`` (modulus: root of half the squared Frobenius norm of the Jones matrix; phase:
+            that of the TE coefficients), the kind "mirror", and the Jones matrix ``(N, 2, 2)`` along zenith and
+            azimuth unit vectors of departure and arrival; None for a bare mesh.
         """
+        friis = self.wavelength_m / (4.0 * np.pi * length)
         if self.table is None:
-            return np.ones(len(patch), dtype=complex)
+            return friis.astype(complex), "mirror", None
         chain = np.concatenate(
             [
                 np.broadcast_to(self.transmitter, (len(hit), 1, 3)),
@@ -417,7 +331,7 @@ class MirrorTracer:
         legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
         jones = np.broadcast_to(np.eye(2, dtype=complex), (len(hit), 2, 2))
         phase = np.ones(len(hit), dtype=complex)
-        basis: np.ndarray | None = None
+        first = basis = np.zeros((len(hit), 2, 3))
         for k in range(hit.shape[1]):
             index = patch[:, k]
             material, normal = self.patches.material[index], self.patches.normal[index]
@@ -429,12 +343,17 @@ class MirrorTracer:
             smooth = np.sqrt(1.0 - self.table.scattering[material] ** 2)
             across = _perpendicular(incoming, normal)
             into = np.stack([across, np.cross(across, incoming)], axis=1)  # TE, TM before
-            if basis is not None:
+            if k == 0:
+                first = into
+            else:
                 jones = np.einsum("nij,nkj->nik", into, basis) @ jones
             jones = (smooth[:, None] * np.stack([te, tm], axis=1))[:, :, None] * jones
             basis = np.stack([across, np.cross(across, outgoing)], axis=1)
             phase = phase * np.where(te == 0, 1.0, te / np.where(te == 0, 1.0, np.abs(te)))
-        return np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2))) * phase
+        out = np.einsum("nij,nkj->nik", transverse_basis(-legs[:, -1]), basis)
+        back = np.einsum("nij,nkj->nik", first, transverse_basis(legs[:, 0]))
+        size = np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2)))
+        return friis * size * phase, "mirror", friis[:, None, None] * (out @ jones @ back)
 
 
 def check_frequency(frequency_hz: Any) -> float:
