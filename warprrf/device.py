@@ -66,27 +66,33 @@ def launch(
     device: Any = None,
     *,
     pieces: int | None = None,
+    cuts: Sequence[int] | None = None,
     adjoint: bool = False,
 ) -> None:
     """Launch ``kernel`` over ``dim`` indices; on a CPU the range is split over all cores.
 
     The kernel's first argument is ``offset: int`` and is supplied here; ``inputs`` are the others, in order.
-    ``pieces`` fixes into how many parts a CPU launch is cut (default: 4 a thread), for kernels that own one buffer a
-    piece. ``adjoint`` runs the kernel's adjoint on the arrays' ``.grad``.
+    ``pieces`` fixes into how many equal parts a CPU launch is cut (default: 4 a thread) and ``cuts`` where, from 0 to
+    ``dim``, for kernels that own one buffer a piece. ``adjoint`` runs the kernel's adjoint on the arrays' ``.grad``.
     """
     if dim <= 0:
         return
     device = resolve(device)
     if device.is_cuda:
-        count = 1
-    elif pieces is not None:
-        count = min(pieces, dim)
+        bounds: Sequence[int] = [0, dim]
+    elif cuts is not None:
+        bounds = cuts
     else:
-        count = min(PIECES_PER_THREAD * threads(), max(1, dim // MIN_SPLIT))
+        count = min(PIECES_PER_THREAD * threads() if pieces is None else pieces, dim)
+        if pieces is None:
+            count = min(count, max(1, dim // MIN_SPLIT))
+        bounds = [dim * k // count for k in range(count + 1)]
+    count = len(bounds) - 1
     kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
-    bounds = [dim * k // count for k in range(count + 1)]
 
     def piece(k: int) -> None:
+        if bounds[k + 1] <= bounds[k]:
+            return
         arguments = [bounds[k], *inputs]
         extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
         wp.launch(

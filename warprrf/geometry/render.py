@@ -160,10 +160,11 @@ def blend_weights(
     total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
     launch(
         raster.kernels.strongest,
-        cam.width * cam.height,
-        [view.rows, view.ids, view.starts, view.view, raster.rules, index, weight, range_, total],
+        len(view.block_starts) - 1,
+        [view.rows, view.order, view.block_ids, view.block_starts, view.rays, view.view, raster.rules, shape[2],
+         kernels.LANES, *(a.flatten() for a in (index, weight, range_, total))],
         device=raster.device,
-    )
+    )  # fmt: skip
     weights, indices, alpha = weight.numpy(), index.numpy(), total.numpy()
     best = np.argmax(weights, axis=2)
     dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]
@@ -173,16 +174,21 @@ def blend_weights(
 
 @dataclass(frozen=True)
 class Prepared:
-    """Gaussians projected for one camera: coefficients and depth-sorted tile lists on the device."""
+    """Gaussians projected for one camera: coefficients of the visible ones near to far, and on the device the lists of
+    which tiles and which blocks of pixels see them."""
 
     camera: Camera
     view: Any
+    rays: Any
     inputs: tuple[wp.array, ...]
+    order: wp.array
     rows: wp.array
-    count: wp.array
     ids: wp.array
+    masks: wp.array
     starts: wp.array
-    entries: int
+    block_ids: wp.array
+    block_starts: wp.array
+    cuts: list[int]
 
 
 @dataclass(frozen=True)
@@ -211,12 +217,11 @@ class Rasterizer:
         self.blending = blending or Blending()
         self.real = real
         self.project_kernels = kernels.build(real)
-        self.kernels = blend_kernels.build(real)
+        self.kernels = blend_kernels.build(real, RULES[self.blending.rule])
         self.rules = kernels.Rules()
         self.rules.alpha_min = self.blending.alpha_min
         self.rules.alpha_max = self.blending.alpha_max
         self.rules.transmittance_min = self.blending.transmittance_min
-        self.rules.rule = RULES[self.blending.rule]
 
     def vector(self, size: int) -> Any:
         """Warp's vector type of this precision."""
@@ -276,10 +281,9 @@ class Rasterizer:
     def prepare(
         self, means: wp.array, quaternions: wp.array, scales: wp.array, opacities: wp.array, cam: Camera
     ) -> Prepared:
-        """Project every Gaussian and list those that each 16 x 16 tile sees, near to far."""
+        """Project every Gaussian and list those that each tile and each of its blocks sees, near to far."""
         n, device = len(means), self.device
-        view = _view(cam)
-        rows = wp.empty((max(n, 1), kernels.ROW), dtype=self.real, device=device)
+        view, rays = _view(cam), self._rays(cam)
         span = wp.empty(n, dtype=wp.vec4i, device=device)
         count = wp.empty(n, dtype=int, device=device)
         distance = wp.empty(n, dtype=float, device=device)
@@ -287,10 +291,17 @@ class Rasterizer:
         launch(
             self.project_kernels.project,
             n,
-            [*inputs, view, self.rules, rows, span, count, distance],
+            [*inputs, view, self.rules, span, count, distance],
             device=device,
         )
         order, ends, entries = _sorted_visible(count, distance)
+        rows = wp.empty(len(order), dtype=self.vector(kernels.ROW), device=device)
+        launch(
+            self.project_kernels.coefficients_of_visible,
+            len(order),
+            [order, *inputs, view, self.rules, rows],
+            device=device,
+        )
         tiles = view.tiles_x * view.tiles_y
         keys = wp.empty(2 * max(entries, 1), dtype=int, device=device)
         ids = wp.empty(2 * max(entries, 1), dtype=int, device=device)
@@ -301,7 +312,59 @@ class Rasterizer:
             )
             wp.utils.radix_sort_pairs(keys, ids, entries)
             launch(kernels.tile_starts, tiles + 1, [keys, entries, starts], device=device)
-        return Prepared(cam, view, inputs, rows, count, ids, starts, entries)
+        masks = wp.empty(max(entries, 1), dtype=int, device=device)
+        counts = wp.empty(tiles, dtype=self.vector(kernels.LANES), device=device)
+        launch(
+            self.project_kernels.block_masks,
+            tiles,
+            [rows, ids, starts, rays, view.tiles_x, masks, counts],
+            device=device,
+        )
+        sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])
+        block_starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
+        block_ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
+        launch(kernels.fill_blocks, tiles, [ids, masks, starts, block_starts, block_ids], device=device)
+        # Where the adjoint's launch is cut: equal work, whatever the number of threads.
+        work = sums[:: kernels.LANES] + np.arange(tiles + 1)
+        cuts = np.searchsorted(work, work[-1] * np.arange(CPU_PIECES + 1) / CPU_PIECES).tolist()
+        return Prepared(
+            cam, view, rays, inputs, order, rows, ids, masks, starts, block_ids, block_starts, cuts
+        )
+
+    def _rays(self, cam: Camera) -> Any:
+        """Directions of the pixels of every column and row of blocks; beyond the image those of its border."""
+        step, per_tile = kernels.BLOCK, kernels.TILE // kernels.BLOCK
+        x = np.arange(-(-cam.width // kernels.TILE) * kernels.TILE)
+        y = np.arange(-(-cam.height // kernels.TILE) * kernels.TILE)
+        u, v = np.minimum(x, cam.width - 1) + 0.5, np.minimum(y, cam.height - 1) + 0.5
+        if cam.kind == "pinhole":
+            across, along, down = (u - cam.cx) / cam.fx, np.ones(len(u)), (v - cam.cy) / cam.fy
+            pitch = 1 / cam.fx, 0.0, 1 / cam.fy
+        else:
+            azimuth, zenith = u * 2 * np.pi / cam.width - np.pi, v * np.pi / cam.height
+            across, along, down = np.cos(azimuth), np.sin(azimuth), 1 / np.tan(zenith)
+            pitch = 2 * np.pi / cam.width, 2 * np.pi / cam.width, np.pi / cam.height
+        rounding = np.finfo(np.float32 if self.real is wp.float32 else np.float64).eps
+
+        def spans(values: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+            blocks = values.reshape(-1, per_tile, step)
+            low, high = blocks.min(axis=2), blocks.max(axis=2)
+            # Widened by a thousandth of a pixel and by rounding: what a block's pixels see is never left out.
+            return (low + high) / 2, (high - low) / 2 + 1e-3 * pitch + 4 * rounding * np.abs(blocks).max(
+                axis=2
+            )
+
+        def lanes(values: np.ndarray) -> wp.array:
+            return wp.array(values, dtype=self.vector(kernels.LANES), device=self.device)
+
+        rays = kernels.rays_of(self.real)()
+        rays.across = lanes(np.tile(across.reshape(-1, step), (1, step)))
+        rays.along = lanes(np.tile(along.reshape(-1, step), (1, step)))
+        rays.down = lanes(np.repeat(down.reshape(-1, step), step, axis=1))
+        columns = [*spans(across, pitch[0]), *spans(along, pitch[1])]
+        rays.columns = lanes(np.stack([np.tile(c, (1, per_tile)) for c in columns], axis=1))
+        rays.rows = lanes(np.stack([np.repeat(r, per_tile, axis=1) for r in spans(down, pitch[2])], axis=1))
+        return rays
 
     def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
@@ -342,46 +405,98 @@ class Rasterizer:
         alpha = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
         depth_sum, left, peak = (wp.zeros(shape, dtype=real, device=device) for _ in range(3))
         dominant = wp.full(shape, -1, dtype=int, device=device)
-        strips = prepared.view.tiles_x * prepared.view.tiles_y * kernels.TILE
+        flat = [a.flatten() for a in (image, alpha, depth_sum, left, dominant, peak)]
+        blocks = len(prepared.block_starts) - 1
+        lanes = self.vector(kernels.LANES)
+        blended = wp.empty((blocks, blend_kernels.PER_BLOCK), dtype=lanes, device=device)
+        owners = wp.empty(blocks, dtype=kernels.integers, device=device)
         for first in range(0, channels, kernels.CHANNELS):
             launch(
                 self.kernels.blend,
-                strips,
-                [prepared.rows, features, first, background, prepared.ids, prepared.starts, prepared.view, self.rules,
-                 image, alpha, depth_sum, left, dominant, peak],
+                blocks,
+                [prepared.rows, self._gathered(prepared, features, first), prepared.block_ids, prepared.block_starts,
+                 prepared.rays, prepared.view, self.rules, blended, owners],
                 device=device,
             )  # fmt: skip
+            launch(
+                self.kernels.lay_out,
+                blocks,
+                [
+                    channels,
+                    first,
+                    background,
+                    prepared.order,
+                    prepared.rays,
+                    prepared.view,
+                    blended,
+                    owners,
+                    *flat,
+                ],
+                device=device,
+            )
         depth = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
         launch(self.kernels.mean_depth, shape[0] * shape[1], [depth_sum, alpha, depth], device=device)
         return Image(image, alpha, depth, depth_sum, dominant, peak), left, background
+
+    def _gathered(self, prepared: Prepared, features: wp.array, first: int) -> wp.array:
+        """Four channels of the visible Gaussians, near to far."""
+        gathered = wp.empty(len(prepared.order), dtype=self.vector(kernels.CHANNELS), device=self.device)
+        launch(
+            self.project_kernels.gather_features,
+            len(gathered),
+            [prepared.order, features, first, gathered],
+            device=self.device,
+        )
+        return gathered
 
     def blend_adjoint(
         self, prepared: Prepared, features: wp.array, background: wp.array, out: Image, left: wp.array
     ) -> wp.array:
         """Add the gradients of every input for those of ``out``; returns each Gaussian's summed blending weight."""
-        device, real = self.device, self.real
-        n = len(features)
-        strips = prepared.view.tiles_x * prepared.view.tiles_y * kernels.TILE
-        pieces = 1 if device.is_cuda else min(CPU_PIECES, strips)
+        device, real, cuda = self.device, self.real, self.device.is_cuda
+        channels, visible = features.shape[1], len(prepared.order)
+        blocks = len(prepared.block_starts) - 1
         means, quaternions, scales, opacities = prepared.inputs
-        seen = wp.zeros(n, dtype=real, device=device)
+        seen = wp.zeros(len(features), dtype=real, device=device)
         feature_grad = _gradient(features)
-        for first in range(0, features.shape[1], kernels.CHANNELS):
-            sums = wp.zeros((pieces, n, kernels.GRADIENTS), dtype=real, device=device)
+        # A tile is one thread's on a CPU; on a GPU every block is, and sums are atomic.
+        parts = kernels.LANES if cuda else 1
+        cuts = [0, blocks] if cuda else prepared.cuts
+        bounds = wp.array(cuts, dtype=int, device=device)
+        seeds = wp.empty((blocks, blend_kernels.PER_BLOCK), dtype=self.vector(kernels.LANES), device=device)
+        flat = [
+            a.flatten()
+            for a in (
+                out.features,
+                out.alpha,
+                out.depth_sum,
+                out.features.grad,
+                out.alpha.grad,
+                out.depth.grad,
+            )
+        ]
+        with_range = int(out.depth.grad.numpy().any())
+        for first in range(0, channels, kernels.CHANNELS):
             launch(
-                self.kernels.blend_adjoint,
-                strips,
-                [strips, pieces, prepared.rows, features, first, prepared.ids, prepared.starts, prepared.view,
-                 self.rules, out.features, out.alpha, out.depth_sum, out.features.grad, out.alpha.grad, out.depth.grad,
-                 sums],
+                self.kernels.seed_adjoint,
+                blocks,
+                [channels, first, prepared.rays, prepared.view, *flat, seeds],
                 device=device,
-                pieces=pieces,
+            )
+            sums = wp.zeros((len(cuts) - 1, visible), dtype=self.vector(kernels.ROW), device=device)
+            launch(
+                self.kernels.blend_adjoint[with_range if first == 0 else 0],
+                cuts[-1],
+                [parts, bounds, prepared.rows, self._gathered(prepared, features, first), prepared.ids, prepared.masks,
+                 prepared.starts, prepared.rays, prepared.view, self.rules, seeds, sums],
+                device=device,
+                cuts=cuts,
             )  # fmt: skip
             launch(
                 self.project_kernels.chain,
-                n,
-                [quaternions, scales, prepared.count, first, sums, _gradient(means), _gradient(quaternions),
-                 _gradient(scales), _gradient(opacities), feature_grad, seen],
+                visible,
+                [prepared.order, means, quaternions, scales, prepared.view, first, sums, _gradient(means),
+                 _gradient(quaternions), _gradient(scales), _gradient(opacities), feature_grad, seen],
                 device=device,
             )  # fmt: skip
         if background.requires_grad:
