@@ -361,6 +361,8 @@ class Rasterizer:
         rays.across = lanes(np.tile(across.reshape(-1, step), (1, step)))
         rays.along = lanes(np.tile(along.reshape(-1, step), (1, step)))
         rays.down = lanes(np.repeat(down.reshape(-1, step), step, axis=1))
+        rays.square_across = wp.array(across**2 + along**2, dtype=self.real, device=self.device)
+        rays.square_down = wp.array(down**2, dtype=self.real, device=self.device)
         columns = [*spans(across, pitch[0]), *spans(along, pitch[1])]
         rays.columns = lanes(np.stack([np.tile(c, (1, per_tile)) for c in columns], axis=1))
         rays.rows = lanes(np.stack([np.repeat(r, per_tile, axis=1) for r in spans(down, pitch[2])], axis=1))
@@ -369,31 +371,32 @@ class Rasterizer:
     def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
         tape = _active_tape()
-        image, left, back = self._blend(prepared, features, background, requires_grad=tape is not None)
+        image, kept = self._blend(prepared, features, background, requires_grad=tape is not None)
         if tape is not None:
             outputs = (image.features, image.alpha, image.depth)
 
             def backward() -> None:
-                self.blend_adjoint(prepared, features, back, image, left)
+                self.blend_adjoint(prepared, features, image, *kept)
                 for (
                     array
                 ) in outputs:  # as Warp's own adjoints do: a second backward adds the same again, not more
                     if not array.retain_grad:
                         array.grad.zero_()
 
-            tape.record_func(backward, _with_gradients(*prepared.inputs, features, back, *outputs))
+            tape.record_func(backward, _with_gradients(*prepared.inputs, features, kept[1], *outputs))
         return image
 
     def blend_with_adjoint(
         self, prepared: Prepared, features: wp.array, background: Any = None
     ) -> tuple[Image, Callable[[], wp.array]]:
         """Blend without a tape: the image, and the function that adds the inputs' gradients for the image's."""
-        image, left, back = self._blend(prepared, features, background, requires_grad=True)
-        return image, lambda: self.blend_adjoint(prepared, features, back, image, left)
+        image, kept = self._blend(prepared, features, background, requires_grad=True)
+        return image, lambda: self.blend_adjoint(prepared, features, image, *kept)
 
     def _blend(
         self, prepared: Prepared, features: wp.array, background: Any, *, requires_grad: bool
-    ) -> tuple[Image, wp.array, wp.array]:
+    ) -> tuple[Image, tuple[wp.array, wp.array, list[wp.array]]]:
+        """The image, and what its adjoint wants besides: transmittance left, background, features near to far."""
         device, real, grad = self.device, self.real, requires_grad
         shape = (prepared.camera.height, prepared.camera.width)
         channels = features.shape[1]
@@ -401,21 +404,22 @@ class Rasterizer:
             background = wp.zeros(channels, dtype=real, device=device)
         elif not isinstance(background, wp.array):
             background = wp.array(np.asarray(background), dtype=real, device=device)
-        image = wp.zeros((*shape, channels), dtype=real, device=device, requires_grad=grad)
-        alpha = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
-        depth_sum, left, peak = (wp.zeros(shape, dtype=real, device=device) for _ in range(3))
-        dominant = wp.full(shape, -1, dtype=int, device=device)
-        flat = [a.flatten() for a in (image, alpha, depth_sum, left, dominant, peak)]
+        image = wp.empty((*shape, channels), dtype=real, device=device, requires_grad=grad)
+        alpha, depth = (wp.empty(shape, dtype=real, device=device, requires_grad=grad) for _ in range(2))
+        depth_sum, left, peak = (wp.empty(shape, dtype=real, device=device) for _ in range(3))
+        dominant = wp.empty(shape, dtype=int, device=device)
+        flat = [a.flatten() for a in (image, alpha, depth, depth_sum, left, dominant, peak)]
         blocks = len(prepared.block_starts) - 1
-        lanes = self.vector(kernels.LANES)
-        blended = wp.empty((blocks, blend_kernels.PER_BLOCK), dtype=lanes, device=device)
-        owners = wp.empty(blocks, dtype=kernels.integers, device=device)
+        blended, blended_lanes = self._per_block(blocks * blend_kernels.PER_BLOCK, real)
+        owners, owner_lanes = self._per_block(blocks, int)
+        gathered = []
         for first in range(0, channels, kernels.CHANNELS):
+            gathered.append(self._gathered(prepared, features, first))
             launch(
                 self.kernels.blend,
                 blocks,
-                [prepared.rows, self._gathered(prepared, features, first), prepared.block_ids, prepared.block_starts,
-                 prepared.rays, prepared.view, self.rules, blended, owners],
+                [prepared.rows, gathered[-1], prepared.block_ids, prepared.block_starts, prepared.rays, prepared.view,
+                 self.rules, blended_lanes, owner_lanes],
                 device=device,
             )  # fmt: skip
             launch(
@@ -434,9 +438,15 @@ class Rasterizer:
                 ],
                 device=device,
             )
-        depth = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
-        launch(self.kernels.mean_depth, shape[0] * shape[1], [depth_sum, alpha, depth], device=device)
-        return Image(image, alpha, depth, depth_sum, dominant, peak), left, background
+        return Image(image, alpha, depth, depth_sum, dominant, peak), (left, background, gathered)
+
+    def _per_block(self, count: int, dtype: Any) -> tuple[wp.array, wp.array]:
+        """Memory for ``count`` numbers per pixel of a block: as numbers, and as one vector per block."""
+        flat = wp.empty(count * kernels.LANES, dtype=dtype, device=self.device)
+        lanes = wp.array(
+            ptr=flat.ptr, shape=count, dtype=wp.types.vector(kernels.LANES, dtype), device=self.device
+        )
+        return flat, lanes
 
     def _gathered(self, prepared: Prepared, features: wp.array, first: int) -> wp.array:
         """Four channels of the visible Gaussians, near to far."""
@@ -450,7 +460,13 @@ class Rasterizer:
         return gathered
 
     def blend_adjoint(
-        self, prepared: Prepared, features: wp.array, background: wp.array, out: Image, left: wp.array
+        self,
+        prepared: Prepared,
+        features: wp.array,
+        out: Image,
+        left: wp.array,
+        background: wp.array,
+        gathered: list[wp.array],
     ) -> wp.array:
         """Add the gradients of every input for those of ``out``; returns each Gaussian's summed blending weight."""
         device, real, cuda = self.device, self.real, self.device.is_cuda
@@ -463,7 +479,7 @@ class Rasterizer:
         parts = kernels.LANES if cuda else 1
         cuts = [0, blocks] if cuda else prepared.cuts
         bounds = wp.array(cuts, dtype=int, device=device)
-        seeds = wp.empty((blocks, blend_kernels.PER_BLOCK), dtype=self.vector(kernels.LANES), device=device)
+        seeds, seed_lanes = self._per_block(blocks * blend_kernels.PER_BLOCK, real)
         flat = [
             a.flatten()
             for a in (
@@ -487,8 +503,8 @@ class Rasterizer:
             launch(
                 self.kernels.blend_adjoint[with_range if first == 0 else 0],
                 cuts[-1],
-                [parts, bounds, prepared.rows, self._gathered(prepared, features, first), prepared.ids, prepared.masks,
-                 prepared.starts, prepared.rays, prepared.view, self.rules, seeds, sums],
+                [parts, bounds, prepared.rows, gathered[first // kernels.CHANNELS], prepared.ids, prepared.masks,
+                 prepared.starts, prepared.rays, prepared.view, self.rules, seed_lanes, sums],
                 device=device,
                 cuts=cuts,
             )  # fmt: skip
@@ -500,10 +516,11 @@ class Rasterizer:
                 device=device,
             )  # fmt: skip
         if background.requires_grad:
+            of_rows = wp.empty((len(left), channels), dtype=wp.float64, device=device)
             launch(
-                self.kernels.background_adjoint, len(background), [left, out.features.grad, background.grad],
-                device=device,
-            )  # fmt: skip
+                self.kernels.background_adjoint, len(left), [left, out.features.grad, of_rows], device=device
+            )
+            launch(self.kernels.add_rows, channels, [of_rows, background.grad], device=device)
         return seen
 
 
@@ -523,22 +540,23 @@ def _gradient(array: wp.array) -> wp.array:
 
 def _sorted_visible(count: wp.array, distance: wp.array) -> tuple[wp.array, wp.array, int]:
     """Visible Gaussians by range (as float32; ties by index), running ends of their tile entries, and the total."""
-    device = count.device
-    counts = count.numpy()
-    visible = np.flatnonzero(counts).astype(np.int32)
-    if len(visible) == 0:
+    device, n = count.device, len(count)
+    visible = int(np.count_nonzero(count.numpy()))
+    if visible == 0:
         return wp.empty(0, dtype=int, device=device), wp.empty(0, dtype=int, device=device), 0
-    order = visible[np.argsort(distance.numpy()[visible], kind="stable")]
-    ends = np.cumsum(counts[order], dtype=np.int64)
-    if ends[-1] > 2**30:
+    total = int(count.numpy().sum(dtype=np.int64))
+    if total > 2**30:
         raise ValueError(
-            f"gaussians: they cover {ends[-1]} tiles in all, more than 2^30; prune large Gaussians or render smaller"
+            f"gaussians: they cover {total} tiles in all, more than 2^30; prune large Gaussians or render smaller"
         )
-    return (
-        wp.array(order, dtype=int, device=device),
-        wp.array(ends.astype(np.int32), dtype=int, device=device),
-        int(ends[-1]),
-    )
+    keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))
+    launch(kernels.sort_keys, n, [count, distance, keys, order], device=device)
+    wp.utils.radix_sort_pairs(keys, order, n)
+    order = order[:visible]
+    ends = wp.empty(visible, dtype=int, device=device)
+    launch(kernels.counts_in_order, visible, [order, count, ends], device=device)
+    wp.utils.array_scan(ends, ends, inclusive=True)
+    return order, ends, total
 
 
 def _view(cam: Camera) -> Any:

@@ -55,7 +55,7 @@ def build(real: Any, rule: int) -> SimpleNamespace:
     Rays = rays_of(real)
     of = lane_functions(real)
     any_positive, choose, choose_number = of.any_positive, of.choose, of.choose_number
-    lower, higher, sums_of = of.lower, of.higher, of.sums
+    lower, higher, sums_of, take, put = of.lower, of.higher, of.sums, of.take, of.put
     tiny = 1.0e-30 if real is wp.float32 else 1.0e-250
 
     if real is wp.float32:
@@ -140,7 +140,7 @@ def build(real: Any, rule: int) -> SimpleNamespace:
         rays: Rays,
         view: View,
         rules: Rules,
-        blended: wp.array(dtype=lanes, ndim=2),
+        blended: wp.array(dtype=lanes),
         owners: wp.array(dtype=integers),
     ):
         """Blend four channels front to back; ranges are over the length of ``rays``."""
@@ -189,15 +189,25 @@ def build(real: Any, rule: int) -> SimpleNamespace:
             c3 += f[3] * weight
             if not any_positive(transmittance - tmin):
                 break
-        blended[block, OF_CHANNELS] = c0
-        blended[block, OF_CHANNELS + 1] = c1
-        blended[block, OF_CHANNELS + 2] = c2
-        blended[block, OF_CHANNELS + 3] = c3
-        blended[block, OF_WEIGHT] = total
-        blended[block, OF_RANGE] = depth
-        blended[block, PEAK] = peak
-        blended[block, LEFT] = transmittance
+        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS)] = c0
+        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 1)] = c1
+        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 2)] = c2
+        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 3)] = c3
+        blended[block * wp.static(PER_BLOCK) + wp.static(OF_WEIGHT)] = total
+        blended[block * wp.static(PER_BLOCK) + wp.static(OF_RANGE)] = depth
+        blended[block * wp.static(PER_BLOCK) + wp.static(PEAK)] = peak
+        blended[block * wp.static(PER_BLOCK) + wp.static(LEFT)] = transmittance
         owners[block] = owner
+
+    @wp.func
+    def line_of(thread: int, view: View):
+        """A tile's line of pixels: its first column, its row, the first of its four blocks, and its place in a block."""
+        tile = thread / wp.static(TILE)
+        down = thread % wp.static(TILE)
+        block = tile * wp.static(LANES) + (down / wp.static(BLOCK)) * wp.static(TILE // BLOCK)
+        x = (tile % view.tiles_x) * wp.static(TILE)
+        y = (tile / view.tiles_x) * wp.static(TILE) + down
+        return x, y, block, (down % wp.static(BLOCK)) * wp.static(BLOCK)
 
     @wp.kernel(module="unique", enable_backward=False)
     def lay_out(
@@ -208,52 +218,55 @@ def build(real: Any, rule: int) -> SimpleNamespace:
         order: wp.array(dtype=int),
         rays: Rays,
         view: View,
-        blended: wp.array(dtype=lanes, ndim=2),
-        owners: wp.array(dtype=integers),
+        blended: wp.array(dtype=real),
+        owners: wp.array(dtype=int),
         image: wp.array(dtype=real),
         alpha_out: wp.array(dtype=real),
         depth_out: wp.array(dtype=real),
+        depth_sum_out: wp.array(dtype=real),
         transmittance_out: wp.array(dtype=real),
         dominant_out: wp.array(dtype=int),
         peak_out: wp.array(dtype=real),
     ):
-        """Blocks to images, before the background."""
-        block = offset + wp.tid()
-        column, line = place_of(block, view)
-        x0 = column * wp.static(BLOCK)
-        y0 = line * wp.static(BLOCK)
-        length = ray_lengths(rays.across[column], rays.along[column], rays.down[line])
+        """Blocks to images, before the background; a thread lays out a tile's line of pixels.
+
+        The mean range is 0 where nothing is seen, so that a loss on it stays finite.
+        """
+        x0, y, block0, inset = line_of(offset + wp.tid(), view)
+        if y >= view.height:
+            return
         shown = wp.min(channels - first, 4)
-        c0 = blended[block, OF_CHANNELS]
-        c1 = blended[block, OF_CHANNELS + 1]
-        c2 = blended[block, OF_CHANNELS + 2]
-        c3 = blended[block, OF_CHANNELS + 3]
-        total = blended[block, OF_WEIGHT]
-        depth = blended[block, OF_RANGE]
-        peak = blended[block, PEAK]
-        transmittance = blended[block, LEFT]
-        owner = owners[block]
-        for lane in range(wp.static(LANES)):
-            x = x0 + lane % wp.static(BLOCK)
-            y = y0 + lane / wp.static(BLOCK)
-            if x < view.width and y < view.height:
-                pixel = y * view.width + x
-                at = pixel * channels + first
-                left = transmittance[lane]
-                image[at] = c0[lane] + background[first] * left
-                if shown > 1:
-                    image[at + 1] = c1[lane] + background[first + 1] * left
-                if shown > 2:
-                    image[at + 2] = c2[lane] + background[first + 2] * left
-                if shown > 3:
-                    image[at + 3] = c3[lane] + background[first + 3] * left
-                if first == 0:
-                    alpha_out[pixel] = total[lane]
-                    depth_out[pixel] = depth[lane] * length[lane]
-                    transmittance_out[pixel] = left
-                    peak_out[pixel] = peak[lane] * length[lane]
-                    if owner[lane] >= 0:
-                        dominant_out[pixel] = order[owner[lane]]
+        square_down = rays.square_down[y]
+        for b in range(wp.min((view.width - x0 + 3) / 4, 4)):
+            x = x0 + b * 4
+            n = wp.min(view.width - x, 4)
+            pixel = y * view.width + x
+            at = (block0 + b) * wp.static(PER_BLOCK * LANES) + inset
+            left = take(blended, at + wp.static(LEFT * LANES), 1, 4)
+            for c in range(shown):
+                color = take(blended, at + wp.static(OF_CHANNELS * LANES) + c * wp.static(LANES), 1, 4)
+                put(image, pixel * channels + first + c, channels, n, color + background[first + c] * left)
+            if first == 0:
+                length = take(rays.square_across, x, 1, 4)
+                alpha = take(blended, at + wp.static(OF_WEIGHT * LANES), 1, 4)
+                depth = take(blended, at + wp.static(OF_RANGE * LANES), 1, 4)
+                peak = take(blended, at + wp.static(PEAK * LANES), 1, 4)
+                mean = vec4()
+                for i in range(4):
+                    length[i] = wp.sqrt(length[i] + square_down)
+                    depth[i] = depth[i] * length[i]
+                    peak[i] = peak[i] * length[i]
+                    mean[i] = depth[i] / wp.where(alpha[i] > real(0.0), alpha[i], real(1.0))
+                put(alpha_out, pixel, 1, n, alpha)
+                put(depth_sum_out, pixel, 1, n, depth)
+                put(depth_out, pixel, 1, n, mean)
+                put(transmittance_out, pixel, 1, n, left)
+                put(peak_out, pixel, 1, n, peak)
+                for i in range(n):
+                    owner = owners[(block0 + b) * wp.static(LANES) + inset + i]
+                    if owner >= 0:
+                        owner = order[owner]
+                    dominant_out[pixel + i] = owner
 
     @wp.kernel(module="unique", enable_backward=False)
     def seed_adjoint(
@@ -268,54 +281,46 @@ def build(real: Any, rule: int) -> SimpleNamespace:
         image_grad: wp.array(dtype=real),
         alpha_grad: wp.array(dtype=real),
         depth_grad: wp.array(dtype=real),
-        seeds: wp.array(dtype=lanes, ndim=2),
+        seeds: wp.array(dtype=real),
     ):
-        """What `blend_adjoint` starts from, block by block."""
-        block = offset + wp.tid()
-        column, line = place_of(block, view)
-        x0 = column * wp.static(BLOCK)
-        y0 = line * wp.static(BLOCK)
-        length = ray_lengths(rays.across[column], rays.along[column], rays.down[line])
-        v0 = lanes()
-        v1 = lanes()
-        v2 = lanes()
-        v3 = lanes()
-        vt = lanes()
-        va = lanes()
-        goal = lanes()
+        """What `blend_adjoint` starts from: images to blocks; a thread takes a tile's line of pixels."""
+        x0, y, block0, inset = line_of(offset + wp.tid(), view)
         shown = wp.min(channels - first, 4)
-        for lane in range(wp.static(LANES)):
-            x = x0 + lane % wp.static(BLOCK)
-            y = y0 + lane / wp.static(BLOCK)
-            if x < view.width and y < view.height:
-                pixel = y * view.width + x
-                at = pixel * channels + first
-                v0[lane] = image_grad[at]
-                r = v0[lane] * image[at]
-                if shown > 1:
-                    v1[lane] = image_grad[at + 1]
-                    r += v1[lane] * image[at + 1]
-                if shown > 2:
-                    v2[lane] = image_grad[at + 2]
-                    r += v2[lane] * image[at + 2]
-                if shown > 3:
-                    v3[lane] = image_grad[at + 3]
-                    r += v3[lane] * image[at + 3]
-                a = alpha_sum[pixel]
-                if first == 0 and a > real(0.0):
-                    vd = depth_grad[pixel] / a
-                    vt[lane] = vd * length[lane]
-                    va[lane] = alpha_grad[pixel] - vd * depth_sum[pixel] / a
-                    r += vd * depth_sum[pixel] + va[lane] * a
-                goal[lane] = r
-        seeds[block, OF_CHANNELS] = v0
-        seeds[block, OF_CHANNELS + 1] = v1
-        seeds[block, OF_CHANNELS + 2] = v2
-        seeds[block, OF_CHANNELS + 3] = v3
-        seeds[block, OF_WEIGHT] = va
-        seeds[block, OF_RANGE] = vt
-        seeds[block, BEHIND] = goal
-        seeds[block, LEFT] = lanes(real(1.0))
+        for b in range(4):
+            x = x0 + b * 4
+            n = wp.clamp(view.width - x, 0, 4)
+            if y >= view.height:
+                n = int(0)
+            pixel = y * view.width + x
+            at = (block0 + b) * wp.static(PER_BLOCK * LANES) + inset
+            goal = vec4()
+            for c in range(4):
+                v = vec4()
+                if c < shown:
+                    v = take(image_grad, pixel * channels + first + c, channels, n)
+                    goal += wp.cw_mul(v, take(image, pixel * channels + first + c, channels, n))
+                put(seeds, at + wp.static(OF_CHANNELS * LANES) + c * wp.static(LANES), 1, 4, v)
+            vt = vec4()
+            va = vec4()
+            if first == 0:
+                sums = take(alpha_sum, pixel, 1, n)
+                depths = take(depth_sum, pixel, 1, n)
+                wanted = take(depth_grad, pixel, 1, n)
+                va = take(alpha_grad, pixel, 1, n)
+                for i in range(4):
+                    seen = sums[i] > real(0.0)
+                    vd = wp.where(seen, wanted[i] / wp.where(seen, sums[i], real(1.0)), real(0.0))
+                    va[i] = wp.where(seen, va[i], real(0.0)) - vd * depths[i] / wp.where(seen, sums[i], real(1.0))
+                    goal[i] = goal[i] + vd * depths[i] + va[i] * sums[i]
+                    vt[i] = vd
+                if n > 0:
+                    length = take(rays.square_across, x, 1, 4)
+                    for i in range(4):
+                        vt[i] = vt[i] * wp.sqrt(length[i] + rays.square_down[y])
+            put(seeds, at + wp.static(OF_WEIGHT * LANES), 1, 4, va)
+            put(seeds, at + wp.static(OF_RANGE * LANES), 1, 4, vt)
+            put(seeds, at + wp.static(BEHIND * LANES), 1, 4, goal)
+            put(seeds, at + wp.static(LEFT * LANES), 1, 4, vec4(real(1.0)))
 
     def adjoint_kernel(with_range: bool) -> Any:
         @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
@@ -331,7 +336,7 @@ def build(real: Any, rule: int) -> SimpleNamespace:
             rays: Rays,
             view: View,
             rules: Rules,
-            seeds: wp.array(dtype=lanes, ndim=2),
+            seeds: wp.array(dtype=lanes),
             sums: wp.array(dtype=coefficients, ndim=2),
         ):
             """Same walk as `blend`; adds each Gaussian's gradient in a tile to ``sums[piece, Gaussian]``.
@@ -380,9 +385,9 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                     mask = mask & (mask - 1)
                     column = column0 + b % wp.static(TILE // BLOCK)
                     line = line0 + b / wp.static(TILE // BLOCK)
-                    block = block0 + b
+                    at = (block0 + b) * wp.static(PER_BLOCK)
                     g0, g1, g2 = forms(row, rays.across[column], rays.along[column], rays.down[line])
-                    transmittance = seeds[block, LEFT]
+                    transmittance = seeds[at + wp.static(LEFT)]
                     n = wp.cw_mul(g1, g1) + wp.cw_mul(g2, g2)
                     square = higher(wp.cw_mul(g0, g0) + row[FLAT] * n, lanes(real(wp.static(tiny))))
                     room = lower(lower(row[CUT] * square - n, g0), transmittance - tmin)
@@ -396,26 +401,26 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                     alpha = lower(row[OPACITY] * raw, amax)
                     weight = wp.cw_mul(alpha, transmittance)
                     t = wp.cw_mul(row[REACH] * g0, inverse)
-                    v0 = seeds[block, OF_CHANNELS]
-                    v1 = seeds[block, OF_CHANNELS + 1]
-                    v2 = seeds[block, OF_CHANNELS + 2]
-                    v3 = seeds[block, OF_CHANNELS + 3]
-                    vt = seeds[block, OF_RANGE]
+                    v0 = seeds[at + wp.static(OF_CHANNELS)]
+                    v1 = seeds[at + wp.static(OF_CHANNELS + 1)]
+                    v2 = seeds[at + wp.static(OF_CHANNELS + 2)]
+                    v3 = seeds[at + wp.static(OF_CHANNELS + 3)]
+                    vt = seeds[at + wp.static(OF_RANGE)]
                     value = (
                         f[0] * v0
                         + f[1] * v1
                         + f[2] * v2
                         + f[3] * v3
                         + wp.cw_mul(vt, t)
-                        + seeds[block, OF_WEIGHT]
+                        + seeds[at + wp.static(OF_WEIGHT)]
                     )
-                    goal = seeds[block, BEHIND] - wp.cw_mul(weight, value)
-                    seeds[block, BEHIND] = goal
+                    goal = seeds[at + wp.static(BEHIND)] - wp.cw_mul(weight, value)
+                    seeds[at + wp.static(BEHIND)] = goal
                     slope = wp.cw_mul(
                         wp.cw_mul(transmittance, value) - behind(goal, alpha), free
                     )  # times opacity: dL/d ln alpha
                     left = thinned(transmittance, alpha, weight)
-                    seeds[block, LEFT] = left
+                    seeds[at + wp.static(LEFT)] = left
                     v = (real(-0.5) * row[OPACITY]) * slope  # dL/dq
                     y0 = (-row[INVERSE]) * wp.cw_mul(n, inverse)
                     lever = wp.cw_mul(g0, inverse)
@@ -546,39 +551,35 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                 total_out[y * view.width + x] = total[lane]
 
     @wp.kernel(module="unique", enable_backward=False)
-    def mean_depth(
-        offset: int,
-        depth_sum: wp.array(dtype=real, ndim=2),
-        alpha: wp.array(dtype=real, ndim=2),
-        depth: wp.array(dtype=real, ndim=2),
-    ):
-        """Blended mean range; 0 where nothing is seen, so that a loss on it stays finite."""
-        pixel = offset + wp.tid()
-        x = pixel % alpha.shape[1]
-        y = pixel / alpha.shape[1]
-        if alpha[y, x] > real(0.0):
-            depth[y, x] = depth_sum[y, x] / alpha[y, x]
-
-    @wp.kernel(module="unique", enable_backward=False)
     def background_adjoint(
         offset: int,
         transmittance: wp.array(dtype=real, ndim=2),
         image_grad: wp.array(dtype=real, ndim=3),
-        background_grad: wp.array(dtype=real),
+        of_rows: wp.array(dtype=wp.float64, ndim=2),
     ):
-        """Gradient of one background channel: the transmittance left, summed over the image."""
-        c = offset + wp.tid()
-        total = wp.float64(0.0)
-        for y in range(transmittance.shape[0]):
+        """Gradient of the background, row by row of the image: the transmittance left times what each pixel wants."""
+        y = offset + wp.tid()
+        for c in range(image_grad.shape[2]):
+            total = wp.float64(0.0)
             for x in range(transmittance.shape[1]):
                 total += wp.float64(transmittance[y, x]) * wp.float64(image_grad[y, x, c])
+            of_rows[y, c] = total
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def add_rows(
+        offset: int, of_rows: wp.array(dtype=wp.float64, ndim=2), background_grad: wp.array(dtype=real)
+    ):
+        c = offset + wp.tid()
+        total = wp.float64(0.0)
+        for y in range(of_rows.shape[0]):
+            total += of_rows[y, c]
         background_grad[c] = background_grad[c] + real(total)
 
     return SimpleNamespace(
+        add_rows=add_rows,
         background_adjoint=background_adjoint,
         blend=blend,
         blend_adjoint=(adjoint_kernel(False), adjoint_kernel(True)),  # with or without gradients of ranges
-        mean_depth=mean_depth,
         lay_out=lay_out,
         seed_adjoint=seed_adjoint,
         strongest=strongest,

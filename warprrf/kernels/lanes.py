@@ -113,13 +113,43 @@ def build(real: Any) -> SimpleNamespace:
         """The sum of each of 16 vectors, by halves: 15 additions of whole vectors."""
         ...
 
+    four = wp.types.vector(BLOCK, real)
+
+    @wp.func_native(f"""
+    wp::vec_t<{BLOCK}, wp::{name}> out;
+    const wp::{name}* from = source.data + at;
+    if (count == {BLOCK}) {{
+        for (int i = 0; i < {BLOCK}; ++i) out[i] = from[i * step];
+    }} else {{
+        for (int i = 0; i < count; ++i) out[i] = from[i * step];
+    }}
+    return out;
+    """)
+    def take(source: wp.array(dtype=real), at: int, step: int, count: int) -> four:  # type: ignore[valid-type, empty-body]
+        """The first ``count`` of four numbers of contiguous memory, ``step`` apart; zero beyond."""
+        ...
+
+    @wp.func_native(f"""
+    wp::{name}* to = target.data + at;
+    if (count == {BLOCK}) {{
+        for (int i = 0; i < {BLOCK}; ++i) to[i * step] = values[i];
+    }} else {{
+        for (int i = 0; i < count; ++i) to[i * step] = values[i];
+    }}
+    """)
+    def put(target: wp.array(dtype=real), at: int, step: int, count: int, values: four):  # type: ignore[valid-type]
+        """Write the first ``count`` of four numbers to contiguous memory, ``step`` apart."""
+        ...
+
     return SimpleNamespace(
         any_positive=any_positive,
         choose=choose,
         choose_number=choose_number,
         higher=higher,
         lower=lower,
+        put=put,
         sums=sums,
+        take=take,
     )
 
 

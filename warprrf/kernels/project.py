@@ -218,6 +218,32 @@ def whitened_frame(a: wp.vec3d):
 
 
 @wp.kernel(enable_backward=False)
+def sort_keys(
+    offset: int,
+    count: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    keys: wp.array(dtype=int),
+    values: wp.array(dtype=int),
+):
+    """Ranges as integers of the same order (a float that is not negative sorts as its bits do); unseen ones last."""
+    i = offset + wp.tid()
+    key = int(2147483647)
+    if count[i] > 0:
+        key = wp.cast(distance[i], wp.int32)
+    keys[i] = key
+    values[i] = i
+
+
+@wp.kernel(enable_backward=False)
+def counts_in_order(
+    offset: int, order: wp.array(dtype=int), count: wp.array(dtype=int), ordered: wp.array(dtype=int)
+):
+    """The count of tiles of each Gaussian, near to far."""
+    i = offset + wp.tid()
+    ordered[i] = count[order[i]]
+
+
+@wp.kernel(enable_backward=False)
 def emit_tiles(
     offset: int,
     order: wp.array(dtype=int),
@@ -291,6 +317,9 @@ def rays_of(real: Any) -> Any:
         across: wp.array(dtype=lanes)  # per column of blocks: camera x of a photo, cos(azimuth) of a panorama
         along: wp.array(dtype=lanes)  # per column of blocks: one (camera z), sin(azimuth)
         down: wp.array(dtype=lanes)  # per row of blocks: camera y, cot(zenith)
+        # The square of a direction's length: a part per column of pixels, and one per row.
+        square_across: wp.array(dtype=real)
+        square_down: wp.array(dtype=real)
         # What each of a tile's blocks spans, as middle and half width.
         columns: wp.array(dtype=lanes, ndim=2)  # per column of tiles: across, its half, along, its half
         rows: wp.array(dtype=lanes, ndim=2)  # per row of tiles: down, its half
