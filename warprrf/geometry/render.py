@@ -296,10 +296,11 @@ class Rasterizer:
         )
         order, ends, entries = _sorted_visible(count, distance)
         rows = wp.empty(len(order), dtype=self.vector(kernels.ROW), device=device)
+        centres = wp.empty(len(order), dtype=self.vector(3), device=device)
         launch(
             self.project_kernels.coefficients_of_visible,
             len(order),
-            [order, *inputs, view, self.rules, rows],
+            [order, *inputs, view, self.rules, rows, centres],
             device=device,
         )
         tiles = view.tiles_x * view.tiles_y
@@ -317,7 +318,7 @@ class Rasterizer:
         launch(
             self.project_kernels.block_masks,
             tiles,
-            [rows, ids, starts, rays, view.tiles_x, masks, counts],
+            [rows, centres, ids, starts, rays, view.tiles_x, masks, counts],
             device=device,
         )
         sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])

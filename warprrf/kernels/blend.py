@@ -54,18 +54,17 @@ def build(real: Any, rule: int) -> SimpleNamespace:
     coefficients = wp.types.vector(ROW, real)
     Rays = rays_of(real)
     of = lane_functions(real)
-    any_positive, choose, choose_number = of.any_positive, of.choose, of.choose_number
-    lower, higher, sums_of, take, put = of.lower, of.higher, of.sums, of.take, of.put
+    any_positive, above, above_number, lower, higher = of.any_positive, of.above, of.above_number, of.lower, of.higher
+    sums_of, take, put, read, read4, write = of.sums, of.take, of.put, of.read, of.read4, of.write
     tiny = 1.0e-30 if real is wp.float32 else 1.0e-250
 
     if real is wp.float32:
 
         @wp.func
         def response(q: lanes):
-            """exp(-q/2) for q >= 0: (Taylor of exp(-q/32), degree 6)^16; absolute error below 5e-7 up to q = 60."""
-            x = lower(q, lanes(real(160.0))) * real(-0.03125)
-            p = lanes(real(1.0 / 120.0)) + x * real(1.0 / 720.0)
-            p = lanes(real(1.0 / 24.0)) + wp.cw_mul(x, p)
+            """exp(-q/2) for 0 <= q <= 80: (Taylor of exp(-q/32), degree 5)^16; absolute error below 1e-6."""
+            x = q * real(-0.03125)
+            p = lanes(real(1.0 / 24.0)) + x * real(1.0 / 120.0)
             p = lanes(real(1.0 / 6.0)) + wp.cw_mul(x, p)
             p = lanes(real(0.5)) + wp.cw_mul(x, p)
             p = lanes(real(1.0)) + wp.cw_mul(x, p)
@@ -164,31 +163,30 @@ def build(real: Any, rule: int) -> SimpleNamespace:
         owner = integers(-1)
         for j in range(starts[block], starts[block + 1]):
             k = ids[j]
-            row = rows[k]
+            row = read(rows, k)
             g0, g1, g2 = forms(row, across, along, down)
             n = wp.cw_mul(g1, g1) + wp.cw_mul(g2, g2)
             square = higher(wp.cw_mul(g0, g0) + row[FLAT] * n, lanes(real(wp.static(tiny))))
             room = lower(lower(row[CUT] * square - n, g0), transmittance - tmin)
             if not any_positive(room):
+                if not any_positive(transmittance - tmin):
+                    break
                 continue
             inverse = wp.cw_div(one, square)
-            alpha = choose(room, lower(row[OPACITY] * response(wp.cw_mul(n, inverse)), amax), lanes())
+            alpha = above(room, lanes(), lower(row[OPACITY] * response(wp.cw_mul(n, inverse)), amax), lanes())
             weight = wp.cw_mul(alpha, transmittance)
             transmittance = thinned(transmittance, alpha, weight)
             t = wp.cw_mul(row[REACH] * g0, inverse)
             depth += wp.cw_mul(weight, t)
             total += weight
-            better = weight - best
+            owner = above_number(weight, best, k, owner)
+            peak = above(weight, best, t, peak)
             best = higher(best, weight)
-            owner = choose_number(better, k, owner)
-            peak = choose(better, t, peak)
-            f = features[k]
+            f = read4(features, k)
             c0 += f[0] * weight
             c1 += f[1] * weight
             c2 += f[2] * weight
             c3 += f[3] * weight
-            if not any_positive(transmittance - tmin):
-                break
         blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS)] = c0
         blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 1)] = c1
         blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 2)] = c2
@@ -363,8 +361,6 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                 if mask == 0:
                     continue
                 k = ids[j]
-                row = rows[k]
-                f = features[k]
                 s0 = lanes()
                 s1 = lanes()
                 s2 = lanes()
@@ -383,61 +379,58 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                 while mask != 0:
                     b = lowest_bit(mask)
                     mask = mask & (mask - 1)
+                    # Read again for each block: operands in memory cost nothing, registers are for the sums.
+                    row = read(rows, k)
+                    f = read4(features, k)
                     column = column0 + b % wp.static(TILE // BLOCK)
                     line = line0 + b / wp.static(TILE // BLOCK)
                     at = (block0 + b) * wp.static(PER_BLOCK)
-                    g0, g1, g2 = forms(row, rays.across[column], rays.along[column], rays.down[line])
-                    transmittance = seeds[at + wp.static(LEFT)]
+                    g0, g1, g2 = forms(
+                        row, read(rays.across, column), read(rays.along, column), read(rays.down, line)
+                    )
+                    transmittance = read(seeds, at + wp.static(LEFT))
                     n = wp.cw_mul(g1, g1) + wp.cw_mul(g2, g2)
                     square = higher(wp.cw_mul(g0, g0) + row[FLAT] * n, lanes(real(wp.static(tiny))))
                     room = lower(lower(row[CUT] * square - n, g0), transmittance - tmin)
                     if not any_positive(room):
                         continue
                     inverse = wp.cw_div(one, square)
-                    raw = choose(room, response(wp.cw_mul(n, inverse)), lanes())
-                    free = choose(
-                        row[OPACITY] * raw - amax, lanes(), raw
-                    )  # response where alpha is not clamped
-                    alpha = lower(row[OPACITY] * raw, amax)
-                    weight = wp.cw_mul(alpha, transmittance)
-                    t = wp.cw_mul(row[REACH] * g0, inverse)
-                    v0 = seeds[at + wp.static(OF_CHANNELS)]
-                    v1 = seeds[at + wp.static(OF_CHANNELS + 1)]
-                    v2 = seeds[at + wp.static(OF_CHANNELS + 2)]
-                    v3 = seeds[at + wp.static(OF_CHANNELS + 3)]
-                    vt = seeds[at + wp.static(OF_RANGE)]
-                    value = (
-                        f[0] * v0
-                        + f[1] * v1
-                        + f[2] * v2
-                        + f[3] * v3
-                        + wp.cw_mul(vt, t)
-                        + seeds[at + wp.static(OF_WEIGHT)]
-                    )
-                    goal = seeds[at + wp.static(BEHIND)] - wp.cw_mul(weight, value)
-                    seeds[at + wp.static(BEHIND)] = goal
-                    slope = wp.cw_mul(
-                        wp.cw_mul(transmittance, value) - behind(goal, alpha), free
-                    )  # times opacity: dL/d ln alpha
-                    left = thinned(transmittance, alpha, weight)
-                    seeds[at + wp.static(LEFT)] = left
-                    v = (real(-0.5) * row[OPACITY]) * slope  # dL/dq
-                    y0 = (-row[INVERSE]) * wp.cw_mul(n, inverse)
+                    q = wp.cw_mul(n, inverse)
                     lever = wp.cw_mul(g0, inverse)
+                    kept = above(room, lanes(), response(q), lanes())
+                    raw = row[OPACITY] * kept
+                    free = above(raw, amax, lanes(), kept)  # the response where alpha is not clamped
+                    alpha = lower(raw, amax)
+                    weight = wp.cw_mul(alpha, transmittance)
+                    v0 = read(seeds, at + wp.static(OF_CHANNELS))
+                    v1 = read(seeds, at + wp.static(OF_CHANNELS + 1))
+                    v2 = read(seeds, at + wp.static(OF_CHANNELS + 2))
+                    v3 = read(seeds, at + wp.static(OF_CHANNELS + 3))
+                    value = f[0] * v0 + f[1] * v1 + f[2] * v2 + f[3] * v3 + read(seeds, at + wp.static(OF_WEIGHT))
+                    if wp.static(with_range):
+                        vt = wp.cw_mul(weight, read(seeds, at + wp.static(OF_RANGE)))
+                        value += row[REACH] * wp.cw_mul(lever, read(seeds, at + wp.static(OF_RANGE)))
+                    goal = read(seeds, at + wp.static(BEHIND)) - wp.cw_mul(weight, value)
+                    write(seeds, at + wp.static(BEHIND), goal)
+                    # dL/da times the response: dL/d opacity
+                    slope = wp.cw_mul(wp.cw_mul(transmittance, value) - behind(goal, alpha), free)
+                    left = thinned(transmittance, alpha, weight)
+                    write(seeds, at + wp.static(LEFT), left)
+                    v = (real(-0.5) * row[OPACITY]) * slope  # dL/dq
+                    y0 = (-row[INVERSE]) * q
                     y1 = wp.cw_mul(lever, g1)
                     y2 = wp.cw_mul(lever, g2)
                     p0 = wp.cw_mul(v, y0)
                     p1 = wp.cw_mul(v, y1)
                     p2 = wp.cw_mul(v, y2)
+                    s0 += wp.cw_mul(v, q)
+                    s1 += p1
+                    s2 += p2
                     s3 += wp.cw_mul(p0, y0)
                     s4 += wp.cw_mul(p0, y1)
                     s5 += wp.cw_mul(p0, y2)
                     s6 += wp.cw_mul(p1, y1)
                     s7 += wp.cw_mul(p1, y2)
-                    s8 += wp.cw_mul(p2, y2)
-                    s0 += p0
-                    s1 += p1
-                    s2 += p2
                     s9 += slope
                     s10 += wp.cw_mul(weight, v0)
                     s11 += wp.cw_mul(weight, v1)
@@ -445,11 +438,10 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                     s13 += wp.cw_mul(weight, v3)
                     s14 += weight
                     if wp.static(with_range):
-                        half = wp.cw_mul(wp.cw_mul(weight, vt), inverse)
+                        half = wp.cw_mul(vt, inverse)
                         h0 = row[LIFT] * wp.cw_mul(half, g0)
                         h1 = row[TILT] * wp.cw_mul(half, g1)
                         h2 = row[TILT] * wp.cw_mul(half, g2)
-                        s0 -= h0
                         s1 -= h1
                         s2 -= h2
                         s3 -= real(2.0) * wp.cw_mul(h0, y0)
@@ -457,7 +449,7 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                         s5 -= wp.cw_mul(h0, y2) + wp.cw_mul(h2, y0)
                         s6 -= real(2.0) * wp.cw_mul(h1, y1)
                         s7 -= wp.cw_mul(h1, y2) + wp.cw_mul(h2, y1)
-                        s8 -= real(2.0) * wp.cw_mul(h2, y2)
+                        s8 += h0
                     if not any_positive(left - tmin):
                         open = open & (-1 - (1 << b))
                 found = sums_of(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12, s13, s14, lanes())
@@ -502,15 +494,17 @@ def build(real: Any, rule: int) -> SimpleNamespace:
         at = integers()
         for j in range(starts[block], starts[block + 1]):
             k = ids[j]
-            row = rows[k]
+            row = read(rows, k)
             g0, g1, g2 = forms(row, across, along, down)
             n = wp.cw_mul(g1, g1) + wp.cw_mul(g2, g2)
             square = higher(wp.cw_mul(g0, g0) + row[FLAT] * n, lanes(real(wp.static(tiny))))
             room = lower(lower(row[CUT] * square - n, g0), transmittance - tmin)
             if not any_positive(room):
+                if not any_positive(transmittance - tmin):
+                    break
                 continue
             inverse = wp.cw_div(one, square)
-            alpha = choose(room, lower(row[OPACITY] * response(wp.cw_mul(n, inverse)), amax), lanes())
+            alpha = above(room, lanes(), lower(row[OPACITY] * response(wp.cw_mul(n, inverse)), amax), lanes())
             weight = wp.cw_mul(alpha, transmittance)
             transmittance = thinned(transmittance, alpha, weight)
             total += weight
@@ -542,8 +536,6 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                                 where = c
                         smallest[lane] = least
                         at[lane] = where
-            if not any_positive(transmittance - tmin):
-                break
         for lane in range(wp.static(LANES)):
             x = x0 + lane % wp.static(BLOCK)
             y = y0 + lane / wp.static(BLOCK)

@@ -61,24 +61,24 @@ def build(real: Any) -> SimpleNamespace:
     wp::vec_t<{LANES}, wp::{name}> out;
     for (int i = 0; i < {LANES}; ++i) {{
         const wp::{name} yes = a[i], no = b[i];
-        out[i] = x[i] > wp::{name}(0) ? yes : no;
+        out[i] = x[i] > y[i] ? yes : no;
     }}
     return out;
     """)
-    def choose(x: lanes, a: lanes, b: lanes) -> lanes:  # type: ignore[valid-type, empty-body]
-        """``a`` in the lanes where x > 0, else ``b``."""
+    def above(x: lanes, y: lanes, a: lanes, b: lanes) -> lanes:  # type: ignore[valid-type, empty-body]
+        """``a`` in the lanes where x > y, else ``b``."""
         ...
 
     @wp.func_native(f"""
     wp::vec_t<{LANES}, wp::int32> out;
     for (int i = 0; i < {LANES}; ++i) {{
         const wp::int32 no = b[i];
-        out[i] = x[i] > wp::{name}(0) ? a : no;
+        out[i] = x[i] > y[i] ? a : no;
     }}
     return out;
     """)
-    def choose_number(x: lanes, a: int, b: integers) -> integers:  # type: ignore[valid-type, empty-body]
-        """``a`` in the lanes where x > 0, else ``b``."""
+    def above_number(x: lanes, y: lanes, a: int, b: integers) -> integers:  # type: ignore[valid-type, empty-body]
+        """``a`` in the lanes where x > y, else ``b``."""
         ...
 
     @wp.func_native(f"""
@@ -113,7 +113,23 @@ def build(real: Any) -> SimpleNamespace:
         """The sum of each of 16 vectors, by halves: 15 additions of whole vectors."""
         ...
 
+    # Warp's own indexing allows for negative indices and strides, some six instructions an access.
+    @wp.func_native("return source.data[i];")
+    def read(source: wp.array(dtype=lanes), i: int) -> lanes:  # type: ignore[valid-type, empty-body]
+        """Element of a contiguous array, ``i >= 0``."""
+        ...
+
+    @wp.func_native("target.data[i] = value;")
+    def write(target: wp.array(dtype=lanes), i: int, value: lanes):  # type: ignore[valid-type]
+        """Set an element of a contiguous array, ``i >= 0``."""
+        ...
+
     four = wp.types.vector(BLOCK, real)
+
+    @wp.func_native("return source.data[i];")
+    def read4(source: wp.array(dtype=four), i: int) -> four:  # type: ignore[valid-type, empty-body]
+        """Element of a contiguous array, ``i >= 0``."""
+        ...
 
     @wp.func_native(f"""
     wp::vec_t<{BLOCK}, wp::{name}> out;
@@ -142,14 +158,17 @@ def build(real: Any) -> SimpleNamespace:
         ...
 
     return SimpleNamespace(
+        above=above,
+        above_number=above_number,
         any_positive=any_positive,
-        choose=choose,
-        choose_number=choose_number,
         higher=higher,
         lower=lower,
         put=put,
+        read=read,
+        read4=read4,
         sums=sums,
         take=take,
+        write=write,
     )
 
 

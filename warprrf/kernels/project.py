@@ -37,9 +37,9 @@ REACH = 12  # |m| |M m|: a range is REACH g0 / |g|^2 [m]
 LIFT, TILT = 13, 14  # smallest scale / 2 [m], and that over |M m|
 INVERSE = 15  # 1 / |M m|
 ROW = 16
-GRADIENTS = (
-    15  # numbers per Gaussian that `blend_adjoint` sums: Y1 3, Y2 6, opacity, features 4, blending weight
-)
+# Numbers per Gaussian that `blend_adjoint` sums: v q, Y1 without its first component 2, Y2 without its last 5, what
+# ranges take from the first component of Y1, opacity, features 4, blending weight.
+GRADIENTS = 15
 SUMS = 16
 # Stays finite where scales are near the smallest number: zero offset times infinity would be NaN.
 STEEPEST = 1.0e15
@@ -335,9 +335,11 @@ def build(real: Any) -> SimpleNamespace:
     lanes = lanes_of(real)
     coefficients = wp.types.vector(ROW, real)
     Rays = rays_of(real)
-    choose = lane_functions(real).choose
+    of = lane_functions(real)
+    above, lower, higher = of.above, of.lower, of.higher
     total = wp.types.vector(GRADIENTS, wp.float64)
     unbounded = 1.0e30 if real is wp.float32 else 1.0e250
+    faintest = 80.0 if real is wp.float32 else 1.0e250  # what `response` is made for: exp(-40)
 
     @wp.func
     def double3(v: vec3):
@@ -391,8 +393,9 @@ def build(real: Any) -> SimpleNamespace:
         view: View,
         rules: Rules,
         rows: wp.array(dtype=coefficients),
+        centres: wp.array(dtype=vec3),
     ):
-        """The rows of the visible Gaussians, near to far."""
+        """The rows of the visible Gaussians, near to far, and where the rays to their means point (0 if nowhere)."""
         place = offset + wp.tid()
         i = order[place]
         m = double3(means[i]) - view.origin
@@ -417,13 +420,25 @@ def build(real: Any) -> SimpleNamespace:
             row[wp.static(G2) + k] = real(forms[axis, 2] * steep)
         opacity = wp.float64(opacities[i])
         row[wp.static(FLAT)] = real(wp.float64(1.0) / (steep * steep))
-        row[wp.static(CUT)] = real(wp.float64(2.0) * wp.log(opacity / rules.alpha_min))
+        cut = wp.float64(2.0) * wp.log(opacity / rules.alpha_min)
+        row[wp.static(CUT)] = real(wp.min(cut, wp.float64(wp.static(faintest))))
         row[wp.static(OPACITY)] = real(opacity)
         row[wp.static(REACH)] = real(range_ * length)
         row[wp.static(LIFT)] = real(wp.float64(0.5) * smin)
         row[wp.static(TILT)] = real(wp.float64(0.5) * smin / steep)
         row[wp.static(INVERSE)] = real(wp.float64(1.0) / steep)
         rows[place] = row
+        centre = vec3()
+        if view.kind == wp.static(PINHOLE):
+            local = view.rotation * m
+            if local[2] > wp.float64(1.0e-6) * range_:
+                centre = vec3(real(local[0] / local[2]), real(1.0), real(local[1] / local[2]))
+        else:
+            axis_distance = wp.sqrt(m[0] * m[0] + m[1] * m[1])
+            if axis_distance > wp.float64(1.0e-6) * range_:
+                m = m / axis_distance
+                centre = vec3(real(m[0]), real(m[1]), real(m[2]))
+        centres[place] = centre
 
     @wp.func
     def magnitude(x: lanes):
@@ -433,6 +448,7 @@ def build(real: Any) -> SimpleNamespace:
     def block_masks(
         offset: int,
         rows: wp.array(dtype=coefficients),
+        centres: wp.array(dtype=vec3),
         ids: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         rays: Rays,
@@ -443,7 +459,7 @@ def build(real: Any) -> SimpleNamespace:
         """Which blocks of its tile each entry can reach, a bit each, and how many entries each block gets.
 
         A ray counts where ``f(d) = cut |g|^2 - g1^2 - g2^2`` and ``g0`` are positive. ``f`` is quadratic in ``d`` and
-        exceeds its tangent plane by no more than ``cut g0(change of d)^2``: hence a bound from the block's middle.
+        exceeds its tangent plane by no more than ``cut g0(change of d)^2``: hence a bound on the box round the block.
         """
         tile = offset + wp.tid()
         x = tile % tiles_x
@@ -459,24 +475,34 @@ def build(real: Any) -> SimpleNamespace:
             powers[b] = real(1 << b)
         count = lanes()
         for j in range(starts[tile], starts[tile + 1]):
-            row = rows[ids[j]]
-            g0 = row[G0] * u + row[G0 + 1] * w + row[G0 + 2] * v
-            g1 = row[G1] * u + row[G1 + 1] * w + row[G1 + 2] * v
-            g2 = row[G2] * u + row[G2 + 1] * w + row[G2 + 2] * v
+            k = ids[j]
+            row = rows[k]
+            # The point of the block's box that is nearest to the mean, and where the box ends beside it.
+            centre = centres[k]
+            pu = lower(higher(lanes(centre[0]), u - hu), u + hu)
+            pw = lower(higher(lanes(centre[1]), w - hw), w + hw)
+            pv = lower(higher(lanes(centre[2]), v - hv), v + hv)
+            du = u - pu
+            dw = w - pw
+            dv = v - pv
+            g0 = row[G0] * pu + row[G0 + 1] * pw + row[G0 + 2] * pv
+            g1 = row[G1] * pu + row[G1 + 1] * pw + row[G1 + 2] * pv
+            g2 = row[G2] * pu + row[G2 + 1] * pw + row[G2 + 2] * pv
             outside = real(1.0) - row[CUT] * row[FLAT]
             s0 = row[CUT] * g0
             s1 = outside * g1
             s2 = outside * g2
             f = wp.cw_mul(s0, g0) - wp.cw_mul(s1, g1) - wp.cw_mul(s2, g2)
-            su = magnitude(row[G0] * s0 - row[G1] * s1 - row[G2] * s2)
-            sw = magnitude(row[G0 + 1] * s0 - row[G1 + 1] * s1 - row[G2 + 1] * s2)
-            sv = magnitude(row[G0 + 2] * s0 - row[G1 + 2] * s1 - row[G2 + 2] * s2)
-            slope = wp.cw_mul(su, hu) + wp.cw_mul(sw, hw) + wp.cw_mul(sv, hv)
-            change = wp.abs(row[G0]) * hu + wp.abs(row[G0 + 1]) * hw + wp.abs(row[G0 + 2]) * hv
+            su = row[G0] * s0 - row[G1] * s1 - row[G2] * s2
+            sw = row[G0 + 1] * s0 - row[G1 + 1] * s1 - row[G2 + 1] * s2
+            sv = row[G0 + 2] * s0 - row[G1 + 2] * s1 - row[G2 + 2] * s2
+            slope = wp.cw_mul(su, du) + wp.cw_mul(sw, dw) + wp.cw_mul(sv, dv)
+            slope += wp.cw_mul(magnitude(su), hu) + wp.cw_mul(magnitude(sw), hw) + wp.cw_mul(magnitude(sv), hv)
+            change = real(2.0) * (wp.abs(row[G0]) * hu + wp.abs(row[G0 + 1]) * hw + wp.abs(row[G0 + 2]) * hv)
             bound = f + real(2.0) * slope + row[CUT] * wp.cw_mul(change, change)
             # From inside the ellipsoid every ray ahead counts.
             bound += lanes(wp.where(outside > real(0.0), real(0.0), real(wp.static(unbounded))))
-            hit = choose(wp.min(bound, g0 + change), lanes(real(1.0)), lanes())
+            hit = above(lower(bound, g0 + change), lanes(), lanes(real(1.0)), lanes())
             count += hit
             masks[j] = int(wp.dot(hit, powers))
         counts[tile] = count
@@ -526,6 +552,10 @@ def build(real: Any) -> SimpleNamespace:
             row = sums[p, place]
             for k in range(wp.static(GRADIENTS)):
                 y[k] += wp.float64(row[k])
+        if first == 0:
+            seen[i] = real(y[14])
+        if y[14] == wp.float64(0.0):  # hidden behind others: no gradient
+            return
         two = wp.float64(2.0)
         q = quaternions[i]
         qw = wp.float64(q[0])
@@ -536,11 +566,12 @@ def build(real: Any) -> SimpleNamespace:
         s = double3(scales[i])
         smin = wp.min(s[0], wp.min(s[1], s[2]))
         m = double3(means[i]) - view.origin
-        frame = whitened_frame(
-            wp.cw_mul(wp.vec3d(smin / s[0], smin / s[1], smin / s[2]), wp.transpose(r) * m)
-        )
-        y1 = frame * wp.vec3d(y[0], y[1], y[2])
-        y2 = frame * wp.mat33d(y[3], y[4], y[5], y[4], y[6], y[7], y[5], y[7], y[8]) * wp.transpose(frame)
+        a = wp.cw_mul(wp.vec3d(smin / s[0], smin / s[1], smin / s[2]), wp.transpose(r) * m)
+        steep = wp.min(wp.length(a) / smin, wp.float64(wp.static(STEEPEST)))
+        frame = whitened_frame(a)
+        y1 = frame * wp.vec3d(-y[0] / steep - y[8], y[1], y[2])
+        y22 = y[0] - y[3] - y[6]  # the trace is the sum of dL/dq times q
+        y2 = frame * wp.mat33d(y[3], y[4], y[5], y[4], y[6], y[7], y[5], y[7], y22) * wp.transpose(frame)
         dm = r * wp.cw_div(y1, s)
         means_grad[i] = means_grad[i] - vec3(real(two * dm[0]), real(two * dm[1]), real(two * dm[2]))
         scales_grad[i] = scales_grad[i] - vec3(
@@ -560,8 +591,6 @@ def build(real: Any) -> SimpleNamespace:
         for k in range(wp.static(CHANNELS)):
             if first + k < features_grad.shape[1]:
                 features_grad[i, first + k] = features_grad[i, first + k] + real(y[10 + k])
-        if first == 0:
-            seen[i] = real(y[14])
 
     return SimpleNamespace(
         block_masks=block_masks,
