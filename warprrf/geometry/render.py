@@ -8,20 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warprrf.device import check_array, launch, resolve
+from warprrf.device import PIECES_PER_THREAD, check_array, launch, resolve, threads
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.kernels import blend as blend_kernels
 from warprrf.kernels import project as kernels
 from warprrf.kernels import sh as sh_kernels
 
-# Gradient sums are kept in this many parts on a CPU, one writer each: the result does not depend on the thread count.
-CPU_PIECES = 4
 RULES = {"product": kernels.PRODUCT, "exp": kernels.EXPONENTIAL}
 
 
@@ -134,8 +133,7 @@ def render(
     image = raster.blend(view, feature_array, np.broadcast_to(back, (feature_array.shape[1],)))
     alpha = image.alpha.numpy()
     dominant = image.dominant.numpy()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(alpha > 0, image.depth_sum.numpy() / alpha, np.inf).astype(np.float32)
+    depth = np.where(alpha > 0, image.depth.numpy(), np.inf).astype(np.float32)
     peak = np.where(dominant >= 0, image.peak.numpy(), np.inf).astype(np.float32)
     return Rendering(image.features.numpy(), alpha, depth, dominant, peak)
 
@@ -159,9 +157,9 @@ def blend_weights(
     range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
     total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
     launch(
-        raster.kernels.strongest,
+        raster._kernels(1).strongest,
         len(view.block_starts) - 1,
-        [view.rows, view.order, view.block_ids, view.block_starts, view.rays, view.view, raster.rules, shape[2],
+        [view.rows, view.block_ids, view.block_starts, view.rays, view.view, raster.rules, shape[2],
          kernels.LANES, *(a.flatten() for a in (index, weight, range_, total))],
         device=raster.device,
     )  # fmt: skip
@@ -174,31 +172,32 @@ def blend_weights(
 
 @dataclass(frozen=True)
 class Prepared:
-    """Gaussians projected for one camera: coefficients of the visible ones near to far, and on the device the lists of
-    which tiles and which blocks of pixels see them."""
+    """Gaussians projected for one camera: coefficients, and the lists of what tiles and blocks of pixels see, near to
+    far, on the device; ``work`` is what each tile has to do, summed up."""
 
     camera: Camera
     view: Any
     rays: Any
     inputs: tuple[wp.array, ...]
-    order: wp.array
     rows: wp.array
+    begins: wp.array
+    count: wp.array
+    slots: wp.array
     ids: wp.array
     masks: wp.array
     starts: wp.array
     block_ids: wp.array
     block_starts: wp.array
-    cuts: list[int]
+    work: np.ndarray
 
 
 @dataclass(frozen=True)
 class Image:
-    """A blended image on the device; ``depth_sum`` is the sum of weight times range."""
+    """A blended image on the device; ``depth`` is 0 where nothing is seen."""
 
     features: wp.array
     alpha: wp.array
     depth: wp.array
-    depth_sum: wp.array
     dominant: wp.array
     peak: wp.array
 
@@ -217,7 +216,6 @@ class Rasterizer:
         self.blending = blending or Blending()
         self.real = real
         self.project_kernels = kernels.build(real)
-        self.kernels = blend_kernels.build(real, RULES[self.blending.rule])
         self.rules = kernels.Rules()
         self.rules.alpha_min = self.blending.alpha_min
         self.rules.alpha_max = self.blending.alpha_max
@@ -283,91 +281,66 @@ class Rasterizer:
     ) -> Prepared:
         """Project every Gaussian and list those that each tile and each of its blocks sees, near to far."""
         n, device = len(means), self.device
-        view, rays = _view(cam), self._rays(cam)
+        view = _view(cam)
+        rays = _rays(
+            cam.kind, cam.width, cam.height, cam.fx, cam.fy, cam.cx, cam.cy, self.real, self.device.alias
+        )
         span = wp.empty(n, dtype=wp.vec4i, device=device)
         count = wp.empty(n, dtype=int, device=device)
         distance = wp.empty(n, dtype=float, device=device)
+        rows = wp.empty(n, dtype=self.vector(kernels.ROW), device=device)
+        centres = wp.empty(n, dtype=self.vector(3), device=device)
+        begins = wp.empty(n, dtype=int, device=device)
         inputs = (means, quaternions, scales, opacities)
         launch(
             self.project_kernels.project,
             n,
-            [*inputs, view, self.rules, span, count, distance],
+            [*inputs, view, self.rules, span, count, distance, rows, centres],
             device=device,
         )
         order, ends, entries = _sorted_visible(count, distance)
-        rows = wp.empty(len(order), dtype=self.vector(kernels.ROW), device=device)
-        centres = wp.empty(len(order), dtype=self.vector(3), device=device)
-        launch(
-            self.project_kernels.coefficients_of_visible,
-            len(order),
-            [order, *inputs, view, self.rules, rows, centres],
-            device=device,
-        )
         tiles = view.tiles_x * view.tiles_y
         keys = wp.empty(2 * max(entries, 1), dtype=int, device=device)
-        ids = wp.empty(2 * max(entries, 1), dtype=int, device=device)
+        slots = wp.empty(2 * max(entries, 1), dtype=int, device=device)
+        whose, ids, masks = (wp.empty(max(entries, 1), dtype=int, device=device) for _ in range(3))
         starts = wp.zeros(tiles + 1, dtype=int, device=device)
         if entries:
             launch(
-                kernels.emit_tiles, len(order), [order, span, ends, view.tiles_x, keys, ids], device=device
+                kernels.emit_tiles,
+                len(order),
+                [order, span, ends, view.tiles_x, keys, slots, whose, begins],
+                device=device,
             )
-            wp.utils.radix_sort_pairs(keys, ids, entries)
+            wp.utils.radix_sort_pairs(keys, slots, entries, 0, tiles.bit_length())
             launch(kernels.tile_starts, tiles + 1, [keys, entries, starts], device=device)
-        masks = wp.empty(max(entries, 1), dtype=int, device=device)
         counts = wp.empty(tiles, dtype=self.vector(kernels.LANES), device=device)
         launch(
             self.project_kernels.block_masks,
             tiles,
-            [rows, centres, ids, starts, rays, view.tiles_x, masks, counts],
+            [rows, centres, whose, slots, starts, rays, view.tiles_x, ids, masks, counts],
             device=device,
         )
         sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])
         block_starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
         block_ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
         launch(kernels.fill_blocks, tiles, [ids, masks, starts, block_starts, block_ids], device=device)
-        # Where the adjoint's launch is cut: equal work, whatever the number of threads.
         work = sums[:: kernels.LANES] + np.arange(tiles + 1)
-        cuts = np.searchsorted(work, work[-1] * np.arange(CPU_PIECES + 1) / CPU_PIECES).tolist()
         return Prepared(
-            cam, view, rays, inputs, order, rows, ids, masks, starts, block_ids, block_starts, cuts
+            camera=cam,
+            view=view,
+            rays=rays,
+            inputs=inputs,
+            rows=rows,
+            begins=begins,
+            count=count,
+            slots=slots,
+            ids=ids,
+            masks=masks,
+            starts=starts,
+            block_ids=block_ids,
+            block_starts=block_starts,
+            work=work,
         )
-
-    def _rays(self, cam: Camera) -> Any:
-        """Directions of the pixels of every column and row of blocks; beyond the image those of its border."""
-        step, per_tile = kernels.BLOCK, kernels.TILE // kernels.BLOCK
-        x = np.arange(-(-cam.width // kernels.TILE) * kernels.TILE)
-        y = np.arange(-(-cam.height // kernels.TILE) * kernels.TILE)
-        u, v = np.minimum(x, cam.width - 1) + 0.5, np.minimum(y, cam.height - 1) + 0.5
-        if cam.kind == "pinhole":
-            across, along, down = (u - cam.cx) / cam.fx, np.ones(len(u)), (v - cam.cy) / cam.fy
-            pitch = 1 / cam.fx, 0.0, 1 / cam.fy
-        else:
-            azimuth, zenith = u * 2 * np.pi / cam.width - np.pi, v * np.pi / cam.height
-            across, along, down = np.cos(azimuth), np.sin(azimuth), 1 / np.tan(zenith)
-            pitch = 2 * np.pi / cam.width, 2 * np.pi / cam.width, np.pi / cam.height
-        rounding = np.finfo(np.float32 if self.real is wp.float32 else np.float64).eps
-
-        def spans(values: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
-            blocks = values.reshape(-1, per_tile, step)
-            low, high = blocks.min(axis=2), blocks.max(axis=2)
-            # Widened by a thousandth of a pixel and by rounding: what a block's pixels see is never left out.
-            return (low + high) / 2, (high - low) / 2 + 1e-3 * pitch + 4 * rounding * np.abs(blocks).max(
-                axis=2
-            )
-
-        def lanes(values: np.ndarray) -> wp.array:
-            return wp.array(values, dtype=self.vector(kernels.LANES), device=self.device)
-
-        rays = kernels.rays_of(self.real)()
-        rays.across = lanes(np.tile(across.reshape(-1, step), (1, step)))
-        rays.along = lanes(np.tile(along.reshape(-1, step), (1, step)))
-        rays.down = lanes(np.repeat(down.reshape(-1, step), step, axis=1))
-        rays.square_across = wp.array(across**2 + along**2, dtype=self.real, device=self.device)
-        rays.square_down = wp.array(down**2, dtype=self.real, device=self.device)
-        columns = [*spans(across, pitch[0]), *spans(along, pitch[1])]
-        rays.columns = lanes(np.stack([np.tile(c, (1, per_tile)) for c in columns], axis=1))
-        rays.rows = lanes(np.stack([np.repeat(r, per_tile, axis=1) for r in spans(down, pitch[2])], axis=1))
-        return rays
 
     def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
@@ -396,8 +369,8 @@ class Rasterizer:
 
     def _blend(
         self, prepared: Prepared, features: wp.array, background: Any, *, requires_grad: bool
-    ) -> tuple[Image, tuple[wp.array, wp.array, list[wp.array]]]:
-        """The image, and what its adjoint wants besides: transmittance left, background, features near to far."""
+    ) -> tuple[Image, tuple[wp.array, wp.array]]:
+        """The image, and what its adjoint wants besides: the transmittance left and the background."""
         device, real, grad = self.device, self.real, requires_grad
         shape = (prepared.camera.height, prepared.camera.width)
         channels = features.shape[1]
@@ -407,58 +380,22 @@ class Rasterizer:
             background = wp.array(np.asarray(background), dtype=real, device=device)
         image = wp.empty((*shape, channels), dtype=real, device=device, requires_grad=grad)
         alpha, depth = (wp.empty(shape, dtype=real, device=device, requires_grad=grad) for _ in range(2))
-        depth_sum, left, peak = (wp.empty(shape, dtype=real, device=device) for _ in range(3))
+        left, peak = (wp.empty(shape, dtype=real, device=device) for _ in range(2))
         dominant = wp.empty(shape, dtype=int, device=device)
-        flat = [a.flatten() for a in (image, alpha, depth, depth_sum, left, dominant, peak)]
-        blocks = len(prepared.block_starts) - 1
-        blended, blended_lanes = self._per_block(blocks * blend_kernels.PER_BLOCK, real)
-        owners, owner_lanes = self._per_block(blocks, int)
-        gathered = []
+        flat = [a.flatten() for a in (image, alpha, depth, left, dominant, peak)]
+        flat_features = _flat(features)
         for first in range(0, channels, kernels.CHANNELS):
-            gathered.append(self._gathered(prepared, features, first))
             launch(
-                self.kernels.blend,
-                blocks,
-                [prepared.rows, gathered[-1], prepared.block_ids, prepared.block_starts, prepared.rays, prepared.view,
-                 self.rules, blended_lanes, owner_lanes],
+                self._kernels(channels - first).blend,
+                len(prepared.block_starts) - 1,
+                [prepared.rows, flat_features, channels, first, background, prepared.block_ids,
+                 prepared.block_starts, prepared.rays, prepared.view, self.rules, *flat],
                 device=device,
             )  # fmt: skip
-            launch(
-                self.kernels.lay_out,
-                blocks,
-                [
-                    channels,
-                    first,
-                    background,
-                    prepared.order,
-                    prepared.rays,
-                    prepared.view,
-                    blended,
-                    owners,
-                    *flat,
-                ],
-                device=device,
-            )
-        return Image(image, alpha, depth, depth_sum, dominant, peak), (left, background, gathered)
+        return Image(image, alpha, depth, dominant, peak), (left, background)
 
-    def _per_block(self, count: int, dtype: Any) -> tuple[wp.array, wp.array]:
-        """Memory for ``count`` numbers per pixel of a block: as numbers, and as one vector per block."""
-        flat = wp.empty(count * kernels.LANES, dtype=dtype, device=self.device)
-        lanes = wp.array(
-            ptr=flat.ptr, shape=count, dtype=wp.types.vector(kernels.LANES, dtype), device=self.device
-        )
-        return flat, lanes
-
-    def _gathered(self, prepared: Prepared, features: wp.array, first: int) -> wp.array:
-        """Four channels of the visible Gaussians, near to far."""
-        gathered = wp.empty(len(prepared.order), dtype=self.vector(kernels.CHANNELS), device=self.device)
-        launch(
-            self.project_kernels.gather_features,
-            len(gathered),
-            [prepared.order, features, first, gathered],
-            device=self.device,
-        )
-        return gathered
+    def _kernels(self, channels: int) -> Any:
+        return blend_kernels.build(self.real, RULES[self.blending.rule], min(channels, kernels.CHANNELS))
 
     def blend_adjoint(
         self,
@@ -467,61 +404,55 @@ class Rasterizer:
         out: Image,
         left: wp.array,
         background: wp.array,
-        gathered: list[wp.array],
     ) -> wp.array:
         """Add the gradients of every input for those of ``out``; returns each Gaussian's summed blending weight."""
-        device, real, cuda = self.device, self.real, self.device.is_cuda
-        channels, visible = features.shape[1], len(prepared.order)
-        blocks = len(prepared.block_starts) - 1
+        device, real, lanes = self.device, self.real, self.vector(kernels.LANES)
+        channels, n = features.shape[1], len(features)
         means, quaternions, scales, opacities = prepared.inputs
-        seen = wp.zeros(len(features), dtype=real, device=device)
+        seen = wp.zeros(n, dtype=real, device=device)
         feature_grad = _gradient(features)
-        # A tile is one thread's on a CPU; on a GPU every block is, and sums are atomic.
-        parts = kernels.LANES if cuda else 1
-        cuts = [0, blocks] if cuda else prepared.cuts
-        bounds = wp.array(cuts, dtype=int, device=device)
-        seeds, seed_lanes = self._per_block(blocks * blend_kernels.PER_BLOCK, real)
-        flat = [
-            a.flatten()
-            for a in (
-                out.features,
-                out.alpha,
-                out.depth_sum,
-                out.features.grad,
-                out.alpha.grad,
-                out.depth.grad,
-            )
-        ]
+        if device.is_cuda:  # a block is one thread's, every tile has its own seeds
+            parts, cuts, bounds = kernels.LANES, None, []
+        else:  # a tile is one thread's; cut into pieces of equal work
+            count = 1 if threads() == 1 else PIECES_PER_THREAD * threads()
+            work = prepared.work
+            parts, cuts = 1, np.searchsorted(work, work[-1] * np.arange(count + 1) / count).tolist()
+            bounds = cuts
+        tiles = len(prepared.work) - 1
+        seeds = wp.empty(
+            (len(bounds) or tiles) * kernels.LANES * blend_kernels.PER_BLOCK, dtype=lanes, device=device
+        )
+        background_sums = wp.empty(tiles * parts, dtype=lanes, device=device)
+        arrays = (out.features, out.alpha, out.depth, left, out.features.grad, out.alpha.grad, out.depth.grad)
+        flat = [a.flatten() for a in arrays]
+        flat_features = _flat(features)
         with_range = int(out.depth.grad.numpy().any())
         for first in range(0, channels, kernels.CHANNELS):
+            blend = self._kernels(channels - first)
+            sums = (wp.empty if parts == 1 else wp.zeros)(len(prepared.ids), dtype=lanes, device=device)
             launch(
-                self.kernels.seed_adjoint,
-                blocks,
-                [channels, first, prepared.rays, prepared.view, *flat, seeds],
-                device=device,
-            )
-            sums = wp.zeros((len(cuts) - 1, visible), dtype=self.vector(kernels.ROW), device=device)
-            launch(
-                self.kernels.blend_adjoint[with_range if first == 0 else 0],
-                cuts[-1],
-                [parts, bounds, prepared.rows, gathered[first // kernels.CHANNELS], prepared.ids, prepared.masks,
-                 prepared.starts, prepared.rays, prepared.view, self.rules, seed_lanes, sums],
+                blend.blend_adjoint[with_range if first == 0 else 0],
+                tiles * parts,
+                [parts, wp.array(bounds, dtype=int, device=device), prepared.rows, flat_features,
+                 channels, first, prepared.ids, prepared.slots, prepared.masks, prepared.starts, prepared.rays,
+                 prepared.view, self.rules, *flat, seeds, sums, background_sums],
                 device=device,
                 cuts=cuts,
             )  # fmt: skip
             launch(
                 self.project_kernels.chain,
-                visible,
-                [prepared.order, means, quaternions, scales, prepared.view, first, sums, _gradient(means),
+                n,
+                [means, quaternions, scales, prepared.view, first, prepared.begins, prepared.count, sums, _gradient(means),
                  _gradient(quaternions), _gradient(scales), _gradient(opacities), feature_grad, seen],
                 device=device,
             )  # fmt: skip
-        if background.requires_grad:
-            of_rows = wp.empty((len(left), channels), dtype=wp.float64, device=device)
-            launch(
-                self.kernels.background_adjoint, len(left), [left, out.features.grad, of_rows], device=device
-            )
-            launch(self.kernels.add_rows, channels, [of_rows, background.grad], device=device)
+            if background.requires_grad:
+                launch(
+                    blend.background_adjoint,
+                    min(channels - first, kernels.CHANNELS),
+                    [first, background_sums, background.grad],
+                    device=device,
+                )
         return seen
 
 
@@ -532,6 +463,10 @@ def _active_tape() -> wp.Tape | None:
 def _with_gradients(*arrays: wp.array) -> list[wp.array]:
     """Those whose gradients the tape keeps; it refuses arrays that want none or are empty."""
     return [array for array in arrays if array.requires_grad and array.size]
+
+
+def _flat(array: wp.array) -> wp.array:
+    return (array if array.is_contiguous else array.contiguous()).flatten()
 
 
 def _gradient(array: wp.array) -> wp.array:
@@ -570,6 +505,43 @@ def _view(cam: Camera) -> Any:
     view.rotation = wp.mat33d(cam.rotation)
     view.origin = wp.vec3d(cam.position)
     return view
+
+
+@lru_cache(maxsize=64)
+def _rays(
+    kind: str, width: int, height: int, fx: float, fy: float, cx: float, cy: float, real: Any, device: str
+) -> Any:
+    """Directions of the pixels of every column and row of blocks; beyond the image those of its border."""
+    step, per_tile = kernels.BLOCK, kernels.TILE // kernels.BLOCK
+    x = np.arange(-(-width // kernels.TILE) * kernels.TILE)
+    y = np.arange(-(-height // kernels.TILE) * kernels.TILE)
+    u, v = np.minimum(x, width - 1) + 0.5, np.minimum(y, height - 1) + 0.5
+    if kind == "pinhole":
+        across, along, down = (u - cx) / fx, np.ones(len(u)), (v - cy) / fy
+        pitch = 1 / fx, 0.0, 1 / fy
+    else:
+        azimuth, zenith = u * 2 * np.pi / width - np.pi, v * np.pi / height
+        across, along, down = np.cos(azimuth), np.sin(azimuth), 1 / np.tan(zenith)
+        pitch = 2 * np.pi / width, 2 * np.pi / width, np.pi / height
+    rounding = np.finfo(np.float32 if real is wp.float32 else np.float64).eps
+
+    def spans(values: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+        blocks = values.reshape(-1, per_tile, step)
+        low, high = blocks.min(axis=2), blocks.max(axis=2)
+        # Widened by a thousandth of a pixel and by rounding: what a block's pixels see is never left out.
+        return (low + high) / 2, (high - low) / 2 + 1e-3 * pitch + 4 * rounding * np.abs(blocks).max(axis=2)
+
+    def lanes(values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=kernels.lanes_of(real), device=device)
+
+    rays = kernels.rays_of(real)()
+    rays.across = lanes(np.tile(across.reshape(-1, step), (1, step)))
+    rays.along = lanes(np.tile(along.reshape(-1, step), (1, step)))
+    rays.down = lanes(np.repeat(down.reshape(-1, step), step, axis=1))
+    columns = [*spans(across, pitch[0]), *spans(along, pitch[1])]
+    rays.columns = lanes(np.stack([np.tile(c, (1, per_tile)) for c in columns], axis=1))
+    rays.rows = lanes(np.stack([np.repeat(r, per_tile, axis=1) for r in spans(down, pitch[2])], axis=1))
+    return rays
 
 
 def _check(g: Any, cam: Any) -> None:

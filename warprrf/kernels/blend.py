@@ -18,6 +18,7 @@ import warp as wp
 from warprrf.kernels.lanes import BLOCK, LANES, VECTORISED, lanes_of, lowest_bit
 from warprrf.kernels.lanes import build as lane_functions
 from warprrf.kernels.project import (
+    CHANNELS,
     CUT,
     FLAT,
     G0,
@@ -36,26 +37,30 @@ from warprrf.kernels.project import (
     rays_of,
 )
 
-# What is kept per block. Blended: four channels, sums of weight and of weight times range, range of the dominant peak,
-# transmittance left. For the adjoint: gradients of channels and sums, what they make of all that lies behind, and again
-# the transmittance left.
-OF_CHANNELS, OF_WEIGHT, OF_RANGE, LEFT = 0, 4, 5, 7
-PEAK = BEHIND = 6
+# What `blend_adjoint` keeps per block: gradients of the channels, of the sums of weight and of weight times range, what
+# they make of all that lies behind, and the transmittance left.
+OF_CHANNELS, OF_WEIGHT, OF_RANGE, BEHIND, LEFT = 0, 4, 5, 6, 7
 PER_BLOCK = 8
 
 
 @cache
-def build(real: Any, rule: int) -> SimpleNamespace:
-    """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``, and one transmittance rule; each is compiled
-    when first launched."""
+def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
+    """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``, one transmittance rule, and 1 to 4 channels at
+    once; each is compiled when first launched."""
     lanes = lanes_of(real)
     integers = lanes_of(int)
-    vec4 = wp.types.vector(4, real)
     coefficients = wp.types.vector(ROW, real)
     Rays = rays_of(real)
     of = lane_functions(real)
-    any_positive, above, above_number, lower, higher = of.any_positive, of.above, of.above_number, of.lower, of.higher
-    sums_of, take, put, read, read4, write = of.sums, of.take, of.put, of.read, of.read4, of.write
+    any_positive, above, above_number, lower, higher = (
+        of.any_positive,
+        of.above,
+        of.above_number,
+        of.lower,
+        of.higher,
+    )
+    sums_of, roots, read, write, number = of.sums, of.roots, of.read, of.write, of.number
+    collect, spread, spread_numbers = of.collect, of.spread, of.spread_numbers
     tiny = 1.0e-30 if real is wp.float32 else 1.0e-250
 
     if real is wp.float32:
@@ -124,27 +129,36 @@ def build(real: Any, rule: int) -> SimpleNamespace:
 
     @wp.func
     def ray_lengths(across: lanes, along: lanes, down: lanes):
-        square = wp.cw_mul(across, across) + wp.cw_mul(along, along) + wp.cw_mul(down, down)
-        for k in range(wp.static(LANES)):
-            square[k] = wp.sqrt(square[k])
-        return square
+        return roots(wp.cw_mul(across, across) + wp.cw_mul(along, along) + wp.cw_mul(down, down))
 
     @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
     def blend(
         offset: int,
         rows: wp.array(dtype=coefficients),
-        features: wp.array(dtype=vec4),
+        features: wp.array(dtype=real),
+        channels: int,
+        first: int,
+        background: wp.array(dtype=real),
         ids: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         rays: Rays,
         view: View,
         rules: Rules,
-        blended: wp.array(dtype=lanes),
-        owners: wp.array(dtype=integers),
+        image: wp.array(dtype=real),
+        alpha_out: wp.array(dtype=real),
+        depth_out: wp.array(dtype=real),
+        transmittance_out: wp.array(dtype=real),
+        dominant_out: wp.array(dtype=int),
+        peak_out: wp.array(dtype=real),
     ):
-        """Blend four channels front to back; ranges are over the length of ``rays``."""
+        """Blend ``width`` channels from ``first`` front to back.
+
+        The mean range ``depth_out`` is 0 where nothing is seen, so that a loss on it stays finite.
+        """
         block = offset + wp.tid()
         column, line = place_of(block, view)
+        if column * wp.static(BLOCK) >= view.width or line * wp.static(BLOCK) >= view.height:
+            return
         across = rays.across[column]
         along = rays.along[column]
         down = rays.down[line]
@@ -182,143 +196,72 @@ def build(real: Any, rule: int) -> SimpleNamespace:
             owner = above_number(weight, best, k, owner)
             peak = above(weight, best, t, peak)
             best = higher(best, weight)
-            f = read4(features, k)
-            c0 += f[0] * weight
-            c1 += f[1] * weight
-            c2 += f[2] * weight
-            c3 += f[3] * weight
-        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS)] = c0
-        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 1)] = c1
-        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 2)] = c2
-        blended[block * wp.static(PER_BLOCK) + wp.static(OF_CHANNELS + 3)] = c3
-        blended[block * wp.static(PER_BLOCK) + wp.static(OF_WEIGHT)] = total
-        blended[block * wp.static(PER_BLOCK) + wp.static(OF_RANGE)] = depth
-        blended[block * wp.static(PER_BLOCK) + wp.static(PEAK)] = peak
-        blended[block * wp.static(PER_BLOCK) + wp.static(LEFT)] = transmittance
-        owners[block] = owner
+            f = k * channels + first
+            c0 += number(features, f) * weight
+            if wp.static(width > 1):
+                c1 += number(features, f + 1) * weight
+            if wp.static(width > 2):
+                c2 += number(features, f + 2) * weight
+            if wp.static(width > 3):
+                c3 += number(features, f + 3) * weight
+        x = column * wp.static(BLOCK)
+        y = line * wp.static(BLOCK)
+        columns = wp.min(view.width - x, wp.static(BLOCK))
+        lines = wp.min(view.height - y, wp.static(BLOCK))
+        pixel = y * view.width + x
+        at = pixel * channels + first
+        step = view.width * channels
+        spread(image, at, step, channels, columns, lines, c0 + background[first] * transmittance)
+        if wp.static(width > 1):
+            spread(image, at + 1, step, channels, columns, lines, c1 + background[first + 1] * transmittance)
+        if wp.static(width > 2):
+            spread(image, at + 2, step, channels, columns, lines, c2 + background[first + 2] * transmittance)
+        if wp.static(width > 3):
+            spread(image, at + 3, step, channels, columns, lines, c3 + background[first + 3] * transmittance)
+        if first == 0:
+            length = ray_lengths(across, along, down)
+            mean = wp.cw_div(wp.cw_mul(depth, length), above(total, lanes(), total, one))
+            spread(alpha_out, pixel, view.width, 1, columns, lines, total)
+            spread(depth_out, pixel, view.width, 1, columns, lines, mean)
+            spread(transmittance_out, pixel, view.width, 1, columns, lines, transmittance)
+            spread(peak_out, pixel, view.width, 1, columns, lines, wp.cw_mul(peak, length))
+            spread_numbers(dominant_out, pixel, view.width, 1, columns, lines, owner)
 
     @wp.func
-    def line_of(thread: int, view: View):
-        """A tile's line of pixels: its first column, its row, the first of its four blocks, and its place in a block."""
-        tile = thread / wp.static(TILE)
-        down = thread % wp.static(TILE)
-        block = tile * wp.static(LANES) + (down / wp.static(BLOCK)) * wp.static(TILE // BLOCK)
-        x = (tile % view.tiles_x) * wp.static(TILE)
-        y = (tile / view.tiles_x) * wp.static(TILE) + down
-        return x, y, block, (down % wp.static(BLOCK)) * wp.static(BLOCK)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def lay_out(
-        offset: int,
-        channels: int,
-        first: int,
-        background: wp.array(dtype=real),
-        order: wp.array(dtype=int),
+    def seed_sums(
+        seeds: wp.array(dtype=lanes),
+        at: int,
+        pixel: int,
+        columns: int,
+        lines: int,
+        x: int,
+        y: int,
         rays: Rays,
         view: View,
-        blended: wp.array(dtype=real),
-        owners: wp.array(dtype=int),
-        image: wp.array(dtype=real),
-        alpha_out: wp.array(dtype=real),
-        depth_out: wp.array(dtype=real),
-        depth_sum_out: wp.array(dtype=real),
-        transmittance_out: wp.array(dtype=real),
-        dominant_out: wp.array(dtype=int),
-        peak_out: wp.array(dtype=real),
-    ):
-        """Blocks to images, before the background; a thread lays out a tile's line of pixels.
-
-        The mean range is 0 where nothing is seen, so that a loss on it stays finite.
-        """
-        x0, y, block0, inset = line_of(offset + wp.tid(), view)
-        if y >= view.height:
-            return
-        shown = wp.min(channels - first, 4)
-        square_down = rays.square_down[y]
-        for b in range(wp.min((view.width - x0 + 3) / 4, 4)):
-            x = x0 + b * 4
-            n = wp.min(view.width - x, 4)
-            pixel = y * view.width + x
-            at = (block0 + b) * wp.static(PER_BLOCK * LANES) + inset
-            left = take(blended, at + wp.static(LEFT * LANES), 1, 4)
-            for c in range(shown):
-                color = take(blended, at + wp.static(OF_CHANNELS * LANES) + c * wp.static(LANES), 1, 4)
-                put(image, pixel * channels + first + c, channels, n, color + background[first + c] * left)
-            if first == 0:
-                length = take(rays.square_across, x, 1, 4)
-                alpha = take(blended, at + wp.static(OF_WEIGHT * LANES), 1, 4)
-                depth = take(blended, at + wp.static(OF_RANGE * LANES), 1, 4)
-                peak = take(blended, at + wp.static(PEAK * LANES), 1, 4)
-                mean = vec4()
-                for i in range(4):
-                    length[i] = wp.sqrt(length[i] + square_down)
-                    depth[i] = depth[i] * length[i]
-                    peak[i] = peak[i] * length[i]
-                    mean[i] = depth[i] / wp.where(alpha[i] > real(0.0), alpha[i], real(1.0))
-                put(alpha_out, pixel, 1, n, alpha)
-                put(depth_sum_out, pixel, 1, n, depth)
-                put(depth_out, pixel, 1, n, mean)
-                put(transmittance_out, pixel, 1, n, left)
-                put(peak_out, pixel, 1, n, peak)
-                for i in range(n):
-                    owner = owners[(block0 + b) * wp.static(LANES) + inset + i]
-                    if owner >= 0:
-                        owner = order[owner]
-                    dominant_out[pixel + i] = owner
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def seed_adjoint(
-        offset: int,
-        channels: int,
-        first: int,
-        rays: Rays,
-        view: View,
-        image: wp.array(dtype=real),
-        alpha_sum: wp.array(dtype=real),
-        depth_sum: wp.array(dtype=real),
-        image_grad: wp.array(dtype=real),
+        alphas: wp.array(dtype=real),
+        ranges: wp.array(dtype=real),
         alpha_grad: wp.array(dtype=real),
         depth_grad: wp.array(dtype=real),
-        seeds: wp.array(dtype=real),
     ):
-        """What `blend_adjoint` starts from: images to blocks; a thread takes a tile's line of pixels."""
-        x0, y, block0, inset = line_of(offset + wp.tid(), view)
-        shown = wp.min(channels - first, 4)
-        for b in range(4):
-            x = x0 + b * 4
-            n = wp.clamp(view.width - x, 0, 4)
-            if y >= view.height:
-                n = int(0)
-            pixel = y * view.width + x
-            at = (block0 + b) * wp.static(PER_BLOCK * LANES) + inset
-            goal = vec4()
-            for c in range(4):
-                v = vec4()
-                if c < shown:
-                    v = take(image_grad, pixel * channels + first + c, channels, n)
-                    goal += wp.cw_mul(v, take(image, pixel * channels + first + c, channels, n))
-                put(seeds, at + wp.static(OF_CHANNELS * LANES) + c * wp.static(LANES), 1, 4, v)
-            vt = vec4()
-            va = vec4()
-            if first == 0:
-                sums = take(alpha_sum, pixel, 1, n)
-                depths = take(depth_sum, pixel, 1, n)
-                wanted = take(depth_grad, pixel, 1, n)
-                va = take(alpha_grad, pixel, 1, n)
-                for i in range(4):
-                    seen = sums[i] > real(0.0)
-                    vd = wp.where(seen, wanted[i] / wp.where(seen, sums[i], real(1.0)), real(0.0))
-                    va[i] = wp.where(seen, va[i], real(0.0)) - vd * depths[i] / wp.where(seen, sums[i], real(1.0))
-                    goal[i] = goal[i] + vd * depths[i] + va[i] * sums[i]
-                    vt[i] = vd
-                if n > 0:
-                    length = take(rays.square_across, x, 1, 4)
-                    for i in range(4):
-                        vt[i] = vt[i] * wp.sqrt(length[i] + rays.square_down[y])
-            put(seeds, at + wp.static(OF_WEIGHT * LANES), 1, 4, va)
-            put(seeds, at + wp.static(OF_RANGE * LANES), 1, 4, vt)
-            put(seeds, at + wp.static(BEHIND * LANES), 1, 4, goal)
-            put(seeds, at + wp.static(LEFT * LANES), 1, 4, vec4(real(1.0)))
+        """Gradients of a block's sums of weight and of weight times range, which are alpha and alpha times the mean
+        range; returned is what they make of the whole pixel."""
+        total = collect(alphas, pixel, view.width, 1, columns, lines)
+        mean = collect(ranges, pixel, view.width, 1, columns, lines)
+        of_weight = above(total, lanes(), collect(alpha_grad, pixel, view.width, 1, columns, lines), lanes())
+        of_range = wp.cw_div(
+            above(total, lanes(), collect(depth_grad, pixel, view.width, 1, columns, lines), lanes()),
+            above(total, lanes(), total, lanes(real(1.0))),
+        )
+        whole = wp.cw_mul(total, of_weight)
+        of_weight -= wp.cw_mul(of_range, mean)
+        length = ray_lengths(
+            read(rays.across, x / wp.static(BLOCK)),
+            read(rays.along, x / wp.static(BLOCK)),
+            read(rays.down, y / wp.static(BLOCK)),
+        )
+        write(seeds, at + wp.static(OF_WEIGHT), of_weight)
+        write(seeds, at + wp.static(OF_RANGE), wp.cw_mul(of_range, length))
+        return whole
 
     def adjoint_kernel(with_range: bool) -> Any:
         @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
@@ -327,39 +270,110 @@ def build(real: Any, rule: int) -> SimpleNamespace:
             parts: int,
             bounds: wp.array(dtype=int),
             rows: wp.array(dtype=coefficients),
-            features: wp.array(dtype=vec4),
+            features: wp.array(dtype=real),
+            channels: int,
+            first: int,
             ids: wp.array(dtype=int),
+            slots: wp.array(dtype=int),
             masks: wp.array(dtype=int),
             starts: wp.array(dtype=int),
             rays: Rays,
             view: View,
             rules: Rules,
+            image: wp.array(dtype=real),
+            alphas: wp.array(dtype=real),
+            ranges: wp.array(dtype=real),
+            remaining: wp.array(dtype=real),
+            image_grad: wp.array(dtype=real),
+            alpha_grad: wp.array(dtype=real),
+            depth_grad: wp.array(dtype=real),
             seeds: wp.array(dtype=lanes),
-            sums: wp.array(dtype=coefficients, ndim=2),
+            sums: wp.array(dtype=coefficients),
+            background_sums: wp.array(dtype=coefficients),
         ):
-            """Same walk as `blend`; adds each Gaussian's gradient in a tile to ``sums[piece, Gaussian]``.
+            """Same walk as `blend`; leaves each Gaussian's gradient in a tile in ``sums[slot of the entry]``.
 
-            dL/da_i = T_i x_i - (R - sum_{j<=i} w_j x_j) / (1 - a_i), x the gradient dotted with the pair's features, R the
-            same dotted with the finished pixel; without the division for the exponential rule. A tile is shared among
-            ``parts`` threads (1 or 16), and piece p holds the threads ``bounds[p] .. bounds[p + 1]``.
+            dL/da_i = T_i x_i - (R - sum_{j<=i} w_j x_j) / (1 - a_i), x the gradient dotted with the pair's features, R
+            the same dotted with the finished pixel; without the division for the exponential rule. A tile is shared
+            among ``parts`` threads, 1 or 16. Threads ``bounds[p] .. bounds[p + 1]`` run one after the other and share
+            ``seeds``, tile after tile; with no bounds every tile has its own.
             """
             thread = offset + wp.tid()
-            piece = int(0)
-            while thread >= bounds[piece + 1]:
-                piece += 1
             tile = thread / parts
             share = wp.static(LANES) / parts
             open = ((1 << share) - 1) << (share * (thread % parts))
+            place = tile
+            if bounds.shape[0] > 0:
+                place = int(0)
+                while thread >= bounds[place + 1]:
+                    place += 1
+            seed0 = place * wp.static(LANES * PER_BLOCK)
             column0 = (tile % view.tiles_x) * wp.static(TILE // BLOCK)
             line0 = (tile / view.tiles_x) * wp.static(TILE // BLOCK)
-            block0 = tile * wp.static(LANES)
             amax = lanes(real(rules.alpha_max))
             tmin = lanes(real(rules.transmittance_min))
             one = lanes(real(1.0))
+            w0 = lanes()
+            w1 = lanes()
+            w2 = lanes()
+            w3 = lanes()
+            unseeded = open
+            while unseeded != 0:
+                b = lowest_bit(unseeded)
+                unseeded = unseeded & (unseeded - 1)
+                at = seed0 + b * wp.static(PER_BLOCK)
+                x = (column0 + b % wp.static(TILE // BLOCK)) * wp.static(BLOCK)
+                y = (line0 + b / wp.static(TILE // BLOCK)) * wp.static(BLOCK)
+                columns = wp.clamp(view.width - x, 0, wp.static(BLOCK))
+                lines = wp.clamp(view.height - y, 0, wp.static(BLOCK))
+                pixel = y * view.width + x
+                step = view.width * channels
+                here = collect(remaining, pixel, view.width, 1, columns, lines)
+                goal = lanes()
+                if first == 0:
+                    goal = seed_sums(
+                        seeds,
+                        at,
+                        pixel,
+                        columns,
+                        lines,
+                        x,
+                        y,
+                        rays,
+                        view,
+                        alphas,
+                        ranges,
+                        alpha_grad,
+                        depth_grad,
+                    )
+                else:
+                    write(seeds, at + wp.static(OF_WEIGHT), lanes())
+                    write(seeds, at + wp.static(OF_RANGE), lanes())
+                for c in range(wp.static(width)):
+                    source = pixel * channels + first + c
+                    v = collect(image_grad, source, step, channels, columns, lines)
+                    goal += wp.cw_mul(v, collect(image, source, step, channels, columns, lines))
+                    write(seeds, at + wp.static(OF_CHANNELS) + c, v)
+                    if wp.static(c == 0):
+                        w0 += wp.cw_mul(v, here)
+                    if wp.static(c == 1):
+                        w1 += wp.cw_mul(v, here)
+                    if wp.static(c == 2):
+                        w2 += wp.cw_mul(v, here)
+                    if wp.static(c == 3):
+                        w3 += wp.cw_mul(v, here)
+                write(seeds, at + wp.static(BEHIND), goal)
+                write(seeds, at + wp.static(LEFT), one)
+            zero = lanes()
+            write(
+                background_sums,
+                thread,
+                sums_of(
+                    w0, w1, w2, w3, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+                ),
+            )
             for j in range(starts[tile], starts[tile + 1]):
                 mask = masks[j] & open
-                if mask == 0:
-                    continue
                 k = ids[j]
                 s0 = lanes()
                 s1 = lanes()
@@ -381,10 +395,10 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                     mask = mask & (mask - 1)
                     # Read again for each block: operands in memory cost nothing, registers are for the sums.
                     row = read(rows, k)
-                    f = read4(features, k)
+                    f = k * channels + first
                     column = column0 + b % wp.static(TILE // BLOCK)
                     line = line0 + b / wp.static(TILE // BLOCK)
-                    at = (block0 + b) * wp.static(PER_BLOCK)
+                    at = seed0 + b * wp.static(PER_BLOCK)
                     g0, g1, g2 = forms(
                         row, read(rays.across, column), read(rays.along, column), read(rays.down, line)
                     )
@@ -403,10 +417,20 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                     alpha = lower(raw, amax)
                     weight = wp.cw_mul(alpha, transmittance)
                     v0 = read(seeds, at + wp.static(OF_CHANNELS))
-                    v1 = read(seeds, at + wp.static(OF_CHANNELS + 1))
-                    v2 = read(seeds, at + wp.static(OF_CHANNELS + 2))
-                    v3 = read(seeds, at + wp.static(OF_CHANNELS + 3))
-                    value = f[0] * v0 + f[1] * v1 + f[2] * v2 + f[3] * v3 + read(seeds, at + wp.static(OF_WEIGHT))
+                    value = number(features, f) * v0 + read(seeds, at + wp.static(OF_WEIGHT))
+                    s10 += wp.cw_mul(weight, v0)
+                    if wp.static(width > 1):
+                        v1 = read(seeds, at + wp.static(OF_CHANNELS + 1))
+                        value += number(features, f + 1) * v1
+                        s11 += wp.cw_mul(weight, v1)
+                    if wp.static(width > 2):
+                        v2 = read(seeds, at + wp.static(OF_CHANNELS + 2))
+                        value += number(features, f + 2) * v2
+                        s12 += wp.cw_mul(weight, v2)
+                    if wp.static(width > 3):
+                        v3 = read(seeds, at + wp.static(OF_CHANNELS + 3))
+                        value += number(features, f + 3) * v3
+                        s13 += wp.cw_mul(weight, v3)
                     if wp.static(with_range):
                         vt = wp.cw_mul(weight, read(seeds, at + wp.static(OF_RANGE)))
                         value += row[REACH] * wp.cw_mul(lever, read(seeds, at + wp.static(OF_RANGE)))
@@ -432,10 +456,6 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                     s6 += wp.cw_mul(p1, y1)
                     s7 += wp.cw_mul(p1, y2)
                     s9 += slope
-                    s10 += wp.cw_mul(weight, v0)
-                    s11 += wp.cw_mul(weight, v1)
-                    s12 += wp.cw_mul(weight, v2)
-                    s13 += wp.cw_mul(weight, v3)
                     s14 += weight
                     if wp.static(with_range):
                         half = wp.cw_mul(vt, inverse)
@@ -453,7 +473,10 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                     if not any_positive(left - tmin):
                         open = open & (-1 - (1 << b))
                 found = sums_of(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12, s13, s14, lanes())
-                wp.atomic_add(sums, piece, k, found)
+                if parts == 1:
+                    write(sums, slots[j], found)
+                else:
+                    wp.atomic_add(sums, slots[j], found)
 
         return blend_adjoint
 
@@ -461,7 +484,6 @@ def build(real: Any, rule: int) -> SimpleNamespace:
     def strongest(
         offset: int,
         rows: wp.array(dtype=coefficients),
-        order: wp.array(dtype=int),
         ids: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         rays: Rays,
@@ -523,7 +545,7 @@ def build(real: Any, rule: int) -> SimpleNamespace:
                             weight_out[first + c] = weight_out[first + c + 1]
                             range_out[first + c] = range_out[first + c + 1]
                         place = capacity - 1
-                    index[first + place] = order[k]
+                    index[first + place] = k
                     weight_out[first + place] = weight[lane]
                     range_out[first + place] = t[lane]
                     kept[lane] = place + 1
@@ -545,34 +567,20 @@ def build(real: Any, rule: int) -> SimpleNamespace:
     @wp.kernel(module="unique", enable_backward=False)
     def background_adjoint(
         offset: int,
-        transmittance: wp.array(dtype=real, ndim=2),
-        image_grad: wp.array(dtype=real, ndim=3),
-        of_rows: wp.array(dtype=wp.float64, ndim=2),
+        first: int,
+        background_sums: wp.array(dtype=coefficients),
+        background_grad: wp.array(dtype=real),
     ):
-        """Gradient of the background, row by row of the image: the transmittance left times what each pixel wants."""
-        y = offset + wp.tid()
-        for c in range(image_grad.shape[2]):
-            total = wp.float64(0.0)
-            for x in range(transmittance.shape[1]):
-                total += wp.float64(transmittance[y, x]) * wp.float64(image_grad[y, x, c])
-            of_rows[y, c] = total
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def add_rows(
-        offset: int, of_rows: wp.array(dtype=wp.float64, ndim=2), background_grad: wp.array(dtype=real)
-    ):
+        """Gradient of one channel of the background: the transmittance left times what each pixel wants."""
         c = offset + wp.tid()
         total = wp.float64(0.0)
-        for y in range(of_rows.shape[0]):
-            total += of_rows[y, c]
-        background_grad[c] = background_grad[c] + real(total)
+        for k in range(background_sums.shape[0]):
+            total += wp.float64(background_sums[k][c])
+        background_grad[first + c] = background_grad[first + c] + real(total)
 
     return SimpleNamespace(
-        add_rows=add_rows,
         background_adjoint=background_adjoint,
         blend=blend,
         blend_adjoint=(adjoint_kernel(False), adjoint_kernel(True)),  # with or without gradients of ranges
-        lay_out=lay_out,
-        seed_adjoint=seed_adjoint,
         strongest=strongest,
     )

@@ -124,52 +124,101 @@ def build(real: Any) -> SimpleNamespace:
         """Set an element of a contiguous array, ``i >= 0``."""
         ...
 
-    four = wp.types.vector(BLOCK, real)
-
     @wp.func_native("return source.data[i];")
-    def read4(source: wp.array(dtype=four), i: int) -> four:  # type: ignore[valid-type, empty-body]
+    def number(source: wp.array(dtype=real), i: int) -> real:  # type: ignore[valid-type, empty-body]
         """Element of a contiguous array, ``i >= 0``."""
         ...
 
     @wp.func_native(f"""
-    wp::vec_t<{BLOCK}, wp::{name}> out;
-    const wp::{name}* from = source.data + at;
-    if (count == {BLOCK}) {{
-        for (int i = 0; i < {BLOCK}; ++i) out[i] = from[i * step];
-    }} else {{
-        for (int i = 0; i < count; ++i) out[i] = from[i * step];
-    }}
+    wp::vec_t<{LANES}, wp::{name}> out;
+    for (int i = 0; i < {LANES}; ++i) out[i] = wp::sqrt(x[i]);
     return out;
     """)
-    def take(source: wp.array(dtype=real), at: int, step: int, count: int) -> four:  # type: ignore[valid-type, empty-body]
-        """The first ``count`` of four numbers of contiguous memory, ``step`` apart; zero beyond."""
+    def roots(x: lanes) -> lanes:  # type: ignore[valid-type, empty-body]
+        """Square root of each number."""
         ...
 
-    @wp.func_native(f"""
-    wp::{name}* to = target.data + at;
-    if (count == {BLOCK}) {{
-        for (int i = 0; i < {BLOCK}; ++i) to[i * step] = values[i];
-    }} else {{
-        for (int i = 0; i < count; ++i) to[i * step] = values[i];
-    }}
-    """)
-    def put(target: wp.array(dtype=real), at: int, step: int, count: int, values: four):  # type: ignore[valid-type]
-        """Write the first ``count`` of four numbers to contiguous memory, ``step`` apart."""
+    @wp.func_native(_collect(name))
+    def collect(
+        source: wp.array(dtype=real), at: int, line: int, step: int, columns: int, rows: int
+    ) -> lanes:  # type: ignore[valid-type, empty-body]
+        """A block of a contiguous image: ``rows`` of ``columns`` pixels from element ``at``, pixels ``step`` and rows
+        ``line`` elements apart; zero beyond."""
+        ...
+
+    @wp.func_native(_spread(name))
+    def spread(
+        target: wp.array(dtype=real), at: int, line: int, step: int, columns: int, rows: int, values: lanes
+    ):  # type: ignore[valid-type]
+        """The inverse of ``collect``."""
+        ...
+
+    @wp.func_native(_spread("int32"))
+    def spread_numbers(
+        target: wp.array(dtype=int), at: int, line: int, step: int, columns: int, rows: int, values: integers
+    ):  # type: ignore[valid-type]
+        """As ``spread``."""
         ...
 
     return SimpleNamespace(
         above=above,
         above_number=above_number,
         any_positive=any_positive,
+        collect=collect,
         higher=higher,
         lower=lower,
-        put=put,
+        number=number,
         read=read,
-        read4=read4,
+        roots=roots,
+        spread=spread,
+        spread_numbers=spread_numbers,
         sums=sums,
-        take=take,
         write=write,
     )
+
+
+def _vector(name: str) -> str:
+    """C++ type ``lanes`` that is kept in registers whole: a CPU compiler's vector where there is one."""
+    return f"""
+#if defined(__clang__)
+    typedef wp::{name} lanes __attribute__((vector_size({LANES} * sizeof(wp::{name})), aligned(4)));
+#else
+    typedef wp::vec_t<{LANES}, wp::{name}> lanes;
+#endif
+"""
+
+
+def _spread(name: str) -> str:
+    """C++ that writes a block to part of an image."""
+    return f"""{_vector(name)}
+    const lanes x = *(const lanes*)&values;
+    wp::{name}* to = target.data + at;
+    if (columns == {BLOCK} && rows == {BLOCK}) {{
+        for (int r = 0; r < {BLOCK}; ++r)
+            for (int c = 0; c < {BLOCK}; ++c) to[r * line + c * step] = x[r * {BLOCK} + c];
+    }} else {{
+        for (int r = 0; r < rows; ++r)
+            for (int c = 0; c < columns; ++c) to[r * line + c * step] = x[r * {BLOCK} + c];
+    }}
+    """
+
+
+def _collect(name: str) -> str:
+    """C++ that reads part of an image as a block."""
+    return f"""{_vector(name)}
+    lanes x = {{}};
+    wp::vec_t<{LANES}, wp::{name}> out;
+    const wp::{name}* from = source.data + at;
+    if (columns == {BLOCK} && rows == {BLOCK}) {{
+        for (int r = 0; r < {BLOCK}; ++r)
+            for (int c = 0; c < {BLOCK}; ++c) x[r * {BLOCK} + c] = from[r * line + c * step];
+    }} else {{
+        for (int r = 0; r < rows; ++r)
+            for (int c = 0; c < columns; ++c) x[r * {BLOCK} + c] = from[r * line + c * step];
+    }}
+    *(lanes*)&out = x;
+    return out;
+    """
 
 
 def _pairwise_sums(name: str) -> str:

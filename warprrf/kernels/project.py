@@ -112,16 +112,20 @@ def tile_span(lo: wp.float64, hi: wp.float64, pixels: int):
 
 
 @wp.func
-def covered_tiles(view: View, m: wp.vec3d, cov: wp.mat33d, radius: wp.float64, inside: bool):
-    """Tiles that the ellipsoid ``radius`` can touch: first column, columns, first row, rows; columns wrap on a sphere.
+def covered_tiles(
+    view: View,
+    m: wp.vec3d,
+    distance: wp.float64,
+    cov: wp.mat33d,
+    r2: wp.float64,
+    extent: wp.float64,
+    inside: bool,
+):
+    """Tiles that the ellipsoid of ``r2`` times the covariance can touch, whose longest axis is ``extent``: first column,
+    columns, first row, rows; columns wrap on a sphere.
 
     A plane through the ray origin with normal l touches the ellipsoid where l^T (r^2 cov - m m^T) l = 0.
     """
-    r2 = radius * radius
-    extent = radius * wp.sqrt(
-        wp.max(wp.max(cov[0, 0] + cov[1, 1] + cov[2, 2], wp.float64(0.0)), wp.float64(1.0e-300))
-    )
-    distance = wp.length(m)
     everything = wp.vec4i(0, view.tiles_x, 0, view.tiles_y)
     nothing = wp.vec4i(0, 0, 0, 0)
     if inside:
@@ -252,17 +256,22 @@ def emit_tiles(
     tiles_x: int,
     keys: wp.array(dtype=int),
     values: wp.array(dtype=int),
+    whose: wp.array(dtype=int),
+    begins: wp.array(dtype=int),
 ):
-    """Write (tile, place in the order) for every covered tile, Gaussians from near to far."""
+    """Write (tile, own index) and whose it is for every covered tile, Gaussians from near to far, and where each begins."""
     i = offset + wp.tid()
-    s = span[order[i]]
+    k = order[i]
+    s = span[k]
     at = int(0)
     if i > 0:
         at = ends[i - 1]
+    begins[k] = at
     for row in range(s[3]):
         for column in range(s[1]):
             keys[at] = (s[2] + row) * tiles_x + (s[0] + column) % tiles_x
-            values[at] = i
+            values[at] = at
+            whose[at] = k
             at += 1
 
 
@@ -317,9 +326,6 @@ def rays_of(real: Any) -> Any:
         across: wp.array(dtype=lanes)  # per column of blocks: camera x of a photo, cos(azimuth) of a panorama
         along: wp.array(dtype=lanes)  # per column of blocks: one (camera z), sin(azimuth)
         down: wp.array(dtype=lanes)  # per row of blocks: camera y, cot(zenith)
-        # The square of a direction's length: a part per column of pixels, and one per row.
-        square_across: wp.array(dtype=real)
-        square_down: wp.array(dtype=real)
         # What each of a tile's blocks spans, as middle and half width.
         columns: wp.array(dtype=lanes, ndim=2)  # per column of tiles: across, its half, along, its half
         rows: wp.array(dtype=lanes, ndim=2)  # per row of tiles: down, its half
@@ -361,8 +367,11 @@ def build(real: Any) -> SimpleNamespace:
         span: wp.array(dtype=wp.vec4i),
         count: wp.array(dtype=int),
         distance: wp.array(dtype=float),
+        rows: wp.array(dtype=coefficients),
+        centres: wp.array(dtype=vec3),
     ):
-        """Per Gaussian and view: the covered tiles, and the range that orders blending."""
+        """Per Gaussian and view: the covered tiles, the range that orders blending, and, where it is seen, the row of
+        coefficients and where the ray to the mean points (0 if nowhere)."""
         i = offset + wp.tid()
         m = double3(means[i]) - view.origin
         range_ = wp.length(m)
@@ -374,42 +383,34 @@ def build(real: Any) -> SimpleNamespace:
         s = double3(scales[i])
         cut = wp.float64(2.0) * wp.log(opacity / rules.alpha_min)
         r = double_rotation(quaternions[i])
-        whitened = wp.cw_div(wp.transpose(r) * m, s)
-        axes = r * wp.diag(s)
-        tiles = covered_tiles(
-            view, m, axes * wp.transpose(axes), wp.sqrt(cut), wp.dot(whitened, whitened) <= cut
-        )
-        span[i] = tiles
-        count[i] = tiles[1] * tiles[3]
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def coefficients_of_visible(
-        offset: int,
-        order: wp.array(dtype=int),
-        means: wp.array(dtype=vec3),
-        quaternions: wp.array(dtype=vec4),
-        scales: wp.array(dtype=vec3),
-        opacities: wp.array(dtype=real),
-        view: View,
-        rules: Rules,
-        rows: wp.array(dtype=coefficients),
-        centres: wp.array(dtype=vec3),
-    ):
-        """The rows of the visible Gaussians, near to far, and where the rays to their means point (0 if nowhere)."""
-        place = offset + wp.tid()
-        i = order[place]
-        m = double3(means[i]) - view.origin
-        s = double3(scales[i])
-        r = double_rotation(quaternions[i])
-        range_ = wp.length(m)
         smin = wp.min(s[0], wp.min(s[1], s[2]))
         scaling = wp.vec3d(smin / s[0], smin / s[1], smin / s[2])
         a = wp.cw_mul(scaling, wp.transpose(r) * (m / range_))
         length = wp.length(a)
-        steep = wp.min(range_ * length / smin, wp.float64(wp.static(STEEPEST)))
+        steepness = range_ * length / smin
+        axes = r * wp.diag(s)
+        extent = wp.sqrt(cut) * wp.max(s[0], wp.max(s[1], s[2]))
+        tiles = covered_tiles(
+            view, m, range_, axes * wp.transpose(axes), cut, extent, steepness * steepness <= cut
+        )
+        if tiles[1] * tiles[3] == 0:
+            return
+        span[i] = tiles
+        count[i] = tiles[1] * tiles[3]
+        steep = wp.min(steepness, wp.float64(wp.static(STEEPEST)))
         forms = r * (wp.diag(scaling) * whitened_frame(a))
+        centre = vec3()
         if view.kind == wp.static(PINHOLE):
             forms = view.rotation * forms
+            m = view.rotation * m
+            if m[2] > wp.float64(1.0e-6) * range_:
+                centre = vec3(real(m[0] / m[2]), real(1.0), real(m[1] / m[2]))
+        else:
+            axis_distance = wp.sqrt(m[0] * m[0] + m[1] * m[1])
+            if axis_distance > wp.float64(1.0e-6) * range_:
+                m = m / axis_distance
+                centre = vec3(real(m[0]), real(m[1]), real(m[2]))
+        centres[i] = centre
         row = coefficients()
         for k in range(3):
             axis = k
@@ -418,27 +419,15 @@ def build(real: Any) -> SimpleNamespace:
             row[wp.static(G0) + k] = real(forms[axis, 0])
             row[wp.static(G1) + k] = real(forms[axis, 1] * steep)
             row[wp.static(G2) + k] = real(forms[axis, 2] * steep)
-        opacity = wp.float64(opacities[i])
-        row[wp.static(FLAT)] = real(wp.float64(1.0) / (steep * steep))
-        cut = wp.float64(2.0) * wp.log(opacity / rules.alpha_min)
+        flat = wp.float64(1.0) / steep
+        row[wp.static(FLAT)] = real(flat * flat)
         row[wp.static(CUT)] = real(wp.min(cut, wp.float64(wp.static(faintest))))
         row[wp.static(OPACITY)] = real(opacity)
         row[wp.static(REACH)] = real(range_ * length)
         row[wp.static(LIFT)] = real(wp.float64(0.5) * smin)
-        row[wp.static(TILT)] = real(wp.float64(0.5) * smin / steep)
-        row[wp.static(INVERSE)] = real(wp.float64(1.0) / steep)
-        rows[place] = row
-        centre = vec3()
-        if view.kind == wp.static(PINHOLE):
-            local = view.rotation * m
-            if local[2] > wp.float64(1.0e-6) * range_:
-                centre = vec3(real(local[0] / local[2]), real(1.0), real(local[1] / local[2]))
-        else:
-            axis_distance = wp.sqrt(m[0] * m[0] + m[1] * m[1])
-            if axis_distance > wp.float64(1.0e-6) * range_:
-                m = m / axis_distance
-                centre = vec3(real(m[0]), real(m[1]), real(m[2]))
-        centres[place] = centre
+        row[wp.static(TILT)] = real(wp.float64(0.5) * smin * flat)
+        row[wp.static(INVERSE)] = real(flat)
+        rows[i] = row
 
     @wp.func
     def magnitude(x: lanes):
@@ -449,14 +438,16 @@ def build(real: Any) -> SimpleNamespace:
         offset: int,
         rows: wp.array(dtype=coefficients),
         centres: wp.array(dtype=vec3),
-        ids: wp.array(dtype=int),
+        whose: wp.array(dtype=int),
+        slots: wp.array(dtype=int),
         starts: wp.array(dtype=int),
         rays: Rays,
         tiles_x: int,
+        ids: wp.array(dtype=int),
         masks: wp.array(dtype=int),
         counts: wp.array(dtype=lanes),
     ):
-        """Which blocks of its tile each entry can reach, a bit each, and how many entries each block gets.
+        """Whose each entry is, which blocks of its tile it can reach, a bit each, and how many entries each block gets.
 
         A ray counts where ``f(d) = cut |g|^2 - g1^2 - g2^2`` and ``g0`` are positive. ``f`` is quadratic in ``d`` and
         exceeds its tangent plane by no more than ``cut g0(change of d)^2``: hence a bound on the box round the block.
@@ -475,7 +466,8 @@ def build(real: Any) -> SimpleNamespace:
             powers[b] = real(1 << b)
         count = lanes()
         for j in range(starts[tile], starts[tile + 1]):
-            k = ids[j]
+            k = whose[slots[j]]
+            ids[j] = k
             row = rows[k]
             # The point of the block's box that is nearest to the mean, and where the box ends beside it.
             centre = centres[k]
@@ -497,7 +489,9 @@ def build(real: Any) -> SimpleNamespace:
             sw = row[G0 + 1] * s0 - row[G1 + 1] * s1 - row[G2 + 1] * s2
             sv = row[G0 + 2] * s0 - row[G1 + 2] * s1 - row[G2 + 2] * s2
             slope = wp.cw_mul(su, du) + wp.cw_mul(sw, dw) + wp.cw_mul(sv, dv)
-            slope += wp.cw_mul(magnitude(su), hu) + wp.cw_mul(magnitude(sw), hw) + wp.cw_mul(magnitude(sv), hv)
+            slope += (
+                wp.cw_mul(magnitude(su), hu) + wp.cw_mul(magnitude(sw), hw) + wp.cw_mul(magnitude(sv), hv)
+            )
             change = real(2.0) * (wp.abs(row[G0]) * hu + wp.abs(row[G0 + 1]) * hw + wp.abs(row[G0 + 2]) * hv)
             bound = f + real(2.0) * slope + row[CUT] * wp.cw_mul(change, change)
             # From inside the ellipsoid every ray ahead counts.
@@ -508,31 +502,16 @@ def build(real: Any) -> SimpleNamespace:
         counts[tile] = count
 
     @wp.kernel(module="unique", enable_backward=False)
-    def gather_features(
-        offset: int,
-        order: wp.array(dtype=int),
-        features: wp.array(dtype=real, ndim=2),
-        first: int,
-        gathered: wp.array(dtype=vec4),
-    ):
-        """Channels ``first .. first + 3`` of the visible Gaussians, near to far; zero where there are fewer."""
-        place = offset + wp.tid()
-        row = vec4()
-        for k in range(wp.static(CHANNELS)):
-            if first + k < features.shape[1]:
-                row[k] = features[order[place], first + k]
-        gathered[place] = row
-
-    @wp.kernel(module="unique", enable_backward=False)
     def chain(
         offset: int,
-        order: wp.array(dtype=int),
         means: wp.array(dtype=vec3),
         quaternions: wp.array(dtype=vec4),
         scales: wp.array(dtype=vec3),
         view: View,
         first: int,
-        sums: wp.array(dtype=coefficients, ndim=2),
+        begins: wp.array(dtype=int),
+        count: wp.array(dtype=int),
+        sums: wp.array(dtype=coefficients),
         means_grad: wp.array(dtype=vec3),
         quaternions_grad: wp.array(dtype=vec4),
         scales_grad: wp.array(dtype=vec3),
@@ -540,16 +519,17 @@ def build(real: Any) -> SimpleNamespace:
         features_grad: wp.array(dtype=real, ndim=2),
         seen: wp.array(dtype=real),
     ):
-        """Sum the pieces and add the gradients of mean, quaternion, scale, opacity and features.
+        """Sum over tiles and add the gradients of mean, quaternion, scale, opacity and features.
 
         With Y1 and Y2 turned back to the Gaussian's axes: dL/dmean = -2 M^T Y1, dL/ds_i = -2 Y2_ii / s_i,
         dL/dw_3 = 2 Y2_12 (s_2/s_1 - s_1/s_2) and cyclic for a local rotation w, and a quaternion turns by q (0, w/2).
         """
-        place = offset + wp.tid()
-        i = order[place]
+        i = offset + wp.tid()
+        if count[i] == 0:
+            return
         y = total()
-        for p in range(sums.shape[0]):
-            row = sums[p, place]
+        for entry in range(begins[i], begins[i] + count[i]):
+            row = sums[entry]
             for k in range(wp.static(GRADIENTS)):
                 y[k] += wp.float64(row[k])
         if first == 0:
@@ -595,7 +575,5 @@ def build(real: Any) -> SimpleNamespace:
     return SimpleNamespace(
         block_masks=block_masks,
         chain=chain,
-        coefficients_of_visible=coefficients_of_visible,
-        gather_features=gather_features,
         project=project,
     )
