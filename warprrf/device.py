@@ -67,6 +67,7 @@ def launch(
     inputs: Sequence[Any],
     device: Any = None,
     *,
+    grain: int = MIN_SPLIT,
     pieces: int | None = None,
     cuts: Sequence[int] | None = None,
     adjoint: bool = False,
@@ -74,8 +75,9 @@ def launch(
     """Launch ``kernel`` over ``dim`` indices; on a CPU the range is split over all cores.
 
     The kernel's first argument is ``offset: int`` and is supplied here; ``inputs`` are the others, in order.
-    ``pieces`` fixes into how many equal parts a CPU launch is cut (default: 4 a thread) and ``cuts`` where, from 0 to
-    ``dim``, for kernels that own one buffer a piece. ``adjoint`` runs the kernel's adjoint on the arrays' ``.grad``.
+    A CPU launch is cut into 4 equal parts a thread, of ``grain`` indices at least: few where one index is much work.
+    ``pieces`` fixes how many parts and ``cuts`` where, for kernels that own one buffer a part. ``adjoint`` runs the
+    kernel's adjoint on the arrays' ``.grad``.
     """
     if dim <= 0:
         return
@@ -89,16 +91,19 @@ def launch(
         if pieces is not None:
             count = min(pieces, dim)
         elif threads() > 1:
-            count = min(PIECES_PER_THREAD * threads(), max(1, dim // MIN_SPLIT))
+            count = min(PIECES_PER_THREAD * threads(), max(1, dim // grain))
         bounds = [dim * k // count for k in range(count + 1)]
     kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
-    arguments = [0, *inputs]
+    arguments = [bounds[0], *inputs]
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     if len(bounds) == 2:
-        wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_tape=False, **extra)
+        size = bounds[1] - bounds[0]
+        wp.launch(kernel, dim=size, inputs=arguments, device=device, record_tape=False, **extra)
         return
     # Arguments are packed once; a piece differs in its offset and length.
-    whole = wp.launch(kernel, dim=dim, inputs=arguments, device=device, record_cmd=True, **extra)
+    whole = wp.launch(
+        kernel, dim=dim, inputs=arguments, device=device, record_tape=False, record_cmd=True, **extra
+    )
     parts = iter([(low, high - low) for low, high in pairwise(bounds) if high > low])
 
     def work() -> None:

@@ -21,6 +21,7 @@ from warprrf.kernels import blend as blend_kernels
 from warprrf.kernels import project as kernels
 from warprrf.kernels import sh as sh_kernels
 
+TILE_GRAIN = 8  # a tile or a block is work enough for few of them to be worth a thread
 RULES = {"product": kernels.PRODUCT, "exp": kernels.EXPONENTIAL}
 
 
@@ -157,11 +158,12 @@ def blend_weights(
     range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
     total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
     launch(
-        raster._kernels(1).strongest,
+        raster.kernels_for(1).strongest,
         len(view.block_starts) - 1,
         [view.rows, view.block_ids, view.block_starts, view.rays, view.view, raster.rules, shape[2],
          kernels.LANES, *(a.flatten() for a in (index, weight, range_, total))],
         device=raster.device,
+        grain=TILE_GRAIN,
     )  # fmt: skip
     weights, indices, alpha = weight.numpy(), index.numpy(), total.numpy()
     best = np.argmax(weights, axis=2)
@@ -220,6 +222,8 @@ class Rasterizer:
         self.rules.alpha_min = self.blending.alpha_min
         self.rules.alpha_max = self.blending.alpha_max
         self.rules.transmittance_min = self.blending.transmittance_min
+        # Threads that share a tile in the adjoint: on a GPU each of its blocks has one.
+        self.parts = kernels.LANES if self.device.is_cuda else 1
 
     def vector(self, size: int) -> Any:
         """Warp's vector type of this precision."""
@@ -319,11 +323,18 @@ class Rasterizer:
             tiles,
             [rows, centres, whose, slots, starts, rays, view.tiles_x, ids, masks, counts],
             device=device,
+            grain=TILE_GRAIN,
         )
         sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])
         block_starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
         block_ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
-        launch(kernels.fill_blocks, tiles, [ids, masks, starts, block_starts, block_ids], device=device)
+        launch(
+            kernels.fill_blocks,
+            tiles,
+            [ids, masks, starts, block_starts, block_ids],
+            device=device,
+            grain=TILE_GRAIN,
+        )
         work = sums[:: kernels.LANES] + np.arange(tiles + 1)
         return Prepared(
             camera=cam,
@@ -386,15 +397,17 @@ class Rasterizer:
         flat_features = _flat(features)
         for first in range(0, channels, kernels.CHANNELS):
             launch(
-                self._kernels(channels - first).blend,
+                self.kernels_for(channels - first).blend,
                 len(prepared.block_starts) - 1,
                 [prepared.rows, flat_features, channels, first, background, prepared.block_ids,
                  prepared.block_starts, prepared.rays, prepared.view, self.rules, *flat],
                 device=device,
+                grain=TILE_GRAIN,
             )  # fmt: skip
         return Image(image, alpha, depth, dominant, peak), (left, background)
 
-    def _kernels(self, channels: int) -> Any:
+    def kernels_for(self, channels: int) -> Any:
+        """Kernels that blend so many channels at once, four at most."""
         return blend_kernels.build(self.real, RULES[self.blending.rule], min(channels, kernels.CHANNELS))
 
     def blend_adjoint(
@@ -411,13 +424,11 @@ class Rasterizer:
         means, quaternions, scales, opacities = prepared.inputs
         seen = wp.zeros(n, dtype=real, device=device)
         feature_grad = _gradient(features)
-        if device.is_cuda:  # a block is one thread's, every tile has its own seeds
-            parts, cuts, bounds = kernels.LANES, None, []
-        else:  # a tile is one thread's; cut into pieces of equal work
-            count = 1 if threads() == 1 else PIECES_PER_THREAD * threads()
+        parts, cuts, bounds = self.parts, None, []
+        if parts == 1:  # cut into pieces of equal work, each with its own seeds
+            pieces = 1 if threads() == 1 else PIECES_PER_THREAD * threads()
             work = prepared.work
-            parts, cuts = 1, np.searchsorted(work, work[-1] * np.arange(count + 1) / count).tolist()
-            bounds = cuts
+            cuts = bounds = np.searchsorted(work, work[-1] * np.arange(pieces + 1) / pieces).tolist()
         tiles = len(prepared.work) - 1
         seeds = wp.empty(
             (len(bounds) or tiles) * kernels.LANES * blend_kernels.PER_BLOCK, dtype=lanes, device=device
@@ -428,7 +439,7 @@ class Rasterizer:
         flat_features = _flat(features)
         with_range = int(out.depth.grad.numpy().any())
         for first in range(0, channels, kernels.CHANNELS):
-            blend = self._kernels(channels - first)
+            blend = self.kernels_for(channels - first)
             sums = (wp.empty if parts == 1 else wp.zeros)(len(prepared.ids), dtype=lanes, device=device)
             launch(
                 blend.blend_adjoint[with_range if first == 0 else 0],
@@ -437,13 +448,14 @@ class Rasterizer:
                  channels, first, prepared.ids, prepared.slots, prepared.masks, prepared.starts, prepared.rays,
                  prepared.view, self.rules, *flat, seeds, sums, background_sums],
                 device=device,
+                pieces=1,  # sums of shared tiles are atomic on a GPU alone
                 cuts=cuts,
             )  # fmt: skip
             launch(
                 self.project_kernels.chain,
                 n,
-                [means, quaternions, scales, prepared.view, first, prepared.begins, prepared.count, sums, _gradient(means),
-                 _gradient(quaternions), _gradient(scales), _gradient(opacities), feature_grad, seen],
+                [means, quaternions, scales, prepared.view, first, prepared.begins, prepared.count, sums,
+                 _gradient(means), _gradient(quaternions), _gradient(scales), _gradient(opacities), feature_grad, seen],
                 device=device,
             )  # fmt: skip
             if background.requires_grad:

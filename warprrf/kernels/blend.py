@@ -565,6 +565,49 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                 total_out[y * view.width + x] = total[lane]
 
     @wp.kernel(module="unique", enable_backward=False)
+    def count_passing(
+        offset: int,
+        rows: wp.array(dtype=coefficients),
+        ids: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        rays: Rays,
+        view: View,
+        rules: Rules,
+        count: wp.array(dtype=int),
+    ):
+        """How many Gaussians contribute to each pixel: a plain loop, for benchmarks and tests."""
+        block = offset + wp.tid()
+        column, line = place_of(block, view)
+        for lane in range(wp.static(LANES)):
+            x = column * wp.static(BLOCK) + lane % wp.static(BLOCK)
+            y = line * wp.static(BLOCK) + lane / wp.static(BLOCK)
+            if x < view.width and y < view.height:
+                transmittance = real(1.0)
+                passing = int(0)
+                for j in range(starts[block], starts[block + 1]):
+                    row = rows[ids[j]]
+                    across = rays.across[column][lane]
+                    along = rays.along[column][lane]
+                    down = rays.down[line][lane]
+                    g0 = row[G0] * across + row[G0 + 1] * along + row[G0 + 2] * down
+                    g1 = row[G1] * across + row[G1 + 1] * along + row[G1 + 2] * down
+                    g2 = row[G2] * across + row[G2 + 1] * along + row[G2 + 2] * down
+                    n = g1 * g1 + g2 * g2
+                    square = g0 * g0 + row[FLAT] * n
+                    if (
+                        n < row[CUT] * square
+                        and g0 > real(0.0)
+                        and transmittance > real(rules.transmittance_min)
+                    ):
+                        passing += 1
+                        alpha = wp.min(row[OPACITY] * wp.exp(real(-0.5) * n / square), real(rules.alpha_max))
+                        if wp.static(rule == PRODUCT):
+                            transmittance = transmittance * (real(1.0) - alpha)
+                        else:
+                            transmittance = transmittance * wp.exp(-alpha)
+                count[y * view.width + x] = passing
+
+    @wp.kernel(module="unique", enable_backward=False)
     def background_adjoint(
         offset: int,
         first: int,
@@ -581,6 +624,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
     return SimpleNamespace(
         background_adjoint=background_adjoint,
         blend=blend,
+        count_passing=count_passing,
         blend_adjoint=(adjoint_kernel(False), adjoint_kernel(True)),  # with or without gradients of ranges
         strongest=strongest,
     )

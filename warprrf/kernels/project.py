@@ -29,7 +29,7 @@ from warprrf.kernels.lanes import build as lane_functions
 TILE = 16  # pixels: tiles are TILE x TILE
 CHANNELS = 4  # feature channels blended by one launch
 # What a row of coefficients holds, one vector per Gaussian and view. The forms are those of directions (across, along,
-# down): camera x, z, y of a photo, world x, y, z of a panorama. M is scaled by the smallest scale in G0, REACH and LIFT.
+# down): camera x, z, y of a photo, world x, y, z of a panorama. G0, REACH, LIFT: M is scaled by the smallest scale.
 G0, G1, G2 = 0, 3, 6  # linear forms; G1 and G2 times |M m|
 FLAT = 9  # 1 / |M m|^2
 CUT, OPACITY = 10, 11  # q at which alpha falls below alpha_min
@@ -121,8 +121,9 @@ def covered_tiles(
     extent: wp.float64,
     inside: bool,
 ):
-    """Tiles that the ellipsoid of ``r2`` times the covariance can touch, whose longest axis is ``extent``: first column,
-    columns, first row, rows; columns wrap on a sphere.
+    """Tiles that the ellipsoid of ``r2`` times the covariance can touch, ``extent`` its longest half axis.
+
+    Returned are first column, columns, first row, rows; columns wrap on a sphere.
 
     A plane through the ray origin with normal l touches the ellipsoid where l^T (r^2 cov - m m^T) l = 0.
     """
@@ -259,7 +260,7 @@ def emit_tiles(
     whose: wp.array(dtype=int),
     begins: wp.array(dtype=int),
 ):
-    """Write (tile, own index) and whose it is for every covered tile, Gaussians from near to far, and where each begins."""
+    """Write (tile, own index) for every covered tile, Gaussians near to far; whose it is, and where each begins."""
     i = offset + wp.tid()
     k = order[i]
     s = span[k]
