@@ -116,17 +116,23 @@ def covered_tiles(
     view: View,
     m: wp.vec3d,
     distance: wp.float64,
-    cov: wp.mat33d,
-    r2: wp.float64,
+    axes: wp.mat33d,
     extent: wp.float64,
     inside: bool,
 ):
-    """Tiles that the ellipsoid of ``r2`` times the covariance can touch, ``extent`` its longest half axis.
+    """Tiles that an ellipsoid can touch: its half axes the columns of ``axes``, the longest one ``extent``; those and
+    its centre ``m`` in the camera's frame (the world's for a panorama).
 
     Returned are first column, columns, first row, rows; columns wrap on a sphere.
 
-    A plane through the ray origin with normal l touches the ellipsoid where l^T (r^2 cov - m m^T) l = 0.
+    A plane through the ray origin with normal l touches the ellipsoid where l^T C l = 0, C = axes axes^T - m m^T.
     """
+    c = wp.mat33d()
+    for i in range(3):
+        for j in range(i, 3):
+            c[i, j] = (
+                axes[i, 0] * axes[j, 0] + axes[i, 1] * axes[j, 1] + axes[i, 2] * axes[j, 2] - m[i] * m[j]
+            )
     everything = wp.vec4i(0, view.tiles_x, 0, view.tiles_y)
     nothing = wp.vec4i(0, 0, 0, 0)
     if inside:
@@ -137,10 +143,8 @@ def covered_tiles(
     if extent < distance:
         cap = wp.asin(extent / distance)
     if view.kind == wp.static(PINHOLE):
-        local = view.rotation * m
-        c = r2 * (view.rotation * cov * wp.transpose(view.rotation)) - wp.outer(local, local)
         if c[2, 2] < wp.float64(0.0):  # the ellipsoid lies on one side of the camera plane
-            if local[2] <= wp.float64(0.0):
+            if m[2] <= wp.float64(0.0):
                 return nothing
             x = tangent_interval(c[0, 0], c[0, 2], c[2, 2])
             y = tangent_interval(c[1, 1], c[1, 2], c[2, 2])
@@ -151,7 +155,7 @@ def covered_tiles(
             wp.max(view.cx, wp.float64(view.width) - view.cx) / view.fx,
             wp.max(view.cy, wp.float64(view.height) - view.cy) / view.fy,
         )
-        if wp.acos(wp.clamp(local[2] / distance, wp.float64(-1.0), wp.float64(1.0))) > cap + wp.atan(
+        if wp.acos(wp.clamp(m[2] / distance, wp.float64(-1.0), wp.float64(1.0))) > cap + wp.atan(
             wp.length(corner)
         ):
             return nothing
@@ -163,9 +167,9 @@ def covered_tiles(
     ty = tile_span((zenith - cap) * per_radian, (zenith + cap) * per_radian, view.height)
     count_y = ty[1] - ty[0] + 1
     # Silhouette seen along the pole axis: the same dual conic in the horizontal plane.
-    c11 = r2 * cov[0, 0] - m[0] * m[0]
-    c12 = r2 * cov[0, 1] - m[0] * m[1]
-    c22 = r2 * cov[1, 1] - m[1] * m[1]
+    c11 = c[0, 0]
+    c12 = c[0, 1]
+    c22 = c[1, 1]
     determinant = c11 * c22 - c12 * c12
     if determinant >= wp.float64(0.0):  # the pole axis meets the ellipse: every azimuth
         return wp.vec4i(0, view.tiles_x, ty[0], count_y)
@@ -384,15 +388,22 @@ def build(real: Any) -> SimpleNamespace:
         s = double3(scales[i])
         cut = wp.float64(2.0) * wp.log(opacity / rules.alpha_min)
         r = double_rotation(quaternions[i])
+        if view.kind == wp.static(PINHOLE):
+            r = view.rotation * r
+            m = view.rotation * m
         smin = wp.min(s[0], wp.min(s[1], s[2]))
         scaling = wp.vec3d(smin / s[0], smin / s[1], smin / s[2])
-        a = wp.cw_mul(scaling, wp.transpose(r) * (m / range_))
+        a = wp.cw_mul(scaling, wp.transpose(r) * m)  # |M m| times the smallest scale
         length = wp.length(a)
-        steepness = range_ * length / smin
-        axes = r * wp.diag(s)
-        extent = wp.sqrt(cut) * wp.max(s[0], wp.max(s[1], s[2]))
+        steepness = length / smin
+        radius = wp.sqrt(cut)
         tiles = covered_tiles(
-            view, m, range_, axes * wp.transpose(axes), cut, extent, steepness * steepness <= cut
+            view,
+            m,
+            range_,
+            r * wp.diag(radius * s),
+            radius * wp.max(s[0], wp.max(s[1], s[2])),
+            steepness * steepness <= cut,
         )
         if tiles[1] * tiles[3] == 0:
             return
@@ -402,8 +413,6 @@ def build(real: Any) -> SimpleNamespace:
         forms = r * (wp.diag(scaling) * whitened_frame(a))
         centre = vec3()
         if view.kind == wp.static(PINHOLE):
-            forms = view.rotation * forms
-            m = view.rotation * m
             if m[2] > wp.float64(1.0e-6) * range_:
                 centre = vec3(real(m[0] / m[2]), real(1.0), real(m[1] / m[2]))
         else:
@@ -424,7 +433,7 @@ def build(real: Any) -> SimpleNamespace:
         row[wp.static(FLAT)] = real(flat * flat)
         row[wp.static(CUT)] = real(wp.min(cut, wp.float64(wp.static(faintest))))
         row[wp.static(OPACITY)] = real(opacity)
-        row[wp.static(REACH)] = real(range_ * length)
+        row[wp.static(REACH)] = real(length)
         row[wp.static(LIFT)] = real(wp.float64(0.5) * smin)
         row[wp.static(TILT)] = real(wp.float64(0.5) * smin * flat)
         row[wp.static(INVERSE)] = real(flat)

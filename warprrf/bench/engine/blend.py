@@ -57,8 +57,8 @@ def run_blend(
     Returns:
         Seconds forward, backward and in all of both (``ours``, ``torch``), by the wall clock and of processor time
         (``cpu_seconds``), ``speedup`` (torch over ours, in all) and ``cpu_speedup``, pairs of pixel and Gaussian that
-        contribute, nanoseconds per such pair, the largest and 99.9 % difference of the images, the largest one away
-        from cutoffs, and the relative difference of the gradients; ``pairs``, ``cores`` and ``spectrum`` of
+        contribute, nanoseconds per such pair, the largest and 99.9 % difference of the images, and the relative
+        difference of the gradients; ``pairs``, ``cores`` (where there are several) and ``spectrum`` of
         :mod:`~warprrf.bench.engine.launches`, each with what is asked.
 
     Raises:
