@@ -17,9 +17,11 @@ import warp as wp
 from warprrf.device import PIECES_PER_THREAD, check_array, launch, resolve, threads
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
+from warprrf.kernels import binning
 from warprrf.kernels import blend as blend_kernels
 from warprrf.kernels import project as kernels
 from warprrf.kernels import sh as sh_kernels
+from warprrf.kernels import weights as weight_kernels
 
 TILE_GRAIN = 8  # a tile or a block is work enough for few of them to be worth a thread
 RULES = {"product": kernels.PRODUCT, "exp": kernels.EXPONENTIAL}
@@ -158,7 +160,7 @@ def blend_weights(
     range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
     total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
     launch(
-        raster.kernels_for(1).strongest,
+        weight_kernels.build(wp.float32, RULES[blending.rule]).strongest,
         len(view.block_starts) - 1,
         [view.rows, view.block_ids, view.block_starts, view.rays, view.view, raster.rules, shape[2],
          kernels.LANES, *(a.flatten() for a in (index, weight, range_, total))],
@@ -310,13 +312,13 @@ class Rasterizer:
         starts = wp.zeros(tiles + 1, dtype=int, device=device)
         if entries:
             launch(
-                kernels.emit_tiles,
+                binning.emit_tiles,
                 len(order),
                 [order, span, ends, view.tiles_x, keys, slots, whose, begins],
                 device=device,
             )
             wp.utils.radix_sort_pairs(keys, slots, entries, 0, tiles.bit_length())
-            launch(kernels.tile_starts, tiles + 1, [keys, entries, starts], device=device)
+            launch(binning.tile_starts, tiles + 1, [keys, entries, starts], device=device)
         counts = wp.empty(tiles, dtype=self.vector(kernels.LANES), device=device)
         launch(
             self.project_kernels.block_masks,
@@ -329,7 +331,7 @@ class Rasterizer:
         block_starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
         block_ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
         launch(
-            kernels.fill_blocks,
+            binning.fill_blocks,
             tiles,
             [ids, masks, starts, block_starts, block_ids],
             device=device,
@@ -498,11 +500,11 @@ def _sorted_visible(count: wp.array, distance: wp.array) -> tuple[wp.array, wp.a
             f"gaussians: they cover {total} tiles in all, more than 2^30; prune large Gaussians or render smaller"
         )
     keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))
-    launch(kernels.sort_keys, n, [count, distance, keys, order], device=device)
+    launch(binning.sort_keys, n, [count, distance, keys, order], device=device)
     wp.utils.radix_sort_pairs(keys, order, n)
     order = order[:visible]
     ends = wp.empty(visible, dtype=int, device=device)
-    launch(kernels.counts_in_order, visible, [order, count, ends], device=device)
+    launch(binning.counts_in_order, visible, [order, count, ends], device=device)
     wp.utils.array_scan(ends, ends, inclusive=True)
     return order, ends, total
 

@@ -20,7 +20,9 @@ import warp as wp
 from warprrf.bench.engine.scenes import gaussians, panorama, photo, room
 from warprrf.device import launch, threads
 from warprrf.geometry.render import RADIO, TILE_GRAIN, Prepared, Rasterizer, blend_weights, render
+from warprrf.kernels import weights
 from warprrf.kernels.lanes import LANES
+from warprrf.kernels.project import PRODUCT
 
 PAIR_NS = {"dense": 4.0, "sparse": 2.0}
 """Asked: nanoseconds of one core per pair of pixel and Gaussian that reaches alpha_min, forward."""
@@ -157,7 +159,7 @@ def passing_pairs(prepared: Prepared) -> int:
     shape = (prepared.camera.height, prepared.camera.width)
     count = wp.zeros(shape, dtype=int, device="cpu")
     launch(
-        raster.kernels_for(1).count_passing,
+        weights.build(wp.float32, PRODUCT).count_passing,
         len(prepared.block_starts) - 1,
         [prepared.rows, prepared.block_ids, prepared.block_starts, prepared.rays, prepared.view, raster.rules,
          count.flatten()],
