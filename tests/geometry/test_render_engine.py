@@ -12,8 +12,10 @@ from warprrf.geometry import render as render_module
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.render import RADIO, Blending, Rasterizer, render
+from warprrf.kernels import binning, blend, project
 from warprrf.kernels.lanes import BLOCK, LANES
 from warprrf.kernels.lanes import build as lane_functions
+from warprrf.kernels.project import PRODUCT
 
 CAMERAS = {
     "pinhole": photo(70, 45),
@@ -203,3 +205,17 @@ def test_features_need_not_be_contiguous():
     straight = raster.blend(prepared, wp.array(room(500)[4], dtype=wp.float32, device="cpu"))
     assert np.array_equal(raster.blend(prepared, part).features.numpy(), straight.features.numpy())
     assert straight.features.numpy().max() > 0.3
+
+
+@pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this build of Warp has no CUDA compiler")
+@pytest.mark.parametrize("name", ["blend", "blend_adjoint", "block_masks", "fill_blocks"])
+def test_kernels_compile_for_cuda(name, tmp_path):
+    """Their native snippets too; no GPU is needed for that."""
+    kernels = {
+        "blend": blend.build(wp.float32, PRODUCT, 3).blend,
+        "blend_adjoint": blend.build(wp.float32, PRODUCT, 3).blend_adjoint[0],
+        "block_masks": project.build(wp.float32).block_masks,
+        "fill_blocks": binning.fill_blocks,
+    }
+    wp.compile_aot_module(kernels[name].module, device=None, arch=80, module_dir=tmp_path, use_ptx=True)
+    assert list(tmp_path.glob("*.ptx"))
