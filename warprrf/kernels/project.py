@@ -76,12 +76,12 @@ class Rules:
 @wp.func
 def rotation_matrix(w: wp.float64, x: wp.float64, y: wp.float64, z: wp.float64):
     """Rotation of the quaternion wxyz, normalised here."""
-    n = wp.sqrt(w * w + x * x + y * y + z * z)
-    w = w / n
-    x = x / n
-    y = y / n
-    z = z / n
     one = wp.float64(1.0)
+    n = one / wp.sqrt(w * w + x * x + y * y + z * z)
+    w = w * n
+    x = x * n
+    y = y * n
+    z = z * n
     two = wp.float64(2.0)
     return wp.mat33d(
         one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
@@ -212,8 +212,8 @@ def whitened_frame(a: wp.vec3d):
 
     Source: Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
     """
-    q = wp.normalize(a)
     one = wp.float64(1.0)
+    q = a * (one / wp.length(a))
     sign = one
     if q[2] < wp.float64(0.0):
         sign = -one
@@ -459,22 +459,23 @@ def build(real: Any) -> SimpleNamespace:
         qz = wp.float64(q[3])
         r = rotation_matrix(qw, qx, qy, qz)
         s = double3(scales[i])
+        t = wp.cw_div(wp.vec3d(wp.float64(1.0), wp.float64(1.0), wp.float64(1.0)), s)
         smin = wp.min(s[0], wp.min(s[1], s[2]))
         m = double3(means[i]) - view.origin
-        a = wp.cw_mul(wp.vec3d(smin / s[0], smin / s[1], smin / s[2]), wp.transpose(r) * m)
+        a = wp.cw_mul(smin * t, wp.transpose(r) * m)
         steep = wp.min(wp.length(a) / smin, wp.float64(wp.static(STEEPEST)))
         frame = whitened_frame(a)
         y1 = frame * wp.vec3d(-y[0] / steep - y[8], y[1], y[2])
         y22 = y[0] - y[3] - y[6]  # the trace is the sum of dL/dq times q
         y2 = frame * wp.mat33d(y[3], y[4], y[5], y[4], y[6], y[7], y[5], y[7], y22) * wp.transpose(frame)
-        dm = r * wp.cw_div(y1, s)
+        dm = r * wp.cw_mul(y1, t)
         means_grad[i] = means_grad[i] - vec3(real(two * dm[0]), real(two * dm[1]), real(two * dm[2]))
         scales_grad[i] = scales_grad[i] - vec3(
-            real(two * y2[0, 0] / s[0]), real(two * y2[1, 1] / s[1]), real(two * y2[2, 2] / s[2])
+            real(two * y2[0, 0] * t[0]), real(two * y2[1, 1] * t[1]), real(two * y2[2, 2] * t[2])
         )
-        wx = two * y2[1, 2] * (s[2] / s[1] - s[1] / s[2])
-        wy = -two * y2[0, 2] * (s[2] / s[0] - s[0] / s[2])
-        wz = two * y2[0, 1] * (s[1] / s[0] - s[0] / s[1])
+        wx = two * y2[1, 2] * (s[2] * t[1] - s[1] * t[2])
+        wy = -two * y2[0, 2] * (s[2] * t[0] - s[0] * t[2])
+        wz = two * y2[0, 1] * (s[1] * t[0] - s[0] * t[1])
         f = two / (qw * qw + qx * qx + qy * qy + qz * qz)
         quaternions_grad[i] = quaternions_grad[i] + vec4(
             real(f * (-qx * wx - qy * wy - qz * wz)),
