@@ -18,8 +18,8 @@ from radio_scenes import box_mesh  # noqa: E402
 
 import warprrf as wr  # noqa: E402
 from warprrf import cli  # noqa: E402
-from warprrf.bench import bistatic  # noqa: E402
-from warprrf.bench.bistatic import checks, report, setting, table  # noqa: E402
+from warprrf.bench import bistatic, setting  # noqa: E402
+from warprrf.bench.bistatic import checks, report, table  # noqa: E402
 from warprrf.bench.bistatic.methods import HARMONIC, UNTAUGHT, VARIANTS, point_at_transmitter  # noqa: E402
 from warprrf.geometry.discs import discs_on_mesh  # noqa: E402
 from warprrf.geometry.meshio import write_mesh  # noqa: E402

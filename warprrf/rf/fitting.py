@@ -20,6 +20,8 @@ from warprrf.device import Progress
 from warprrf.kernels import field as _kernels
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
+from warprrf.rf.opacity import RATE as OPACITY_RATE
+from warprrf.rf.opacity import OpacityTraining
 from warprrf.rf.transport import Transport
 
 KINDS = {"exp": _kernels.EXPONENTIAL, "linear": _kernels.CLAMPED, "signed": _kernels.SIGNED}
@@ -82,6 +84,7 @@ class State:
         step: steps done.
         coefficients, first, second: coefficients and Adam's moments, shape ``(G, 16)``.
         losses: loss of each step.
+        opacity: logits of the opacities and their moments, shape ``(3, G)``; None where they are not trained.
     """
 
     step: int
@@ -89,6 +92,7 @@ class State:
     first: np.ndarray
     second: np.ndarray
     losses: list[float] = field(default_factory=list)
+    opacity: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,7 @@ class Batch:
     pair_weight: wp.array
     pixel_start: wp.array
     pair_of_pixel: wp.array
+    pair_order: np.ndarray
 
     def pair_owner(self) -> np.ndarray:
         """Which of the Gaussians seen each pair belongs to, shape ``(E,)``."""
@@ -186,6 +191,7 @@ class Problem:
             pair_weight=self.upload(part.weight[order]),
             pixel_start=integers(part.start),
             pair_of_pixel=integers(place),
+            pair_order=order,
         )
 
 
@@ -241,12 +247,17 @@ class BatchTarget:
 class Layer:
     """Loss and gradient of one layer's coefficients on a :class:`Problem`'s batches."""
 
-    def __init__(self, problem: Problem, target: Target, kind: str) -> None:
-        self.problem, self.target, self.kind = problem, target, KINDS[kind]
+    def __init__(
+        self, problem: Problem, target: Target, kind: str, opacity: OpacityTraining | None = None
+    ) -> None:
+        self.problem, self.target, self.kind, self.opacity = problem, target, KINDS[kind], opacity
         p, k = problem, problem.kernels
         shape = (len(p.transport.receivers), p.pixels)
         self.weights = [batch.pair_weight for batch in p.batches]
-        if target.unit is not None:
+        if opacity is not None:  # weights are made anew in every step
+            self.weights = [wp.zeros_like(batch.pair_weight) for batch in p.batches]
+            self.opacity_gradient = np.zeros(len(p.seen))
+        elif target.unit is not None:
             self.weights = [
                 p.upload(batch.pair_weight.numpy() * target.unit[batch.pair_owner()]) for batch in p.batches
             ]
@@ -295,6 +306,8 @@ class Layer:
         p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
         target, size = self.target, len(data.image)
         total, image, absolute, score, adjoint = self.scalars
+        if self.opacity is not None:
+            self.opacity.weights(index, self.weights[index])
         p.launch(
             k.contributions, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_direction,
             self.weights[index], p.basis, coefficients, self.contribution,
@@ -319,6 +332,8 @@ class Layer:
             k.coefficient_adjoint, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_pixel,
             batch.pair_direction, self.weights[index], p.basis, self.contribution, adjoint, self.gradient,
         )  # fmt: skip
+        if self.opacity is not None:
+            self.opacity_gradient = self.opacity.gradient(index, self.contribution, total, adjoint)
         if not need_loss:
             return float("nan")
         error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data.count
@@ -347,6 +362,7 @@ def fit_layer(
     each: Callable[[State], None] | None = None,
     stage: str = "fit",
     progress: Progress | None = None,
+    opacity: OpacityTraining | None = None,
 ) -> State:
     """Fit one layer.
 
@@ -360,6 +376,7 @@ def fit_layer(
         state: go on from here instead of starting.
         each: called with the state every 50 steps and after the last.
         stage, progress: for the progress callback.
+        opacity: opacities that are trained with the layer; None leaves them as they are.
 
     Returns:
         Final state; coefficients of the Gaussians ``problem.seen``, shape ``(G, 16)``.
@@ -370,7 +387,7 @@ def fit_layer(
     active = np.arange(_kernels.COEFFICIENTS) < count
     rate = np.where(active, rates.directional, 0.0)
     rate[0] = rates.constant
-    layer = Layer(problem, target, kind)
+    layer = Layer(problem, target, kind, opacity)
     if state is None:
         table = np.zeros((len(p.seen), _kernels.COEFFICIENTS))
         table[:, 0] = target.initial
@@ -383,7 +400,8 @@ def fit_layer(
     decay1, decay2, epsilon = ADAM
 
     def snapshot(step: int) -> State:
-        return State(step, coefficients.numpy(), first.numpy(), second.numpy(), losses)
+        logits = None if opacity is None else opacity.state
+        return State(step, coefficients.numpy(), first.numpy(), second.numpy(), losses, logits)
 
     for step in range(state.step, steps):
         index = p.batch_at(step)
@@ -399,6 +417,10 @@ def fit_layer(
             p.real(1 / (1 - decay1 ** (step + 1))), p.real(1 / (1 - decay2 ** (step + 1))), p.real(epsilon),
             initial, layer.gradient, first, second, coefficients,
         )  # fmt: skip
+        if opacity is not None:
+            opacity.step(
+                layer.opacity_gradient, step + 1, OPACITY_RATE * FINAL_RATE ** (step / max(steps - 1, 1))
+            )
         if progress is not None:
             progress(stage, step + 1, steps)
         if each is not None and ((step + 1) % 50 == 0 or step + 1 == steps):

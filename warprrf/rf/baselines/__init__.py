@@ -1,4 +1,4 @@
-"""Learned baselines that know no geometry, in PyTorch: NeRF2 and a conditional GAN (``pip install "warprrf[baselines]"``).
+"""Learned baselines that know no geometry, in PyTorch (extra ``baselines``): NeRF2 and a conditional GAN.
 
 Both learn pictures of spectra in [0, 1]: the dB image of the data set, mapped by its stated range, which is what their
 mean square and L1 losses suit. What they predict goes back the same way to path gain, so that every metric treats them

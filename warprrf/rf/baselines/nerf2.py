@@ -39,7 +39,9 @@ if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
 
 ADAM_RATE, ADAM_DECAY, FINAL_RATE = 8e-4, 5e-5, 1e-6
-SPREADING_M = 0.025  # the c above, lambda / (4 pi) of the published 915 MHz; amplitudes are learned on top of it
+SPREADING_M = (
+    0.025  # the c above, lambda / (4 pi) of the published 915 MHz; amplitudes are learned on top of it
+)
 LAST_STEP_M = 1e10  # the published length of the last sample: what reaches it stays there
 OPAQUE_LEAK = 1e-10
 RAYS_AT_ONCE = 2048  # of a prediction: bounds its memory
@@ -180,7 +182,8 @@ class NeRF2(ImageModel):
     def _build(cls, options: NeRF2Options, shape: tuple[int, int], seed: int) -> Any:
         nn = torch_module().nn
         encoded, width = 3 + 6 * options.octaves, options.width
-        joined = [encoded if i == 0 else width + (encoded if i == options.skip + 1 else 0) for i in range(options.depth)]
+        joined = [width + (encoded if i == options.skip + 1 else 0) for i in range(options.depth)]
+        joined[0] = encoded
         with seeded(seed):
             return nn.ModuleDict(
                 {
@@ -219,7 +222,9 @@ def render(network: Any, options: NeRF2Options, origin: Any, toward: Any, source
         x = torch.relu(layer(x))
     attenuation = network["attenuation"](x)
     # Direction and transmitter do not change along a ray, so they are encoded once a ray.
-    ray = torch.cat([encode(toward, options.octaves), encode(source / options.scale_m, options.octaves)], dim=-1)
+    ray = torch.cat(
+        [encode(toward, options.octaves), encode(source / options.scale_m, options.octaves)], dim=-1
+    )
     ray = ray[:, None].expand(-1, options.samples, -1)
     signal = network["signal"](torch.cat([network["feature"](x), ray], dim=-1))
 

@@ -147,9 +147,7 @@ def set_weights(network: Any, tensors: dict[str, np.ndarray]) -> None:
 
 
 def _state(networks: dict[str, Any], optimisers: dict[str, Any]) -> dict[str, np.ndarray]:
-    found = {
-        f"network/{n}/{k}": v for n, network in networks.items() for k, v in weights_of(network).items()
-    }
+    found = {f"network/{n}/{k}": v for n, network in networks.items() for k, v in weights_of(network).items()}
     for name, optimiser in optimisers.items():
         for index, parameter in enumerate(p for group in optimiser.param_groups for p in group["params"]):
             for key, value in optimiser.state.get(parameter, {}).items():
@@ -157,9 +155,7 @@ def _state(networks: dict[str, Any], optimisers: dict[str, Any]) -> dict[str, np
     return found
 
 
-def _restore(
-    networks: dict[str, Any], optimisers: dict[str, Any], tensors: dict[str, np.ndarray]
-) -> None:
+def _restore(networks: dict[str, Any], optimisers: dict[str, Any], tensors: dict[str, np.ndarray]) -> None:
     torch = torch_module()
     for name, network in networks.items():
         head = f"network/{name}/"
@@ -266,9 +262,7 @@ class ImageModel(ABC):
                 report=header["report"],
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{os.fspath(path)}: corrupt or no baseline of this version: {error}"
-            ) from error
+            raise ValueError(f"{os.fspath(path)}: corrupt or no baseline of this version: {error}") from error
 
     @classmethod
     @abstractmethod
@@ -285,9 +279,7 @@ class ImageModel(ABC):
         return next(self.network.parameters()).device
 
     def _positions(self, rx: Any, transmitter: Any) -> tuple[np.ndarray, np.ndarray]:
-        source = (
-            self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
-        )
+        source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         return check_array("rx", rx, (3,)), source
 
 
