@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from warprrf.bench.methods import (
+    field_code,
     fit_bistatic,
     fit_harmonic,
     fit_lookup,

@@ -1,4 +1,4 @@
-"""The two commands: `warprrf bench table1` and `warprrf bench sparsity`. They share one folder and its finished runs."""
+"""The commands `warprrf bench table1` and `warprrf bench sparsity`; they share one folder and its finished runs."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def run(
         for t in ("exact", "sionna")
         if t in chosen.truths or (t == "exact" and "paper-law" in chosen.truths)
     ]
-    known = dict(zip(measured, files(data, measured), strict=True))
+    known: dict[str, Path] = dict(zip(measured, files(data, measured), strict=True))
     with StagedRun(folder, fresh=fresh, progress=progress) as stages:
         if fresh:
             shutil.rmtree(folder / "runs", ignore_errors=True)
@@ -155,11 +155,8 @@ def _scale(
         unknown = [v for v in value or () if v not in allowed]
         if unknown or (value is not None and not value):
             raise ValueError(f"{label}: got {', '.join(unknown) or 'none'}, expected of {', '.join(allowed)}")
-    for label, numbers, least in (
-        ("counts", counts, 1),
-        ("seeds", seeds, 0),
-        ("every", every and [every], 1),
-    ):
+    several = None if every is None else [every]
+    for label, numbers, least in (("counts", counts, 1), ("seeds", seeds, 0), ("every", several, 1)):
         if numbers is not None and any(isinstance(n, bool) or n != int(n) or n < least for n in numbers):
             raise ValueError(f"{label}: got {list(numbers)}, expected whole numbers of at least {least}")
     own = None if counts is None else tuple(sorted(set(map(int, counts))))

@@ -18,7 +18,7 @@ Row = dict[str, Any]
 
 
 def sparsity_curves(rows: Sequence[Row]) -> Any:
-    """PSNR and SSIM against training receivers, a row of panels a truth, bands from least to most over the receivers."""
+    """PSNR and SSIM against training receivers, a row of panels a truth; bands from least to most over receivers."""
     truths = list(dict.fromkeys(row["truth"] for row in rows))
     figure = require("matplotlib.figure", extra="plots").Figure(
         figsize=(12.5, 4.4 * len(truths) + 0.6), layout="constrained"
@@ -100,36 +100,40 @@ def speed_against_error(rows: Sequence[Row]) -> Any:
     """RMSE against the time of a spectrum and against training time, every method a point, a row of panels a count."""
     counts = sorted({row["count"] for row in rows if row["count"]})
     figure = require("matplotlib.figure", extra="plots").Figure(
-        figsize=(12.5, 4.6 * len(counts)), layout="constrained"
+        figsize=(13.5, 4.6 * len(counts) + 0.4), layout="constrained"
     )
     axes = figure.subplots(len(counts), 2, squeeze=False)
+    methods = [m for m in METHODS if any(row["method"] == m for row in rows)]
+    number = {method: k + 1 for k, method in enumerate(methods)}
     for count, (left, right) in zip(counts, axes, strict=True):
         own = [row for row in rows if row["count"] in (0, count)]
-        _points(left, [(row, row["seconds_per_spectrum"]) for row in own], "time of a spectrum [s]")
+        asked = [(row, row["seconds_per_spectrum"]) for row in own]
+        _points(left, asked, number, "time of a spectrum [s]")
         taught = [(row, row["train_s"]) for row in own if row["train_s"]]
-        _points(right, taught, "time to train, transport included [s]")
+        _points(right, taught, number, "time to train, transport included [s]")
         for ax in (left, right):
             ax.set_title(f"truth: {TRUTHS[own[0]['truth']]}, {count} training receivers", fontsize=10)
+    keys = [
+        axes[0, 0].scatter([], [], color=METHODS[m][1], s=90, label=f"{number[m]}  {METHODS[m][0]}")
+        for m in methods
+    ]
+    figure.legend(handles=keys, loc="outside right center", fontsize=9, frameon=False)
     return figure
 
 
-def _points(ax: Any, rows: Sequence[tuple[Row, float]], name: str) -> None:
+def _points(ax: Any, rows: Sequence[tuple[Row, float]], number: dict[str, int], name: str) -> None:
     for row, seconds in rows:
-        label, colour = METHODS[row["method"]]
         marker = "o" if row["count"] else "D"
+        place = ([seconds], [row["rmse_db"]])
         ax.scatter(
-            [seconds], [row["rmse_db"]], color=colour, marker=marker, s=60, zorder=3, edgecolors="white"
+            *place, color=METHODS[row["method"]][1], marker=marker, s=170, edgecolors="white", zorder=3
         )
-        ax.annotate(
-            label,
-            (seconds, row["rmse_db"]),
-            xytext=(7, 3),
-            textcoords="offset points",
-            fontsize=8,
-            color=colour,
-        )
+        ax.text(
+            seconds, row["rmse_db"], str(number[row["method"]]), color="white", fontsize=8, ha="center",
+            va="center_baseline", zorder=4,
+        )  # fmt: skip
     ax.set_xscale("log")
-    ax.margins(x=0.25, y=0.12)
+    ax.margins(x=0.12, y=0.12)
     ax.set_ylim(bottom=0)
     ax.set_xlabel(name)
     ax.set_ylabel("RMSE [dB]")

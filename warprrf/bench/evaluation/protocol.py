@@ -8,7 +8,7 @@ receivers there are left out and test receivers elsewhere are not asked.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,7 @@ def plan(
     scale: Scale,
     *,
     methods: Sequence[str] | None = None,
-    held: dict[tuple[str, str], Iterable[int]],
+    held: Mapping[tuple[str, str], Sequence[int]],
 ) -> list[Run]:
     """The runs of a command, those of one set of training receivers beside each other.
 

@@ -66,6 +66,8 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("beam_gain_loss_db_blocked", "blocked", "{:.2f}"),
     ("tof_error_median_ns", "ToF [ns]", "{:.3g}"),
     ("aod_error_median_deg", "AoD [deg]", "{:.2g}"),
+    ("loss_first", "loss, first tenth", "{:.3g}"),
+    ("loss_last", "last tenth", "{:.3g}"),
     ("train_s", "train [s]", "{:.4g}"),
     ("seconds_per_spectrum", "a spectrum [s]", "{:.3g}"),
     ("peak_memory_gib", "peak memory [GiB]", "{:.2f}"),
@@ -81,12 +83,12 @@ AHEAD = (
 """Figures in which ours is compared with the best of the others, and the sign of better."""
 
 LAW_TEXT = """\
-What decides is the distance law. Light that a surface scatters arrives with a power per solid angle that does not fall
-with the distance to the receiver, because the footprint of a pixel grows as fast as the power falls: it goes as 1 / d1^2
-alone, d1 from the transmitter to the surface. RF-3DGS has no distances: a Gaussian sends the same to every receiver in a
-direction, which is this law. RF-3DGS+ multiplies by (d1 + d2)^-2, which holds for mirror reflections and line of sight,
-and must unlearn it from receiver to receiver. `paper's law` are targets whose scattering was given that factor path by
-path, everything else the same: where the paper's law is the truth, its model has no such error."""
+What decides is the distance law. Light that a surface scatters arrives with a power per solid angle that does not
+fall with the distance to the receiver, because the footprint of a pixel grows as fast as the power falls: it goes as
+1 / d1^2 alone, d1 from the transmitter to the surface. RF-3DGS has no distances: a Gaussian sends the same to every
+receiver in a direction, which is this law. RF-3DGS+ multiplies by (d1 + d2)^-2, which holds for mirror reflections and
+line of sight, and must unlearn it from receiver to receiver. `paper's law` are targets whose scattering was given that
+factor path by path, everything else the same: where the paper's law is the truth, its model has no such error."""
 
 
 def summarise(rows: Iterable[Row]) -> list[Row]:
@@ -115,18 +117,17 @@ def _mean(group: list[Row]) -> Row:
         "devices": sorted({f"{row['device']}, {row['cores']} cores, {row['processor']}" for row in group}),
     }
     ends = {f"{name}_{end}": fold for name in SPREAD for end, fold in (("min", min), ("max", max))}
-    for name, value in first.items():
+    for name in first:
         values = [row.get(name) for row in group]
-        if isinstance(value, bool) or not all(isinstance(v, int | float) for v in values):
-            merged.setdefault(name, None if value is None else merged.get(name))
-        elif name not in merged:
-            merged[name] = ends[name](values) if name in ends else float(np.mean(values))
+        numbers = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
+        if name not in merged and len(numbers) + values.count(None) == len(values):
+            merged[name] = ends.get(name, np.mean)(numbers) if numbers else None
     spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in group]
     merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
     merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
     merged["model_mib"] = None if merged.get("model_bytes") is None else merged["model_bytes"] / 2**20
     return {
-        k: v for k, v in merged.items() if k not in ("per_receiver", "losses", "details", "shown", "seed")
+        k: v for k, v in merged.items() if k not in ("per_receiver", "details", "shown", "seed")
     }
 
 
@@ -141,8 +142,8 @@ def paper_finding(rows: Sequence[Row]) -> list[Row]:
         line: Row = {"truth": truth, "split": split, "count": count, "opacity": method != "rf3dgs+"}
         for key in ("psnr_db", "psnr_db_blocked", "ssim", "rmse_db"):
             a, b = plus.get(key), other.get(key)
-            both = a is not None and b is not None
-            line[key] = {"rf3dgs+": a, "rf3dgs": b, "difference": a - b if both else None}
+            difference = None if a is None or b is None else a - b
+            line[key] = {"rf3dgs+": a, "rf3dgs": b, "difference": difference}
         found.append(line)
     order = list(TRUTHS)
     return sorted(
@@ -177,7 +178,7 @@ def ours_against_all(rows: Sequence[Row]) -> list[Row]:
                 "best": best[key],
                 "method": best["method"],
                 "margin": margin,
-                "ahead": bool(sign * margin > 0),
+                "ahead": bool(sign * margin >= 0),
             }
         plus = next((row for row in others if row["method"] == "rf3dgs+"), None)
         if plus is not None:
@@ -339,7 +340,7 @@ def _finding_text(finding: Sequence[Row]) -> str:
 def _ahead_text(ahead: Sequence[Row]) -> str:
     names = {key: name for key, name, _ in COLUMNS}
     titles = [
-        (names[k] if not k.endswith("_blocked") else f"{names[k.removesuffix('_blocked')]}, blocked")
+        f"{names[k.removesuffix('_blocked')]}, blocked" if k.endswith("_blocked") else names[k]
         for k, _ in AHEAD
     ]
     lines = []
@@ -353,16 +354,13 @@ def _ahead_text(ahead: Sequence[Row]) -> str:
         where = TRUTHS[row["truth"]] + ("" if row["split"] == "random" else ", region")
         lines.append([where, str(row["count"]), *cells, *ratios])
     behind = [
-        f"{TRUTHS[row['truth']]}, {row['split']}, {row['count']} receivers: {title} behind {METHODS[row[key]['method']][0]}"
+        f"{TRUTHS[row['truth']]}, {row['split']}, {row['count']} receivers: {title} behind "
+        f"{METHODS[row[key]['method']][0]}"
         for row in ahead
         for (key, _), title in zip(AHEAD, titles, strict=True)
         if row.get(key) is not None and not row[key]["ahead"]
     ]
-    verdict = (
-        "Ahead of every other method in every figure."
-        if not behind
-        else "Not ahead: " + "; ".join(behind) + "."
-    )
+    verdict = "Behind no other method in any figure." if not behind else "Behind: " + "; ".join(behind) + "."
     head = ["truth", "receivers", *titles, "trains faster than RF-3DGS+, times", "infers faster, times"]
     text = "Ours less the best of the other methods in each figure, which is named."
     return "\n\n".join([text, _table(head, lines), verdict])

@@ -1,4 +1,4 @@
-"""Runs carried out one by one: here, or on the workers of a dask cluster; each finished one is kept in files of its own.
+"""Runs carried out one by one, here or on the workers of a dask cluster; each finished one is kept in its own files.
 
 A worker takes a run and the setting, which is plain values and paths: on several machines they must see the same files.
 It returns figures and pictures, and the process that started the sweep writes them, under a temporary name that is then
@@ -106,7 +106,7 @@ def execute(
         **_extremes(found["per_receiver"]),
         **peak,
         "model_bytes": _size(fitted),
-        "losses": fitted.losses,
+        **_ends(fitted.losses),
         "details": fitted.details,
         "note": method.note,
         "processor": processor_name(),
@@ -131,6 +131,14 @@ def _extremes(per_receiver: dict[str, np.ndarray]) -> Row:
         found[f"{name}_min"] = float(values.min()) if len(values) else None
         found[f"{name}_max"] = float(values.max()) if len(values) else None
     return found
+
+
+def _ends(losses: list[float] | None) -> Row:
+    """Mean loss of the first and the last tenth of the steps."""
+    if not losses:
+        return {"loss_first": None, "loss_last": None}
+    tenth = max(1, len(losses) // 10)
+    return {"loss_first": float(np.mean(losses[:tenth])), "loss_last": float(np.mean(losses[-tenth:]))}
 
 
 def _size(fitted: Fitted) -> int | None:
@@ -224,12 +232,14 @@ def mark_of(run: Run, setting: Setting) -> str:
 
 def _effort(run: Run, setting: Setting) -> dict[str, Any]:
     """The part of the effort that a method feels."""
-    heads = {
-        "rf3dgs+": "harmonic", "rf3dgs": "harmonic", "rf3dgs+alpha": "harmonic", "rf3dgs-alpha": "harmonic", "nerf2": "nerf2", "cgan": "cgan", "sionna": "sionna",
+    heads: dict[str, tuple[str, ...]] = {
+        **dict.fromkeys(("rf3dgs+", "rf3dgs", "rf3dgs+alpha", "rf3dgs-alpha"), ("harmonic",)),
+        "nerf2": ("nerf2",),
+        "cgan": ("cgan",),
+        "sionna": ("sionna",),
         "sionna-calibrated": ("calibration", "sionna"),
-    }  # fmt: skip
-    head = heads.get(run.method)
-    return {k: v for k, v in vars(setting.effort).items() if head is not None and k.startswith(head)}
+    }
+    return {k: v for k, v in vars(setting.effort).items() if k.startswith(heads.get(run.method, ("none",)))}
 
 
 def sweep(

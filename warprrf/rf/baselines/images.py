@@ -56,7 +56,7 @@ class SpectrumImages:
     @classmethod
     def of(cls, data: SpectrumDataset | SpectrumImages) -> SpectrumImages:
         """A data set's dB images mapped to [0, 1] by its floor and range; pictures are returned as they are."""
-        if isinstance(data, cls):
+        if isinstance(data, SpectrumImages):
             return data
         gain = np.asarray(data.path_gain)
         return cls(
