@@ -11,9 +11,16 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from warprrf.rf import lookups, metrics  # noqa: E402
-from warprrf.rf.baselines import CGAN, CGANOptions, NeRF2, NeRF2Options, SpectrumImages, load_nerf2_spectra  # noqa: E402
+from warprrf.rf.baselines import (  # noqa: E402
+    CGAN,
+    CGANOptions,
+    NeRF2,
+    NeRF2Options,
+    SpectrumImages,
+    load_nerf2_spectra,
+    training,  # noqa: E402
+)
 from warprrf.rf.baselines import nerf2 as nerf2_module  # noqa: E402
-from warprrf.rf.baselines import training  # noqa: E402
 from warprrf.rf.baselines.images import path_gain_of  # noqa: E402
 from warprrf.rf.dataset import SpectrumDataset  # noqa: E402
 from warprrf.rf.spectrum import pixel_directions  # noqa: E402
@@ -158,7 +165,9 @@ def test_a_ray_is_the_sum_of_what_its_points_send_through_those_before_them() ->
         total += positive(signal[i, 0]) * np.exp(1j * angle(signal[i, 1])) * through * 0.025 / distance
         if i < 4:
             step = t[i + 1] - t[i]
-            through *= np.exp(-positive(attenuation[i, 0]) * step) * np.exp(1j * angle(attenuation[i, 1]) * step)
+            through *= np.exp(-positive(attenuation[i, 0]) * step) * np.exp(
+                1j * angle(attenuation[i, 1]) * step
+            )
     assert shown == pytest.approx(abs(total), rel=1e-4)
 
 
@@ -231,7 +240,7 @@ def test_public_layout_is_read_by_its_own_conventions(public: Path) -> None:
 
 
 def test_nerf2_trains_on_its_public_layout(public: Path) -> None:
-    model = fit("NeRF2", load_nerf2_spectra(public, "train"), iterations=120)
+    model = fit("NeRF2", load_nerf2_spectra(public, "train"), iterations=300, rays=64)
     losses = model.report["losses"]
     assert np.mean(losses[-10:]) < 0.6 * np.mean(losses[:10])
     drawn = model.image([1.0, 2.0, 0.5], [1.5, 1.0, 1.5])

@@ -338,7 +338,7 @@ def _there(
         name = f"{run.key}-{time.time_ns()}"
         futures[client.submit(work, run, setting, budget, key=name, pure=False, priority=-place)] = run
     try:
-        for future in distributed.as_completed(list(futures)):
+        for future in distributed.as_completed(list(futures), loop=client.loop):
             run = futures[future]
             try:
                 result = future.result()
