@@ -126,9 +126,7 @@ def _mean(group: list[Row]) -> Row:
     merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
     merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
     merged["model_mib"] = None if merged.get("model_bytes") is None else merged["model_bytes"] / 2**20
-    return {
-        k: v for k, v in merged.items() if k not in ("per_receiver", "details", "shown", "seed")
-    }
+    return {k: v for k, v in merged.items() if k not in ("per_receiver", "details", "shown", "seed")}
 
 
 def paper_finding(rows: Sequence[Row]) -> list[Row]:

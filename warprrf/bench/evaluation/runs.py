@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from warprrf.bench.evaluation.methods import AFTER, METHODS, UNTAUGHT, Task, code_mark
 from warprrf.bench.evaluation.protocol import Run, Setting, shown_receivers, truth_of
@@ -172,7 +173,7 @@ def peak_memory(device: Any = None) -> Iterator[Row]:
     found["peak_memory_bytes"] = _high_water_mark()
     if where.is_cuda:
         torch = sys.modules.get("torch")
-        warp_bytes = require("warp", extra="all").get_mempool_used_mem_high(where)
+        warp_bytes = wp.get_mempool_used_mem_high(where)
         found["peak_gpu_bytes"] = int(warp_bytes) + (
             int(torch.cuda.max_memory_allocated()) if torch is not None else 0
         )
