@@ -168,6 +168,7 @@ def _scale(
         curve_counts=own,
         region_counts=own,
         network_counts=own,
+        opacity_counts=own,
         seeds=None if seeds is None else tuple(map(int, seeds)),
         every=every,
         effort=effort,

@@ -26,6 +26,7 @@ HELD_OUT = 0.25  # of the receivers' extent along the longer side
 
 TABLE_METHODS = tuple(METHODS)
 CURVE_METHODS = ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "idw", "constant")
+OPACITY_METHODS = ("rf3dgs+alpha", "rf3dgs-alpha")
 LAW_METHODS = ("rf3dgs+", "rf3dgs")
 """Methods that the paper's law is tried on: its finding is about these two."""
 
@@ -66,6 +67,7 @@ class Scale:
         table_counts: training receivers of the table.
         curve_counts: training receivers of the sparsity curves.
         network_counts: those of them that NeRF2 and the GAN are trained on.
+        opacity_counts: those of them that opacity is trained on, too.
         seeds, truths, splits: which.
         region_counts: training receivers of the region split.
         every: each how-manieth test receiver counts.
@@ -77,6 +79,7 @@ class Scale:
     table_counts: tuple[int, ...]
     curve_counts: tuple[int, ...]
     network_counts: tuple[int, ...]
+    opacity_counts: tuple[int, ...]
     seeds: tuple[int, ...]
     truths: tuple[str, ...]
     splits: tuple[str, ...]
@@ -93,13 +96,14 @@ SCALES = {
         table_counts=(10, 50, 400),
         curve_counts=(10, 15, 20, 25, 50, 100, 200, 400),
         network_counts=(10, 50, 400),
+        opacity_counts=(10, 50),
         seeds=(0,),
         truths=("exact", "paper-law"),
         splits=("random", "region"),
         region_counts=(50,),
-        every=2,
+        every=4,
         effort=Effort(
-            nerf2_iterations=500, nerf2_rays=256, nerf2_samples=32, cgan_iterations=500, cgan_batch=4
+            nerf2_iterations=500, nerf2_rays=256, nerf2_samples=32, cgan_iterations=500, cgan_batch=2
         ),
         least_shape=(60, 120),
     ),
@@ -108,6 +112,7 @@ SCALES = {
         table_counts=PUBLISHED_COUNTS,
         curve_counts=PUBLISHED_COUNTS,
         network_counts=PUBLISHED_COUNTS,
+        opacity_counts=PUBLISHED_COUNTS,
         seeds=(0, 1, 2),
         truths=("exact", "sionna", "paper-law"),
         splits=("random", "region"),
@@ -149,15 +154,20 @@ def plan(
             for seed in scale.seeds:
                 for count in counts:
                     for method in (m for m in own if m not in UNTAUGHT):
-                        if METHODS[method].network and (
-                            split != "random" or count not in scale.network_counts
-                        ):
+                        if not _wanted(method, split, count, scale):
                             continue
                         runs += [Run(truth, split, count, seed, method, v) for v in METHODS[method].variants]
             for method in (m for m in own if m in UNTAUGHT):
                 seeds = scale.seeds if METHODS[method].random else scale.seeds[:1]
                 runs += [Run(truth, split, 0, seed, method) for seed in seeds]
     return runs
+
+
+def _wanted(method: str, split: str, count: int, scale: Scale) -> bool:
+    """Whether a costly method is asked for this set."""
+    if METHODS[method].network:
+        return split == "random" and count in scale.network_counts
+    return method not in OPACITY_METHODS or (split == "random" and count in scale.opacity_counts)
 
 
 def _counts(kind: str, scale: Scale) -> tuple[int, ...]:

@@ -71,6 +71,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("train_s", "train [s]", "{:.4g}"),
     ("seconds_per_spectrum", "a spectrum [s]", "{:.3g}"),
     ("peak_memory_gib", "peak memory [GiB]", "{:.2f}"),
+    ("peak_gpu_gib", "peak GPU memory [GiB]", "{:.2f}"),
     ("model_mib", "model [MiB]", "{:.3g}"),
 )
 PAIRS = {"rf3dgs+": "rf3dgs", "rf3dgs+alpha": "rf3dgs-alpha"}
@@ -125,6 +126,8 @@ def _mean(group: list[Row]) -> Row:
     spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in group]
     merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
     merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
+    on_gpu = [row["peak_gpu_bytes"] for row in group if row.get("peak_gpu_bytes") is not None]
+    merged["peak_gpu_gib"] = max(on_gpu) / 2**30 if on_gpu else None
     merged["model_mib"] = None if merged.get("model_bytes") is None else merged["model_bytes"] / 2**20
     return {k: v for k, v in merged.items() if k not in ("per_receiver", "details", "shown", "seed")}
 

@@ -335,8 +335,9 @@ def _there(
     distributed = require("distributed", extra="cluster")
     futures = {}
     for place, (run, budget) in enumerate(jobs):
-        # The first asked for is the first done, so that runs of one set of receivers meet what was traced for them.
-        name = f"{run.key}-{time.time_ns()}"
+        # One prefix for all keys: dask would else hand out small groups of other prefixes first, and runs of one set of
+        # receivers would not meet what was traced for them. The first asked for is the first done.
+        name = f"run-{place}-{time.time_ns()}"
         futures[client.submit(work, run, setting, budget, key=name, pure=False, priority=-place)] = run
     try:
         for future in distributed.as_completed(list(futures), loop=client.loop):
