@@ -165,6 +165,10 @@ def test_plan_has_nested_counts_one_run_for_what_is_untaught_and_networks_where_
     assert len(planned) == len(set(planned))
     networks = {(r.count, r.split) for r in planned if r.method == "nerf2"}
     assert networks == {(10, "random"), (50, "random"), (400, "random")}
+    assert {(r.count, r.split) for r in planned if r.method == "rf3dgs-alpha"} == {
+        (10, "random"),
+        (50, "random"),
+    }
     assert [r.count for r in planned if r.method == "zero" and r.split == "random"] == [0]
     assert {r.method for r in planned if r.truth == "paper-law"} == set(protocol.LAW_METHODS)
     assert {r.count for r in planned if r.split == "region"} == {0, 50}
@@ -265,6 +269,24 @@ def test_finding_has_the_sign_that_was_found_and_margins_name_the_best_other() -
     assert (ours["rmse_db"]["margin"], ours["rmse_db"]["ahead"]) == (-1.0, True)
     assert (ours["train_ratio"], ours["spectrum_ratio"]) == (2.0, 4.0)
     assert "psnr_db_blocked" not in ours
+
+
+def test_text_says_what_the_law_is_worth() -> None:
+    def line(truth: str, count: int, difference: float) -> dict[str, Any]:
+        return {
+            "truth": truth, "split": "random", "count": count, "opacity": False, "psnr_db": {"difference": difference},
+        }  # fmt: skip
+
+    lines = [
+        line("exact", 10, -0.6),
+        line("exact", 25, -0.4),
+        line("paper-law", 10, 0.2),
+        line("sionna", 10, 9.0),
+    ]
+    text = report._law_worth(lines)
+    assert "by +0.80 dB in the mean, from -0.60 to +0.20 dB, so that the paper's finding holds" in text
+    assert "not ahead even there" in report._law_worth([*lines[:2], line("paper-law", 25, -0.1)])
+    assert report._law_worth(lines[:2]) == ""
 
 
 # ---------------------------------------------------------------------------------------- workers of a cluster
