@@ -214,7 +214,7 @@ def markdown(kind: str, found: dict[str, Any]) -> str:
         parts += ["### RF-3DGS+ against RF-3DGS", _finding_text(found["finding"])]
     if found["ahead"]:
         parts += ["### Ours against all", _ahead_text(found["ahead"])]
-    return "\n\n".join(parts)
+    return "\n\n".join(part for part in parts if part)
 
 
 def method_table(rows: Sequence[Row]) -> str:
