@@ -184,6 +184,11 @@ class HarmonicField(RadioField):
         )
         listed = None
         if train_opacity:
+            if not isinstance(seen, Transport):
+                raise ValueError(
+                    "transport: got weights stored on disk together with train_opacity=True, which makes weights anew; "
+                    "expected weights in memory, or None"
+                )
             listed = list_responses(gaussians, seen, ds.range_db, device=device, progress=progress)
             seen = listed.transport
         ready = time.perf_counter()
