@@ -90,6 +90,7 @@ examples:
   warprrf bench newrf --data external/newrf --out runs/newrf
   warprrf bench bistatic --truths exact --counts 10 50
   warprrf bench engine
+  warprrf bench beams
 """
 
 HELP_BENCH_BISTATIC = """\
@@ -112,6 +113,17 @@ Each measurement is kept: a killed run loses one. For figures worth quoting leav
 examples:
   warprrf bench engine
   warprrf bench engine --quick --out runs/engine-quick
+"""
+
+HELP_BENCH_BEAMS = """\
+Fits the bistatic field and RF-3DGS+, picks each test receiver's beam without pilots, and compares received SNR and
+spectral efficiency on the true channel with exhaustive and hierarchical search, the nearest training receiver's beam,
+pointing at the transmitter, zero spectra and random beams. Fitted fields are kept: a killed run continues.
+
+examples:
+  warprrf bench beams
+  warprrf bench beams --truths exact --counts 10 --every 4 --sides 4 16 --out runs/quick     a first look
+  warprrf bench beams --data spectra_full.nc spectra_sionna_full.nc --geometry room
 """
 
 HELP_DATA = """\

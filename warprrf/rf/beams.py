@@ -18,7 +18,7 @@ Waves are plane: a beam of more than a thousand elements loses to that within a 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,7 +30,7 @@ from warprrf.rf.path_set import Paths
 from warprrf.rf.spectrum import Spectrum, directions_from_angles, pixel_directions
 
 MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
-_TERMS = 1 << 22  # numbers held at once while paths are summed
+_TERMS = 1 << 18  # numbers held at once while paths are summed: what fits a cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,31 +77,42 @@ class Codebook:
 
         Elements' patterns count: |amplitude|^2 is the beam's power gain.
         """
-        parts, size = self._parts(directions)
+        d = np.asarray(directions, dtype=np.float64)
+        size = np.sqrt(self.array.gain(d))
+        parts = self._waves(d)
         if len(parts) == 1:
             return parts[0] * size
-        return (parts[0][:, None] * (parts[1] * size)[None]).reshape(len(self), -1)
+        return (parts[0][:, None] * (parts[1] * size)[None]).reshape(len(self), len(d))
 
     def superposed(self, directions: Any, gains: Any) -> np.ndarray:
-        """w^T h of every beam for plane waves of complex ``gains`` (L,) along ``directions`` (L, 3), shape ``(B,)``."""
-        return self._summed(directions, np.asarray(gains), lambda part: part, np.sqrt)
+        """w^T h of every beam for plane waves of complex ``gains`` (..., L) along ``directions`` (L, 3).
+
+        Returns:
+            Shape ``(..., B)``.
+        """
+        values = np.asarray(gains, dtype=complex)
+        d = np.asarray(directions, dtype=np.float64)
+        size = np.sqrt(self.array.gain(d))
+        return self._summed(d, values * size, lambda waves: waves)
 
     def power(self, directions: Any, powers: Any) -> np.ndarray:
-        """Mean |w^T h|^2 of every beam for waves of ``powers`` (L,) and independent phases, shape ``(B,)``."""
-        return self._summed(directions, np.asarray(powers, np.float64), _squared, lambda gain: gain)
-
-    def _summed(self, directions: Any, values: np.ndarray, shape: Any, element: Any) -> np.ndarray:
+        """Mean |w^T h|^2 of every beam for waves of ``powers`` (..., L) and independent phases, shape ``(..., B)``."""
+        values = np.asarray(powers, dtype=np.float64)
         d = np.asarray(directions, dtype=np.float64)
-        total: Any = 0.0
-        for part in _chunks(len(d), max(len(f) for f in self.factors) + self.array.rows + self.array.cols):
-            waves = [shape(p) for p in self._waves(d[part])]
-            weighted = waves[-1] * (values[part] * element(self.array.gain(d[part])))
-            total = total + (weighted.sum(axis=1) if len(waves) == 1 else waves[0] @ weighted.T)
-        return np.broadcast_to(np.asarray(total).ravel(), (len(self),)).copy()
+        return self._summed(d, values * self.array.gain(d), _squared)
 
-    def _parts(self, directions: Any) -> tuple[list[np.ndarray], np.ndarray]:
-        d = np.asarray(directions, dtype=np.float64)
-        return self._waves(d), np.sqrt(self.array.gain(d))
+    def _summed(
+        self, d: np.ndarray, values: np.ndarray, measure: Callable[[np.ndarray], np.ndarray]
+    ) -> np.ndarray:
+        """Sum of ``values`` (..., L) times ``measure`` of what each beam receives of unit waves along ``d`` (L, 3)."""
+        rows = values.reshape(int(np.prod(values.shape[:-1])), len(d))
+        total = np.zeros((len(rows), len(self)), dtype=values.dtype)
+        for part in _chunks(len(d), sum(len(f) for f in self.factors)):
+            waves = [measure(w) for w in self._waves(d[part])]
+            for out, row in zip(total, rows, strict=True):
+                weighted = waves[-1] * row[part]
+                out += weighted.sum(axis=1) if len(waves) == 1 else (waves[0] @ weighted.T).ravel()
+        return total.reshape(*values.shape[:-1], len(self))
 
     def _waves(self, d: np.ndarray) -> list[np.ndarray]:
         """What each factor receives of unit plane waves, shapes ``(B, L)``, without the elements' pattern."""
@@ -109,14 +120,10 @@ class Codebook:
             return [self.factors[0] @ self.array.response(d, 1.0).T]
         across, down = np.broadcast_to(np.asarray(self.array.spacing, np.float64), (2,))[::-1]
         local = d @ self.array.rotation
-        column = (np.arange(self.array.cols) - 0.5 * (self.array.cols - 1)) * across
-        row = (0.5 * (self.array.rows - 1) - np.arange(self.array.rows)) * down
+        # Down the array z falls from element to element.
         return [
-            weights @ np.exp(2j * np.pi * place[:, None] * cosine)
-            for weights, place, cosine in (
-                (self.factors[0], column, local[:, 1]),
-                (self.factors[1], row, local[:, 2]),
-            )
+            self.factors[0] @ _steps(across * local[:, 1], self.array.cols),
+            self.factors[1] @ _steps(-down * local[:, 2], self.array.rows),
         ]
 
 
@@ -124,8 +131,8 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
     """Beams at equally spaced spatial frequencies, across and down the array; orthonormal without oversampling.
 
     Beam k of B along a side of n elements, B = ``oversampling`` n, looks along the cosine ((k + 1/2) / B - 1/2) /
-    spacing to +y across the array and to -z down it. Beams 2 k and 2 k + 1 of a side twice as long halve what it covers.
-    At half-wavelength spacing those of the corners, where both cosines are large, point nowhere.
+    spacing to +y across the array and to -z down it. Beams 2 k and 2 k + 1 of a side twice as long halve what it
+    covers. At half-wavelength spacing those of the corners, where both cosines are large, point nowhere.
 
     Raises:
         ValueError: for a polarised array, or oversampling below 1.
@@ -175,7 +182,7 @@ class BeamChoice:
     Attributes:
         tx: Index of the transmitter's beam.
         rx: Index of the receiver's beam.
-        gain: Predicted mean |w_r^T H w_t|^2 [linear]; 0 for a receiver that no path reaches, whose choice means nothing.
+        gain: Predicted mean |w_r^T H w_t|^2 [linear]; 0 for a receiver that no path reaches: any choice.
     """
 
     tx: np.ndarray
@@ -263,7 +270,7 @@ def select_beams_multiuser(
     Raises:
         TypeError, ValueError: as for :func:`select_beams`; without users, or for noise that is not positive.
     """
-    if not (np.isscalar(noise) and np.isfinite(noise) and noise > 0):  # type: ignore[arg-type]
+    if not (np.isfinite(noise) and noise > 0):
         raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")
     tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
     given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | Paths) else sources
@@ -365,6 +372,18 @@ def _pair_gains(rays: _Rays, tx: Codebook, rx: Codebook) -> np.ndarray:
         received = _squared(rx.amplitude(arrival[part]))
         total += (received * power[part]) @ _squared(tx.amplitude(departure[part])).T
     return total
+
+
+def _steps(turns: np.ndarray, count: int) -> np.ndarray:
+    """exp(2 pi j turns n) of ``count`` elements n about their middle, shape ``(count, L)``, by products."""
+    waves = np.empty((count, len(turns)), dtype=complex)
+    waves[0] = np.exp(-2j * np.pi * turns * (0.5 * (count - 1)))
+    done = 1
+    while done < count:
+        more = min(done, count - done)
+        np.multiply(waves[:more], np.exp(2j * np.pi * turns * done), out=waves[done : done + more])
+        done += more
+    return waves
 
 
 def _dft(count: int, oversampling: int) -> np.ndarray:
