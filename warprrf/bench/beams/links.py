@@ -4,7 +4,7 @@ A channel is that of a band of 2.16 GHz. Line of sight and mirrors come from the
 its materials, every element at its own distance (spherical waves). Scattering is a set of plane waves, each with the
 power and the delay of one ray and a phase drawn from a seed. For a data set of the exact engine they are the engine's own diffuse rays and mirrors reflect once, as in its
 spectra. For one of Sionna RT mirrors reflect up to twice, and all other power of the receiver's own spectrum is spread
-over 9 rays a pixel, which leave along the pixel's departure angle.
+over 4 rays a pixel, which leave along the pixel's departure angle.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from warprrf.rf.spectrum import angles_from_directions, directions_from_angles, 
 SUB_PIXELS = (
     3  # square root of the rays a pixel: 1 degree apart; beams of 64 x 64 elements are 1.8 degrees apart
 )
-NEGLIGIBLE = 1e-3  # the weakest rays are left out, up to this share of the scattered power
+NEGLIGIBLE = 3e-3  # the weakest rays are left out, up to this share of the scattered power
 OVERSAMPLING = 2
 """Of the codebooks: neighbouring beams cross 0.9 dB down instead of 3.9 dB, so that a wrong neighbour costs little."""
 BANDWIDTH_HZ = 2.16e9  # the narrowest channel of IEEE Std 802.15.3d
-FREQUENCIES = 16  # over that band
+FREQUENCIES = 8  # over that band
 _CHUNK = 1024
 
 
