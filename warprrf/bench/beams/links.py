@@ -2,9 +2,9 @@
 
 A channel is that of a band of 2.16 GHz. Line of sight and mirrors come from the image method on the true scene with
 its materials, every element at its own distance (spherical waves). Scattering is a set of plane waves, each with the
-power and the delay of one ray and a phase drawn from a seed. For a data set of the exact engine they are the engine's own diffuse rays and mirrors reflect once, as in its
-spectra. For one of Sionna RT mirrors reflect up to twice, and all other power of the receiver's own spectrum is spread
-over 4 rays a pixel, which leave along the pixel's departure angle.
+power and the delay of one ray and a phase drawn from a seed. For a data set of the exact engine they are the engine's
+own diffuse rays and mirrors reflect once, as in its spectra. For one of Sionna RT mirrors reflect up to twice, and all
+other power of the receiver's own spectrum is spread over 4 rays a pixel, which leave along the pixel's departure angle.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ class Ends:
 
     @cached_property
     def tx_book(self) -> Codebook:
-        """DFT beams of the transmitter."""
-        return dft_codebook(self.tx, OVERSAMPLING)
+        """Beams of the transmitter."""
+        return _book(self.tx)
 
     @cached_property
     def rx_book(self) -> Codebook:
-        """DFT beams of the receiver."""
-        return dft_codebook(self.rx, OVERSAMPLING)
+        """Beams of the receiver."""
+        return _book(self.rx)
 
     @property
     def elements(self) -> int:
@@ -239,6 +239,11 @@ class Links:
             np.repeat(rest[lit] / count, count),
             np.repeat(tau[lit], count),
         )
+
+
+def _book(array: PlanarArray) -> Codebook:
+    """The oversampled DFT codebook; the one beam of a single element."""
+    return dft_codebook(array, OVERSAMPLING if array.elements > 1 else 1)
 
 
 def _middle(whole: PlanarArray, part: PlanarArray) -> np.ndarray:

@@ -95,7 +95,8 @@ def _document(report: dict[str, Any]) -> list[str]:
             "",
             f"{found['receivers']} test receivers, {found['blocked']} of them without line of sight. Transmitted "
             f"{report['tx_power_dbm']:g} dBm, noise {report['noise_dbm']:.1f} dBm over "
-            f"{report['bandwidth_hz'] / 1e9:g} GHz, {report['frame_pilots']} pilots fill the time for which a beam holds. Line of sight / blocked.",
+            f"{report['bandwidth_hz'] / 1e9:g} GHz, {report['frame_pilots']} pilots fill the time for which a beam "
+            "holds. Line of sight / blocked.",
         ]
         for ends in dict.fromkeys(row["ends"] for row in found["links"]):
             rows = [row for row in found["links"] if row["ends"] == ends]

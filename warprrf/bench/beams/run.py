@@ -91,6 +91,7 @@ def run_beams(
         "frame_pilots": FRAME_PILOTS,
         "truths": {},
     }
+    report["bandwidth_hz"] = BANDWIDTH_HZ
     with StagedRun(out, fresh=fresh, progress=progress) as run:
         for file in files(data, truths):
             truth = Truth.load(file, tuple(counts), every)
