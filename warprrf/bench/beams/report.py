@@ -135,7 +135,7 @@ def over_elements(figure_class: Any, rows: list[Row], swept: str, truth: str) ->
     for column, (suffix, name) in enumerate(RECEIVERS.items()):
         for ax, quantity, label in (
             (axes[0, column], "snr_db", "median received SNR [dB]"),
-            (axes[1, column], "efficiency", "mean spectral efficiency [bit/s/Hz]"),
+            (axes[1, column], "efficiency", "mean spectral efficiency less pilots [bit/s/Hz]"),
         ):
             for method in NAMES:
                 chosen = [
@@ -153,6 +153,7 @@ def over_elements(figure_class: Any, rows: list[Row], swept: str, truth: str) ->
         axes[1, column].set_xlabel(f"elements of the {SWEPT[swept]}'s array")
     for ax in axes.flat:
         ax.set_xticks(sorted({r["elements"] for r in rows if r["swept"] == swept}))
+        ax.minorticks_off()
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)
     figure.suptitle(f"Beams on the true channel ({truth}), {count} training receivers where any", fontsize=12)
@@ -170,7 +171,7 @@ def over_training(figure_class: Any, rows: list[Row], truth: str) -> Any:
     for column, (suffix, name) in enumerate(RECEIVERS.items()):
         for ax, quantity, label in (
             (axes[0, column], "within", "share within 1 dB of exhaustive search"),
-            (axes[1, column], "efficiency", "mean spectral efficiency [bit/s/Hz]"),
+            (axes[1, column], "efficiency", "mean spectral efficiency less pilots [bit/s/Hz]"),
         ):
             for method in NAMES:
                 points = [(r["n_train"], r[quantity + suffix]) for r in of_size if r["method"] == method]
@@ -201,7 +202,7 @@ def _style(method: str) -> dict[str, Any]:
         "marker": "o",
         "markersize": 4,
         "linewidth": 2.2 if method == "bistatic" else 1.3,
-        "zorder": 3 if method == "bistatic" else 2,
+        "zorder": 4 if searched else 3 if method == "bistatic" else 2,
     }
 
 
