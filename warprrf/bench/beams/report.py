@@ -135,7 +135,7 @@ def over_elements(figure_class: Any, rows: list[Row], swept: str, truth: str) ->
     for column, (suffix, name) in enumerate(RECEIVERS.items()):
         for ax, quantity, label in (
             (axes[0, column], "snr_db", "median received SNR [dB]"),
-            (axes[1, column], "efficiency", "mean spectral efficiency less pilots [bit/s/Hz]"),
+            (axes[1, column], "efficiency", "mean efficiency less pilots [bit/s/Hz]"),
         ):
             for method in NAMES:
                 chosen = [
@@ -171,7 +171,7 @@ def over_training(figure_class: Any, rows: list[Row], truth: str) -> Any:
     for column, (suffix, name) in enumerate(RECEIVERS.items()):
         for ax, quantity, label in (
             (axes[0, column], "within", "share within 1 dB of exhaustive search"),
-            (axes[1, column], "efficiency", "mean spectral efficiency less pilots [bit/s/Hz]"),
+            (axes[1, column], "efficiency", "mean efficiency less pilots [bit/s/Hz]"),
         ):
             for method in NAMES:
                 points = [(r["n_train"], r[quantity + suffix]) for r in of_size if r["method"] == method]
