@@ -18,7 +18,7 @@ COMMANDS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("command", (*COMMANDS, "bench newrf", "bench bistatic"))
+@pytest.mark.parametrize("command", (*COMMANDS, "bench newrf", "bench bistatic", "bench beams"))
 def test_help_shows_an_example_that_the_parser_takes(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

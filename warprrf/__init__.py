@@ -20,9 +20,11 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Air": "rf.absorption",
+    "BeamChoice": "rf.beams",
     "Blending": "geometry.render",
     "BlendWeights": "geometry.render",
     "Camera": "geometry.camera",
+    "Codebook": "rf.beams",
     "GaussianRays": "geometry.gaussian_rays",
     "Gaussians": "geometry.gaussians",
     "Material": "rf.materials",
@@ -37,7 +39,9 @@ _HOMES = {
     "Spectrum": "rf.spectrum",
     "SpectrumDataset": "rf.dataset",
     "THZ_CHANNELS": "rf.thz_channels",
+    "beam_gains": "rf.beams",
     "blend_weights": "geometry.render",
+    "dft_codebook": "rf.beams",
     "evaluate": "rf.metrics",
     "fit_reflections": "rf.reflections",
     "gas_attenuation_db_per_m": "rf.absorption",
@@ -48,7 +52,10 @@ _HOMES = {
     "reconstruct": "geometry.reconstruction",
     "relevance": "rf.relevance",
     "render": "geometry.render",
+    "select_beams": "rf.beams",
+    "select_beams_multiuser": "rf.beams",
     "simulate": "rf.simulate",
+    "steering_codebook": "rf.beams",
     "thz_channel": "rf.thz_channels",
     "trace_paths": "rf.paths",
     "write_deepmimo": "rf.deepmimo",
@@ -74,6 +81,13 @@ if TYPE_CHECKING:
     from warprrf.rf.arrays import PlanarArray as PlanarArray
     from warprrf.rf.arrays import orientation_towards as orientation_towards
     from warprrf.rf.arrays import plane_wave_error as plane_wave_error
+    from warprrf.rf.beams import BeamChoice as BeamChoice
+    from warprrf.rf.beams import Codebook as Codebook
+    from warprrf.rf.beams import beam_gains as beam_gains
+    from warprrf.rf.beams import dft_codebook as dft_codebook
+    from warprrf.rf.beams import select_beams as select_beams
+    from warprrf.rf.beams import select_beams_multiuser as select_beams_multiuser
+    from warprrf.rf.beams import steering_codebook as steering_codebook
     from warprrf.rf.dataset import SpectrumDataset as SpectrumDataset
     from warprrf.rf.deepmimo import write_deepmimo as write_deepmimo
     from warprrf.rf.field import RadioField as RadioField

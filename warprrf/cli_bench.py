@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from warprrf.cli_bars import Bars
-from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BISTATIC, HELP_BENCH_ENGINE, HELP_BENCH_EVALUATION
+from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BEAMS, HELP_BENCH_BISTATIC, HELP_BENCH_ENGINE, HELP_BENCH_EVALUATION
 
 Add = Callable[..., argparse.ArgumentParser]
 
@@ -62,6 +62,21 @@ def add_benches(add: Add) -> None:
         ("sparsity", "PSNR and SSIM over the number of training receivers"),
     ):
         _add_evaluation(add(name, _bench, line, HELP_BENCH_EVALUATION, tables))
+    beams = add("beams", _bench, "beams chosen from the field, beside pilots", HELP_BENCH_BEAMS, tables)
+    beams.add_argument("--out", help="folder of the results (default runs/beams)")
+    beams.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    beams.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    beams.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    beams.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (5 10 50)")
+    beams.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
+    beams.add_argument(
+        "--sides", nargs="+", type=int, metavar="N", help="elements a side of an array (4 8 16 32 64)"
+    )
+    beams.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
+    beams.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+
 
 
 def _add_evaluation(one: argparse.ArgumentParser) -> None:
@@ -194,6 +209,32 @@ def _bench_evaluation(args: argparse.Namespace, bars: Bars) -> None:
     print(f"\n{Path(out) / args.name}.md: the tables with pictures; .csv and .json: every figure")
 
 
+def _bench_beams(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import beams
+
+    out = args.out or "runs/beams"
+    given = {
+        "data": args.data and (args.data if len(args.data) > 1 else args.data[0]),
+        "geometry": args.geometry,
+        "scene": args.scene,
+        "counts": args.counts,
+        "truths": args.truths,
+        "sides": args.sides,
+    }
+    report = beams.run_beams(
+        out,
+        every=args.every,
+        seed=args.seed,
+        fresh=args.fresh,
+        device=args.device,
+        progress=bars,
+        **{name: value for name, value in given.items() if value is not None},
+    )
+    bars.close()
+    print(beams.summary_text(report))
+    print(f"\n{Path(out) / 'beams.md'}: the tables with pictures; beams.json: every figure")
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "newrf": _bench_newrf,
     "bistatic": _bench_bistatic,
@@ -202,6 +243,7 @@ BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "channel": _bench_channel,
     "table1": _bench_evaluation,
     "sparsity": _bench_evaluation,
+    "beams": _bench_beams,
 }
 """Benchmarks by name: what `warprrf bench NAME` runs."""
 

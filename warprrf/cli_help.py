@@ -92,6 +92,7 @@ examples:
   warprrf bench engine
   warprrf bench table1
   warprrf bench sparsity
+  warprrf bench beams
 """
 
 HELP_BENCH_BISTATIC = """\
@@ -128,6 +129,17 @@ examples:
   warprrf bench sparsity --workers 0
   warprrf bench table1 --methods bistatic rf3dgs+ rf3dgs --counts 10 --every 10      a first look, in minutes
   warprrf bench table1 --scale paper --data spectra_full.nc spectra_sionna_full.nc --scheduler tcp://lab:8786
+"""
+
+HELP_BENCH_BEAMS = """\
+Fits the bistatic field and RF-3DGS+, picks each test receiver's beam without pilots, and compares received SNR and
+spectral efficiency on the true channel with exhaustive and hierarchical search, the nearest training receiver's beam,
+pointing at the transmitter, zero spectra and random beams. Fitted fields are kept: a killed run continues.
+
+examples:
+  warprrf bench beams
+  warprrf bench beams --truths exact --counts 10 --every 4 --sides 4 16 --out runs/quick     a first look
+  warprrf bench beams --data spectra_full.nc spectra_sionna_full.nc --geometry room
 """
 
 HELP_DATA = """\
