@@ -7,7 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from warprrf.cli_bars import Bars
-from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BEAMS, HELP_BENCH_BISTATIC, HELP_BENCH_ENGINE, HELP_BENCH_EVALUATION
+from warprrf.cli_help import (
+    HELP_BENCH,
+    HELP_BENCH_BEAMS,
+    HELP_BENCH_BISTATIC,
+    HELP_BENCH_ENGINE,
+    HELP_BENCH_EVALUATION,
+)
 
 Add = Callable[..., argparse.ArgumentParser]
 
@@ -76,7 +82,6 @@ def add_benches(add: Add) -> None:
     )
     beams.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
     beams.add_argument("--fresh", action="store_true", help="start over instead of continuing")
-
 
 
 def _add_evaluation(one: argparse.ArgumentParser) -> None:
