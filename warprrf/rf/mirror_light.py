@@ -22,10 +22,10 @@ EVERY = 4  # of a pixel's rays, one in so many looks for mirrored light
 
 @dataclass(frozen=True)
 class MirrorSight:
-    """What one receiver sees of mirrored light, one row for each pair of a ray and an image that lights it.
+    """What receivers see of mirrored light, one row for each pair of a ray and an image that lights it.
 
     Attributes:
-        pixel: pixel of the ray, shape ``(L,)``.
+        pixel: pixel of the ray, shape ``(L,)``; those of the second receiver count on from the first's.
         patch: the mirror, shape ``(L,)``.
         cosine: of incidence on the mirror, shape ``(L,)``.
         face: what the ray meets, on the device.
@@ -96,8 +96,8 @@ class MirrorLight:
         share = reflected_share(self.tracer, p, self._patch, self._cosine)
         return np.bincount(self.surface.element[self._face], share * self._irradiance, minlength=elements)
 
-    def sight(self, receiver: np.ndarray, met: Met) -> MirrorSight:
-        """What the grid's rays from ``receiver`` (3,), which met ``met``, see of mirrored light."""
+    def sight(self, receivers: np.ndarray, met: Met) -> MirrorSight:
+        """What the grid's rays from ``receivers``, (3,) or (O, 3), which met ``met``, see of mirrored light."""
         s, tracer = self.surface, self.tracer
         rays = np.arange(0, len(met.face), EVERY)
         face = met.face.numpy()[rays]
@@ -107,8 +107,10 @@ class MirrorLight:
         row = np.repeat(np.arange(len(rays)), count)
         within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
         chain = self._chains[self._first[element[row]] + within]
-        direction = tracer.directions[rays]
-        points = receiver + met.range_m.numpy()[rays, None] * direction
+        own = rays % len(tracer.directions)
+        direction = tracer.directions[own]
+        start = np.asarray(receivers, float).reshape(-1, 3)[rays // len(tracer.directions)]
+        points = start + met.range_m.numpy()[rays, None] * direction
         if len(row) == 0:
             none = np.zeros(0, int)
             return self._pack(none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
@@ -132,7 +134,7 @@ class MirrorLight:
         cos_s = np.maximum((normal[k] * look[k]).sum(axis=1), 0.0)
         high = cos_s + tracer.half_width
         low = np.maximum(cos_s - tracer.half_width, 0.01 * tracer.half_width)
-        strength = EVERY * tracer.solid_angle[rays[row[k]]] * cos_in[k]
+        strength = EVERY * tracer.solid_angle[own[row[k]]] * cos_in[k]
         strength /= (4.0 * np.pi * np.maximum(length[k], NEAREST_M)) ** 2
         return self._pack(
             rays[row[k]] // tracer.sub_pixels**2,
