@@ -65,7 +65,7 @@ class MirrorLight:
         flat = s.mesh.face_normals
         normal = np.where(((s.normal * flat).sum(axis=1) < 0)[:, None], -s.normal, s.normal)
         centre = s.mesh.triangles.mean(axis=1)
-        face, chain, point = self.tree.candidates(centre, 1)
+        face, chain, point = self.tree.candidates(centre, 1, device=tracer.device)
         level = self.tree.levels[0]
         # light must come from in front of the face, and not from the patch that it belongs to
         facing = ((point[:, 0] - centre[face]) * normal[face]).sum(axis=1) > 0
