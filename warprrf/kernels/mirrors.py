@@ -2,8 +2,7 @@
 
 import warp as wp
 
-BLOCK = 512
-"""Chains that one thread tries."""
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
@@ -11,7 +10,7 @@ class Chains:
     """Chains of mirror reflections; each continues another (``parent``, -1: none) by one patch.
 
     ``image`` is the transmitter's image in the last patch, ``depth`` [m] the height of the image before over its plane.
-    Patches have planes (``normal``, ``plane_offset``) and boxes from ``low`` to ``high`` [m].
+    Patches have planes (``normal``, ``plane_offset``) and boxes of ``half`` sizes about ``middle`` [m].
     """
 
     patch: wp.array(dtype=wp.int32)
@@ -20,8 +19,8 @@ class Chains:
     depth: wp.array(dtype=wp.float64)
     normal: wp.array(dtype=wp.vec3d)
     plane_offset: wp.array(dtype=wp.float64)
-    low: wp.array(dtype=wp.vec3d)
-    high: wp.array(dtype=wp.vec3d)
+    middle: wp.array(dtype=wp.vec3d)
+    half: wp.array(dtype=wp.vec3d)
 
 
 @wp.func
@@ -36,11 +35,9 @@ def unfolds(chains: Chains, chain: int, end: wp.vec3d):
         if side > wp.float64(0.0):
             share = side / wp.max(side + chains.depth[link], wp.float64(1.0e-12))
             here = here + share * (chains.image[link] - here)
-            low = chains.low[p]
-            high = chains.high[p]
-            for axis in range(3):
-                if here[axis] < low[axis] or here[axis] > high[axis]:
-                    inside = False
+            gap = here - chains.middle[p]
+            half = chains.half[p]
+            inside = wp.abs(gap[0]) <= half[0] and wp.abs(gap[1]) <= half[1] and wp.abs(gap[2]) <= half[2]
             link = chains.parent[link]
         else:
             inside = False
@@ -54,20 +51,16 @@ def find_chains(
     first: int,
     last: int,
     points: wp.array(dtype=wp.vec3d),
-    start: wp.array(dtype=wp.int32),
-    count: wp.array(dtype=wp.int32),
-    found: wp.array(dtype=wp.int32),
+    words: wp.array2d(dtype=wp.uint32),
 ):
-    """Counts the chains ``first`` to ``last`` (one past) that reach each point, in blocks; lists them from ``start`` on
-    if ``found`` has room."""
+    """Which of the chains ``first`` to ``last`` (one past) reach each point: a row of bits, lowest first."""
     k = offset + wp.tid()
-    blocks = (last - first + BLOCK - 1) / BLOCK
-    point = points[k / blocks]
-    begin = first + (k % blocks) * BLOCK
-    number = int(0)
-    for chain in range(begin, wp.min(begin + BLOCK, last)):
-        if unfolds(chains, chain, point):
-            if found.shape[0] > 0:
-                found[start[k] + number] = chain - first
-            number += 1
-    count[k] = number
+    row = k / words.shape[1]
+    column = k % words.shape[1]
+    point = points[row]
+    begin = first + 32 * column
+    word = wp.uint32(0)
+    for bit in range(wp.min(32, last - begin)):
+        if unfolds(chains, begin + bit, point):
+            word = word | (wp.uint32(1) << wp.uint32(bit))
+    words[row, column] = word

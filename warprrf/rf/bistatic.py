@@ -454,6 +454,11 @@ class BistaticField(RadioField):
     # ------------------------------------------------------------------------------------------ parts
 
     @property
+    def mesh(self) -> Mesh:  # type: ignore[override]
+        """What blocks."""
+        return self.surface.mesh
+
+    @property
     def wavelength_m(self) -> float:
         """Wavelength [m]."""
         return SPEED_OF_LIGHT / self.frequency_hz

@@ -10,7 +10,10 @@ import os
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from warprrf.device import Progress
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf import field_files
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD
 
@@ -28,9 +31,19 @@ class RadioField(ABC):
     """A fitted radio field; build it with :meth:`fit` or :meth:`load`.
 
     Attributes:
+        transmitter: position it was fitted for [m], shape ``(3,)``.
+        frequency_hz: carrier [Hz].
+        shape: rows and columns of its spectra.
+        mesh: what blocks; None if the geometry has no mesh.
+        device: where it computes.
         report: how the fit went.
     """
 
+    transmitter: np.ndarray
+    frequency_hz: float
+    shape: tuple[int, int]
+    mesh: Mesh | None
+    device: Any
     report: dict[str, Any]
 
     @property
@@ -104,7 +117,7 @@ class RadioField(ABC):
             rx: receiver positions.
             transmitter: as for :meth:`spectrum`.
             beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
-            shape: rows and columns of the grid that rays fill; 30 x 60 by default, the field's own for other models.
+            shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models.
             progress: called as ``progress("links", done, total)``.
 
         Raises:

@@ -1,8 +1,8 @@
 """What a link gets, without its whole spectrum: total and best path gain, delay spread, the gain of the best beam.
 
 The beam is the receiver's: von Mises-Fisher, kappa = 1 / sigma^2, of directivity D(psi) = 2 kappa exp(kappa (cos(psi) -
-1)) / (1 - exp(-2 kappa)), its mean over the sphere one. Its gain towards a direction is the sum over paths of path gain
-times D at the angle between. The best direction is looked for at the line of sight and mirror paths, exactly, and at the
+1)) / (1 - exp(-2 kappa)), its mean over the sphere one. Steered somewhere, it brings the sum over paths of path gain
+times D at the angle between. The best direction is sought at the line of sight and mirror paths, exactly, and at the
 pixels of a grid for what is diffuse.
 """
 
@@ -46,9 +46,7 @@ class Links:
     @classmethod
     def joined(cls, parts: Sequence[Links]) -> Links:
         """One after another."""
-        return cls(
-            **{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__}
-        )
+        return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__})
 
 
 def directivity(sigma: float, cosine: Any = 1.0) -> np.ndarray:
@@ -81,7 +79,7 @@ class BeamSearch:
 
         Args:
             diffuse: path gain per pixel, before any beam, shape ``(R, H, W)``.
-            receiver, arrival, power: of each sharp path: whose it is ``(L,)``, unit direction ``(L, 3)``, gain ``(L,)``.
+            receiver, arrival, power: each sharp path's receiver ``(L,)``, unit direction ``(L, 3)`` and gain ``(L,)``.
         """
         count = len(diffuse)
         gain = np.moveaxis(self._beam(np.moveaxis(diffuse, 0, -1)), -1, 0) * self._density
@@ -109,19 +107,14 @@ def find_links(
     from warprrf.rf.bistatic import BistaticField
     from warprrf.rf.bistatic_links import SHAPE, LinkTracer
 
-    mesh = field.surface.mesh if isinstance(field, BistaticField) else field.mesh
-    receivers = check_receiver("rx", _device.check_array("rx", rx, (None, 3)), mesh)
+    receivers = check_receiver("rx", _device.check_array("rx", rx, (None, 3)), field.mesh)
     source = (
-        field.transmitter
-        if transmitter is None
-        else _device.check_array("transmitter", transmitter, (3,))
+        field.transmitter if transmitter is None else _device.check_array("transmitter", transmitter, (3,))
     )
     if (np.linalg.norm(receivers - source, axis=1) == 0).any():
         raise ValueError("rx: got the transmitter's own position; expected them apart")
     if not (np.isfinite(beam_sigma_rad) and beam_sigma_rad > 0):
-        raise ValueError(
-            f"beam_sigma_rad: got {beam_sigma_rad!r}, expected a positive beam width in radians"
-        )
+        raise ValueError(f"beam_sigma_rad: got {beam_sigma_rad!r}, expected a positive beam width in radians")
     trace: Callable[[np.ndarray], Links]
     if isinstance(field, BistaticField):
         tracer = LinkTracer(field, source, beam_sigma_rad, check_shape(shape or SHAPE))

@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.kernels.mirrors import BLOCK, Chains, find_chains
+from warprrf.kernels.mirrors import Chains, find_chains
 from warprrf.rf.surface import Surface
 
 SLACK_M = 0.1  # boxes of patches are widened by it: outlines of a reconstructed mesh are torn
@@ -117,22 +117,16 @@ class MirrorTree:
         if chains is not None and rows is not None:
             return self._unfold(points, rows, chains, order)
         where = _device.resolve(device)
-        first = sum(len(before.depth) for before in self.levels[: order - 1])
-        blocks = -(-len(level.depth) // BLOCK)
-        threads = len(points) * blocks
-        none = wp.zeros(0, dtype=wp.int32, device=where)
-        count = wp.zeros(threads, dtype=wp.int32, device=where)
+        first, chains = sum(len(before.depth) for before in self.levels[: order - 1]), len(level.depth)
+        words = wp.zeros((len(points), -(-chains // 32)), dtype=wp.uint32, device=where)
         ends = wp.array(points, dtype=wp.vec3d, device=where)
-        common = [self._on_device(where), first, first + len(level.depth), ends]
-        _device.launch(find_chains, threads, [*common, none, count, none], device=where)
-        number = count.numpy()
-        start = np.cumsum(number) - number
-        found = wp.empty(int(number.sum()), dtype=wp.int32, device=where)
-        if len(found):
-            at = wp.array(start, dtype=wp.int32, device=where)
-            _device.launch(find_chains, threads, [*common, at, count, found], device=where)
-        row = np.repeat(np.arange(len(points)), number.reshape(len(points), blocks).sum(axis=1))
-        return self._unfold(points, row, found.numpy().astype(np.int64), order)
+        inputs = [self._on_device(where), first, first + chains, ends, words]
+        _device.launch(find_chains, words.size, inputs, device=where)
+        bits = np.unpackbits(
+            words.numpy().astype("<u4", copy=False).view(np.uint8), axis=1, bitorder="little"
+        )
+        row, chain = np.nonzero(bits)
+        return self._unfold(points, row, chain, order)
 
     def _on_device(self, where: Any) -> Any:
         """The kernels' view of all chains, level after level."""
@@ -156,8 +150,9 @@ class MirrorTree:
             )
             chains.normal = wp.array(self.normal, dtype=wp.vec3d, device=where)
             chains.plane_offset = wp.array(self.offset, dtype=wp.float64, device=where)
-            chains.low = wp.array(self.low - SLACK_M, dtype=wp.vec3d, device=where)
-            chains.high = wp.array(self.high + SLACK_M, dtype=wp.vec3d, device=where)
+            half = 0.5 * (self.high - self.low) + SLACK_M
+            chains.middle = wp.array(self.middle, dtype=wp.vec3d, device=where)
+            chains.half = wp.array(half, dtype=wp.vec3d, device=where)
             self._uploaded[key] = chains
         return self._uploaded[key]
 
