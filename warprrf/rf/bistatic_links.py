@@ -14,7 +14,6 @@ import numpy as np
 from warprrf.rf.bounces import BounceTracer, Met
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.links import BeamSearch, Links
-from warprrf.rf.mirror_light import MirrorLight
 from warprrf.rf.second_bounce import mirrored_scene
 from warprrf.rf.specular import specular_paths
 
@@ -51,7 +50,7 @@ class LinkTracer:
         self._search = BeamSearch(shape, beam_sigma_rad, device=field.device)
         self._sent = field.sent(transmitter) if field.terms.diffuse else None
         lit_by_mirrors = field.terms.diffuse and field.terms.mirror_scatter
-        self._mirrors = MirrorLight(self._tracer, transmitter) if lit_by_mirrors else None
+        self._mirrors = field.element_light(transmitter).mirrors if lit_by_mirrors else None
         self.batch = max(1, RAYS_AT_A_TIME // len(self._tracer.directions))
 
     def __call__(self, receivers: np.ndarray) -> Links:
@@ -121,7 +120,7 @@ class LinkTracer:
         field = self.field
         out = np.zeros(len(receivers) * self.shape[0] * self.shape[1])
         if self._mirrors is not None:
-            seen = self._mirrors.sight(receivers, met)
+            seen = self._mirrors.sight(receivers, met, self._tracer)
             power = self._mirrors.power(seen, field.parameters, field.wavelength_m)
             out += np.bincount(seen.pixel, power, minlength=len(out))
         if field.terms.scatter_mirror:

@@ -96,9 +96,15 @@ class MirrorLight:
         share = reflected_share(self.tracer, p, self._patch, self._cosine)
         return np.bincount(self.surface.element[self._face], share * self._irradiance, minlength=elements)
 
-    def sight(self, receivers: np.ndarray, met: Met) -> MirrorSight:
-        """What the grid's rays from ``receivers``, (3,) or (O, 3), which met ``met``, see of mirrored light."""
-        s, tracer = self.surface, self.tracer
+    def sight(self, receivers: np.ndarray, met: Met, tracer: BounceTracer | None = None) -> MirrorSight:
+        """What rays from ``receivers``, (3,) or (O, 3), see of mirrored light.
+
+        Args:
+            receivers: where they start.
+            met: what they met.
+            tracer: whose rays they are, if another's of the same surface.
+        """
+        s, tracer = self.surface, tracer or self.tracer
         rays = np.arange(0, len(met.face), EVERY)
         face = met.face.numpy()[rays]
         rays, face = rays[face >= 0], face[face >= 0]
