@@ -59,8 +59,8 @@ def seconds_of(run, repeats=2):
 
 
 def curve(ax, rows, error, label, colour="#0b6e99"):
-    """Time against error of `rows`, each point labelled with the knob's value."""
-    shown = [r for r in rows if r[error] > 0]
+    """Time against error of `rows`, each point labelled with the knob's value; errors below 1e-4 dB are left out."""
+    shown = [r for r in rows if r[error] > 1e-4]
     ax.loglog([1e3 * r["seconds"] for r in shown], [r[error] for r in shown], "o-", color=colour, label=label)
     for r in shown:
         ax.annotate(
@@ -144,13 +144,14 @@ plt.show()
 
 # %%
 field = BistaticField.prior(scene, dataset, terms=Terms(mirror_order=2))
-toward = dataset.transmitter - seen[:2]
+near = seen[:5]
+toward = dataset.transmitter - near
 toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
 rows = []
 for shape in ((15, 30), (30, 60), (60, 120)):
     coarse = replace(field, shape=shape)
     coarse.tracer, coarse.beam  # made once for a grid
-    seconds, spectra = seconds_of(lambda coarse=coarse: [coarse.spectrum(p) for p in seen[:2]], repeats=1)
+    seconds, spectra = seconds_of(lambda coarse=coarse: [coarse.spectrum(p) for p in near], repeats=1)
     angle = []
     for spectrum, direction in zip(spectra, toward, strict=True):
         i, j = np.unravel_index(spectrum.path_gain.argmax(), shape)
@@ -160,7 +161,7 @@ for shape in ((15, 30), (30, 60), (60, 120)):
     rows.append(
         {
             "shape": shape,
-            "seconds": seconds / 2,
+            "seconds": seconds / len(near),
             "degrees": np.mean(angle),
             "gain": [10 * np.log10(s.total_path_gain) for s in spectra],
         }
@@ -247,7 +248,7 @@ ax.set_xlabel("time a cell [ms]"), ax.set_ylabel("rms error, blocked cells [dB]"
 plt.show()
 
 # %%
-found = model.radio_map(1.5, 0.5)
+found = model.radio_map(1.5, 0.6)
 figure, axes = plt.subplots(1, 2, figsize=(14, 4.8))
 found.plot("total_path_gain", ax=axes[0])
 found.plot("best_beam_snr_db", ax=axes[1])

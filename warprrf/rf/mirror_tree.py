@@ -117,14 +117,13 @@ class MirrorTree:
         if chains is not None and rows is not None:
             return self._unfold(points, rows, chains, order)
         where = _device.resolve(device)
-        first, chains = sum(len(before.depth) for before in self.levels[: order - 1]), len(level.depth)
-        words = wp.zeros((len(points), -(-chains // 32)), dtype=wp.uint32, device=where)
+        first, count = sum(len(before.depth) for before in self.levels[: order - 1]), len(level.depth)
+        words = wp.zeros((len(points), -(-count // 32)), dtype=wp.uint32, device=where)
         ends = wp.array(points, dtype=wp.vec3d, device=where)
-        inputs = [self._on_device(where), first, first + chains, ends, words]
+        inputs = [self._on_device(where), first, first + count, ends, words]
         _device.launch(find_chains, words.size, inputs, device=where)
-        bits = np.unpackbits(
-            words.numpy().astype("<u4", copy=False).view(np.uint8), axis=1, bitorder="little"
-        )
+        octets = words.numpy().astype("<u4", copy=False).view(np.uint8)
+        bits = np.unpackbits(octets, axis=1, bitorder="little")
         row, chain = np.nonzero(bits)
         return self._unfold(points, row, chain, order)
 
