@@ -120,7 +120,7 @@ class MirrorLight:
         if len(row) == 0:
             none = np.zeros(0, int)
             return self._pack(none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
-        row, chain, point = self.tree.candidates(points, 1, chains=chain, rows=row)
+        row, chain, point = self.tree.candidates(points, 1, chains=chain, rows=row, device=tracer.device)
         look = -direction[row]
         normal = s.normal[face[row]]
         turned = (s.mesh.face_normals[face[row]] * look).sum(axis=1) < 0

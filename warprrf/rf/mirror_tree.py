@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.kernels.mirrors import Chains, find_chains
+from warprrf.kernels.mirrors import Chains, find_chains, unfold_chains
 from warprrf.rf.surface import Surface
 
 SLACK_M = 0.1  # boxes of patches are widened by it: outlines of a reconstructed mesh are torn
@@ -113,19 +113,24 @@ class MirrorTree:
             Index of the point and of the chain, shape ``(L,)`` each, and interaction points from the transmitter on,
             shape ``(L, order, 3)``.
         """
-        level = self.levels[order - 1]
-        if chains is not None and rows is not None:
-            return self._unfold(points, rows, chains, order)
         where = _device.resolve(device)
-        first, count = sum(len(before.depth) for before in self.levels[: order - 1]), len(level.depth)
-        words = wp.zeros((len(points), -(-count // 32)), dtype=wp.uint32, device=where)
+        first = sum(len(level.depth) for level in self.levels[: order - 1])
         ends = wp.array(points, dtype=wp.vec3d, device=where)
-        inputs = [self._on_device(where), first, first + count, ends, words]
-        _device.launch(find_chains, words.size, inputs, device=where)
-        octets = words.numpy().astype("<u4", copy=False).view(np.uint8)
-        bits = np.unpackbits(octets, axis=1, bitorder="little")
-        row, chain = np.nonzero(bits)
-        return self._unfold(points, row, chain, order)
+        if chains is None or rows is None:
+            count = len(self.levels[order - 1].depth)
+            words = wp.zeros((len(points), -(-count // 32)), dtype=wp.uint32, device=where)
+            inputs = [self._on_device(where), first, first + count, ends, words]
+            _device.launch(find_chains, words.size, inputs, device=where)
+            octets = words.numpy().astype("<u4", copy=False).view(np.uint8)
+            rows, chains = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+        found = wp.zeros((len(rows), order), dtype=wp.vec3d, device=where)
+        inside = wp.zeros(len(rows), dtype=wp.bool, device=where)
+        pairs = [wp.array(index, dtype=wp.int32, device=where) for index in (rows, first + chains)]
+        _device.launch(
+            unfold_chains, len(rows), [self._on_device(where), ends, *pairs, found, inside], device=where
+        )
+        kept = np.flatnonzero(inside.numpy())
+        return rows[kept], chains[kept], found.numpy()[kept]
 
     def _on_device(self, where: Any) -> Any:
         """The kernels' view of all chains, level after level."""
@@ -154,27 +159,6 @@ class MirrorTree:
             chains.half = wp.array(half, dtype=wp.vec3d, device=where)
             self._uploaded[key] = chains
         return self._uploaded[key]
-
-    def _unfold(
-        self, points: np.ndarray, row: np.ndarray, chain: np.ndarray, order: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mirror points from the receiver back to the transmitter, dropping pairs as soon as one misses its box."""
-        here = points[row]
-        link = chain
-        found = np.zeros((len(row), order, 3))
-        for k in range(order - 1, -1, -1):
-            level = self.levels[k]
-            p = level.patch[link, k]
-            side = np.einsum("nk,nk->n", self.normal[p], here) - self.offset[p]
-            share = side / np.maximum(side + level.depth[link], 1e-12)
-            point = here + share[:, None] * (level.image[link] - here)
-            keep = (side > 0) & ((point >= self.low[p] - SLACK_M) & (point <= self.high[p] + SLACK_M)).all(
-                axis=1
-            )
-            row, chain, link, found = row[keep], chain[keep], level.parent[link[keep]], found[keep]
-            here = point[keep]
-            found[:, k] = here
-        return row, chain, found
 
 
 def _angular_radius(radius: np.ndarray, distance: np.ndarray) -> np.ndarray:
