@@ -420,7 +420,7 @@ def _plots(
             )
             for r in rows:
                 label = f"{r['samples']:.0e}" if "samples" in r else f"{r['rays']}"
-                ax.annotate(label, (r["core_s"], r[key]), (4, 4), textcoords="offset points", fontsize=8)
+                ax.annotate(label, (r["core_s"], r[key]), (4, 4), textcoords="offset points", fontsize=7)
         if report["reference"][key] is not None:
             ax.axhline(
                 report["reference"][key], color="#8c8c8c", linestyle=":", label="noise of the reference"
