@@ -66,6 +66,8 @@ def curve(ax, rows, error, label, colour="#0b6e99"):
         ax.annotate(
             str(r["value"]), (1e3 * r["seconds"], r[error]), (5, 4), textcoords="offset points", fontsize=8
         )
+    if ax.get_xlim()[1] < 6 * ax.get_xlim()[0]:
+        ax.set_xscale("linear")
     ax.set_xlabel("time [ms]"), ax.grid(alpha=0.3, which="both")
 
 
@@ -78,7 +80,8 @@ def curve(ax, rows, error, label, colour="#0b6e99"):
 # when its transmittance falls below `transmittance_min`. For photos 1/255 is enough, because a pixel has 8 bits. A
 # radio image is 60 dB deep: what is skipped there would be visible, so its cutoffs follow from the noise floor.
 #
-# *Top K* is how many Gaussians a pixel keeps for the fit. The last panel is the grid: its error is that of reading the
+# *Top K* is how many Gaussians a pixel keeps for the fit: it costs memory more than time (where times scatter, it is
+# the machine's other work). The last panel is the grid: its error is that of reading the
 # image at the nearest pixel, so it is a property of the picture, not of the method.
 
 # %%
