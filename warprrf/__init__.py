@@ -83,8 +83,8 @@ if TYPE_CHECKING:
     from warprrf.rf.newrf import load_newrf as load_newrf
     from warprrf.rf.paths import Paths as Paths
     from warprrf.rf.paths import trace_paths as trace_paths
-    from warprrf.rf.reflections import fit_reflections as fit_reflections
     from warprrf.rf.radio_map import RadioMap as RadioMap
+    from warprrf.rf.reflections import fit_reflections as fit_reflections
     from warprrf.rf.relevance import Relevance as Relevance
     from warprrf.rf.relevance import relevance as relevance
     from warprrf.rf.scene import Scene as Scene

@@ -27,7 +27,7 @@ from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field import RadioField
 from warprrf.rf.radio_map import RadioMap
 from warprrf.rf.scene import Scene
-from warprrf.rf.sionna_engine import load_sionna_scene
+from warprrf.rf.sionna_engine import SionnaMap
 
 SCENE = "data/lobby/scene.xml"
 SPECTRA = "data/lobby/spectra_sionna.nc"
@@ -106,7 +106,15 @@ def run_map(
     fine = fitted.radio_map(height, 0.5 * cell, bounds=_bounds(room, cell), shape=shapes[0])
     ours.append({"rays": 4 * shapes[0][0] * shapes[0][1], "average": 4, **_spent(started)})
 
-    solver = _Sionna(room, fitted, maps[0])
+    solver = SionnaMap(
+        room,
+        transmitter=fitted.transmitter,
+        frequency_hz=fitted.frequency_hz,
+        x=maps[0].x,
+        y=maps[0].y,
+        height_m=height,
+        depth=DEPTH,
+    )
     marks = fingerprint(
         [Path(scene), reference, DEPTH, height, maps[0].x, maps[0].y, seed, fitted.transmitter]
     )
@@ -254,47 +262,6 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-class _Sionna:
-    """RadioMapSolver on the cells of a map: mean over transmit polarisations of its path gain, shape (Y, X)."""
-
-    def __init__(self, room: Scene, field: BistaticField, like: RadioMap) -> None:
-        self._scene = load_sionna_scene(room, frequency_hz=field.frequency_hz)
-        self._rt = _device.require("sionna.rt", extra="sionna")
-        self._mitsuba = _device.require("mitsuba", extra="sionna")
-        self._solver = self._rt.RadioMapSolver()
-        self._scene.rx_array = self._array("V")
-        self._scene.add(self._rt.Transmitter("tx", position=field.transmitter.tolist()))
-        self._like = like
-
-    def _array(self, polarisation: str) -> Any:
-        return self._rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarisation)
-
-    def __call__(self, samples: int, *, seed: int) -> np.ndarray:
-        """A map from ``samples`` rays, half of them sent in each polarisation."""
-        m, point = self._like, self._mitsuba
-        width, depth = m.cell_m * len(m.x), m.cell_m * len(m.y)
-        middle = 0.5 * (m.x[0] + m.x[-1]), 0.5 * (m.y[0] + m.y[-1]), m.height_m
-        total = np.zeros((len(m.y), len(m.x)))
-        for k, polarisation in enumerate("VH"):
-            self._scene.tx_array = self._array(polarisation)
-            solved = self._solver(
-                self._scene,
-                center=point.Point3f(*(float(v) for v in middle)),
-                orientation=point.Point3f(0.0),
-                size=point.Point2f(
-                    width - 1e-3 * m.cell_m, depth - 1e-3 * m.cell_m
-                ),  # whole cells are made of it
-                cell_size=point.Point2f(m.cell_m, m.cell_m),
-                samples_per_tx=max(samples // 2, 1),
-                max_depth=DEPTH,
-                diffuse_reflection=True,
-                refraction=False,
-                seed=2 * seed + k,
-            )
-            total += 0.5 * np.asarray(solved.path_gain.numpy(), np.float64)[0]
-        return total
-
-
 def _field(
     given: Any, spectra: str | os.PathLike[str], geometry: str | os.PathLike[str], seed: int, device: Any
 ) -> tuple[RadioField, float | None]:
@@ -326,7 +293,7 @@ def _counted(room: Scene, like: RadioMap) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reference(
-    solver: _Sionna, path: Path, marks: str, samples: int, seed: int, progress: Progress | None
+    solver: SionnaMap, path: Path, marks: str, samples: int, seed: int, progress: Progress | None
 ) -> np.ndarray:
     """Two maps of half the samples each, (2, Y, X); kept in ``path``."""
     if path.is_file():
