@@ -60,6 +60,7 @@ IMPORT_NAMES = {
     "PIL": "pillow",
     "drjit": "sionna-rt",
     "mitsuba": "sionna-rt",
+    "yaml": "pyyaml",
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from warprrf.cli_bars import Bars
-from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BISTATIC, HELP_BENCH_ENGINE
+from warprrf.cli_help import HELP_BENCH, HELP_BENCH_BISTATIC, HELP_BENCH_ENGINE, HELP_BENCH_EVALUATION
 
 Add = Callable[..., argparse.ArgumentParser]
 
@@ -67,6 +67,36 @@ def add_benches(add: Add) -> None:
     plan.add_argument(
         "--reference", type=float, metavar="N", help="samples of Sionna's reference (default 1e8)"
     )
+    for name, line in (
+        ("table1", "every method of the paper's table, and more, side by side"),
+        ("sparsity", "PSNR and SSIM over the number of training receivers"),
+    ):
+        _add_evaluation(add(name, _bench, line, HELP_BENCH_EVALUATION, tables))
+
+
+def _add_evaluation(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--scale", choices=("small", "paper"), default="small",
+        help="small: within an hour on two cores; paper: full schedules, all subsets and seeds (default small)",
+    )  # fmt: skip
+    one.add_argument("--out", help="folder of the results of both commands (default runs/evaluation)")
+    one.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    one.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    one.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    one.add_argument("--methods", nargs="+", metavar="METHOD", help="only these")
+    one.add_argument("--truths", nargs="+", metavar="TRUTH", help="exact, sionna, paper-law (the scale's)")
+    one.add_argument("--splits", nargs="+", metavar="SPLIT", help="random, region (the scale's)")
+    one.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (the scale's)")
+    one.add_argument("--seeds", nargs="+", type=int, metavar="S", help="orders of the training receivers")
+    one.add_argument("--every", type=int, metavar="K", help="each K-th test receiver (the scale's)")
+    one.add_argument("--scheduler", metavar="ADDRESS", help="of a dask scheduler, such as tcp://lab:8786")
+    one.add_argument(
+        "--workers", type=int, default=1, metavar="N",
+        help="processes of a local cluster without --scheduler (default 1; 0: in this process)",
+    )  # fmt: skip
+    one.add_argument("--fresh", action="store_true", help="start over instead of continuing")
 
 
 def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
@@ -164,6 +194,32 @@ def _bench_map(args: argparse.Namespace, bars: Bars) -> None:
     print(radio_map.table(report))
 
 
+def _bench_evaluation(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import evaluation
+
+    out = args.out or "runs/evaluation"
+    names = ("geometry", "scene", "methods", "truths", "splits", "counts", "seeds", "every")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if args.seed and "seeds" not in given:
+        given["seeds"] = [args.seed]
+    if args.data:
+        given["data"] = args.data if len(args.data) > 1 else args.data[0]
+    report = evaluation.run(
+        args.name,
+        out,
+        scale=args.scale,
+        scheduler=args.scheduler,
+        workers=args.workers,
+        device=args.device,
+        fresh=args.fresh,
+        progress=bars,
+        **given,
+    )
+    bars.close()
+    print(evaluation.markdown(args.name, report))
+    print(f"\n{Path(out) / args.name}.md: the tables with pictures; .csv and .json: every figure")
+
+
 BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "newrf": _bench_newrf,
     "bistatic": _bench_bistatic,
@@ -171,6 +227,8 @@ BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "engine": _bench_engine,
     "channel": _bench_channel,
     "map": _bench_map,
+    "table1": _bench_evaluation,
+    "sparsity": _bench_evaluation,
 }
 """Benchmarks by name: what `warprrf bench NAME` runs."""
 

@@ -100,6 +100,8 @@ examples:
   warprrf bench bistatic --truths exact --counts 10 50
   warprrf bench engine
   warprrf bench map --field field.safetensors
+  warprrf bench table1
+  warprrf bench sparsity
 """
 
 HELP_BENCH_BISTATIC = """\
@@ -122,6 +124,20 @@ Each measurement is kept: a killed run loses one. For figures worth quoting leav
 examples:
   warprrf bench engine
   warprrf bench engine --quick --out runs/engine-quick
+"""
+
+HELP_BENCH_EVALUATION = """\
+Every method on the same receivers: bistatic, RF-3DGS+ and RF-3DGS (opacity frozen and trained), NeRF2, a conditional
+GAN, Sionna RT with assumed and with calibrated materials, lookups. Both commands share one folder: a finished run is
+kept in a file of its own, a killed sweep loses the run at work, and a run is done again only if its data, geometry,
+options or code changed. The truth `paper-law` is made: scattering that falls with the whole path's length, as the
+paper's law has it. Needs the extras plots, baselines, sionna and cluster; --workers 0 does without the last.
+
+examples:
+  warprrf bench table1
+  warprrf bench sparsity --workers 0
+  warprrf bench table1 --methods bistatic rf3dgs+ rf3dgs --counts 10 --every 10      a first look, in minutes
+  warprrf bench table1 --scale paper --data spectra_full.nc spectra_sionna_full.nc --scheduler tcp://lab:8786
 """
 
 HELP_DATA = """\

@@ -11,7 +11,9 @@ import importlib
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from functools import cache
+from itertools import pairwise
 from types import ModuleType
 from typing import Any
 
@@ -56,7 +58,7 @@ def threads() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=threads(), thread_name_prefix="warprrf")
+    return ThreadPoolExecutor(max_workers=max(threads() - 1, 1), thread_name_prefix="warprrf")
 
 
 def launch(
@@ -65,40 +67,57 @@ def launch(
     inputs: Sequence[Any],
     device: Any = None,
     *,
+    grain: int = MIN_SPLIT,
     pieces: int | None = None,
+    cuts: Sequence[int] | None = None,
     adjoint: bool = False,
 ) -> None:
     """Launch ``kernel`` over ``dim`` indices; on a CPU the range is split over all cores.
 
     The kernel's first argument is ``offset: int`` and is supplied here; ``inputs`` are the others, in order.
-    ``pieces`` fixes into how many parts a CPU launch is cut (default: 4 a thread), for kernels that own one buffer a
-    piece. ``adjoint`` runs the kernel's adjoint on the arrays' ``.grad``.
+    A CPU launch is cut into 4 equal parts a thread, of ``grain`` indices at least: few where one index is much work.
+    ``pieces`` fixes how many parts and ``cuts`` where, for kernels that own one buffer a part. ``adjoint`` runs the
+    kernel's adjoint on the arrays' ``.grad``.
     """
     if dim <= 0:
         return
     device = resolve(device)
     if device.is_cuda:
-        count = 1
-    elif pieces is not None:
-        count = min(pieces, dim)
+        bounds: Sequence[int] = [0, dim]
+    elif cuts is not None:
+        bounds = cuts
     else:
-        count = min(PIECES_PER_THREAD * threads(), max(1, dim // MIN_SPLIT))
+        count = 1
+        if pieces is not None:
+            count = min(pieces, dim)
+        elif threads() > 1:
+            count = min(PIECES_PER_THREAD * threads(), max(1, dim // grain))
+        bounds = [dim * k // count for k in range(count + 1)]
     kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
-    bounds = [dim * k // count for k in range(count + 1)]
-
-    def piece(k: int) -> None:
-        arguments = [bounds[k], *inputs]
-        extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
-        wp.launch(
-            kernel, dim=bounds[k + 1] - bounds[k], inputs=arguments, device=device, record_tape=False, **extra
-        )
-
-    if count == 1 or threads() == 1:
-        for k in range(count):
-            piece(k)
+    arguments = [bounds[0], *inputs]
+    extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
+    if len(bounds) == 2:
+        size = bounds[1] - bounds[0]
+        wp.launch(kernel, dim=size, inputs=arguments, device=device, record_tape=False, **extra)
         return
-    for done in [_pool().submit(piece, k) for k in range(count)]:
-        done.result()
+    # Arguments are packed once; a piece differs in its offset and length.
+    whole = wp.launch(
+        kernel, dim=dim, inputs=arguments, device=device, record_tape=False, record_cmd=True, **extra
+    )
+    parts = iter([(low, high - low) for low, high in pairwise(bounds) if high > low])
+
+    def work() -> None:
+        for start, size in parts:  # the threads share the iterator: each takes the next piece when it is free
+            part = copy(whole)
+            part.params, part.fwd_args = list(whole.params), list(whole.fwd_args)
+            part.set_param_at_index(0, start)
+            part.set_dim(size)
+            part.launch()
+
+    others = [_pool().submit(work) for _ in range(min(threads(), len(bounds) - 1) - 1)]
+    work()
+    for other in others:
+        other.result()
 
 
 def require(module: str, extra: str) -> ModuleType:

@@ -13,24 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "rf"))
-from radio_scenes import box_mesh  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parent))
+from small_room import SHAPE, TRANSMITTER, small_room  # noqa: E402
 
 import warprrf as wr  # noqa: E402
 from warprrf import cli  # noqa: E402
-from warprrf.bench import bistatic  # noqa: E402
-from warprrf.bench.bistatic import checks, report, setting, table  # noqa: E402
+from warprrf.bench import bistatic, setting  # noqa: E402
+from warprrf.bench.bistatic import checks, report, table  # noqa: E402
 from warprrf.bench.bistatic.methods import HARMONIC, UNTAUGHT, VARIANTS, point_at_transmitter  # noqa: E402
-from warprrf.geometry.discs import discs_on_mesh  # noqa: E402
-from warprrf.geometry.meshio import write_mesh  # noqa: E402
 from warprrf.rf import lookups  # noqa: E402
 from warprrf.rf.fresnel import SPEED_OF_LIGHT  # noqa: E402
 from warprrf.rf.metrics import angle_deg, strongest_direction  # noqa: E402
-from warprrf.rf.simulate import sample_receivers  # noqa: E402
 
-LOBBY = Path(__file__).resolve().parents[2] / "data" / "lobby"
-TRANSMITTER = (0.8, 0.9, 2.2)
-SHAPE = (12, 24)
 COUNTS = {"exact": (4, 10), "sionna": (4,)}
 OPTIONS: dict[str, Any] = {
     "counts": (4, 10, 400),
@@ -50,37 +44,7 @@ FILLED = (
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A room of concrete with a block of marble: scene, its mesh as a reconstruction, spectra of 14 receivers."""
-    folder = tmp_path_factory.mktemp("room")
-    shutil.copy(LOBBY / "materials.json", folder)
-    shapes = ""
-    for name, material, (vertices, faces) in (
-        ("walls", "concrete", box_mesh([0, 0, 0], [5, 4, 3], inward=True)),
-        ("block", "marble", box_mesh([2.2, 1.2, -0.01], [3.0, 2.8, 2.6])),
-    ):
-        write_mesh(folder / f"{name}.ply", vertices, faces)
-        shapes += (
-            f'<bsdf type="diffuse" id="mat-itu_{material}"/><shape type="ply" id="{name}">'
-            f'<string name="filename" value="{name}.ply"/><ref id="mat-itu_{material}" name="bsdf"/></shape>\n'
-        )
-    (folder / "scene.xml").write_text(f'<scene version="3.0.0">\n{shapes}</scene>\n')
-    scene = wr.Scene.load(folder / "scene.xml")
-    receivers = sample_receivers(scene, 14, clearance=0.2, seed=3)
-    ds = wr.simulate(
-        scene,
-        transmitter=TRANSMITTER,
-        receivers=receivers,
-        frequency_hz=300e9,
-        shape=SHAPE,
-        beam_sigma_rad=np.radians(6.0),
-        roles=["train"] * 10 + ["test"] * 4,
-        device="cpu",
-    )
-    assert 0 < np.count_nonzero(ds.line_of_sight[10:]) < 4
-    ds.save(folder / "spectra.nc")
-    replace(ds.subset([*range(4), *range(10, 14)]), engine="sionna").save(folder / "spectra_sionna.nc")
-    wr.Reconstruction(discs_on_mesh(scene.mesh, 800), scene.mesh).save(folder / "reconstruction")
-    return folder
+    return small_room(tmp_path_factory.mktemp("room"))
 
 
 def whole(out: Path, data: Path, **changed: Any) -> dict[str, Any]:

@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 
 from warprrf.bench.engine.blend import run_blend  # noqa: E402
 from warprrf.bench.engine.torch_renderer import render_with_torch  # noqa: E402
+from warprrf.device import threads  # noqa: E402
 from warprrf.geometry import interop  # noqa: E402
 from warprrf.geometry.camera import Camera  # noqa: E402
 from warprrf.geometry.render import Blending  # noqa: E402
@@ -162,4 +163,9 @@ def test_blend_benchmark_runs_small_and_its_two_images_are_one(tmp_path):
     assert json.loads((tmp_path / "blend.json").read_text())["gaussians"] == 300
     assert result["image_difference"]["quantile_99.9"] < result["asked"]["image_difference"]
     assert max(result["gradient_difference"].values()) < 1e-2
-    assert result["passing_pairs"] > 1000 and result["speedup"] > 0
+    assert result["passing_pairs"] > 1000 and result["speedup"] > 0 and result["cpu_speedup"] > 0
+    # Both renderers count the same pairs, but for those on a cutoff.
+    assert result["pairs"]["dense"]["passing_pairs"] == pytest.approx(result["passing_pairs"], rel=1e-3)
+    assert result["pairs"]["sparse"]["forward_ns"] > 0
+    assert result["spectrum"]["render_s"] > 0 and result["spectrum"]["gaussians"] == 1500
+    assert threads() == 1 or result["cores"]["identical"]

@@ -9,17 +9,35 @@ from typing import Any
 
 from warprrf.device import resolve, threads
 
-PACKAGES = ("warprrf", "warp-lang", "numpy", "pycolmap", "open3d", "xarray", "h5netcdf", "safetensors")
+PACKAGES = (
+    "warprrf",
+    "warp-lang",
+    "numpy",
+    "pycolmap",
+    "open3d",
+    "xarray",
+    "h5netcdf",
+    "safetensors",
+    "torch",
+    "sionna-rt",
+    "distributed",
+)
 
 
-def machine(device: Any = None) -> dict[str, Any]:
-    """What the figures were measured on: processor, cores, system, versions."""
+def processor_name() -> str:
+    """The processor's name."""
     processor = platform.processor() or platform.machine()
     if Path("/proc/cpuinfo").is_file():
         names = [
             line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")
         ]
         processor = names[0].split(":", 1)[1].strip() if names else processor
+    return processor
+
+
+def machine(device: Any = None) -> dict[str, Any]:
+    """What the figures were measured on: processor, cores, system, versions."""
+    processor = processor_name()
     versions = {}
     for package in PACKAGES:
         try:

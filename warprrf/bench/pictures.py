@@ -14,12 +14,18 @@ METHODS = {
     "rf3dgs+": ("RF-3DGS+", "#0b6e99"),
     "rf3dgs+los": ("RF-3DGS+ with line of sight", "#4fb3d9"),
     "rf3dgs": ("RF-3DGS", "#c4570f"),
+    "rf3dgs+alpha": ("RF-3DGS+, opacity trained", "#7db7d3"),
+    "rf3dgs-alpha": ("RF-3DGS, opacity trained", "#e79a5b"),
     "nearest": ("nearest", "#6b4c9a"),
     "idw": ("IDW", "#3a7d44"),
     "mean": ("mean image", "#8c8c8c"),
     "constant": ("constant", "#bdbdbd"),
     "transmitter": ("point at the transmitter", "#c9a227"),
     "zero": ("our geometry, zero spectra", "#e58aa4"),
+    "nerf2": ("NeRF2", "#2a9d8f"),
+    "cgan": ("CGAN", "#7f4f24"),
+    "sionna": ("Sionna RT, assumed materials", "#33415c"),
+    "sionna-calibrated": ("Sionna RT, calibrated", "#5c7aea"),
 }
 """Name and colour of each method."""
 

@@ -46,7 +46,7 @@ def compare_twin(
     twin = write_twin(field, folder)
     scene = Scene.load(twin.xml)
     even = [replace(material, pattern="lambertian") for material in scene.materials]
-    scenes = {"twin": scene, "twin_lambertian": _with_materials(scene, even)}
+    scenes = {"twin": scene, "twin_lambertian": scene.with_materials(even)}
     if true_scene is not None:
         scenes["true_scene"] = true_scene
     figures: dict[str, Any] = {"field": evaluate(test, field.spectrum)}
@@ -83,14 +83,3 @@ def compare_twin(
 
 def _next(answers: Iterator[Spectrum], _receiver: Any) -> Spectrum:
     return next(answers)
-
-
-def _with_materials(scene: Scene, materials: list[Any]) -> Scene:
-    return Scene(
-        scene.mesh,
-        materials,
-        scene.face_material,
-        face_object=scene.face_object,
-        object_names=scene.object_names,
-        xml_path=scene.xml_path,
-    )

@@ -22,7 +22,6 @@ import warp as wp
 from warprrf.device import check_array, launch, resolve
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.render import (
-    CPU_PIECES,
     RADIO,
     RULES,
     Blending,
@@ -31,8 +30,8 @@ from warprrf.geometry.render import (
     _with_gradients,
 )
 from warprrf.kernels import gaussian_rays as kernels
-from warprrf.kernels.project import Rules
 
+CPU_PIECES = 4  # gradient sums on a CPU, one writer each: the result does not depend on the thread count
 LARGEST = 1e15
 """Of coordinates and directions: squares and products of them stay finite, also in float32."""
 
@@ -115,7 +114,7 @@ class GaussianRays:
                 f"gaussians: got {type(gaussians).__name__}, expected warprrf.Gaussians or four Warp arrays"
             )
         self._kernels = kernels.build(self.inputs[3].dtype)
-        self._rules = Rules()
+        self._rules = kernels.Rules()
         self._rules.alpha_min = self.blending.alpha_min
         self._rules.alpha_max = self.blending.alpha_max
         self._rules.transmittance_min = self.blending.transmittance_min

@@ -8,20 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warprrf.device import check_array, launch, resolve
+from warprrf.device import PIECES_PER_THREAD, check_array, launch, resolve, threads
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
+from warprrf.kernels import binning
 from warprrf.kernels import blend as blend_kernels
 from warprrf.kernels import project as kernels
 from warprrf.kernels import sh as sh_kernels
+from warprrf.kernels import weights as weight_kernels
 
-# Gradient sums are kept in this many parts on a CPU, one writer each: the result does not depend on the thread count.
-CPU_PIECES = 4
+TILE_GRAIN = 8  # a tile or a block is work enough for few of them to be worth a thread
 RULES = {"product": kernels.PRODUCT, "exp": kernels.EXPONENTIAL}
 
 
@@ -134,8 +136,7 @@ def render(
     image = raster.blend(view, feature_array, np.broadcast_to(back, (feature_array.shape[1],)))
     alpha = image.alpha.numpy()
     dominant = image.dominant.numpy()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(alpha > 0, image.depth_sum.numpy() / alpha, np.inf).astype(np.float32)
+    depth = np.where(alpha > 0, image.depth.numpy(), np.inf).astype(np.float32)
     peak = np.where(dominant >= 0, image.peak.numpy(), np.inf).astype(np.float32)
     return Rendering(image.features.numpy(), alpha, depth, dominant, peak)
 
@@ -159,11 +160,13 @@ def blend_weights(
     range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
     total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
     launch(
-        raster.kernels.strongest,
-        cam.width * cam.height,
-        [view.rows, view.ids, view.starts, view.view, raster.rules, index, weight, range_, total],
+        weight_kernels.build(wp.float32, RULES[blending.rule]).strongest,
+        len(view.block_starts) - 1,
+        [view.rows, view.block_ids, view.block_starts, view.rays, view.view, raster.rules, shape[2],
+         kernels.LANES, *(a.flatten() for a in (index, weight, range_, total))],
         device=raster.device,
-    )
+        grain=TILE_GRAIN,
+    )  # fmt: skip
     weights, indices, alpha = weight.numpy(), index.numpy(), total.numpy()
     best = np.argmax(weights, axis=2)
     dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]
@@ -173,26 +176,32 @@ def blend_weights(
 
 @dataclass(frozen=True)
 class Prepared:
-    """Gaussians projected for one camera: coefficients and depth-sorted tile lists on the device."""
+    """Gaussians projected for one camera: coefficients, and the lists of what tiles and blocks of pixels see, near to
+    far, on the device; ``work`` is what each tile has to do, summed up."""
 
     camera: Camera
     view: Any
+    rays: Any
     inputs: tuple[wp.array, ...]
     rows: wp.array
+    begins: wp.array
     count: wp.array
+    slots: wp.array
     ids: wp.array
+    masks: wp.array
     starts: wp.array
-    entries: int
+    block_ids: wp.array
+    block_starts: wp.array
+    work: np.ndarray
 
 
 @dataclass(frozen=True)
 class Image:
-    """A blended image on the device; ``depth_sum`` is the sum of weight times range."""
+    """A blended image on the device; ``depth`` is 0 where nothing is seen."""
 
     features: wp.array
     alpha: wp.array
     depth: wp.array
-    depth_sum: wp.array
     dominant: wp.array
     peak: wp.array
 
@@ -211,12 +220,12 @@ class Rasterizer:
         self.blending = blending or Blending()
         self.real = real
         self.project_kernels = kernels.build(real)
-        self.kernels = blend_kernels.build(real)
         self.rules = kernels.Rules()
         self.rules.alpha_min = self.blending.alpha_min
         self.rules.alpha_max = self.blending.alpha_max
         self.rules.transmittance_min = self.blending.transmittance_min
-        self.rules.rule = RULES[self.blending.rule]
+        # Threads that share a tile in the adjoint: on a GPU each of its blocks has one.
+        self.parts = kernels.LANES if self.device.is_cuda else 1
 
     def vector(self, size: int) -> Any:
         """Warp's vector type of this precision."""
@@ -276,61 +285,105 @@ class Rasterizer:
     def prepare(
         self, means: wp.array, quaternions: wp.array, scales: wp.array, opacities: wp.array, cam: Camera
     ) -> Prepared:
-        """Project every Gaussian and list those that each 16 x 16 tile sees, near to far."""
+        """Project every Gaussian and list those that each tile and each of its blocks sees, near to far."""
         n, device = len(means), self.device
         view = _view(cam)
-        rows = wp.empty((max(n, 1), kernels.ROW), dtype=self.real, device=device)
+        rays = _rays(
+            cam.kind, cam.width, cam.height, cam.fx, cam.fy, cam.cx, cam.cy, self.real, self.device.alias
+        )
         span = wp.empty(n, dtype=wp.vec4i, device=device)
         count = wp.empty(n, dtype=int, device=device)
         distance = wp.empty(n, dtype=float, device=device)
+        rows = wp.empty(n, dtype=self.vector(kernels.ROW), device=device)
+        centres = wp.empty(n, dtype=self.vector(3), device=device)
+        begins = wp.empty(n, dtype=int, device=device)
         inputs = (means, quaternions, scales, opacities)
         launch(
             self.project_kernels.project,
             n,
-            [*inputs, view, self.rules, rows, span, count, distance],
+            [*inputs, view, self.rules, span, count, distance, rows, centres],
             device=device,
         )
         order, ends, entries = _sorted_visible(count, distance)
         tiles = view.tiles_x * view.tiles_y
         keys = wp.empty(2 * max(entries, 1), dtype=int, device=device)
-        ids = wp.empty(2 * max(entries, 1), dtype=int, device=device)
+        slots = wp.empty(2 * max(entries, 1), dtype=int, device=device)
+        whose, ids, masks = (wp.empty(max(entries, 1), dtype=int, device=device) for _ in range(3))
         starts = wp.zeros(tiles + 1, dtype=int, device=device)
         if entries:
             launch(
-                kernels.emit_tiles, len(order), [order, span, ends, view.tiles_x, keys, ids], device=device
+                binning.emit_tiles,
+                len(order),
+                [order, span, ends, view.tiles_x, keys, slots, whose, begins],
+                device=device,
             )
-            wp.utils.radix_sort_pairs(keys, ids, entries)
-            launch(kernels.tile_starts, tiles + 1, [keys, entries, starts], device=device)
-        return Prepared(cam, view, inputs, rows, count, ids, starts, entries)
+            wp.utils.radix_sort_pairs(keys, slots, entries, 0, tiles.bit_length())
+            launch(binning.tile_starts, tiles + 1, [keys, entries, starts], device=device)
+        counts = wp.empty(tiles, dtype=self.vector(kernels.LANES), device=device)
+        launch(
+            self.project_kernels.block_masks,
+            tiles,
+            [rows, centres, whose, slots, starts, rays, view.tiles_x, ids, masks, counts],
+            device=device,
+            grain=TILE_GRAIN,
+        )
+        sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])
+        block_starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
+        block_ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
+        launch(
+            binning.fill_blocks,
+            tiles,
+            [ids, masks, starts, block_starts, block_ids],
+            device=device,
+            grain=TILE_GRAIN,
+        )
+        work = sums[:: kernels.LANES] + np.arange(tiles + 1)
+        return Prepared(
+            camera=cam,
+            view=view,
+            rays=rays,
+            inputs=inputs,
+            rows=rows,
+            begins=begins,
+            count=count,
+            slots=slots,
+            ids=ids,
+            masks=masks,
+            starts=starts,
+            block_ids=block_ids,
+            block_starts=block_starts,
+            work=work,
+        )
 
     def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
         tape = _active_tape()
-        image, left, back = self._blend(prepared, features, background, requires_grad=tape is not None)
+        image, kept = self._blend(prepared, features, background, requires_grad=tape is not None)
         if tape is not None:
             outputs = (image.features, image.alpha, image.depth)
 
             def backward() -> None:
-                self.blend_adjoint(prepared, features, back, image, left)
+                self.blend_adjoint(prepared, features, image, *kept)
                 for (
                     array
                 ) in outputs:  # as Warp's own adjoints do: a second backward adds the same again, not more
                     if not array.retain_grad:
                         array.grad.zero_()
 
-            tape.record_func(backward, _with_gradients(*prepared.inputs, features, back, *outputs))
+            tape.record_func(backward, _with_gradients(*prepared.inputs, features, kept[1], *outputs))
         return image
 
     def blend_with_adjoint(
         self, prepared: Prepared, features: wp.array, background: Any = None
     ) -> tuple[Image, Callable[[], wp.array]]:
         """Blend without a tape: the image, and the function that adds the inputs' gradients for the image's."""
-        image, left, back = self._blend(prepared, features, background, requires_grad=True)
-        return image, lambda: self.blend_adjoint(prepared, features, back, image, left)
+        image, kept = self._blend(prepared, features, background, requires_grad=True)
+        return image, lambda: self.blend_adjoint(prepared, features, image, *kept)
 
     def _blend(
         self, prepared: Prepared, features: wp.array, background: Any, *, requires_grad: bool
-    ) -> tuple[Image, wp.array, wp.array]:
+    ) -> tuple[Image, tuple[wp.array, wp.array]]:
+        """The image, and what its adjoint wants besides: the transmittance left and the background."""
         device, real, grad = self.device, self.real, requires_grad
         shape = (prepared.camera.height, prepared.camera.width)
         channels = features.shape[1]
@@ -338,57 +391,82 @@ class Rasterizer:
             background = wp.zeros(channels, dtype=real, device=device)
         elif not isinstance(background, wp.array):
             background = wp.array(np.asarray(background), dtype=real, device=device)
-        image = wp.zeros((*shape, channels), dtype=real, device=device, requires_grad=grad)
-        alpha = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
-        depth_sum, left, peak = (wp.zeros(shape, dtype=real, device=device) for _ in range(3))
-        dominant = wp.full(shape, -1, dtype=int, device=device)
-        strips = prepared.view.tiles_x * prepared.view.tiles_y * kernels.TILE
+        image = wp.empty((*shape, channels), dtype=real, device=device, requires_grad=grad)
+        alpha, depth = (wp.empty(shape, dtype=real, device=device, requires_grad=grad) for _ in range(2))
+        left, peak = (wp.empty(shape, dtype=real, device=device) for _ in range(2))
+        dominant = wp.empty(shape, dtype=int, device=device)
+        flat = [a.flatten() for a in (image, alpha, depth, left, dominant, peak)]
+        flat_features = _flat(features)
         for first in range(0, channels, kernels.CHANNELS):
             launch(
-                self.kernels.blend,
-                strips,
-                [prepared.rows, features, first, background, prepared.ids, prepared.starts, prepared.view, self.rules,
-                 image, alpha, depth_sum, left, dominant, peak],
+                self.kernels_for(channels - first).blend,
+                len(prepared.block_starts) - 1,
+                [prepared.rows, flat_features, channels, first, background, prepared.block_ids,
+                 prepared.block_starts, prepared.rays, prepared.view, self.rules, *flat],
                 device=device,
+                grain=TILE_GRAIN,
             )  # fmt: skip
-        depth = wp.zeros(shape, dtype=real, device=device, requires_grad=grad)
-        launch(self.kernels.mean_depth, shape[0] * shape[1], [depth_sum, alpha, depth], device=device)
-        return Image(image, alpha, depth, depth_sum, dominant, peak), left, background
+        return Image(image, alpha, depth, dominant, peak), (left, background)
+
+    def kernels_for(self, channels: int) -> Any:
+        """Kernels that blend so many channels at once, four at most."""
+        return blend_kernels.build(self.real, RULES[self.blending.rule], min(channels, kernels.CHANNELS))
 
     def blend_adjoint(
-        self, prepared: Prepared, features: wp.array, background: wp.array, out: Image, left: wp.array
+        self,
+        prepared: Prepared,
+        features: wp.array,
+        out: Image,
+        left: wp.array,
+        background: wp.array,
     ) -> wp.array:
         """Add the gradients of every input for those of ``out``; returns each Gaussian's summed blending weight."""
-        device, real = self.device, self.real
-        n = len(features)
-        strips = prepared.view.tiles_x * prepared.view.tiles_y * kernels.TILE
-        pieces = 1 if device.is_cuda else min(CPU_PIECES, strips)
+        device, real, lanes = self.device, self.real, self.vector(kernels.LANES)
+        channels, n = features.shape[1], len(features)
         means, quaternions, scales, opacities = prepared.inputs
         seen = wp.zeros(n, dtype=real, device=device)
         feature_grad = _gradient(features)
-        for first in range(0, features.shape[1], kernels.CHANNELS):
-            sums = wp.zeros((pieces, n, kernels.GRADIENTS), dtype=real, device=device)
+        parts, cuts, bounds = self.parts, None, []
+        if parts == 1:  # cut into pieces of equal work, each with its own seeds
+            pieces = 1 if threads() == 1 else PIECES_PER_THREAD * threads()
+            work = prepared.work
+            cuts = bounds = np.searchsorted(work, work[-1] * np.arange(pieces + 1) / pieces).tolist()
+        tiles = len(prepared.work) - 1
+        seeds = wp.empty(
+            (len(bounds) or tiles) * kernels.LANES * blend_kernels.PER_BLOCK, dtype=lanes, device=device
+        )
+        background_sums = wp.empty(tiles * parts, dtype=lanes, device=device)
+        arrays = (out.features, out.alpha, out.depth, left, out.features.grad, out.alpha.grad, out.depth.grad)
+        flat = [a.flatten() for a in arrays]
+        flat_features = _flat(features)
+        with_range = int(out.depth.grad.numpy().any())
+        for first in range(0, channels, kernels.CHANNELS):
+            blend = self.kernels_for(channels - first)
+            sums = (wp.empty if parts == 1 else wp.zeros)(len(prepared.ids), dtype=lanes, device=device)
             launch(
-                self.kernels.blend_adjoint,
-                strips,
-                [strips, pieces, prepared.rows, features, first, prepared.ids, prepared.starts, prepared.view,
-                 self.rules, out.features, out.alpha, out.depth_sum, out.features.grad, out.alpha.grad, out.depth.grad,
-                 sums],
+                blend.blend_adjoint[with_range if first == 0 else 0],
+                tiles * parts,
+                [parts, wp.array(bounds, dtype=int, device=device), prepared.rows, flat_features,
+                 channels, first, prepared.ids, prepared.slots, prepared.masks, prepared.starts, prepared.rays,
+                 prepared.view, self.rules, *flat, seeds, sums, background_sums],
                 device=device,
-                pieces=pieces,
+                pieces=1,  # sums of shared tiles are atomic on a GPU alone
+                cuts=cuts,
             )  # fmt: skip
             launch(
                 self.project_kernels.chain,
                 n,
-                [quaternions, scales, prepared.count, first, sums, _gradient(means), _gradient(quaternions),
-                 _gradient(scales), _gradient(opacities), feature_grad, seen],
+                [means, quaternions, scales, prepared.view, first, prepared.begins, prepared.count, sums,
+                 _gradient(means), _gradient(quaternions), _gradient(scales), _gradient(opacities), feature_grad, seen],
                 device=device,
             )  # fmt: skip
-        if background.requires_grad:
-            launch(
-                self.kernels.background_adjoint, len(background), [left, out.features.grad, background.grad],
-                device=device,
-            )  # fmt: skip
+            if background.requires_grad:
+                launch(
+                    blend.background_adjoint,
+                    min(channels - first, kernels.CHANNELS),
+                    [first, background_sums, background.grad],
+                    device=device,
+                )
         return seen
 
 
@@ -401,6 +479,10 @@ def _with_gradients(*arrays: wp.array) -> list[wp.array]:
     return [array for array in arrays if array.requires_grad and array.size]
 
 
+def _flat(array: wp.array) -> wp.array:
+    return (array if array.is_contiguous else array.contiguous()).flatten()
+
+
 def _gradient(array: wp.array) -> wp.array:
     """Where an input's gradient goes; a scratch array if nobody asked for it."""
     return array.grad if array.requires_grad else wp.zeros_like(array)
@@ -408,22 +490,23 @@ def _gradient(array: wp.array) -> wp.array:
 
 def _sorted_visible(count: wp.array, distance: wp.array) -> tuple[wp.array, wp.array, int]:
     """Visible Gaussians by range (as float32; ties by index), running ends of their tile entries, and the total."""
-    device = count.device
-    counts = count.numpy()
-    visible = np.flatnonzero(counts).astype(np.int32)
-    if len(visible) == 0:
+    device, n = count.device, len(count)
+    visible = int(np.count_nonzero(count.numpy()))
+    if visible == 0:
         return wp.empty(0, dtype=int, device=device), wp.empty(0, dtype=int, device=device), 0
-    order = visible[np.argsort(distance.numpy()[visible], kind="stable")]
-    ends = np.cumsum(counts[order], dtype=np.int64)
-    if ends[-1] > 2**30:
+    total = int(count.numpy().sum(dtype=np.int64))
+    if total > 2**30:
         raise ValueError(
-            f"gaussians: they cover {ends[-1]} tiles in all, more than 2^30; prune large Gaussians or render smaller"
+            f"gaussians: they cover {total} tiles in all, more than 2^30; prune large Gaussians or render smaller"
         )
-    return (
-        wp.array(order, dtype=int, device=device),
-        wp.array(ends.astype(np.int32), dtype=int, device=device),
-        int(ends[-1]),
-    )
+    keys, order = (wp.empty(2 * n, dtype=int, device=device) for _ in range(2))
+    launch(binning.sort_keys, n, [count, distance, keys, order], device=device)
+    wp.utils.radix_sort_pairs(keys, order, n)
+    order = order[:visible]
+    ends = wp.empty(visible, dtype=int, device=device)
+    launch(binning.counts_in_order, visible, [order, count, ends], device=device)
+    wp.utils.array_scan(ends, ends, inclusive=True)
+    return order, ends, total
 
 
 def _view(cam: Camera) -> Any:
@@ -436,6 +519,43 @@ def _view(cam: Camera) -> Any:
     view.rotation = wp.mat33d(cam.rotation)
     view.origin = wp.vec3d(cam.position)
     return view
+
+
+@lru_cache(maxsize=64)
+def _rays(
+    kind: str, width: int, height: int, fx: float, fy: float, cx: float, cy: float, real: Any, device: str
+) -> Any:
+    """Directions of the pixels of every column and row of blocks; beyond the image those of its border."""
+    step, per_tile = kernels.BLOCK, kernels.TILE // kernels.BLOCK
+    x = np.arange(-(-width // kernels.TILE) * kernels.TILE)
+    y = np.arange(-(-height // kernels.TILE) * kernels.TILE)
+    u, v = np.minimum(x, width - 1) + 0.5, np.minimum(y, height - 1) + 0.5
+    if kind == "pinhole":
+        across, along, down = (u - cx) / fx, np.ones(len(u)), (v - cy) / fy
+        pitch = 1 / fx, 0.0, 1 / fy
+    else:
+        azimuth, zenith = u * 2 * np.pi / width - np.pi, v * np.pi / height
+        across, along, down = np.cos(azimuth), np.sin(azimuth), 1 / np.tan(zenith)
+        pitch = 2 * np.pi / width, 2 * np.pi / width, np.pi / height
+    rounding = np.finfo(np.float32 if real is wp.float32 else np.float64).eps
+
+    def spans(values: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray]:
+        blocks = values.reshape(-1, per_tile, step)
+        low, high = blocks.min(axis=2), blocks.max(axis=2)
+        # Widened by a thousandth of a pixel and by rounding: what a block's pixels see is never left out.
+        return (low + high) / 2, (high - low) / 2 + 1e-3 * pitch + 4 * rounding * np.abs(blocks).max(axis=2)
+
+    def lanes(values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=kernels.lanes_of(real), device=device)
+
+    rays = kernels.rays_of(real)()
+    rays.across = lanes(np.tile(across.reshape(-1, step), (1, step)))
+    rays.along = lanes(np.tile(along.reshape(-1, step), (1, step)))
+    rays.down = lanes(np.repeat(down.reshape(-1, step), step, axis=1))
+    columns = [*spans(across, pitch[0]), *spans(along, pitch[1])]
+    rays.columns = lanes(np.stack([np.tile(c, (1, per_tile)) for c in columns], axis=1))
+    rays.rows = lanes(np.stack([np.repeat(r, per_tile, axis=1) for r in spans(down, pitch[2])], axis=1))
+    return rays
 
 
 def _check(g: Any, cam: Any) -> None:

@@ -3,9 +3,10 @@
 Adjoint: with ``y = M (t d - m)`` (so that ``q = |y|^2``) the envelope theorem gives ``dq = 2 y.(dM r - M dmean)``,
 ``r = M^-1 y``, and ``dt = -(g.do + (y + t g).dg)/|g|^2``. Both are symmetric in whitened coordinates: every pair adds
 to a 3-vector ``Y1`` and a symmetric 3x3 ``Y2`` per Gaussian, which `chain` turns into gradients of mean, quaternion
-and scale.
+and scale. In the turned coordinates of the linear forms ``y = (-|M m| (g1^2 + g2^2), |M m| g0 g1, |M m| g0 g2)/|g|^2``.
 
-A thread blends a strip of 16 pixels of one row; the strip is one Warp vector, which a CPU executes with wide registers.
+A thread of `blend` owns a block of 4 x 4 pixels and walks the block's list. A thread of `blend_adjoint` owns a tile:
+for each Gaussian it visits the blocks that the Gaussian reaches and reduces their sums over pixels once.
 """
 
 from functools import cache
@@ -14,482 +15,418 @@ from typing import Any
 
 import warp as wp
 
+from warprrf.kernels.lanes import BLOCK, LANES, VECTORISED, lanes_of, lowest_bit
+from warprrf.kernels.lanes import build as lane_functions
 from warprrf.kernels.project import (
-    AA,
-    AB1,
-    AB2,
-    B1,
-    B2,
-    BB11,
-    BB12,
-    BB22,
     CHANNELS,
     CUT,
-    E1,
-    E2,
-    FIRST_ROW,
-    GRAM,
+    FLAT,
     INVERSE,
-    LAST_ROW,
-    MH,
+    LIFT,
     OPACITY,
-    PRODUCT,
-    RANGE,
-    SMALLEST,
-    STRIP,
+    REACH,
+    ROW,
     TILE,
-    A,
+    TILT,
     Rules,
     View,
-    pixel_direction,
-)  # fmt: skip
+    rays_of,
+)
+from warprrf.kernels.response import build as response_functions
+
+# What `blend_adjoint` keeps per block: gradients of the channels, of the sums of weight and of weight times range, what
+# they make of all that lies behind, and the transmittance left.
+OF_CHANNELS, OF_WEIGHT, OF_RANGE, BEHIND, LEFT = 0, 4, 5, 6, 7
+PER_BLOCK = 8
 
 
 @cache
-def build(real: Any) -> SimpleNamespace:
-    """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
-    strip = wp.types.vector(STRIP, real)
-    big = 1.0e30 if real is wp.float32 else 1.0e250
-    tiny = 1.0e-30 if real is wp.float32 else 1.0e-250
+def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
+    """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``, one transmittance rule, and 1 to 4 channels at
+    once; each is compiled when first launched."""
+    lanes = lanes_of(real)
+    integers = lanes_of(int)
+    coefficients = wp.types.vector(ROW, real)
+    Rays = rays_of(real)
+    of = lane_functions(real)
+    any_positive, above, above_number, lower, higher = (
+        of.any_positive,
+        of.above,
+        of.above_number,
+        of.lower,
+        of.higher,
+    )
+    sums_of, read, write, number = of.sums, of.read, of.write, of.number
+    collect, spread, spread_numbers = of.collect, of.spread, of.spread_numbers
+    shared = response_functions(real, rule)
+    behind, forms, place_of, response = shared.behind, shared.forms, shared.place_of, shared.response
+    ray_lengths, thinned, tiny = shared.ray_lengths, shared.thinned, shared.tiny
 
-    @wp.func
-    def step(x: strip):
-        """1 where x > 0, else 0 (NaN-free arithmetic select)."""
-        return wp.min(wp.max(x * real(wp.static(big)), strip()), strip(real(1.0)))
-
-    # Reductions as trees: a chain of 16 dependent additions is what wp.dot and wp.max compile to on a CPU.
-    @wp.func
-    def lane_sum(x: strip):
-        return (((x[0] + x[8]) + (x[4] + x[12])) + ((x[2] + x[10]) + (x[6] + x[14]))) + (
-            ((x[1] + x[9]) + (x[5] + x[13])) + ((x[3] + x[11]) + (x[7] + x[15]))
-        )
-
-    @wp.func
-    def lane_max(x: strip):
-        return wp.max(
-            wp.max(
-                wp.max(wp.max(x[0], x[8]), wp.max(x[4], x[12])),
-                wp.max(wp.max(x[2], x[10]), wp.max(x[6], x[14])),
-            ),
-            wp.max(
-                wp.max(wp.max(x[1], x[9]), wp.max(x[5], x[13])),
-                wp.max(wp.max(x[3], x[11]), wp.max(x[7], x[15])),
-            ),
-        )
-
-    if real is wp.float32:
-
-        @wp.func
-        def negative_exponential(h: strip):
-            """exp(-h) for h >= 0: (Taylor of exp(-h/16), degree 6)^16; absolute error below 5e-7."""
-            one = strip(real(1.0))
-            x = wp.min(h, strip(real(80.0))) * real(-0.0625)
-            p = one + x * real(0.16666666666666666)
-            p = one + wp.cw_mul(x, p) * real(0.2)
-            p = one + wp.cw_mul(x, p) * real(0.25)
-            p = one + wp.cw_mul(x, p) * real(0.3333333333333333)
-            p = one + wp.cw_mul(x, p) * real(0.5)
-            p = wp.max(one + wp.cw_mul(x, p), strip())
-            p = wp.cw_mul(p, p)
-            p = wp.cw_mul(p, p)
-            p = wp.cw_mul(p, p)
-            return wp.cw_mul(p, p)
-
-    else:
-
-        @wp.func
-        def negative_exponential(h: strip):
-            out = strip()
-            for k in range(wp.static(STRIP)):
-                out[k] = wp.exp(-h[k])
-            return out
-
-    @wp.func
-    def local_ray(rows: wp.array(dtype=real, ndim=2), k: int, dx: strip, dy: strip, dz: strip):
-        """Components (w, u1, u2) of the strip's rays in the Gaussian's frame."""
-        u1 = rows[k, E1] * dx + rows[k, E1 + 1] * dy + rows[k, E1 + 2] * dz
-        u2 = rows[k, E2] * dx + rows[k, E2 + 1] * dy + rows[k, E2 + 2] * dz
-        w = rows[k, MH] * dx + rows[k, MH + 1] * dy + rows[k, MH + 2] * dz
-        return w, u1, u2
-
-    @wp.func
-    def quadratics(rows: wp.array(dtype=real, ndim=2), k: int, w: strip, u1: strip, u2: strip):
-        """Numerator of q, a.g and |g|^2."""
-        n = rows[k, GRAM] * wp.cw_mul(u1, u1) + rows[k, GRAM + 1] * wp.cw_mul(u2, u2)
-        p = rows[k, AB1] * u1 + rows[k, AB2] * u2
-        ag = rows[k, AA] * w + p
-        h1 = rows[k, AB1] * w + rows[k, BB11] * u1 + rows[k, BB12] * u2
-        h2 = rows[k, AB2] * w + rows[k, BB12] * u1 + rows[k, BB22] * u2
-        side = wp.cw_mul(u1, h1) + wp.cw_mul(u2, h2)
-        gg = wp.max(wp.cw_mul(w, ag) + side, strip(real(wp.static(tiny))))
-        return n, ag, gg, side
-
-    @wp.func
-    def strip_directions(view: View, x0: int, y: int):
-        dx = strip()
-        dy = strip()
-        dz = strip()
-        for k in range(wp.static(STRIP)):
-            d = pixel_direction(view, x0 + k, y)
-            dx[k] = real(d[0])
-            dy[k] = real(d[1])
-            dz[k] = real(d[2])
-        return dx, dy, dz
-
-    @wp.func
-    def thinned(transmittance: strip, alpha: strip, rule: int):
-        if rule == wp.static(PRODUCT):
-            return wp.cw_mul(transmittance, strip(real(1.0)) - alpha)
-        return wp.cw_mul(transmittance, negative_exponential(alpha))
-
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
     def blend(
         offset: int,
-        rows: wp.array(dtype=real, ndim=2),
-        features: wp.array(dtype=real, ndim=2),
+        rows: wp.array(dtype=coefficients),
+        features: wp.array(dtype=real),
+        channels: int,
         first: int,
         background: wp.array(dtype=real),
         ids: wp.array(dtype=int),
         starts: wp.array(dtype=int),
+        rays: Rays,
         view: View,
         rules: Rules,
-        image: wp.array(dtype=real, ndim=3),
-        alpha_out: wp.array(dtype=real, ndim=2),
-        depth_out: wp.array(dtype=real, ndim=2),
-        transmittance_out: wp.array(dtype=real, ndim=2),
-        dominant_out: wp.array(dtype=int, ndim=2),
-        peak_out: wp.array(dtype=real, ndim=2),
+        image: wp.array(dtype=real),
+        alpha_out: wp.array(dtype=real),
+        depth_out: wp.array(dtype=real),
+        transmittance_out: wp.array(dtype=real),
+        dominant_out: wp.array(dtype=int),
+        peak_out: wp.array(dtype=real),
     ):
-        """Blend channels ``first .. first + 3`` front to back. ``depth_out`` holds the sum of weight times t."""
-        i = offset + wp.tid()
-        tile = i / wp.static(TILE)
-        x0 = (tile % view.tiles_x) * wp.static(TILE)
-        y = (tile / view.tiles_x) * wp.static(TILE) + i % wp.static(TILE)
-        if y >= view.height:
-            return
-        row = real(y)
-        dx, dy, dz = strip_directions(view, x0, y)
-        channels = wp.min(features.shape[1] - first, wp.static(CHANNELS))
-        amax = strip(real(rules.alpha_max))
-        tmin = strip(real(rules.transmittance_min))
-        transmittance = strip(real(1.0))
-        c0 = strip()
-        c1 = strip()
-        c2 = strip()
-        c3 = strip()
-        depth = strip()
-        total = strip()
-        best = strip()
-        owner = strip(real(-1.0))
-        peak = strip()
-        for j in range(starts[tile], starts[tile + 1]):
-            k = ids[j]
-            if row >= rows[k, FIRST_ROW] and row <= rows[k, LAST_ROW]:
-                w, u1, u2 = local_ray(rows, k, dx, dy, dz)
-                n, ag, gg, side = quadratics(rows, k, w, u1, u2)
-                q = wp.cw_div(n, gg)
-                room = strip(rows[k, CUT]) - q
-                if lane_max(room) > real(0.0):
-                    keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
-                    alpha = wp.min(rows[k, OPACITY] * negative_exponential(real(0.5) * q), amax)
-                    alpha = wp.cw_mul(alpha, keep)
-                    weight = wp.cw_mul(alpha, transmittance)
-                    transmittance = thinned(transmittance, alpha, rules.rule)
-                    t = rows[k, RANGE] * wp.cw_div(ag, gg)
-                    depth += wp.cw_mul(weight, t)
-                    total += weight
-                    better = step(weight - best)
-                    best = wp.max(best, weight)
-                    owner += wp.cw_mul(better, strip(real(k)) - owner)
-                    peak += wp.cw_mul(better, t - peak)
-                    c0 += features[k, first] * weight
-                    if channels > 1:
-                        c1 += features[k, first + 1] * weight
-                    if channels > 2:
-                        c2 += features[k, first + 2] * weight
-                    if channels > 3:
-                        c3 += features[k, first + 3] * weight
-                    if lane_max(transmittance) <= real(rules.transmittance_min):
-                        break
-        c0 += background[first] * transmittance
-        if channels > 1:
-            c1 += background[first + 1] * transmittance
-        if channels > 2:
-            c2 += background[first + 2] * transmittance
-        if channels > 3:
-            c3 += background[first + 3] * transmittance
-        for lane in range(wp.static(STRIP)):
-            x = x0 + lane
-            if x < view.width:
-                image[y, x, first] = c0[lane]
-                if channels > 1:
-                    image[y, x, first + 1] = c1[lane]
-                if channels > 2:
-                    image[y, x, first + 2] = c2[lane]
-                if channels > 3:
-                    image[y, x, first + 3] = c3[lane]
-                if first == 0:
-                    alpha_out[y, x] = total[lane]
-                    depth_out[y, x] = depth[lane]
-                    transmittance_out[y, x] = transmittance[lane]
-                    dominant_out[y, x] = int(owner[lane])
-                    peak_out[y, x] = peak[lane]
+        """Blend ``width`` channels from ``first`` front to back.
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def blend_adjoint(
-        offset: int,
-        strips: int,
-        pieces: int,
-        rows: wp.array(dtype=real, ndim=2),
-        features: wp.array(dtype=real, ndim=2),
-        first: int,
-        ids: wp.array(dtype=int),
-        starts: wp.array(dtype=int),
-        view: View,
-        rules: Rules,
-        image: wp.array(dtype=real, ndim=3),
-        alpha_sum: wp.array(dtype=real, ndim=2),
-        depth_sum: wp.array(dtype=real, ndim=2),
-        image_grad: wp.array(dtype=real, ndim=3),
-        alpha_grad: wp.array(dtype=real, ndim=2),
-        depth_grad: wp.array(dtype=real, ndim=2),
-        sums: wp.array(dtype=real, ndim=3),
-    ):
-        """Same walk as `blend`; adds each pair's gradient to ``sums[piece, Gaussian]``.
-
-        dL/da_i = T_i x_i - (R - sum_{j<=i} w_j x_j) / (1 - a_i), x the gradient dotted with the pair's features, R the
-        same dotted with the finished pixel; without the division for the exponential rule.
+        The mean range ``depth_out`` is 0 where nothing is seen, so that a loss on it stays finite.
         """
-        i = offset + wp.tid()
-        piece = ((i + 1) * pieces - 1) / strips
-        tile = i / wp.static(TILE)
-        x0 = (tile % view.tiles_x) * wp.static(TILE)
-        y = (tile / view.tiles_x) * wp.static(TILE) + i % wp.static(TILE)
-        if y >= view.height or starts[tile] == starts[tile + 1]:
+        block = offset + wp.tid()
+        column, line = place_of(block, view)
+        if column * wp.static(BLOCK) >= view.width or line * wp.static(BLOCK) >= view.height:
             return
-        channels = wp.min(features.shape[1] - first, wp.static(CHANNELS))
-        v0 = strip()
-        v1 = strip()
-        v2 = strip()
-        v3 = strip()
-        vt = strip()
-        va = strip()
-        goal = strip()
-        for lane in range(wp.static(STRIP)):
-            x = x0 + lane
-            if x < view.width:
-                v0[lane] = image_grad[y, x, first]
-                r = v0[lane] * image[y, x, first]
-                if channels > 1:
-                    v1[lane] = image_grad[y, x, first + 1]
-                    r += v1[lane] * image[y, x, first + 1]
-                if channels > 2:
-                    v2[lane] = image_grad[y, x, first + 2]
-                    r += v2[lane] * image[y, x, first + 2]
-                if channels > 3:
-                    v3[lane] = image_grad[y, x, first + 3]
-                    r += v3[lane] * image[y, x, first + 3]
-                if first == 0:
-                    a = alpha_sum[y, x]
-                    if a > real(0.0):
-                        vt[lane] = depth_grad[y, x] / a
-                        va[lane] = alpha_grad[y, x] - depth_grad[y, x] * depth_sum[y, x] / (a * a)
-                        r += vt[lane] * depth_sum[y, x] + va[lane] * a
-                goal[lane] = r
-        with_depth = lane_sum(wp.cw_mul(vt, vt)) > real(0.0)
-        row = real(y)
-        dx, dy, dz = strip_directions(view, x0, y)
-        one = strip(real(1.0))
-        amax = strip(real(rules.alpha_max))
-        tmin = strip(real(rules.transmittance_min))
-        transmittance = strip(real(1.0))
-        for j in range(starts[tile], starts[tile + 1]):
+        across = rays.across[column]
+        along = rays.along[column]
+        down = rays.down[line]
+        amax = lanes(real(rules.alpha_max))
+        tmin = lanes(real(rules.transmittance_min))
+        one = lanes(real(1.0))
+        transmittance = lanes(real(1.0))
+        c0 = lanes()
+        c1 = lanes()
+        c2 = lanes()
+        c3 = lanes()
+        depth = lanes()
+        total = lanes()
+        best = lanes()
+        peak = lanes()
+        owner = integers(-1)
+        for j in range(starts[block], starts[block + 1]):
             k = ids[j]
-            if row >= rows[k, FIRST_ROW] and row <= rows[k, LAST_ROW]:
-                w, u1, u2 = local_ray(rows, k, dx, dy, dz)
-                n, ag, gg, side = quadratics(rows, k, w, u1, u2)
-                q = wp.cw_div(n, gg)
-                room = strip(rows[k, CUT]) - q
-                if lane_max(room) > real(0.0):
-                    keep = wp.cw_mul(wp.cw_mul(step(room), step(ag)), step(transmittance - tmin))
-                    response = wp.cw_mul(negative_exponential(real(0.5) * q), keep)
-                    raw = rows[k, OPACITY] * response
-                    alpha = wp.min(raw, amax)
-                    free = one - step(raw - amax)
+            row = read(rows, k)
+            g0, g1, g2 = forms(row, across, along, down)
+            n = wp.cw_mul(g1, g1) + wp.cw_mul(g2, g2)
+            square = higher(wp.cw_mul(g0, g0) + row[FLAT] * n, lanes(real(wp.static(tiny))))
+            room = lower(lower(row[CUT] * square - n, g0), transmittance - tmin)
+            if not any_positive(room):
+                if not any_positive(transmittance - tmin):
+                    break
+                continue
+            inverse = wp.cw_div(one, square)
+            alpha = above(room, lanes(), lower(row[OPACITY] * response(wp.cw_mul(n, inverse)), amax), lanes())
+            weight = wp.cw_mul(alpha, transmittance)
+            transmittance = thinned(transmittance, alpha, weight)
+            t = wp.cw_mul(row[REACH] * g0, inverse)
+            depth += wp.cw_mul(weight, t)
+            total += weight
+            owner = above_number(weight, best, k, owner)
+            peak = above(weight, best, t, peak)
+            best = higher(best, weight)
+            f = k * channels + first
+            c0 += number(features, f) * weight
+            if wp.static(width > 1):
+                c1 += number(features, f + 1) * weight
+            if wp.static(width > 2):
+                c2 += number(features, f + 2) * weight
+            if wp.static(width > 3):
+                c3 += number(features, f + 3) * weight
+        x = column * wp.static(BLOCK)
+        y = line * wp.static(BLOCK)
+        columns = wp.min(view.width - x, wp.static(BLOCK))
+        lines = wp.min(view.height - y, wp.static(BLOCK))
+        pixel = y * view.width + x
+        at = pixel * channels + first
+        step = view.width * channels
+        spread(image, at, step, channels, columns, lines, c0 + background[first] * transmittance)
+        if wp.static(width > 1):
+            spread(image, at + 1, step, channels, columns, lines, c1 + background[first + 1] * transmittance)
+        if wp.static(width > 2):
+            spread(image, at + 2, step, channels, columns, lines, c2 + background[first + 2] * transmittance)
+        if wp.static(width > 3):
+            spread(image, at + 3, step, channels, columns, lines, c3 + background[first + 3] * transmittance)
+        if first == 0:
+            length = ray_lengths(across, along, down)
+            mean = wp.cw_div(wp.cw_mul(depth, length), above(total, lanes(), total, one))
+            spread(alpha_out, pixel, view.width, 1, columns, lines, total)
+            spread(depth_out, pixel, view.width, 1, columns, lines, mean)
+            spread(transmittance_out, pixel, view.width, 1, columns, lines, transmittance)
+            spread(peak_out, pixel, view.width, 1, columns, lines, wp.cw_mul(peak, length))
+            spread_numbers(dominant_out, pixel, view.width, 1, columns, lines, owner)
+
+    @wp.func
+    def seed_sums(
+        seeds: wp.array(dtype=lanes),
+        at: int,
+        pixel: int,
+        columns: int,
+        lines: int,
+        x: int,
+        y: int,
+        rays: Rays,
+        view: View,
+        alphas: wp.array(dtype=real),
+        ranges: wp.array(dtype=real),
+        alpha_grad: wp.array(dtype=real),
+        depth_grad: wp.array(dtype=real),
+    ):
+        """Gradients of a block's sums of weight and of weight times range, which are alpha and alpha times the mean
+        range; returned is what they make of the whole pixel."""
+        total = collect(alphas, pixel, view.width, 1, columns, lines)
+        mean = collect(ranges, pixel, view.width, 1, columns, lines)
+        of_weight = above(total, lanes(), collect(alpha_grad, pixel, view.width, 1, columns, lines), lanes())
+        of_range = wp.cw_div(
+            above(total, lanes(), collect(depth_grad, pixel, view.width, 1, columns, lines), lanes()),
+            above(total, lanes(), total, lanes(real(1.0))),
+        )
+        whole = wp.cw_mul(total, of_weight)
+        of_weight -= wp.cw_mul(of_range, mean)
+        length = ray_lengths(
+            read(rays.across, x / wp.static(BLOCK)),
+            read(rays.along, x / wp.static(BLOCK)),
+            read(rays.down, y / wp.static(BLOCK)),
+        )
+        write(seeds, at + wp.static(OF_WEIGHT), of_weight)
+        write(seeds, at + wp.static(OF_RANGE), wp.cw_mul(of_range, length))
+        return whole
+
+    def adjoint_kernel(with_range: bool) -> Any:
+        @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
+        def blend_adjoint(
+            offset: int,
+            parts: int,
+            bounds: wp.array(dtype=int),
+            rows: wp.array(dtype=coefficients),
+            features: wp.array(dtype=real),
+            channels: int,
+            first: int,
+            ids: wp.array(dtype=int),
+            slots: wp.array(dtype=int),
+            masks: wp.array(dtype=int),
+            starts: wp.array(dtype=int),
+            rays: Rays,
+            view: View,
+            rules: Rules,
+            image: wp.array(dtype=real),
+            alphas: wp.array(dtype=real),
+            ranges: wp.array(dtype=real),
+            remaining: wp.array(dtype=real),
+            image_grad: wp.array(dtype=real),
+            alpha_grad: wp.array(dtype=real),
+            depth_grad: wp.array(dtype=real),
+            seeds: wp.array(dtype=lanes),
+            sums: wp.array(dtype=coefficients),
+            background_sums: wp.array(dtype=coefficients),
+        ):
+            """Same walk as `blend`; leaves each Gaussian's gradient in a tile in ``sums[slot of the entry]``.
+
+            dL/da_i = T_i x_i - (R - sum_{j<=i} w_j x_j) / (1 - a_i), x the gradient dotted with the pair's features, R
+            the same dotted with the finished pixel; without the division for the exponential rule. A tile is shared
+            among ``parts`` threads, 1 or 16. Threads ``bounds[p] .. bounds[p + 1]`` run one after the other and share
+            ``seeds``, tile after tile; with no bounds every tile has its own.
+            """
+            thread = offset + wp.tid()
+            tile = thread / parts
+            share = wp.static(LANES) / parts
+            open = ((1 << share) - 1) << (share * (thread % parts))
+            place = tile
+            if bounds.shape[0] > 0:
+                place = int(0)
+                while thread >= bounds[place + 1]:
+                    place += 1
+            seed0 = place * wp.static(LANES * PER_BLOCK)
+            column0 = (tile % view.tiles_x) * wp.static(TILE // BLOCK)
+            line0 = (tile / view.tiles_x) * wp.static(TILE // BLOCK)
+            amax = lanes(real(rules.alpha_max))
+            tmin = lanes(real(rules.transmittance_min))
+            one = lanes(real(1.0))
+            w0 = lanes()
+            w1 = lanes()
+            w2 = lanes()
+            w3 = lanes()
+            unseeded = open
+            while unseeded != 0:
+                b = lowest_bit(unseeded)
+                unseeded = unseeded & (unseeded - 1)
+                at = seed0 + b * wp.static(PER_BLOCK)
+                x = (column0 + b % wp.static(TILE // BLOCK)) * wp.static(BLOCK)
+                y = (line0 + b / wp.static(TILE // BLOCK)) * wp.static(BLOCK)
+                columns = wp.clamp(view.width - x, 0, wp.static(BLOCK))
+                lines = wp.clamp(view.height - y, 0, wp.static(BLOCK))
+                pixel = y * view.width + x
+                step = view.width * channels
+                here = collect(remaining, pixel, view.width, 1, columns, lines)
+                goal = lanes()
+                if first == 0:
+                    goal = seed_sums(
+                        seeds,
+                        at,
+                        pixel,
+                        columns,
+                        lines,
+                        x,
+                        y,
+                        rays,
+                        view,
+                        alphas,
+                        ranges,
+                        alpha_grad,
+                        depth_grad,
+                    )
+                else:
+                    write(seeds, at + wp.static(OF_WEIGHT), lanes())
+                    write(seeds, at + wp.static(OF_RANGE), lanes())
+                for c in range(wp.static(width)):
+                    source = pixel * channels + first + c
+                    v = collect(image_grad, source, step, channels, columns, lines)
+                    goal += wp.cw_mul(v, collect(image, source, step, channels, columns, lines))
+                    write(seeds, at + wp.static(OF_CHANNELS) + c, v)
+                    if wp.static(c == 0):
+                        w0 += wp.cw_mul(v, here)
+                    if wp.static(c == 1):
+                        w1 += wp.cw_mul(v, here)
+                    if wp.static(c == 2):
+                        w2 += wp.cw_mul(v, here)
+                    if wp.static(c == 3):
+                        w3 += wp.cw_mul(v, here)
+                write(seeds, at + wp.static(BEHIND), goal)
+                write(seeds, at + wp.static(LEFT), one)
+            zero = lanes()
+            write(
+                background_sums,
+                thread,
+                sums_of(
+                    w0, w1, w2, w3, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
+                ),
+            )
+            for j in range(starts[tile], starts[tile + 1]):
+                mask = masks[j] & open
+                k = ids[j]
+                s0 = lanes()
+                s1 = lanes()
+                s2 = lanes()
+                s3 = lanes()
+                s4 = lanes()
+                s5 = lanes()
+                s6 = lanes()
+                s7 = lanes()
+                s8 = lanes()
+                s9 = lanes()
+                s10 = lanes()
+                s11 = lanes()
+                s12 = lanes()
+                s13 = lanes()
+                s14 = lanes()
+                while mask != 0:
+                    b = lowest_bit(mask)
+                    mask = mask & (mask - 1)
+                    # Read again for each block: operands in memory cost nothing, registers are for the sums.
+                    row = read(rows, k)
+                    f = k * channels + first
+                    column = column0 + b % wp.static(TILE // BLOCK)
+                    line = line0 + b / wp.static(TILE // BLOCK)
+                    at = seed0 + b * wp.static(PER_BLOCK)
+                    g0, g1, g2 = forms(
+                        row, read(rays.across, column), read(rays.along, column), read(rays.down, line)
+                    )
+                    transmittance = read(seeds, at + wp.static(LEFT))
+                    n = wp.cw_mul(g1, g1) + wp.cw_mul(g2, g2)
+                    square = higher(wp.cw_mul(g0, g0) + row[FLAT] * n, lanes(real(wp.static(tiny))))
+                    room = lower(lower(row[CUT] * square - n, g0), transmittance - tmin)
+                    if not any_positive(room):
+                        continue
+                    inverse = wp.cw_div(one, square)
+                    q = wp.cw_mul(n, inverse)
+                    lever = wp.cw_mul(g0, inverse)
+                    kept = above(room, lanes(), response(q), lanes())
+                    raw = row[OPACITY] * kept
+                    free = above(raw, amax, lanes(), kept)  # the response where alpha is not clamped
+                    alpha = lower(raw, amax)
                     weight = wp.cw_mul(alpha, transmittance)
-                    t = rows[k, RANGE] * wp.cw_div(ag, gg)
-                    value = features[k, first] * v0
-                    if channels > 1:
-                        value += features[k, first + 1] * v1
-                    if channels > 2:
-                        value += features[k, first + 2] * v2
-                    if channels > 3:
-                        value += features[k, first + 3] * v3
-                    if first == 0:
-                        value += wp.cw_mul(vt, t) + va
-                    goal -= wp.cw_mul(weight, value)
-                    behind = goal
-                    if rules.rule == wp.static(PRODUCT):
-                        behind = wp.cw_div(goal, wp.max(one - alpha, strip(real(wp.static(tiny)))))
-                    slope = wp.cw_mul(wp.cw_mul(wp.cw_mul(transmittance, value) - behind, keep), free)
-                    transmittance = thinned(transmittance, alpha, rules.rule)
-                    v = real(-0.5) * wp.cw_mul(slope, raw)  # dL/dq
-                    # y = M (t d - m) without cancellation: t w - |m| = -|m| side / gg
-                    off = rows[k, INVERSE] * wp.cw_div(strip(-rows[k, RANGE]), gg)
-                    lift = wp.cw_mul(off, side)
-                    s1 = rows[k, INVERSE] * wp.cw_mul(t, u1)
-                    s2 = rows[k, INVERSE] * wp.cw_mul(t, u2)
-                    y0 = rows[k, A] * lift + rows[k, B1] * s1 + rows[k, B2] * s2
-                    y1 = rows[k, A + 1] * lift + rows[k, B1 + 1] * s1 + rows[k, B2 + 1] * s2
-                    y2 = rows[k, A + 2] * lift + rows[k, B1 + 2] * s1 + rows[k, B2 + 2] * s2
+                    v0 = read(seeds, at + wp.static(OF_CHANNELS))
+                    value = number(features, f) * v0 + read(seeds, at + wp.static(OF_WEIGHT))
+                    s10 += wp.cw_mul(weight, v0)
+                    if wp.static(width > 1):
+                        v1 = read(seeds, at + wp.static(OF_CHANNELS + 1))
+                        value += number(features, f + 1) * v1
+                        s11 += wp.cw_mul(weight, v1)
+                    if wp.static(width > 2):
+                        v2 = read(seeds, at + wp.static(OF_CHANNELS + 2))
+                        value += number(features, f + 2) * v2
+                        s12 += wp.cw_mul(weight, v2)
+                    if wp.static(width > 3):
+                        v3 = read(seeds, at + wp.static(OF_CHANNELS + 3))
+                        value += number(features, f + 3) * v3
+                        s13 += wp.cw_mul(weight, v3)
+                    if wp.static(with_range):
+                        vt = wp.cw_mul(weight, read(seeds, at + wp.static(OF_RANGE)))
+                        value += row[REACH] * wp.cw_mul(lever, read(seeds, at + wp.static(OF_RANGE)))
+                    goal = read(seeds, at + wp.static(BEHIND)) - wp.cw_mul(weight, value)
+                    write(seeds, at + wp.static(BEHIND), goal)
+                    # dL/da times the response: dL/d opacity
+                    slope = wp.cw_mul(wp.cw_mul(transmittance, value) - behind(goal, alpha), free)
+                    left = thinned(transmittance, alpha, weight)
+                    write(seeds, at + wp.static(LEFT), left)
+                    v = (real(-0.5) * row[OPACITY]) * slope  # dL/dq
+                    y0 = (-row[INVERSE]) * q
+                    y1 = wp.cw_mul(lever, g1)
+                    y2 = wp.cw_mul(lever, g2)
                     p0 = wp.cw_mul(v, y0)
                     p1 = wp.cw_mul(v, y1)
                     p2 = wp.cw_mul(v, y2)
-                    s00 = lane_sum(wp.cw_mul(p0, y0))
-                    s01 = lane_sum(wp.cw_mul(p0, y1))
-                    s02 = lane_sum(wp.cw_mul(p0, y2))
-                    s11 = lane_sum(wp.cw_mul(p1, y1))
-                    s12 = lane_sum(wp.cw_mul(p1, y2))
-                    s22 = lane_sum(wp.cw_mul(p2, y2))
-                    if with_depth:
-                        half = (real(0.5) * rows[k, SMALLEST]) * wp.cw_div(wp.cw_mul(weight, vt), gg)
-                        h0 = wp.cw_mul(half, rows[k, A] * w + rows[k, B1] * u1 + rows[k, B2] * u2)
-                        h1 = wp.cw_mul(half, rows[k, A + 1] * w + rows[k, B1 + 1] * u1 + rows[k, B2 + 1] * u2)
-                        h2 = wp.cw_mul(half, rows[k, A + 2] * w + rows[k, B1 + 2] * u1 + rows[k, B2 + 2] * u2)
-                        p0 -= h0
-                        p1 -= h1
-                        p2 -= h2
-                        s00 -= real(2.0) * lane_sum(wp.cw_mul(h0, y0))
-                        s01 -= lane_sum(wp.cw_mul(h0, y1)) + lane_sum(wp.cw_mul(h1, y0))
-                        s02 -= lane_sum(wp.cw_mul(h0, y2)) + lane_sum(wp.cw_mul(h2, y0))
-                        s11 -= real(2.0) * lane_sum(wp.cw_mul(h1, y1))
-                        s12 -= lane_sum(wp.cw_mul(h1, y2)) + lane_sum(wp.cw_mul(h2, y1))
-                        s22 -= real(2.0) * lane_sum(wp.cw_mul(h2, y2))
-                    wp.atomic_add(sums, piece, k, 0, lane_sum(p0))
-                    wp.atomic_add(sums, piece, k, 1, lane_sum(p1))
-                    wp.atomic_add(sums, piece, k, 2, lane_sum(p2))
-                    wp.atomic_add(sums, piece, k, 3, s00)
-                    wp.atomic_add(sums, piece, k, 4, s01)
-                    wp.atomic_add(sums, piece, k, 5, s02)
-                    wp.atomic_add(sums, piece, k, 6, s11)
-                    wp.atomic_add(sums, piece, k, 7, s12)
-                    wp.atomic_add(sums, piece, k, 8, s22)
-                    wp.atomic_add(sums, piece, k, 9, lane_sum(wp.cw_mul(slope, response)))
-                    wp.atomic_add(sums, piece, k, 10, lane_sum(wp.cw_mul(weight, v0)))
-                    if channels > 1:
-                        wp.atomic_add(sums, piece, k, 11, lane_sum(wp.cw_mul(weight, v1)))
-                    if channels > 2:
-                        wp.atomic_add(sums, piece, k, 12, lane_sum(wp.cw_mul(weight, v2)))
-                    if channels > 3:
-                        wp.atomic_add(sums, piece, k, 13, lane_sum(wp.cw_mul(weight, v3)))
-                    if first == 0:
-                        wp.atomic_add(sums, piece, k, 14, lane_sum(weight))
-                    if lane_max(transmittance) <= real(rules.transmittance_min):
-                        break
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def strongest(
-        offset: int,
-        rows: wp.array(dtype=real, ndim=2),
-        ids: wp.array(dtype=int),
-        starts: wp.array(dtype=int),
-        view: View,
-        rules: Rules,
-        index: wp.array(dtype=int, ndim=3),
-        weight_out: wp.array(dtype=real, ndim=3),
-        range_out: wp.array(dtype=real, ndim=3),
-        total: wp.array(dtype=real, ndim=2),
-    ):
-        """The ``K`` largest blending weights of each pixel in front-to-back order, their Gaussians and peak ranges."""
-        pixel = offset + wp.tid()
-        x = pixel % view.width
-        y = pixel / view.width
-        tile = (y / wp.static(TILE)) * view.tiles_x + x / wp.static(TILE)
-        d = pixel_direction(view, x, y)
-        dx = real(d[0])
-        dy = real(d[1])
-        dz = real(d[2])
-        transmittance = real(1.0)
-        kept = int(0)
-        smallest = real(0.0)
-        at = int(0)
-        capacity = index.shape[2]
-        for j in range(starts[tile], starts[tile + 1]):
-            k = ids[j]
-            u1 = rows[k, E1] * dx + rows[k, E1 + 1] * dy + rows[k, E1 + 2] * dz
-            u2 = rows[k, E2] * dx + rows[k, E2 + 1] * dy + rows[k, E2 + 2] * dz
-            w = rows[k, MH] * dx + rows[k, MH + 1] * dy + rows[k, MH + 2] * dz
-            n = rows[k, GRAM] * u1 * u1 + rows[k, GRAM + 1] * u2 * u2
-            ag = rows[k, AA] * w + rows[k, AB1] * u1 + rows[k, AB2] * u2
-            gg = w * ag + u1 * (rows[k, AB1] * w + rows[k, BB11] * u1 + rows[k, BB12] * u2)
-            gg = wp.max(
-                gg + u2 * (rows[k, AB2] * w + rows[k, BB12] * u1 + rows[k, BB22] * u2), real(wp.static(tiny))
-            )
-            if n < rows[k, CUT] * gg and ag > real(0.0):
-                alpha = wp.min(rows[k, OPACITY] * wp.exp(real(-0.5) * n / gg), real(rules.alpha_max))
-                weight = alpha * transmittance
-                if rules.rule == wp.static(PRODUCT):
-                    transmittance = transmittance * (real(1.0) - alpha)
+                    s0 += wp.cw_mul(v, q)
+                    s1 += p1
+                    s2 += p2
+                    s3 += wp.cw_mul(p0, y0)
+                    s4 += wp.cw_mul(p0, y1)
+                    s5 += wp.cw_mul(p0, y2)
+                    s6 += wp.cw_mul(p1, y1)
+                    s7 += wp.cw_mul(p1, y2)
+                    s9 += slope
+                    s14 += weight
+                    if wp.static(with_range):
+                        half = wp.cw_mul(vt, inverse)
+                        h0 = row[LIFT] * wp.cw_mul(half, g0)
+                        h1 = row[TILT] * wp.cw_mul(half, g1)
+                        h2 = row[TILT] * wp.cw_mul(half, g2)
+                        s1 -= h1
+                        s2 -= h2
+                        s3 -= real(2.0) * wp.cw_mul(h0, y0)
+                        s4 -= wp.cw_mul(h0, y1) + wp.cw_mul(h1, y0)
+                        s5 -= wp.cw_mul(h0, y2) + wp.cw_mul(h2, y0)
+                        s6 -= real(2.0) * wp.cw_mul(h1, y1)
+                        s7 -= wp.cw_mul(h1, y2) + wp.cw_mul(h2, y1)
+                        s8 += h0
+                    if not any_positive(left - tmin):
+                        open = open & (-1 - (1 << b))
+                found = sums_of(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12, s13, s14, lanes())
+                if parts == 1:
+                    write(sums, slots[j], found)
                 else:
-                    transmittance = transmittance * wp.exp(-alpha)
-                total[y, x] = total[y, x] + weight
-                place = kept
-                if kept == capacity:
-                    place = -1
-                    if weight > smallest:
-                        for c in range(at, capacity - 1):  # close the gap: the order along the ray stays
-                            index[y, x, c] = index[y, x, c + 1]
-                            weight_out[y, x, c] = weight_out[y, x, c + 1]
-                            range_out[y, x, c] = range_out[y, x, c + 1]
-                        place = capacity - 1
-                if place >= 0:
-                    index[y, x, place] = k
-                    weight_out[y, x, place] = weight
-                    range_out[y, x, place] = rows[k, RANGE] * ag / gg
-                    kept = wp.min(kept + 1, capacity)
-                    if kept == capacity:
-                        smallest = weight_out[y, x, 0]
-                        at = int(0)
-                        for c in range(1, capacity):
-                            if weight_out[y, x, c] < smallest:
-                                smallest = weight_out[y, x, c]
-                                at = c
-                if transmittance <= real(rules.transmittance_min):
-                    break
+                    wp.atomic_add(sums, slots[j], found)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def mean_depth(
-        offset: int,
-        depth_sum: wp.array(dtype=real, ndim=2),
-        alpha: wp.array(dtype=real, ndim=2),
-        depth: wp.array(dtype=real, ndim=2),
-    ):
-        """Blended mean range; 0 where nothing is seen, so that a loss on it stays finite."""
-        pixel = offset + wp.tid()
-        x = pixel % alpha.shape[1]
-        y = pixel / alpha.shape[1]
-        if alpha[y, x] > real(0.0):
-            depth[y, x] = depth_sum[y, x] / alpha[y, x]
+        return blend_adjoint
 
     @wp.kernel(module="unique", enable_backward=False)
     def background_adjoint(
         offset: int,
-        transmittance: wp.array(dtype=real, ndim=2),
-        image_grad: wp.array(dtype=real, ndim=3),
+        first: int,
+        background_sums: wp.array(dtype=coefficients),
         background_grad: wp.array(dtype=real),
     ):
-        """Gradient of one background channel: the transmittance left, summed over the image."""
+        """Gradient of one channel of the background: the transmittance left times what each pixel wants."""
         c = offset + wp.tid()
         total = wp.float64(0.0)
-        for y in range(transmittance.shape[0]):
-            for x in range(transmittance.shape[1]):
-                total += wp.float64(transmittance[y, x]) * wp.float64(image_grad[y, x, c])
-        background_grad[c] = background_grad[c] + real(total)
+        for k in range(background_sums.shape[0]):
+            total += wp.float64(background_sums[k][c])
+        background_grad[first + c] = background_grad[first + c] + real(total)
 
     return SimpleNamespace(
         background_adjoint=background_adjoint,
         blend=blend,
-        blend_adjoint=blend_adjoint,
-        mean_depth=mean_depth,
-        strongest=strongest,
+        blend_adjoint=(adjoint_kernel(False), adjoint_kernel(True)),  # with or without gradients of ranges
     )

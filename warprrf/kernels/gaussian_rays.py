@@ -20,13 +20,23 @@ from typing import Any
 
 import warp as wp
 
-from warprrf.kernels.project import PRODUCT, Rules, rotation_matrix
+from warprrf.kernels.project import PRODUCT, rotation_matrix
 
 SUMS = 10  # numbers per Gaussian that the adjoints sum: Y1 3, Y2 6, opacity
 BY_PEAK, BY_RANGE = 0, 1  # order of hits: peak along the ray, or distance of the mean from the ray's origin
 
 # What float32 may err in placing a ray or a box, over the largest length in the scene: about 20 roundings of 2^-24.
 ROUNDING = 1.5e-6
+
+
+@wp.struct
+class Rules:
+    """How alphas along a ray become transmittance: cutoff, clamp, early exit, rule."""
+
+    alpha_min: wp.float64
+    alpha_max: wp.float64
+    transmittance_min: wp.float64
+    rule: int
 
 
 @wp.struct

@@ -543,19 +543,23 @@ class BistaticField(RadioField):
         owner = self.surface.patch_group
         return np.where(known, owner[np.where(known, paths.patch, 0)] if len(owner) else -1, -1)
 
-    def _bounce_points(self, sight: Sight, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of each pixel's strongest ray: its power (H, W), the point met (H, W, 3) and its range (H, W)."""
+    def _bounce_points(self, sight: Sight, rays: np.ndarray) -> np.ndarray:
+        """The point that each pixel's strongest ray meets (H, W, 3)."""
         per_pixel = rays.reshape(-1, self.tracer.sub_pixels**2)
         best = per_pixel.argmax(axis=1) + np.arange(len(per_pixel)) * per_pixel.shape[1]
         range_m = sight.met.range_m.numpy()[best]
         with np.errstate(invalid="ignore"):
             point = sight.receiver + range_m[:, None] * self.tracer.directions[best]
-        return rays[best].reshape(self.shape), point.reshape(*self.shape, 3), range_m.reshape(self.shape)
+        return point.reshape(*self.shape, 3)
 
     def _strongest(self, sight: Sight, parts: Composed) -> tuple[np.ndarray, np.ndarray]:
-        """Delay [s] and angles of departure [rad] of each pixel's strongest path; NaN where empty."""
-        strength, point, range_m = self._bounce_points(sight, parts.rays)
-        dark = strength <= 0
+        """Delay [s] and angles of departure [rad] of each pixel's strongest path through the receiver beam; NaN where
+        empty."""
+        ray = self.tracer.strongest(parts.rays, self.beam_sigma_rad)
+        dark = ray < 0
+        ray = np.maximum(ray, 0)
+        range_m = np.where(dark, np.nan, sight.met.range_m.numpy()[ray])
+        point = sight.receiver + range_m[..., None] * self.tracer.directions[ray]
         outward = np.where(dark[..., None], 1.0, point - sight.transmitter)
         length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
         if len(parts.specular):
@@ -580,7 +584,7 @@ class BistaticField(RadioField):
         kinds = np.where(p.order[exact] == 0, "los", "mirror").astype("<U7")
         vertices = p.point[exact]
         diffuse = parts.rays.reshape(*self.shape, -1).sum(axis=-1) + parts.further
-        point = self._bounce_points(sight, parts.rays + self._anything(sight, parts))[1]
+        point = self._bounce_points(sight, parts.rays + self._anything(sight, parts))
         kept = diffuse > self.floor
         if not kept.any() and diffuse.max() > 0:
             kept = diffuse == diffuse.max()

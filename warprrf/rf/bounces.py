@@ -24,7 +24,7 @@ from warprrf import device as _device
 from warprrf.kernels import bounce
 from warprrf.rf.exact import sub_pixel_directions
 from warprrf.rf.fresnel import lobe_norm, slab_reflection
-from warprrf.rf.spectrum import spread
+from warprrf.rf.spectrum import spread, strongest_rays
 from warprrf.rf.surface import Surface
 
 LOBES = (0, 2, 5, 12, 30)
@@ -273,6 +273,11 @@ class BounceTracer:
         _device.launch(bounce.resolve_bounces, pixels, inputs, device=self.device)
         image = out.numpy()[:, :columns] * np.float32(wavelength_m**2)
         return groups, image.reshape(pixels, len(groups), len(self.lobes), bounce.MOMENTS)
+
+    def strongest(self, power: np.ndarray, sigma: float) -> np.ndarray:
+        """Which ray of the grid, of ``power`` (K,), gives each pixel the most through a beam; see
+        :func:`strongest_rays`."""
+        return strongest_rays(self._directions, power, self.shape, sigma, device=self.device)
 
     def scatter(
         self, met: Met, lit: Lit, weight: np.ndarray, log_excess: np.ndarray, wavelength_m: float

@@ -93,6 +93,7 @@ class Checkpoint:
             self.states[name] = State(
                 step=int(info["step"]),
                 losses=list(info["losses"]),
+                opacity=tensors.get(f"{name}/opacity"),
                 **{k: tensors[f"{name}/{k}"] for k in _ARRAYS},  # type: ignore[arg-type]
             )
 
@@ -107,6 +108,9 @@ class Checkpoint:
     def _save(self, name: str, state: State) -> None:
         self.states[name] = state
         tensors = {f"{layer}/{k}": getattr(s, k) for layer, s in self.states.items() for k in _ARRAYS}
+        tensors |= {
+            f"{layer}/opacity": s.opacity for layer, s in self.states.items() if s.opacity is not None
+        }
         layers = {layer: {"step": s.step, "losses": s.losses} for layer, s in self.states.items()}
         write(self.path or "", tensors, {"identity": self.identity, "layers": layers}, CHECKPOINT_FORMAT)
 

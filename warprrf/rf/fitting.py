@@ -23,6 +23,8 @@ from warprrf.geometry.gaussians import replacing
 from warprrf.kernels import field as _kernels
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
+from warprrf.rf.opacity import RATE as OPACITY_RATE
+from warprrf.rf.opacity import OpacityTraining
 from warprrf.rf.transport import Transport
 
 if TYPE_CHECKING:
@@ -91,6 +93,7 @@ class State:
         step: steps done.
         coefficients, first, second: coefficients and Adam's moments, shape ``(G, 16)``.
         losses: loss of each step.
+        opacity: logits of the opacities and their moments, shape ``(3, G)``; None where they are not trained.
     """
 
     step: int
@@ -98,6 +101,7 @@ class State:
     first: np.ndarray
     second: np.ndarray
     losses: list[float] = field(default_factory=list)
+    opacity: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -300,11 +304,15 @@ class BatchTarget:
 class Layer:
     """Loss and gradient of one layer's coefficients on a :class:`Problem`'s batches."""
 
-    def __init__(self, problem: Problem, target: Target, kind: str) -> None:
-        self.problem, self.target, self.kind = problem, target, KINDS[kind]
+    def __init__(
+        self, problem: Problem, target: Target, kind: str, opacity: OpacityTraining | None = None
+    ) -> None:
+        self.problem, self.target, self.kind, self.opacity = problem, target, KINDS[kind], opacity
         p, k = problem, problem.kernels
         shape = (len(p.transport.receivers), p.pixels)
         self._scaled: dict[int, wp.array] = {}
+        if opacity is not None:
+            self.opacity_gradient = np.zeros(len(p.seen))
         self.images = np.asarray(target.image, p.precision).reshape(shape)
         ones, zeros = np.ones(shape, p.precision), np.zeros(shape, p.precision)
         factor = ones if target.factor is None else np.asarray(target.factor, p.precision).reshape(shape)
@@ -346,8 +354,13 @@ class Layer:
         return out
 
     def weights(self, index: int) -> wp.array:
-        """The weights of batch ``index`` in the target's unit; kept where all batches are in memory."""
+        """The weights of batch ``index`` in the target's unit; kept where all batches are in memory. Where opacities
+        are trained, as they are now."""
         batch, unit = self.problem.batches[index], self.target.unit
+        if self.opacity is not None:
+            now = wp.zeros_like(batch.pair_weight)
+            self.opacity.weights(index, now)
+            return now
         if unit is None:
             return batch.pair_weight
         if index not in self._scaled:
@@ -387,6 +400,8 @@ class Layer:
             k.coefficient_adjoint, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_pixel,
             batch.pair_direction, weights, p.basis, self.contribution, adjoint, self.gradient,
         )  # fmt: skip
+        if self.opacity is not None:
+            self.opacity_gradient = self.opacity.gradient(index, self.contribution, total, adjoint)
         if not need_loss:
             return float("nan")
         error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data.count
@@ -415,6 +430,7 @@ def fit_layer(
     each: Callable[[State], None] | None = None,
     stage: str = "fit",
     progress: Progress | None = None,
+    opacity: OpacityTraining | None = None,
 ) -> State:
     """Fit one layer.
 
@@ -428,6 +444,7 @@ def fit_layer(
         state: go on from here instead of starting.
         each: called with the state every 50 steps and after the last.
         stage, progress: for the progress callback.
+        opacity: opacities that are trained with the layer; None leaves them as they are.
 
     Returns:
         Final state; coefficients of the Gaussians ``problem.seen``, shape ``(G, 16)``.
@@ -438,7 +455,7 @@ def fit_layer(
     active = np.arange(_kernels.COEFFICIENTS) < count
     rate = np.where(active, rates.directional, 0.0)
     rate[0] = rates.constant
-    layer = Layer(problem, target, kind)
+    layer = Layer(problem, target, kind, opacity)
     if state is None:
         table = np.zeros((len(p.seen), _kernels.COEFFICIENTS))
         table[:, 0] = target.initial
@@ -451,7 +468,8 @@ def fit_layer(
     decay1, decay2, epsilon = ADAM
 
     def snapshot(step: int) -> State:
-        return State(step, coefficients.numpy(), first.numpy(), second.numpy(), losses)
+        logits = None if opacity is None else opacity.state
+        return State(step, coefficients.numpy(), first.numpy(), second.numpy(), losses, logits)
 
     for step in range(state.step, steps):
         index = p.batch_at(step)
@@ -467,6 +485,10 @@ def fit_layer(
             p.real(1 / (1 - decay1 ** (step + 1))), p.real(1 / (1 - decay2 ** (step + 1))), p.real(epsilon),
             initial, layer.gradient, first, second, coefficients,
         )  # fmt: skip
+        if opacity is not None:
+            opacity.step(
+                layer.opacity_gradient, step + 1, OPACITY_RATE * FINAL_RATE ** (step / max(steps - 1, 1))
+            )
         if progress is not None:
             progress(stage, step + 1, steps)
         if each is not None and ((step + 1) % 50 == 0 or step + 1 == steps):

@@ -36,6 +36,7 @@ from warprrf.rf.field_paths import View, near_line_of_sight, paths_of
 from warprrf.rf.field_targets import targets
 from warprrf.rf.fitting import KINDS, Problem, Rates, fit_layer, harmonics
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.opacity import OpacityTraining, list_responses
 from warprrf.rf.paths import Paths
 from warprrf.rf.single_bounce import FieldOptions, SingleBounce
 from warprrf.rf.spectrum import Spectrum, angles_from_directions
@@ -107,6 +108,7 @@ class HarmonicField(RadioField):
         batch: int = 10,
         rates: Rates | None = None,
         transport: Transport | StoredTransport | None = None,
+        train_opacity: bool = False,
         checkpoint: str | os.PathLike[str] | None = None,
         seed: int = 0,
         device: Any = None,
@@ -132,6 +134,8 @@ class HarmonicField(RadioField):
             rates: learning rates and ridge.
             transport: blending weights of ``ds.receivers``, if they were computed before; stored ones are fitted from
                 disk (:func:`warprrf.rf.transport_store.store_transport`).
+            train_opacity: also train the opacities with the gain, as RF-3DGS does; the field then has Gaussians of its
+                own opacities. Needs the ``product`` transmittance.
             checkpoint: file to save progress to and go on from; removed when the fit is done.
             seed: of the batches.
             device: where to compute.
@@ -178,6 +182,15 @@ class HarmonicField(RadioField):
             delay_unit=1.0,
             device=device,
         )
+        listed = None
+        if train_opacity:
+            if not isinstance(seen, Transport):
+                raise ValueError(
+                    "transport: got weights stored on disk together with train_opacity=True, which makes weights anew; "
+                    "expected weights in memory, or None"
+                )
+            listed = list_responses(gaussians, seen, ds.range_db, device=device, progress=progress)
+            seen = listed.transport
         ready = time.perf_counter()
         plan = targets(blank.law, ds, images, seen)
         problem = Problem(seen, batch=batch, seed=seed, device=device)
@@ -185,14 +198,20 @@ class HarmonicField(RadioField):
             n: int(iterations) if n == "gain" else min(CHANNEL_STEPS, int(iterations)) for n in plan.layers
         }
         learned = Rates() if rates is None else rates
-        identity = field_files.fingerprint(options, learned, seed, batch, steps, seen, *plan.layers.values())
+        identity = field_files.fingerprint(
+            options, learned, seed, batch, steps, seen, train_opacity, *plan.layers.values()
+        )
         saver = field_files.Checkpoint(checkpoint, identity)
         layers, losses, done = {}, {}, 0
         for name, target in plan.layers.items():
+            kept, opacity = saver.state(name), None
+            if listed is not None and name == "gain":
+                before = None if kept is None else kept.opacity
+                opacity = OpacityTraining(problem, listed, gaussians.opacities, target.unit, before)
             state = fit_layer(
                 problem, target, options.gain if name == "gain" else "signed", steps=steps[name],
                 degree=options.sh_degree, rates=learned if name == "gain" else CHANNEL_RATES,
-                state=saver.state(name), each=saver.saving(name),
+                state=kept, each=saver.saving(name), opacity=opacity,
                 progress=_shifted(progress, done, sum(steps.values())),
             )  # fmt: skip
             done += steps[name]
@@ -201,9 +220,16 @@ class HarmonicField(RadioField):
             unit = 1.0 if target.unit is None else target.unit[:, None]
             everyone[problem.seen] = state.coefficients * unit
             layers[name], losses[name] = everyone, [float(loss) for loss in state.losses]
+            if listed is not None and opacity is not None:
+                trained = np.array(gaussians.opacities, np.float32)
+                trained[problem.seen] = opacity.opacities
+                gaussians = replace(gaussians, opacities=trained)
+                # Channels are blended with the opacities that the gain has found.
+                problem = Problem(listed.with_opacities(trained), batch=batch, seed=seed, device=device)
         saver.remove()
         return replace(
             blank,
+            gaussians=gaussians,
             layers=layers,
             gain_unit=plan.gain_unit,
             delay_unit=plan.delay_unit,
@@ -217,6 +243,7 @@ class HarmonicField(RadioField):
                 "gaussians_seen": len(problem.seen),
                 "iterations": int(iterations),
                 "seed": int(seed),
+                "train_opacity": bool(train_opacity),
                 "losses": losses,
             },
         )

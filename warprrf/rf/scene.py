@@ -116,6 +116,23 @@ class Scene:
             xml_path=xml,
         )
 
+    def with_materials(self, materials: Sequence[Material]) -> Scene:
+        """The same surfaces made of other materials, one for each of :attr:`materials`.
+
+        Raises:
+            ValueError: if there are not as many.
+        """
+        if len(materials) != len(self.materials):
+            raise ValueError(f"materials: got {len(materials)}, expected {len(self.materials)}, one for each")
+        return Scene(
+            self.mesh,
+            materials,
+            self.face_material,
+            face_object=self.face_object,
+            object_names=self.object_names,
+            xml_path=self.xml_path,
+        )
+
     @property
     def bounds(self) -> np.ndarray:
         """Lower and upper corner of the mesh [m], shape ``(2, 3)``."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.bench.bistatic.methods import sight_of
-from warprrf.bench.bistatic.setting import Geometry, Truth
+from warprrf.bench.setting import Geometry, Truth
 from warprrf.device import Progress
 from warprrf.rf import bistatic_fit, metrics
 from warprrf.rf.bistatic import BistaticField

@@ -19,8 +19,8 @@ import warprrf as wr
 from warprrf.bench.bistatic import checks, report
 from warprrf.bench.bistatic.methods import HARMONIC, UNTAUGHT, VARIANTS, score, source_of
 from warprrf.bench.bistatic.plots import WHOLE
-from warprrf.bench.bistatic.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
 from warprrf.bench.machine import machine
+from warprrf.bench.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
 from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
 from warprrf.device import Progress
 from warprrf.rf import lookups
@@ -266,7 +266,7 @@ class _Bench:
                     ),
                 )
                 rows.append({"truth": truth.name, "n_train": truth.few, "model": name, **row})
-        self.geometry.forget()
+        self.geometry.forget(keep="weights")
         return rows
 
     def _of_fields(self, name: str, work: Callable[..., Row], *, scene: bool = False) -> list[Row]:

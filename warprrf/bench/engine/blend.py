@@ -1,9 +1,9 @@
 """Blending, forward and backward: our rasteriser beside the vectorised torch renderer, measured in one run.
 
-The scene is a room of flat Gaussians, 18 x 12 x 4 m, seen by a pinhole camera inside: what photos are refined with.
-Both get the same tensors and the same loss, a fixed weighted sum of the image, and both are called through torch's
-autograd; times cover projection, binning, blending and the gradients of means, quaternions, scales, opacities and
-features.
+The scene is a room of flat Gaussians seen by a pinhole camera inside: what photos are refined with. Both get the same
+tensors and the same loss, a fixed weighted sum of the image, and both are called through torch's autograd; times cover
+projection, binning, blending and the gradients of means, quaternions, scales, opacities and features. What is asked of
+single launches stands beside: :mod:`warprrf.bench.engine.launches`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warprrf.bench.engine.launches import cores, pair_costs, spectrum_times
+from warprrf.bench.engine.scenes import photo, room
 from warprrf.bench.engine.torch_renderer import render_with_torch
 from warprrf.bench.machine import machine
 from warprrf.bench.stages import write_json
 from warprrf.device import Progress, require, threads
 from warprrf.geometry import interop
-from warprrf.geometry.camera import Camera
 
 if TYPE_CHECKING:
     import torch
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 ASKED = {"speedup": 20.0, "image_difference": 1e-4}
 """How many times faster than the torch renderer ours must be, and how far apart their images may lie where no cutoff
 decides differently."""
-
-ROOM = (18.0, 12.0, 4.0)  # m
 
 
 def run_blend(
@@ -41,22 +40,26 @@ def run_blend(
     height: int = 300,
     repeats: int = 5,
     seed: int = 0,
+    launches: bool = True,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Time ours and the torch renderer on a CPU in float32; the runs alternate and the fastest of each counts.
 
     Both use as many threads as ours does (``WARPRRF_THREADS`` where set). On a busy machine compare one thread with
-    one: each tensor operation waits for all of torch's threads.
+    one, by processor time: each tensor operation waits for all of torch's threads.
 
     Args:
         out: write the result to this JSON file.
         n: Gaussians.
         repeats: timed runs of each, after one that warms up.
+        launches: measure single launches too: cost per pair, all cores, a spectrum.
 
     Returns:
-        Seconds forward, backward and in all of both (``ours``, ``torch``), ``speedup`` (torch over ours, in all), pairs
-        of pixel and Gaussian that contribute, nanoseconds per such pair, and the largest and 99.9 % difference of the
-        images and the relative difference of the gradients.
+        Seconds forward, backward and in all of both (``ours``, ``torch``), by the wall clock and of processor time
+        (``cpu_seconds``), ``speedup`` (torch over ours, in all) and ``cpu_speedup``, pairs of pixel and Gaussian that
+        contribute, nanoseconds per such pair, the largest and 99.9 % difference of the images, and the relative
+        difference of the gradients; ``pairs``, ``cores`` (where there are several) and ``spectrum`` of
+        :mod:`~warprrf.bench.engine.launches`, each with what is asked.
 
     Raises:
         ImportError: without torch.
@@ -75,7 +78,7 @@ def run_blend(
 
     before = torch.get_num_threads()
     torch.set_num_threads(threads())
-    runs: dict[str, list[tuple[float, float]]] = {"ours": [], "torch": []}
+    runs: dict[str, list[tuple[float, float, float]]] = {"ours": [], "torch": []}
     images: dict[str, Any] = {}
     gradients: dict[str, Any] = {}
     for k in range(repeats + 1):
@@ -99,15 +102,17 @@ def run_blend(
         "asked": ASKED,
     }
     for name, times in runs.items():
-        forward, backward = min(times, key=sum)
+        forward, backward, _ = min(times, key=lambda t: t[0] + t[1])
         result[name] = {
             **result.get(name, {}),
             "forward_s": forward,
             "backward_s": backward,
             "seconds": forward + backward,
+            "cpu_seconds": min(t[2] for t in times),
             "ns_per_passing_pair": 1e9 * (forward + backward) / max(counted.passing, 1),
         }
     result["speedup"] = result["torch"]["seconds"] / result["ours"]["seconds"]
+    result["cpu_speedup"] = result["torch"]["cpu_seconds"] / result["ours"]["cpu_seconds"]
     difference = (images["ours"] - images["torch"]).abs().numpy()
     result["image_difference"] = {
         "largest": float(difference.max()),
@@ -120,54 +125,27 @@ def run_blend(
             gradients["ours"], gradients["torch"], strict=True,
         )
     }  # fmt: skip
+    if launches:
+        # Fewer Gaussians are larger ones; a tenth of the scene's own cover a block of pixels evenly.
+        result["pairs"] = pair_costs({"dense": n, "sparse": n // 10}, width=width, height=height, seed=seed)
+        result["spectrum"] = spectrum_times(5 * n, seed=seed)
+        if threads() > 1:
+            result["cores"] = cores(10 * n, width=4 * width, height=4 * height, seed=seed)
     if out is not None:
         write_json(Path(out), result)
     return result
 
 
-def room(n: int, seed: int = 0) -> tuple[np.ndarray, ...]:
-    """Flat Gaussians on the six sides of the room: means, quaternions, scales, opacities, colours, float32.
-
-    In-plane scales are such that neighbours overlap whatever their number is; opacities are those of a refined scene.
-    """
-    rng = np.random.default_rng(seed)
-    size = np.asarray(ROOM)
-    area = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
-    axis = rng.choice(3, n, p=area / area.sum())
-    means = rng.uniform(0, 1, (n, 3)) * size
-    means[np.arange(n), axis] = rng.integers(0, 2, n) * size[axis]
-    spacing = np.sqrt(2 * area.sum() / n)
-    scales = spacing * np.exp(rng.uniform(np.log(0.3), np.log(1.0), (n, 3)))
-    scales[np.arange(n), axis] = 0.05 * spacing
-    quaternions = np.concatenate([np.ones((n, 1)), rng.normal(scale=0.05, size=(n, 3))], axis=1)
-    values = (means, quaternions, scales, rng.uniform(0.3, 0.95, n), rng.uniform(size=(n, 3)))
-    return tuple(v.astype(np.float32) for v in values)
-
-
-def photo(width: int, height: int) -> Camera:
-    """A camera in the room's corner, 80 degrees wide, looking along the diagonal."""
-    position = np.array([1.5, 1.5, 1.7])
-    forward = np.array([16.5, 10.5, 1.5]) - position
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ position
-    focal = 0.5 * width / np.tan(np.radians(40))
-    return Camera.pinhole(
-        width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, world_to_camera=pose
-    )
-
-
 def _timed(
     function: Callable[[], torch.Tensor], parameters: list[torch.Tensor], weights: torch.Tensor
-) -> tuple[tuple[float, float], torch.Tensor, tuple[torch.Tensor, ...]]:
-    """Seconds forward and backward, the image, and the gradients."""
+) -> tuple[tuple[float, float, float], torch.Tensor, tuple[torch.Tensor, ...]]:
+    """Seconds forward and backward, processor time of both, the image, and the gradients."""
     torch = require("torch", "baselines")
+    cpu = time.process_time()
     start = time.perf_counter()
     image = function()
     middle = time.perf_counter()
     gradients = torch.autograd.grad((image * weights).sum(), parameters)
     end = time.perf_counter()
-    return (middle - start, end - middle), image.detach(), gradients
+    times = (middle - start, end - middle, time.process_time() - cpu)
+    return times, image.detach(), gradients

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.bench.engine.blend import ROOM
 from warprrf.bench.engine.forms import best_seconds
+from warprrf.bench.engine.scenes import ROOM
 from warprrf.bench.engine.transport import cover, positions
 from warprrf.bench.interaction_points import interaction_point_rows
 from warprrf.device import resolve

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.bench.engine.blend import ROOM, room
+from warprrf.bench.engine.scenes import ROOM, room
 from warprrf.device import Progress
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.rf import field_files
@@ -108,7 +108,7 @@ def positions(count: int, seed: int) -> np.ndarray:
 
 
 def cover(count: int, seed: int) -> Gaussians:
-    """The room of :func:`warprrf.bench.engine.blend.room` as Gaussians."""
+    """The room of :func:`warprrf.bench.engine.scenes.room` as Gaussians."""
     means, quaternions, scales, opacities, _ = room(count, seed)
     return Gaussians(means, quaternions, scales, opacities, np.zeros((count, 1, 3), np.float32))
 

@@ -63,9 +63,9 @@ class Truth:
         left_out = tuple(sorted(set(counts) - set(kept)))
         return cls(data.engine, fingerprint([file]), data, kept, left_out, every)
 
-    def train(self, count: int) -> SpectrumDataset:
-        """The first ``count`` training receivers."""
-        return self.data.split(count)[0]
+    def train(self, count: int, seed: int = 0) -> SpectrumDataset:
+        """The first ``count`` training receivers, in the order that ``seed`` gives them."""
+        return self.data.split(count, seed=seed)[0]
 
     @cached_property
     def test(self) -> SpectrumDataset:
@@ -157,9 +157,15 @@ class Geometry:
             self._weights[slot] = key, seen, time.perf_counter() - start
         return self._weights[slot][1:]
 
-    def forget(self) -> None:
-        """Drop what was traced: a hundred receivers fill gigabytes."""
-        self._rays.clear()
+    def forget(self, keep: str = "") -> None:
+        """Drop what training receivers see, hundreds of them fill gigabytes; but for ``"rays"`` or ``"weights"``.
+
+        Rays of test receivers go with the others: they are as large. Their weights are small, and stay.
+        """
+        if keep != "rays":
+            self._rays.clear()
+        if keep != "weights":
+            self._weights.pop("train", None)
 
 
 def files(

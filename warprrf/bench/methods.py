@@ -1,0 +1,169 @@
+"""What several benches compare, fitted in one way: fields on the reconstruction, lookups, and what needs no data.
+
+What receivers see of the geometry is computed once and shared by the methods that need it (:class:`Geometry`); its time
+is counted to every one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warprrf as wr
+from warprrf.bench.setting import Geometry
+from warprrf.device import Progress
+from warprrf.rf import lookups
+from warprrf.rf.bistatic import BistaticField, Sight
+from warprrf.rf.bistatic_training import BistaticTransport
+from warprrf.rf.dataset import SpectrumDataset
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.harmonic import HarmonicField
+from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
+
+# Files of one model alone: changing them leaves the other's rows as they are.
+_BISTATIC = (
+    "bistatic", "bistatic_fit", "bistatic_training", "bounces", "grouping", "mirror_light", "mirror_tree", "residuals",
+    "second_bounce", "specular", "surface", "uncertainty",
+)  # fmt: skip
+_HARMONIC = ("harmonic", "fitting", "field_paths", "field_targets", "opacity", "single_bounce", "transport")
+_NEITHER = (
+    "absorption", "antenna", "blockage", "llvm", "mirror_chains", "mitsuba_photos", "newrf", "reflections",
+    "relevance", "relevance_choice", "relevance_model", "sionna_calibration", "sionna_engine", "twin",
+)  # fmt: skip
+
+
+def field_code(*, bistatic: bool, harmonic: bool) -> tuple[str, ...]:
+    """Files and packages below ``warprrf/`` that the figures of our own fields, or of neither, depend on."""
+    other = {*_NEITHER, *(() if bistatic else _BISTATIC), *(() if harmonic else _HARMONIC)}
+    folder = Path(wr.__file__).parent / "rf"
+    files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in other]
+    return ("device.py", "kernels", "geometry", *files)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A method after it has learned what it can.
+
+    Attributes:
+        predict: from a receiver position (3,) [m] to a :class:`Spectrum`.
+        transport_s: seconds that tracing the training receivers took; None where nothing is traced.
+        fit_s: seconds that learning took; None where nothing is learned.
+        before_s: seconds that each prediction took beforehand, for all test receivers together.
+        field: what can be saved (anything with ``.save(path)``), or None.
+        size_bytes: what a prediction needs, where there is nothing to save.
+        losses: loss by step, where there is one.
+        details: whatever else belongs into the row.
+    """
+
+    predict: Callable[[Any], Spectrum] = field(repr=False)
+    transport_s: float | None = None
+    fit_s: float | None = None
+    before_s: float = 0.0
+    field: Any = None
+    size_bytes: int | None = None
+    losses: list[float] | None = None
+    details: dict[str, Any] | None = None
+
+
+def fit_bistatic(
+    geometry: Geometry, train: SpectrumDataset, *, progress: Progress | None = None, **options: Any
+) -> Fitted:
+    """The bistatic field on the reconstruction."""
+    rays = geometry.rays(train, progress=progress)
+    found = wr.RadioField.fit(
+        geometry.reconstruction, train, transport=rays, device=geometry.device, progress=progress, **options
+    )
+    return Fitted(found.spectrum, transport_s=rays.seconds, fit_s=found.report["fit_time_s"], field=found)
+
+
+def fit_harmonic(
+    geometry: Geometry,
+    train: SpectrumDataset,
+    test: SpectrumDataset,
+    model: str,
+    *,
+    slot: str = "test",
+    progress: Progress | None = None,
+    **options: Any,
+) -> Fitted:
+    """RF-3DGS+ or RF-3DGS on the reconstruction.
+
+    Blending weights of the test receivers are computed beforehand for all variants; the time of a spectrum from nothing
+    includes them. Where opacity was trained they are the field's own, computed as it is asked.
+
+    Args:
+        test: receivers that will be asked for.
+        slot: where the geometry keeps their weights.
+        options: of :meth:`HarmonicField.fit`.
+    """
+    weights, seconds = geometry.weights(train, progress=progress)
+    learned = HarmonicField.fit(
+        geometry.reconstruction, train, model, transport=weights, device=geometry.device, progress=progress,
+        **options,
+    )  # fmt: skip
+    losses = learned.report["losses"]["gain"]
+    timed = {
+        "transport_s": seconds,
+        "fit_s": learned.report["fit_time_s"],
+        "field": learned,
+        "losses": losses,
+    }
+    if learned.report["train_opacity"]:
+        return Fitted(learned.spectrum, **timed)
+    seen, seconds = geometry.weights(test, slot=slot, progress=progress)
+    return Fitted(
+        lambda rx: learned.spectrum(rx, transport=seen.at(rx)), before_s=seconds / len(test), **timed
+    )
+
+
+def fit_lookup(name: str, variant: str, train: SpectrumDataset) -> Fitted:
+    """A lookup of :mod:`warprrf.rf.lookups`; ``variant`` is what inverse-distance weighting averages."""
+    options = {"domain": variant} if variant else {}
+    size = {"constant": 4, "mean": train.path_gain[0].nbytes if len(train) else 0}
+    return Fitted(
+        getattr(lookups, name)(train, **options), size_bytes=size.get(name, int(train.path_gain.nbytes))
+    )
+
+
+def untaught(name: str, geometry: Geometry, test: SpectrumDataset) -> Fitted:
+    """``"zero"``: our model on the reconstruction before any spectrum; ``"transmitter"``: its direction alone.
+
+    Of ``test`` only transmitter, carrier, grid, beam, floor and range are looked at.
+    """
+    if name == "zero":
+        prior = BistaticField.prior(geometry.reconstruction, test, device=geometry.device)
+        return Fitted(prior.spectrum, field=prior)
+    if name != "transmitter":
+        raise ValueError(f'name: got {name!r}, expected "zero" or "transmitter"')
+    return Fitted(point_at_transmitter(test, geometry.device), size_bytes=24)
+
+
+def point_at_transmitter(ds: SpectrumDataset, device: Any = None) -> Callable[[Any], Spectrum]:
+    """A predictor that knows where the transmitter is and nothing of the room: its beam, with Friis' gain."""
+
+    def predict(receiver: Any) -> Spectrum:
+        toward = ds.transmitter - np.asarray(receiver, np.float64)
+        distance = float(np.linalg.norm(toward))
+        friis = (SPEED_OF_LIGHT / ds.frequency_hz / (4.0 * np.pi * distance)) ** 2
+        gain = spread(toward[None], np.array([friis]), ds.shape, ds.beam_sigma_rad, device=device)
+        departure = np.stack(angles_from_directions(-toward)).astype(np.float32)
+        lit = gain > 0
+        return Spectrum(
+            path_gain=gain.astype(np.float32),
+            delay_s=np.where(lit, distance / SPEED_OF_LIGHT, np.nan),
+            aod=np.where(lit[..., None], departure, np.float32(np.nan)),
+            floor=ds.floor,
+            range_db=ds.range_db,
+        )
+
+    return predict
+
+
+def sight_of(rays: BistaticTransport) -> Callable[[Any], Sight]:
+    """What was traced for a receiver, by its position."""
+    known = {s.receiver.tobytes(): s for s in rays.sights}
+    return lambda receiver: known[np.asarray(receiver, np.float64).tobytes()]
