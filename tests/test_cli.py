@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from warprrf import cli
+from warprrf.rf.radio_map import RadioMap
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = (
-    "lobby", "reconstruct", "simulate", "fit", "relevance", "render", "evaluate", "twin", "bench", "data",
+    "lobby", "reconstruct", "simulate", "fit", "relevance", "render", "evaluate", "map", "twin", "bench", "data",
 )  # fmt: skip
 
 
@@ -84,6 +85,8 @@ BAD = {
         [*RENDER, "{tmp}/one.ply", "--position", "0", "0", "1", "--look-at", "0", "0", "2"],
         "--look-at",
     ),
+    "map of no kind": (["map", "{tmp}/bad.safetensors", "-o", "{tmp}/m.tif"], "m.tif"),
+    "map of a corrupt field": (["map", "{tmp}/bad.safetensors", "-o", "{tmp}/m.nc"], "bad.safetensors"),
     "field without receiver": ([*RENDER, "{tmp}/bad.safetensors"], "--receiver"),
     "no rays": (["bench", "newrf", "--data", "{tmp}", "--out", "{tmp}/run"], "newrf_conference.npz"),
     "no lobby": (["lobby", "--data", "{tmp}", "--out", "{tmp}/run"], "photos"),
@@ -209,3 +212,10 @@ def test_simulate_fit_evaluate_and_render_round_trip(
     rounded = [float(word) for word in position]
     np.testing.assert_allclose(stored["path_gain"], stored_field.spectrum(rounded).path_gain, rtol=1e-6)
     assert (tmp_path / "s.png").read_bytes()[:4] == b"\x89PNG"
+    plan = ["map", field, "-o", tmp_path / "m.nc", "--cell", 4, "--bounds", 1, 1, 13, 9, "--power-dbm", 7]
+    assert cli.main([str(word) for word in [*plan, *common]]) == 0
+    found, expected = RadioMap.load(tmp_path / "m.nc"), stored_field.radio_map(1.5, 4, bounds=[1, 1, 13, 9])
+    np.testing.assert_allclose(found.total_path_gain, expected.total_path_gain, rtol=1e-6)
+    np.testing.assert_allclose(found.best_beam_snr_db, expected.best_beam_snr_db - 13.0, atol=1e-6)
+    assert f"{found.free.sum()} cells in the air" in capsys.readouterr().out
+    assert (tmp_path / "m.png").read_bytes()[:4] == b"\x89PNG"

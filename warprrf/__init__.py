@@ -32,6 +32,7 @@ _HOMES = {
     "Paths": "rf.paths",
     "PlanarArray": "rf.arrays",
     "RadioField": "rf.field",
+    "RadioMap": "rf.radio_map",
     "Rasterizer": "geometry.render",
     "Relevance": "rf.relevance",
     "Reconstruction": "geometry.reconstruction",
@@ -96,6 +97,7 @@ if TYPE_CHECKING:
     from warprrf.rf.newrf import load_newrf as load_newrf
     from warprrf.rf.paths import Paths as Paths
     from warprrf.rf.paths import trace_paths as trace_paths
+    from warprrf.rf.radio_map import RadioMap as RadioMap
     from warprrf.rf.reflections import fit_reflections as fit_reflections
     from warprrf.rf.relevance import Relevance as Relevance
     from warprrf.rf.relevance import relevance as relevance

@@ -27,6 +27,7 @@ from warprrf.cli_help import (
     HELP_EVALUATE,
     HELP_FIT,
     HELP_LOBBY,
+    HELP_MAP,
     HELP_RECONSTRUCT,
     HELP_RELEVANCE,
     HELP_RENDER,
@@ -43,6 +44,7 @@ a walk through, in a checkout:
   warprrf fit room spectra.nc -o field.safetensors --model rf3dgs+
   warprrf evaluate field.safetensors spectra.nc --train 50
   warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
+  warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
   warprrf twin field.safetensors -o twin           scene.xml and materials.json for Sionna RT
 
 Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
@@ -214,6 +216,33 @@ def _render(args: argparse.Namespace, bars: Bars) -> None:
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     write_atomically(Path(args.out), lambda path: Image.fromarray(pixels).save(path))
     print(f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians")
+
+
+def _map(args: argparse.Namespace, bars: Bars) -> None:
+    path = Path(args.out)
+    if path.suffix not in (".nc", ".png"):
+        raise ValueError(f"{path}: expected .nc (NetCDF, a picture beside it) or .png (the picture alone)")
+    field = wr.RadioField.load(_existing(args.field), device=args.device)
+    found = field.radio_map(
+        args.height,
+        args.cell,
+        transmitter=args.transmitter,
+        bounds=args.bounds,
+        beam_sigma_rad=np.deg2rad(args.beam_sigma_deg),
+        transmit_power_dbm=args.power_dbm,
+        bandwidth_hz=args.bandwidth,
+        noise_figure_db=args.noise_figure,
+        progress=bars,
+    )
+    bars.close()
+    if path.suffix == ".nc":
+        found.save(path)
+    found.picture(path.with_suffix(".png"))
+    gain, snr = (found.shown(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))
+    print(
+        f"{path}: {found.free.sum()} cells in the air of {found.free.size}; median total path gain "
+        f"{np.median(gain):.1f} dB, median SNR of the best beam {np.median(snr):.1f} dB, lowest {snr.min():.1f} dB"
+    )
 
 
 def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
@@ -530,6 +559,26 @@ def _parser() -> argparse.ArgumentParser:
     )
     eva.add_argument("--no-lookups", dest="lookups", action="store_false", help="the field alone")
     eva.add_argument("-o", "--out", help="JSON file of the figures")
+
+    plan = add("map", _map, "a field's radio map over the floor plan", HELP_MAP)
+    plan.add_argument("field", help="field file (.safetensors)")
+    plan.add_argument("-o", "--out", required=True, help="NetCDF file (.nc), or the picture alone (.png)")
+    plan.add_argument("--height", type=float, default=1.5, metavar="M", help="of receivers (default 1.5)")
+    plan.add_argument("--cell", type=float, default=0.25, metavar="M", help="width of a cell (default 0.25)")
+    plan.add_argument(
+        "--transmitter", nargs=3, type=float, metavar=("X", "Y", "Z"), help="if another than the fitted one"
+    )
+    plan.add_argument(
+        "--bounds", nargs=4, type=float, metavar=("X0", "Y0", "X1", "Y1"), help="part of the plan, metres"
+    )
+    plan.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receive beam (default 2 degrees)")
+    plan.add_argument("--power-dbm", type=float, default=20.0, help="isotropic transmitter (default 20)")
+    plan.add_argument(
+        "--bandwidth", type=float, default=2.16e9, metavar="HZ", help="of noise (default 2.16e9)"
+    )
+    plan.add_argument(
+        "--noise-figure", type=float, default=10.0, metavar="DB", help="of receivers (default 10)"
+    )
 
     twin = add("twin", _twin, "a field's digital twin: a scene for Sionna RT", HELP_TWIN)
     twin.add_argument("field", help="field file (.safetensors) of model bistatic")

@@ -63,6 +63,16 @@ def add_benches(add: Add) -> None:
         "--small", action="store_true", help="leave out 1e5 paths between 1024 and 16 elements"
     )
     radio.add_argument("--no-sionna", action="store_true", help="leave out the comparison with Sionna RT")
+    plan = add("map", _bench, "the radio map beside Sionna RT's RadioMapSolver", HELP_BENCH, tables)
+    plan.add_argument("--out", help="folder of the results (default runs/map)")
+    plan.add_argument("--field", metavar="FILE", help="bistatic field (default: fitted to 50 spectra)")
+    plan.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    plan.add_argument("--scene", metavar="XML", help="true scene (default the lobby)")
+    plan.add_argument("--spectra", metavar="FILE", help="what the field is fitted to (default the lobby's)")
+    plan.add_argument("--cell", type=float, metavar="M", help="width of a cell (default 0.25)")
+    plan.add_argument(
+        "--reference", type=float, metavar="N", help="samples of Sionna's reference (default 1e8)"
+    )
     for name, line in (
         ("table1", "every method of the paper's table, and more, side by side"),
         ("sparsity", "PSNR and SSIM over the number of training receivers"),
@@ -188,6 +198,22 @@ def _bench_channel(args: argparse.Namespace, bars: Bars) -> None:
     print(channel.table(report))
 
 
+def _bench_map(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import radio_map
+
+    named = {name: getattr(args, name) for name in ("field", "geometry", "scene", "spectra", "cell")}
+    named["reference"] = None if args.reference is None else int(args.reference)
+    report = radio_map.run_map(
+        args.out or "runs/map",
+        seed=args.seed,
+        device=args.device,
+        progress=bars,
+        **{name: value for name, value in named.items() if value is not None},
+    )
+    bars.close()
+    print(radio_map.table(report))
+
+
 def _bench_evaluation(args: argparse.Namespace, bars: Bars) -> None:
     from warprrf.bench import evaluation
 
@@ -246,6 +272,7 @@ BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
     "relevance": _bench_relevance,
     "engine": _bench_engine,
     "channel": _bench_channel,
+    "map": _bench_map,
     "table1": _bench_evaluation,
     "sparsity": _bench_evaluation,
     "beams": _bench_beams,

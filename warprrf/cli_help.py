@@ -70,6 +70,15 @@ examples:
   warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
 """
 
+HELP_MAP = """\
+Total path gain, the strongest path's gain, delay spread and the SNR of the receiver's best beam, at the centres of
+cells; NaN inside solids and outside the room, as the field's mesh has them. A NetCDF file gets a picture beside it.
+
+examples:
+  warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
+  warprrf map field.safetensors -o corner.png --bounds 0 0 5 4 --cell 0.1 --transmitter 2 3 3.2
+"""
+
 HELP_TWIN = """\
 Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
 opens the scene as it is, all lobes Lambertian; `warprrf.load_sionna_scene` sets the scattering patterns too, and
@@ -90,6 +99,7 @@ examples:
   warprrf bench newrf --data external/newrf --out runs/newrf
   warprrf bench bistatic --truths exact --counts 10 50
   warprrf bench engine
+  warprrf bench map --field field.safetensors
   warprrf bench table1
   warprrf bench sparsity
   warprrf bench beams

@@ -28,9 +28,9 @@ def rt():
     except ImportError as error:
         pytest.skip(str(error))
     pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
-    from warprrf.rf.sionna_engine import _sionna
+    from warprrf.rf.sionna_engine import sionna_rt
 
-    return _sionna()
+    return sionna_rt()
 
 
 def solve(rt, scene, tx_array, rx_array, depth=2, diffuse=False):

@@ -27,7 +27,7 @@ from warprrf.rf.materials import Material
 from warprrf.rf.path_set import Paths, carrier_phase
 from warprrf.rf.paths import MirrorTracer, trace_paths
 from warprrf.rf.scene import Scene
-from warprrf.rf.sionna_engine import load_sionna_scene
+from warprrf.rf.sionna_engine import load_sionna_scene, sionna_rt
 from warprrf.rf.thz_channels import thz_channel
 
 FREQUENCY_HZ = 300e9
@@ -396,7 +396,7 @@ def _solve(
 ) -> tuple[Any, float]:
     """Sionna RT's paths from :data:`TRANSMITTER` to ``points``, and the seconds of its solver."""
     loaded = load_sionna_scene(room, frequency_hz=carrier)
-    rt = _device.require("sionna.rt", extra="sionna")
+    rt = sionna_rt()
     for name, (polarisation, rows, cols) in (("tx_array", tx), ("rx_array", rx)):
         array = rt.PlanarArray(num_rows=rows, num_cols=cols, pattern="iso", polarization=polarisation)
         setattr(loaded, name, array)

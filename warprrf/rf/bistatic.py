@@ -306,7 +306,7 @@ class BistaticField(RadioField):
     def compose(self, sight: Sight) -> Composed:
         """The spectrum of what is seen, by its parts."""
         p, gain = self.parameters, np.exp(self.parameters.log_gain)
-        strength = self._specular(sight.paths)
+        strength = self.path_power(sight.paths)
         image = np.tensordot(strength.astype(np.float32), sight.beams, axes=1).astype(np.float64)
         rays = np.zeros(len(self.tracer.solid_angle))
         if self.terms.diffuse:
@@ -344,7 +344,7 @@ class BistaticField(RadioField):
     def _sent_on(self, sight: Sight) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Pixel, group and path gain of what groups send on of light that other surfaces gave them."""
         parts = []
-        sent = self._sent(sight.transmitter)
+        sent = self.sent(sight.transmitter)
         if sent is not None:
             seen = sight.elements
             power = seen.power(sent, self.wavelength_m)
@@ -363,7 +363,7 @@ class BistaticField(RadioField):
             return np.zeros(self.shape)
         return mirrored_scene(
             self._mirror_tracer, sight.receiver, sight.transmitter, self.parameters, self.wavelength_m,
-            self._sent(sight.transmitter),
+            self.sent(sight.transmitter),
         )  # fmt: skip
 
     def view(self, sight: Sight, pixels: np.ndarray, target_db: np.ndarray | None = None) -> View:
@@ -454,6 +454,11 @@ class BistaticField(RadioField):
     # ------------------------------------------------------------------------------------------ parts
 
     @property
+    def mesh(self) -> Mesh:  # type: ignore[override]
+        """What blocks."""
+        return self.surface.mesh
+
+    @property
     def wavelength_m(self) -> float:
         """Wavelength [m]."""
         return SPEED_OF_LIGHT / self.frequency_hz
@@ -506,7 +511,7 @@ class BistaticField(RadioField):
             self._element_light[key] = ElementLight(self.tracer, transmitter, self.wavelength_m)
         return self._element_light[key]
 
-    def _sent(self, transmitter: np.ndarray) -> np.ndarray | None:
+    def sent(self, transmitter: np.ndarray) -> np.ndarray | None:
         """Radiance (E,) that elements send on besides first bounces [1/(m^2 sr)], None where there is none."""
         if not (self.terms.further or self.terms.indirect):
             return None
@@ -523,7 +528,7 @@ class BistaticField(RadioField):
             self._radiance[key] = sent
         return self._radiance[key]
 
-    def _specular(self, paths: SpecularPaths) -> np.ndarray:
+    def path_power(self, paths: SpecularPaths) -> np.ndarray:
         """Power of each line-of-sight and mirror path, shape ``(L,)``."""
         base = (self.wavelength_m / (4.0 * np.pi * paths.length_m)) ** 2 * paths.share**2
         power = specular_power(base, self._met_groups(paths), paths.cosine, self.parameters)[0] * np.exp(

@@ -211,9 +211,10 @@ class BounceTracer:
         self._exponent, self._norm = _lobe_tables(self.lobes, str(self.device))
         self._moments = wp.array(fresnel_curves().moments, dtype=wp.float32, device=self.device)
 
-    def meet(self, receiver: np.ndarray) -> Met:
-        """What the grid's rays from ``receiver`` (3,) meet."""
-        return self._meet(np.asarray(receiver, float).reshape(1, 3), self._directions, self._solid_angle)
+    def meet(self, receivers: np.ndarray) -> Met:
+        """What the grid's rays from ``receivers``, (3,) or (O, 3), meet, one receiver's after another's."""
+        origins = np.asarray(receivers, float).reshape(-1, 3)
+        return self._meet(origins, self._directions, self._solid_angle, len(origins) * len(self._directions))
 
     def meet_rays(self, origins: np.ndarray, directions: np.ndarray, solid_angle: np.ndarray) -> Met:
         """What rays meet: ``origins`` (O, 3), a whole number of ``directions`` (K, 3) each."""
@@ -221,10 +222,10 @@ class BounceTracer:
             origins,
             wp.array(directions, dtype=wp.vec3d, device=self.device),
             wp.array(solid_angle, dtype=wp.float32, device=self.device),
+            len(directions),
         )
 
-    def _meet(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array) -> Met:
-        count = max(len(directions), len(origins))
+    def _meet(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array, count: int) -> Met:
         met = Met(
             wp.array(origins, dtype=wp.vec3d, device=self.device), directions, solid_angle,
             wp.empty(count, dtype=wp.int32, device=self.device), wp.empty(count, dtype=wp.float64, device=self.device),

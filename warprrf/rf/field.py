@@ -10,11 +10,18 @@ import os
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from warprrf.device import Progress
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf import field_files
+from warprrf.rf.spectrum import BEAM_SIGMA_RAD
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
+    from warprrf.rf.links import Links
     from warprrf.rf.paths import Paths
+    from warprrf.rf.radio_map import RadioMap
     from warprrf.rf.spectrum import Spectrum
 
 MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
@@ -24,9 +31,19 @@ class RadioField(ABC):
     """A fitted radio field; build it with :meth:`fit` or :meth:`load`.
 
     Attributes:
+        transmitter: position it was fitted for [m], shape ``(3,)``.
+        frequency_hz: carrier [Hz].
+        shape: rows and columns of its spectra.
+        mesh: what blocks; None if the geometry has no mesh.
+        device: where it computes.
         report: how the fit went.
     """
 
+    transmitter: np.ndarray
+    frequency_hz: float
+    shape: tuple[int, int]
+    mesh: Mesh | None
+    device: Any
     report: dict[str, Any]
 
     @property
@@ -81,6 +98,43 @@ class RadioField(ABC):
     @abstractmethod
     def paths(self, rx: Any, transmitter: Any = None, max_paths: int | None = None) -> Paths:
         """Propagation paths at ``rx`` (3,) or (R, 3) [m]."""
+
+    def links(
+        self,
+        rx: Any,
+        transmitter: Any = None,
+        *,
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        shape: tuple[int, int] | None = None,
+        progress: Progress | None = None,
+    ) -> Links:
+        """Total and best path gain, delay spread and best-beam gain at ``rx`` (R, 3) [m], without spectra.
+
+        A ``bistatic`` field traces several receivers at once on a coarser grid of rays, for a small part of a
+        spectrum's time; other models take their paths one receiver at a time.
+
+        Args:
+            rx: receiver positions.
+            transmitter: as for :meth:`spectrum`.
+            beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
+            shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models.
+            progress: called as ``progress("links", done, total)``.
+
+        Raises:
+            ValueError: as for :meth:`spectrum`, and for a beam width that is not positive.
+        """
+        from warprrf.rf.links import find_links
+
+        return find_links(self, rx, transmitter, beam_sigma_rad, shape, progress)
+
+    def radio_map(
+        self, height: float, cell: float = 0.25, transmitter: Any = None, **options: Any
+    ) -> RadioMap:
+        """Links over a floor plan, at ``height`` [m] in cells of ``cell`` [m]; see
+        :func:`warprrf.rf.radio_map.radio_map`."""
+        from warprrf.rf.radio_map import radio_map
+
+        return radio_map(self, height, cell, transmitter, **options)
 
     @abstractmethod
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -22,10 +22,10 @@ EVERY = 4  # of a pixel's rays, one in so many looks for mirrored light
 
 @dataclass(frozen=True)
 class MirrorSight:
-    """What one receiver sees of mirrored light, one row for each pair of a ray and an image that lights it.
+    """What receivers see of mirrored light, one row for each pair of a ray and an image that lights it.
 
     Attributes:
-        pixel: pixel of the ray, shape ``(L,)``.
+        pixel: pixel of the ray, shape ``(L,)``; those of the second receiver count on from the first's.
         patch: the mirror, shape ``(L,)``.
         cosine: of incidence on the mirror, shape ``(L,)``.
         face: what the ray meets, on the device.
@@ -65,7 +65,7 @@ class MirrorLight:
         flat = s.mesh.face_normals
         normal = np.where(((s.normal * flat).sum(axis=1) < 0)[:, None], -s.normal, s.normal)
         centre = s.mesh.triangles.mean(axis=1)
-        face, chain, point = self.tree.candidates(centre, 1)
+        face, chain, point = self.tree.candidates(centre, 1, device=tracer.device)
         level = self.tree.levels[0]
         # light must come from in front of the face, and not from the patch that it belongs to
         facing = ((point[:, 0] - centre[face]) * normal[face]).sum(axis=1) > 0
@@ -96,9 +96,15 @@ class MirrorLight:
         share = reflected_share(self.tracer, p, self._patch, self._cosine)
         return np.bincount(self.surface.element[self._face], share * self._irradiance, minlength=elements)
 
-    def sight(self, receiver: np.ndarray, met: Met) -> MirrorSight:
-        """What the grid's rays from ``receiver`` (3,), which met ``met``, see of mirrored light."""
-        s, tracer = self.surface, self.tracer
+    def sight(self, receivers: np.ndarray, met: Met, tracer: BounceTracer | None = None) -> MirrorSight:
+        """What rays from ``receivers``, (3,) or (O, 3), see of mirrored light.
+
+        Args:
+            receivers: where they start.
+            met: what they met.
+            tracer: whose rays they are, if another's of the same surface.
+        """
+        s, tracer = self.surface, tracer or self.tracer
         rays = np.arange(0, len(met.face), EVERY)
         face = met.face.numpy()[rays]
         rays, face = rays[face >= 0], face[face >= 0]
@@ -107,12 +113,14 @@ class MirrorLight:
         row = np.repeat(np.arange(len(rays)), count)
         within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
         chain = self._chains[self._first[element[row]] + within]
-        direction = tracer.directions[rays]
-        points = receiver + met.range_m.numpy()[rays, None] * direction
+        own = rays % len(tracer.directions)
+        direction = tracer.directions[own]
+        start = np.asarray(receivers, float).reshape(-1, 3)[rays // len(tracer.directions)]
+        points = start + met.range_m.numpy()[rays, None] * direction
         if len(row) == 0:
             none = np.zeros(0, int)
             return self._pack(none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
-        row, chain, point = self.tree.candidates(points, 1, chains=chain, rows=row)
+        row, chain, point = self.tree.candidates(points, 1, chains=chain, rows=row, device=tracer.device)
         look = -direction[row]
         normal = s.normal[face[row]]
         turned = (s.mesh.face_normals[face[row]] * look).sum(axis=1) < 0
@@ -132,7 +140,7 @@ class MirrorLight:
         cos_s = np.maximum((normal[k] * look[k]).sum(axis=1), 0.0)
         high = cos_s + tracer.half_width
         low = np.maximum(cos_s - tracer.half_width, 0.01 * tracer.half_width)
-        strength = EVERY * tracer.solid_angle[rays[row[k]]] * cos_in[k]
+        strength = EVERY * tracer.solid_angle[own[row[k]]] * cos_in[k]
         strength /= (4.0 * np.pi * np.maximum(length[k], NEAREST_M)) ** 2
         return self._pack(
             rays[row[k]] // tracer.sub_pixels**2,

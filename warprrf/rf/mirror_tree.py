@@ -8,13 +8,16 @@ the P^k chains of a room is few enough to try for every receiver.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import warp as wp
 
+from warprrf import device as _device
+from warprrf.kernels.mirrors import Chains, find_chains, unfold_chains
 from warprrf.rf.surface import Surface
 
 SLACK_M = 0.1  # boxes of patches are widened by it: outlines of a reconstructed mesh are torn
-_BLOCK = 2_000_000  # candidates that are tried at once
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class MirrorTree:
         reach = np.einsum("bck,ak->abc", boxes, self.normal) - self.offset[:, None, None]
         before = reach.max(axis=2) > 0.0
         self._mutual = before & before.T
+        self._uploaded: dict[str, Any] = {}
         self.levels: list[Level] = []
         for k in range(min(order, len(self.offset)) if len(self.offset) else 0):
             self.levels.append(self._next(self.levels[-1]) if k else self._first())
@@ -95,6 +99,7 @@ class MirrorTree:
         *,
         chains: np.ndarray | None = None,
         rows: np.ndarray | None = None,
+        device: Any = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Chains of ``order`` reflections whose points lie in the boxes of their patches; nothing is cast.
 
@@ -102,46 +107,58 @@ class MirrorTree:
             points: where the chains end (N, 3).
             order: reflections.
             chains, rows: pairs of a chain and a point to try; all by default.
+            device: where all are tried.
 
         Returns:
             Index of the point and of the chain, shape ``(L,)`` each, and interaction points from the transmitter on,
             shape ``(L, order, 3)``.
         """
-        level = self.levels[order - 1]
-        if chains is not None and rows is not None:
-            return self._unfold(points, rows, chains, order)
-        step = max(1, _BLOCK // max(len(level.depth), 1))
-        parts = []
-        for start in range(0, len(points), step):
-            block = points[start : start + step]
-            last = level.patch[:, -1]
-            below = (block @ self.normal.T - self.offset)[:, last]
-            row, chain = np.nonzero(below > 0)
-            parts.append(self._unfold(points, row + start, chain, order))
-        if not parts:
-            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, order, 3))
-        return tuple(np.concatenate(p) for p in zip(*parts, strict=True))  # type: ignore[return-value]
+        where = _device.resolve(device)
+        first = sum(len(level.depth) for level in self.levels[: order - 1])
+        ends = wp.array(points, dtype=wp.vec3d, device=where)
+        if chains is None or rows is None:
+            count = len(self.levels[order - 1].depth)
+            words = wp.zeros((len(points), -(-count // 32)), dtype=wp.uint32, device=where)
+            inputs = [self._on_device(where), first, first + count, ends, words]
+            _device.launch(find_chains, words.size, inputs, device=where)
+            octets = words.numpy().astype("<u4", copy=False).view(np.uint8)
+            rows, chains = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+        found = wp.zeros((len(rows), order), dtype=wp.vec3d, device=where)
+        inside = wp.zeros(len(rows), dtype=wp.bool, device=where)
+        pairs = [wp.array(index, dtype=wp.int32, device=where) for index in (rows, first + chains)]
+        _device.launch(
+            unfold_chains, len(rows), [self._on_device(where), ends, *pairs, found, inside], device=where
+        )
+        kept = np.flatnonzero(inside.numpy())
+        return rows[kept], chains[kept], found.numpy()[kept]
 
-    def _unfold(
-        self, points: np.ndarray, row: np.ndarray, chain: np.ndarray, order: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mirror points from the receiver back to the transmitter, dropping pairs as soon as one misses its box."""
-        here = points[row]
-        link = chain
-        found = np.zeros((len(row), order, 3))
-        for k in range(order - 1, -1, -1):
-            level = self.levels[k]
-            p = level.patch[link, k]
-            side = np.einsum("nk,nk->n", self.normal[p], here) - self.offset[p]
-            share = side / np.maximum(side + level.depth[link], 1e-12)
-            point = here + share[:, None] * (level.image[link] - here)
-            keep = (side > 0) & ((point >= self.low[p] - SLACK_M) & (point <= self.high[p] + SLACK_M)).all(
-                axis=1
+    def _on_device(self, where: Any) -> Any:
+        """The kernels' view of all chains, level after level."""
+        key = str(where)
+        if key not in self._uploaded:
+            shift = np.cumsum([0, *(len(level.depth) for level in self.levels)])
+            parent = [
+                np.where(level.parent < 0, -1, level.parent + shift[max(k - 1, 0)])
+                for k, level in enumerate(self.levels)
+            ]
+            chains = Chains()
+            chains.patch = wp.array(
+                np.concatenate([level.patch[:, -1] for level in self.levels]), dtype=wp.int32, device=where
             )
-            row, chain, link, found = row[keep], chain[keep], level.parent[link[keep]], found[keep]
-            here = point[keep]
-            found[:, k] = here
-        return row, chain, found
+            chains.parent = wp.array(np.concatenate(parent), dtype=wp.int32, device=where)
+            chains.image = wp.array(
+                np.concatenate([level.image for level in self.levels]), dtype=wp.vec3d, device=where
+            )
+            chains.depth = wp.array(
+                np.concatenate([level.depth for level in self.levels]), dtype=wp.float64, device=where
+            )
+            chains.normal = wp.array(self.normal, dtype=wp.vec3d, device=where)
+            chains.plane_offset = wp.array(self.offset, dtype=wp.float64, device=where)
+            half = 0.5 * (self.high - self.low) + SLACK_M
+            chains.middle = wp.array(self.middle, dtype=wp.vec3d, device=where)
+            chains.half = wp.array(half, dtype=wp.vec3d, device=where)
+            self._uploaded[key] = chains
+        return self._uploaded[key]
 
 
 def _angular_radius(radius: np.ndarray, distance: np.ndarray) -> np.ndarray:

@@ -72,19 +72,23 @@ class ElementLight:
 
 
 def mirrored_scene(
-    tracer: BounceTracer, receiver: np.ndarray, transmitter: np.ndarray, p: Parameters, wavelength_m: float,
+    tracer: BounceTracer, receivers: np.ndarray, transmitter: np.ndarray, p: Parameters, wavelength_m: float,
     sent: np.ndarray | None,
 ) -> np.ndarray:  # fmt: skip
-    """Path gain per pixel (H, W) that mirrors show ``receiver`` of the lit scene: first bounces, and ``sent`` radiance
-    of the elements (E,) besides. ``tracer`` needs few rays a pixel."""
+    """Path gain per pixel that mirrors show ``receivers`` of the lit scene: first bounces, and ``sent`` radiance of the
+    elements (E,) besides. Shape (H, W) for one receiver (3,), (O, H, W) for several (O, 3). ``tracer`` needs few rays a
+    pixel."""
     surface = tracer.surface
-    met = tracer.meet(receiver)
+    places = np.asarray(receivers, float)
+    shape = (*places.shape[:-1], *tracer.shape, -1)
+    places = places.reshape(-1, 3)
+    met = tracer.meet(places)
     face, t = met.face.numpy(), met.range_m.numpy()
     out = np.zeros(len(face))
     known = (face >= 0) & (surface.patch[np.maximum(face, 0)] >= 0)
     group = surface.group[np.maximum(face, 0)]
     normal = surface.plane_normal[np.maximum(surface.patch[np.maximum(face, 0)], 0)]
-    d = tracer.directions
+    d = np.tile(tracer.directions, (len(places), 1))
     cosine = -(d * normal).sum(axis=1)
     share = np.where(
         known & (cosine > 0),
@@ -93,18 +97,19 @@ def mirrored_scene(
     )
     k = np.flatnonzero(share > LEAST_MIRROR)
     if len(k) == 0:
-        return out.reshape(*tracer.shape, -1).sum(axis=-1)
+        return out.reshape(shape).sum(axis=-1)
     turned = d[k] + 2.0 * cosine[k, None] * normal[k]
-    start = receiver + t[k, None] * d[k] + LIFT_M * normal[k]
-    again = tracer.meet_rays(start, turned, tracer.solid_angle[k])
+    start = places[k // len(tracer.directions)] + t[k, None] * d[k] + LIFT_M * normal[k]
+    solid_angle = tracer.solid_angle[k % len(tracer.directions)]
+    again = tracer.meet_rays(start, turned, solid_angle)
     lit = tracer.light(again, transmitter)
     power = tracer.scatter(again, lit, p.weight, p.log_excess, wavelength_m).astype(float)
     if sent is not None:
         second = again.face.numpy()
         radiance = np.where(second >= 0, sent[surface.element[np.maximum(second, 0)]], 0.0)
-        power += (wavelength_m / (4.0 * np.pi)) ** 2 * tracer.solid_angle[k] * radiance
+        power += (wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * radiance
     out[k] = share[k] * power
-    return out.reshape(*tracer.shape, -1).sum(axis=-1)
+    return out.reshape(shape).sum(axis=-1)
 
 
 @dataclass(frozen=True)

@@ -229,7 +229,7 @@ def _mirror_chains(
     surface: Surface, tree: MirrorTree, receivers: np.ndarray, order: int, device: Any
 ) -> SpecularPaths:
     """Paths of ``order`` reflections, each leg tried along one ray."""
-    row, chain, point = tree.candidates(receivers, order)
+    row, chain, point = tree.candidates(receivers, order, device=device)
     free = unobstructed(surface, tree, receivers[row], chain, point, device)
     row, chain, point = row[free], chain[free], point[free]
     patch = tree.levels[order - 1].patch[chain]
