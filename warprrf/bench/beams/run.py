@@ -14,8 +14,8 @@ from warprrf.bench.beams.links import BANDWIDTH_HZ, Ends, Links, ends, gains
 from warprrf.bench.beams.report import write
 from warprrf.bench.beams.search import hierarchical
 from warprrf.bench.bistatic.methods import source_of
-from warprrf.bench.bistatic.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
 from warprrf.bench.machine import machine
+from warprrf.bench.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
 from warprrf.bench.stages import StagedRun, source, write_atomically, write_json
 from warprrf.device import Progress
 from warprrf.rf.beams import select_beams, select_beams_multiuser, signal_over_interference
