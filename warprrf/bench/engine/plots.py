@@ -88,6 +88,7 @@ def growth(curves: dict[str, tuple[str, list[tuple[float, float]]]]) -> Any:
         x, y = np.array(points, dtype=float).T
         ax.loglog(x, y, color=COLOUR, marker="o", markersize=5, label="measured")
         ax.loglog(x, y[-1] * x / x[-1], color="#888888", linestyle=":", label="proportional")
+        ax.xaxis.set_minor_formatter(require("matplotlib.ticker", extra="plots").NullFormatter())
         ax.set_title(title)
         ax.set_xlabel(label)
         ax.set_ylabel("seconds")
