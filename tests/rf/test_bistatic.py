@@ -317,3 +317,28 @@ def test_a_tracer_on_true_materials_matches_the_exact_engine(scene: RadioScene) 
 def test_terms_state_what_they_allow() -> None:
     assert not Terms().further
     assert Terms(diffuse_order=2).further
+
+
+def test_a_fit_goes_on_after_steps_that_were_cut_short() -> None:
+    """One weight has 9 nepers to go, 1.5 a step, while pixels that nothing explains hide how much each step gains."""
+    from dataclasses import replace
+
+    lit, hopeless = 20, 4000
+    none = np.zeros((lit + hopeless, 0), np.float32)
+    basis = np.zeros((lit + hopeless, 1, 1, 3), np.float32)
+    true = fitting.Parameters.prior(1, 1)
+    basis[:lit, 0, 0] = 200.0 * fresnel_curves().at(fresnel_curves().coordinates, true.log_excess)[0][0]
+    view = fitting.View(
+        groups=np.array([0]), basis=basis, seen=np.zeros(0, int), dark=none, gain=np.zeros(0),
+        path_group=np.zeros((0, 3), int), cosine=np.zeros((0, 3)), beam=none.T,
+        extra=np.zeros(lit + hopeless, np.float32), again_group=np.zeros(0, int), again=none,
+        target_db=np.full(lit + hopeless, 40.0),
+    )  # fmt: skip
+    target = fitting.NEPER * np.log1p(fitting.predict(view, true)[0])
+    view.target_db[:lit] = target
+    start = replace(true, log_weight=true.log_weight - 9.0)
+    loose = fitting.Deviations(weight=1e3, excess=1e-3, mirror=1e3, energy=1e6)
+    found = fitting.fit_groups([view], start, np.ones(1), deviations=loose)
+    now = fitting.NEPER * np.log1p(fitting.predict(view, found.parameters)[:lit])
+    assert found.steps > 5
+    assert np.abs(now - target).max() < 0.1

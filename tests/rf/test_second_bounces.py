@@ -239,3 +239,23 @@ def test_the_beam_at_some_pixels_is_that_of_the_whole_image() -> None:
     whole = beam(images.reshape(*SHAPE, 3)).reshape(-1, 3)
     assert np.allclose(beam.at(pixels, images), whole[pixels], rtol=1e-5)
     assert np.allclose(whole.sum(axis=0), images.sum(axis=0), rtol=1e-12)
+
+
+def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
+    """In a closed room whose surfaces send L evenly, the sum over pixels is (lambda / 4 pi)^2 4 pi L."""
+    import trimesh
+
+    from warprrf.geometry.mesh import Mesh
+    from warprrf.rf.bounces import BounceTracer
+    from warprrf.rf.second_bounce import SeenElements
+    from warprrf.rf.surface import Surface
+
+    box = trimesh.creation.box((6.0, 4.0, 3.0))
+    surface = Surface.of(Mesh(box.vertices, box.faces[:, ::-1]))
+    tracer = BounceTracer(surface, (12, 24))
+    seen = SeenElements.of(tracer, tracer.meet(np.array([0.5, -0.3, 0.2])))
+    assert seen.solid_angle.sum() == pytest.approx(4.0 * np.pi, rel=1e-6)
+    radiance, wavelength = 0.7, 1e-3
+    power = seen.power(np.full(len(surface.element_area), radiance), wavelength)
+    assert power.sum() == pytest.approx((wavelength / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6)
+    assert np.array_equal(np.unique(seen.pixel), np.arange(12 * 24))
