@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from warprrf.cli_bars import Bars
 from warprrf.cli_help import (
@@ -131,14 +132,6 @@ def _bench_bistatic(args: argparse.Namespace, bars: Bars) -> None:
     from warprrf.bench import bistatic
 
     out = args.out or "runs/bistatic"
-    given = {
-        "data": args.data and (args.data if len(args.data) > 1 else args.data[0]),
-        "geometry": args.geometry,
-        "scene": args.scene,
-        "second": args.second,
-        "counts": args.counts,
-        "truths": args.truths,
-    }
     report = bistatic.run(
         out,
         every=args.every,
@@ -147,7 +140,7 @@ def _bench_bistatic(args: argparse.Namespace, bars: Bars) -> None:
         fresh=args.fresh,
         device=args.device,
         progress=bars,
-        **{name: value for name, value in given.items() if value is not None},
+        **_given(args, "data", "geometry", "scene", "second", "counts", "truths"),
     )
     bars.close()
     print(bistatic.summary_text(report))
@@ -201,14 +194,15 @@ def _bench_channel(args: argparse.Namespace, bars: Bars) -> None:
 def _bench_map(args: argparse.Namespace, bars: Bars) -> None:
     from warprrf.bench import radio_map
 
-    named = {name: getattr(args, name) for name in ("field", "geometry", "scene", "spectra", "cell")}
-    named["reference"] = None if args.reference is None else int(args.reference)
+    named = _given(args, "field", "geometry", "scene", "spectra", "cell")
+    if args.reference is not None:
+        named["reference"] = int(args.reference)
     report = radio_map.run_map(
         args.out or "runs/map",
         seed=args.seed,
         device=args.device,
         progress=bars,
-        **{name: value for name, value in named.items() if value is not None},
+        **named,
     )
     bars.close()
     print(radio_map.table(report))
@@ -218,12 +212,11 @@ def _bench_evaluation(args: argparse.Namespace, bars: Bars) -> None:
     from warprrf.bench import evaluation
 
     out = args.out or "runs/evaluation"
-    names = ("geometry", "scene", "methods", "truths", "splits", "counts", "seeds", "every")
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    given = _given(
+        args, "data", "geometry", "scene", "methods", "truths", "splits", "counts", "seeds", "every"
+    )
     if args.seed and "seeds" not in given:
         given["seeds"] = [args.seed]
-    if args.data:
-        given["data"] = args.data if len(args.data) > 1 else args.data[0]
     report = evaluation.run(
         args.name,
         out,
@@ -244,14 +237,6 @@ def _bench_beams(args: argparse.Namespace, bars: Bars) -> None:
     from warprrf.bench import beams
 
     out = args.out or "runs/beams"
-    given = {
-        "data": args.data and (args.data if len(args.data) > 1 else args.data[0]),
-        "geometry": args.geometry,
-        "scene": args.scene,
-        "counts": args.counts,
-        "truths": args.truths,
-        "sides": args.sides,
-    }
     report = beams.run_beams(
         out,
         every=args.every,
@@ -259,11 +244,19 @@ def _bench_beams(args: argparse.Namespace, bars: Bars) -> None:
         fresh=args.fresh,
         device=args.device,
         progress=bars,
-        **{name: value for name, value in given.items() if value is not None},
+        **_given(args, "data", "geometry", "scene", "counts", "truths", "sides"),
     )
     bars.close()
     print(beams.summary_text(report))
     print(f"\n{Path(out) / 'beams.md'}: the tables with pictures; beams.json: every figure")
+
+
+def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the options that were given; one file or folder of data by itself."""
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if len(given.get("data", ())) == 1:
+        given["data"] = given["data"][0]
+    return given
 
 
 BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
