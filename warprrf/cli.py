@@ -131,6 +131,7 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
         beam_sigma_rad=np.deg2rad(args.beam_sigma_deg),
         refraction=args.refraction,
         seed=args.seed,
+        gas=args.gas,
         workspace=unfinished,
         progress=bars,
         device=args.device,
@@ -499,6 +500,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     sim.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receiver beam (default 2 degrees)")
     sim.add_argument("--refraction", action="store_true", help="transmission through walls (sionna)")
+    sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
 
     fit = add("fit", _fit, "a radio field from geometry and measured spectra", HELP_FIT)
     fit.add_argument("geometry", help="a reconstruction's folder, splats (.ply) or a scene (.xml)")

@@ -164,6 +164,26 @@ def light_surface(
                 grazing[k] = wp.log(high / low) / (high - low)
 
 
+@wp.kernel
+def absorb(
+    offset: int,
+    source: wp.vec3d,
+    loss: float,
+    origins: wp.array(dtype=wp.vec3d),
+    per_origin: int,
+    directions: wp.array(dtype=wp.vec3d),
+    face: wp.array(dtype=wp.int32),
+    range_m: wp.array(dtype=wp.float64),
+    strength: wp.array(dtype=wp.float32),
+):
+    """Take from ``strength`` what air of ``loss`` [neper/m] keeps between source, what the ray met and its origin."""
+    k = offset + wp.tid()
+    if strength[k] > 0.0:
+        point = origins[k / per_origin] + range_m[k] * directions[k % directions.shape[0]]
+        length = wp.float32(wp.length(source - point) + range_m[k])
+        strength[k] = strength[k] * wp.exp(-loss * length)
+
+
 @wp.func
 def table_value(table: wp.array2d(dtype=wp.float32), row: int, cosine: float):
     """Row of a table over cosine in [0, 1], interpolated linearly."""

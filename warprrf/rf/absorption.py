@@ -6,6 +6,7 @@ Doppler broadening, and the dry continuum. No line data is fetched: both tables 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ LOW_HZ, HIGH_HZ = 1e9, 1000e9
 TEMPERATURE_K = 288.15  # ITU-R P.835, mean annual global reference atmosphere at sea level
 PRESSURE_HPA = 1013.25
 WATER_VAPOUR_G_M3 = 7.5
+_PREFIX = "air_"
 
 
 @dataclass(frozen=True)
@@ -41,23 +43,47 @@ class Air:
             water_vapour_g_m3=self.water_vapour_g_m3,
         )
 
+    def transmittance(self, frequency_hz: float, length_m: Any) -> np.ndarray:
+        """Share of power that ``length_m`` [m] of it lets through, 10^(-gamma d / 10), shape as ``length_m``."""
+        return np.asarray(10.0 ** (-0.1 * self.attenuation_db_per_m(frequency_hz) * np.asarray(length_m)))
 
-def air_of(gas: Any) -> Air | None:
+    def loss_per_m(self, frequency_hz: float) -> float:
+        """Loss of power [neper/m]: transmittance is exp of minus this a metre."""
+        return float(0.1 * np.log(10.0) * self.attenuation_db_per_m(frequency_hz))
+
+    @property
+    def attributes(self) -> dict[str, float]:
+        """As attributes of a file: ``air_temperature_k`` and so on."""
+        return {f"{_PREFIX}{name}": value for name, value in vars(self).items()}
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, Any]) -> Air | None:
+        """The air among a file's attributes; None if there is none."""
+        found = {k.removeprefix(_PREFIX): float(v) for k, v in attributes.items() if k.startswith(_PREFIX)}
+        return cls(**found) if found else None
+
+
+def air_of(gas: Any, frequency_hz: float | None = None) -> Air | None:
     """The air to reckon with: None for False, the standard atmosphere for True, :class:`Air` as it is.
 
     A :class:`~warprrf.rf.relevance.Relevance` decides by whether it kept the effect "gas".
 
     Raises:
         TypeError: for anything else.
+        ValueError: if air is to be reckoned with at a ``frequency_hz`` outside ITU-R P.676.
     """
-    if gas is None or isinstance(gas, Air):
-        return gas
-    if isinstance(gas, bool | np.bool_):
-        return Air() if gas else None
     kept = getattr(gas, "kept", None)
-    if isinstance(kept, tuple):
-        return Air() if "gas" in kept else None
-    raise TypeError(f"gas: got {type(gas).__name__}, expected True, False, an Air or a Relevance")
+    if gas is None or isinstance(gas, Air):
+        air = gas
+    elif isinstance(gas, bool | np.bool_):
+        air = Air() if gas else None
+    elif isinstance(kept, tuple):
+        air = Air() if "gas" in kept else None
+    else:
+        raise TypeError(f"gas: got {type(gas).__name__}, expected True, False, an Air or a Relevance")
+    if air is not None and frequency_hz is not None:
+        air.attenuation_db_per_m(frequency_hz)
+    return air
 
 
 def gas_attenuation_db_per_m(

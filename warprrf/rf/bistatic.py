@@ -7,6 +7,8 @@ A pixel holds the power of every path of a scattering surface, spread by the rec
   normalised lobes (:mod:`warprrf.rf.bounces`);
 - what those light in turn (:mod:`warprrf.rf.second_bounce`), and an indirect radiance of each group.
 
+Where the data hold absorption by the air, every leg of a path has its own.
+
 Parameters belong to groups of surfaces that look alike and are few, so ten spectra suffice; because each term is a
 function of both directions and of the path's lengths, the field holds for a transmitter that it never saw.
 """
@@ -23,8 +25,9 @@ import numpy as np
 from warprrf.device import check_array
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf import field_files
+from warprrf.rf.absorption import Air, air_of
 from warprrf.rf.bistatic_fit import NEPER, Layout, Parameters, View, jacobian, specular_power
-from warprrf.rf.bounces import LOBES, BeamOperator, BounceTracer, Lit, Met
+from warprrf.rf.bounces import LOBES, SUB_PIXELS, BeamOperator, BounceTracer, Lit, Met
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.mirror_light import MirrorSight
@@ -144,6 +147,7 @@ class BistaticField(RadioField):
         material: of each group, shape ``(G,)``.
         residual: ln gain of each element over its group, shape ``(E,)``.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
+        air: absorption of every path: that of the data set it was fitted to; None for none.
         report: how the fit went.
     """
 
@@ -159,6 +163,7 @@ class BistaticField(RadioField):
     material: np.ndarray = field(repr=False)
     residual: np.ndarray = field(repr=False)
     errors: ErrorModel | None = field(default=None, repr=False)
+    air: Air | None = None
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: Any = field(default=None, repr=False)
 
@@ -180,7 +185,7 @@ class BistaticField(RadioField):
     ) -> BistaticField:
         """The field before any measurement: every surface is taken for :meth:`Parameters.prior`.
 
-        Of ``ds`` only transmitter, carrier, grid, beam, floor and range count; its spectra are not looked at.
+        Of ``ds`` only transmitter, carrier, grid, beam, floor, range and air count; its spectra are not looked at.
 
         Args:
             geometry: Reconstruction, Scene, Mesh or Surface.
@@ -204,10 +209,15 @@ class BistaticField(RadioField):
             parameters=Parameters.prior(surface.groups, len(modelled.lobes)),
             material=surface.material,
             residual=np.zeros(len(surface.element_area)),
+            air=getattr(ds, "air", None),
             device=device,
         )
 
     # ------------------------------------------------------------------------------------------ asking
+
+    def with_gas(self, gas: Any = True) -> BistaticField:
+        """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
+        return replace(self, air=air_of(gas, self.frequency_hz))
 
     def spectrum(
         self, rx: Any, transmitter: Any = None, *, uncertainty: bool = False, sight: Sight | None = None
@@ -376,6 +386,7 @@ class BistaticField(RadioField):
         face = sight.met.face.numpy()
         met = np.flatnonzero(face >= 0)
         rays = (self.wavelength_m / (4.0 * np.pi)) ** 2 * self.tracer.solid_angle[met] / self.floor
+        rays = rays * self.tracer.through_air(sight.met.range_m.numpy()[met])
         cell = (met // self.tracer.sub_pixels**2) * groups + self.surface.group[face[met]]
         dark = np.bincount(cell, rays, minlength=count * groups).reshape(count, groups)
         visible = np.flatnonzero(dark.any(axis=0))
@@ -383,6 +394,7 @@ class BistaticField(RadioField):
         gain = (
             (self.wavelength_m / (4.0 * np.pi * sight.paths.length_m)) ** 2
             * sight.paths.share**2
+            * self.tracer.through_air(sight.paths.length_m)
             / self.floor
         )
         return View(
@@ -414,6 +426,7 @@ class BistaticField(RadioField):
         header = {name: getattr(self, name) for name in _PLAIN}
         header |= {"model": "bistatic", "terms": asdict(self.terms), "report": self.report}
         header |= {"log_gain": p.log_gain, "group_names": s.group_names, "skin_m": s.skin_m}
+        header |= {} if self.air is None else self.air.attributes
         field_files.write(path, tensors, header)
 
     @classmethod
@@ -443,6 +456,7 @@ class BistaticField(RadioField):
                 material=tensors["material"],
                 residual=tensors["residual"],
                 errors=ErrorModel(**errors) if errors else None,
+                air=Air.from_attributes(header),
                 report=header["report"],
                 device=device,
             )
@@ -466,7 +480,14 @@ class BistaticField(RadioField):
     @cached_property
     def tracer(self) -> BounceTracer:
         """Rays of the grid on the surface."""
-        return BounceTracer(self.surface, self.shape, lobes=self.terms.lobes, device=self.device)
+        return self.tracer_of(self.shape)
+
+    def tracer_of(self, shape: tuple[int, int], sub_pixels: int = SUB_PIXELS) -> BounceTracer:
+        """Rays of a grid of ``shape`` on the surface, ``sub_pixels`` squared a pixel."""
+        loss = 0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz)
+        return BounceTracer(
+            self.surface, shape, lobes=self.terms.lobes, sub_pixels=sub_pixels, loss_per_m=loss, device=self.device
+        )  # fmt: skip
 
     @cached_property
     def beam(self) -> BeamOperator:
@@ -475,13 +496,7 @@ class BistaticField(RadioField):
 
     @cached_property
     def _mirror_tracer(self) -> BounceTracer:
-        return BounceTracer(
-            self.surface,
-            self.shape,
-            lobes=self.terms.lobes,
-            sub_pixels=MIRRORED_SUB_PIXELS,
-            device=self.device,
-        )
+        return self.tracer_of(self.shape, MIRRORED_SUB_PIXELS)
 
     @cached_property
     def _element_light(self) -> dict[bytes, ElementLight]:
@@ -531,6 +546,7 @@ class BistaticField(RadioField):
     def path_power(self, paths: SpecularPaths) -> np.ndarray:
         """Power of each line-of-sight and mirror path, shape ``(L,)``."""
         base = (self.wavelength_m / (4.0 * np.pi * paths.length_m)) ** 2 * paths.share**2
+        base = base * self.tracer.through_air(paths.length_m)
         power = specular_power(base, self._met_groups(paths), paths.cosine, self.parameters)[0] * np.exp(
             self.parameters.log_gain
         )
@@ -604,7 +620,7 @@ class BistaticField(RadioField):
             self.frequency_hz,
         )
         order = np.argsort(-np.abs(found.gain), kind="stable")[:max_paths]
-        return found.select(order)
+        return replace(found.select(order), air=self.air)
 
     def _anything(self, sight: Sight, parts: Composed) -> np.ndarray:
         """A trace of power for every ray that meets something, so that a pixel lit by further bounces has a point."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warprrf.rf.bounces import BounceTracer, Met
+from warprrf.rf.bounces import Met
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.links import BeamSearch, Links
 from warprrf.rf.second_bounce import mirrored_scene
@@ -44,9 +44,8 @@ class LinkTracer:
         shape: tuple[int, int] = SHAPE,
     ) -> None:
         self.field, self.transmitter, self.shape = field, transmitter, shape
-        common = {"lobes": field.terms.lobes, "device": field.device}
-        self._tracer = BounceTracer(field.surface, shape, sub_pixels=SUB_PIXELS, **common)
-        self._mirror_tracer = BounceTracer(field.surface, shape, sub_pixels=1, **common)
+        self._tracer = field.tracer_of(shape, SUB_PIXELS)
+        self._mirror_tracer = field.tracer_of(shape, 1)
         self._search = BeamSearch(shape, beam_sigma_rad, device=field.device)
         self._sent = field.sent(transmitter) if field.terms.diffuse else None
         lit_by_mirrors = field.terms.diffuse and field.terms.mirror_scatter
@@ -103,6 +102,7 @@ class LinkTracer:
         solid_angle = np.tile(tracer.solid_angle, count)
         if self._sent is not None:
             radiance = np.where(meets, self._sent[element], 0.0)
+            radiance = radiance * tracer.through_air(np.where(meets, met.range_m.numpy(), 0.0))
             power += (field.wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * radiance
         # What is known by pixels alone goes to the pixel's rays in equal shares.
         per_pixel = tracer.sub_pixels**2

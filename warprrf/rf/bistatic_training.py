@@ -11,6 +11,7 @@ import numpy as np
 
 from warprrf.device import Progress, check_array
 from warprrf.rf import bistatic_fit as _fit
+from warprrf.rf.absorption import Air
 from warprrf.rf.bistatic import BistaticField, Sight, Terms
 from warprrf.rf.bistatic_fit import NEPER, Fit, Parameters, View
 from warprrf.rf.bounces import LOBES
@@ -58,7 +59,7 @@ class BistaticTransport:
     Attributes:
         surface: patches, groups, elements.
         sights: one for each receiver.
-        transmitter, frequency_hz, shape, beam_sigma_rad: what it was traced for.
+        transmitter, frequency_hz, shape, beam_sigma_rad, air: what it was traced for.
         lobes: exponents of the lobes.
         seconds: what it took.
     """
@@ -71,6 +72,7 @@ class BistaticTransport:
     beam_sigma_rad: float
     lobes: tuple[int, ...]
     seconds: float
+    air: Air | None = None
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> BistaticTransport:
         """Some of its receivers."""
@@ -112,7 +114,7 @@ def trace(
             progress("transport", r + 1, len(receivers))
     return BistaticTransport(
         surface, sights, blank.transmitter, blank.frequency_hz, blank.shape, blank.beam_sigma_rad, blank.terms.lobes,
-        time.perf_counter() - started,
+        time.perf_counter() - started, blank.air,
     )  # fmt: skip
 
 
@@ -470,10 +472,11 @@ def _check_transport(seen: BistaticTransport, ds: SpectrumDataset, lobes: tuple[
         and all(np.array_equal(s.receiver, r) for s, r in zip(seen.sights, ds.receivers, strict=True))
         and np.array_equal(seen.transmitter, ds.transmitter)
         and seen.frequency_hz == ds.frequency_hz
+        and seen.air == getattr(ds, "air", None)
         and (lobes is None or tuple(lobes) == seen.lobes)
     )
     if not same:
         raise ValueError(
             f"transport: got what {len(seen.sights)} receivers see with lobes {seen.lobes}; expected exactly the "
-            f"{len(ds.receivers)} receivers, transmitter, carrier, grid and lobes of this fit"
+            f"{len(ds.receivers)} receivers, transmitter, carrier, grid, air and lobes of this fit"
         )

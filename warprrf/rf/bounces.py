@@ -7,7 +7,8 @@ the footprint of its solid angle Omega:
 
     (lambda / 4 pi)^2 Omega f_s |Gamma|^2 cos(theta_i) / (cos(theta_s) d1^2)
 
-with f_s a mix of normalised lobes and |Gamma|^2 a Fresnel curve of one permittivity per material group.
+with f_s a mix of normalised lobes and |Gamma|^2 a Fresnel curve of one permittivity per material group. Absorption by
+the air is that of each leg: lit rays hold those from the source to the ray's origin.
 """
 
 from __future__ import annotations
@@ -190,6 +191,7 @@ class BounceTracer:
         shape: rows and columns of a spectrum.
         lobes: exponents of the lobe mix.
         sub_pixels: square root of the rays per pixel.
+        loss_per_m: absorption by the air [neper/m].
         device: where rays are cast.
     """
 
@@ -200,9 +202,11 @@ class BounceTracer:
         *,
         lobes: tuple[int, ...] = LOBES,
         sub_pixels: int = SUB_PIXELS,
+        loss_per_m: float = 0.0,
         device: Any = None,
     ) -> None:
         self.surface, self.shape, self.lobes, self.sub_pixels = surface, shape, tuple(lobes), sub_pixels
+        self.loss_per_m = float(loss_per_m)
         self.device = _device.resolve(device)
         self.directions, self.solid_angle = sub_pixel_directions(shape, sub_pixels)
         self._directions = wp.array(self.directions, dtype=wp.vec3d, device=self.device)
@@ -210,6 +214,10 @@ class BounceTracer:
         self.half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
         self._exponent, self._norm = _lobe_tables(self.lobes, str(self.device))
         self._moments = wp.array(fresnel_curves().moments, dtype=wp.float32, device=self.device)
+
+    def through_air(self, length_m: Any) -> np.ndarray | float:
+        """Share of power that ``length_m`` [m] of air lets through; 1.0 without absorption."""
+        return np.exp(-self.loss_per_m * np.asarray(length_m)) if self.loss_per_m else 1.0
 
     def meet(self, receivers: np.ndarray) -> Met:
         """What the grid's rays from ``receivers``, (3,) or (O, 3), meet, one receiver's after another's."""
@@ -250,6 +258,9 @@ class BounceTracer:
             NEAREST_M,            *lit.inputs,
         ]  # fmt: skip
         _device.launch(bounce.light_surface, count, inputs, device=self.device)
+        if self.loss_per_m:
+            inputs = [source.position, self.loss_per_m, *met.inputs, lit.strength]
+            _device.launch(bounce.absorb, count, inputs, device=self.device)
         return lit
 
     def resolve(self, met: Met, lit: Lit, wavelength_m: float) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
+from warprrf.rf.absorption import Air
 from warprrf.rf.antenna import deembed_dataset
 from warprrf.rf.paths import check_frequency
 from warprrf.rf.spectrum import Spectrum, check_shape, default_floor, pixel_angles, to_db
@@ -52,7 +53,7 @@ class SpectrumDataset:
         seed: Seed of the engine.
         role: "train" or "test" for each receiver, shape ``(R,)``.
         line_of_sight: Whether the receiver sees the transmitter, shape ``(R,)``, bool.
-        attributes: Anything else worth keeping: depth, samples, versions.
+        attributes: Anything else worth keeping: depth, samples, versions; the air (:attr:`air`).
     """
 
     receivers: np.ndarray
@@ -170,6 +171,11 @@ class SpectrumDataset:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of a spectrum."""
         return self.path_gain.shape[1], self.path_gain.shape[2]
+
+    @property
+    def air(self) -> Air | None:
+        """The air whose absorption is in the path gains, by the attributes ``air_...``; None for none."""
+        return Air.from_attributes(self.attributes)
 
     @property
     def path_gain_db(self) -> np.ndarray:

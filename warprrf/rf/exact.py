@@ -3,7 +3,8 @@
 Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths`). Diffuse scattering is evaluated along 64
 directions per pixel, each with one receiver ray and one shadow ray on the mesh, as a path of its own: path gain
 (lambda / 4 pi)^2 S^2 |Gamma|^2 f_s cos(theta_i) / (cos(theta_s) d1^2) times its share of the pixel's solid angle, with
-|Gamma|^2 the mean over transmit polarisations. All paths are spread by one receiver beam.
+|Gamma|^2 the mean over transmit polarisations. All paths are spread by one receiver beam. Absorption by the air, where
+asked for, is that of each path's own length.
 
 The directions form a rank-1 lattice of equal solid angles, shifted from row to row and column to column: a regular grid
 would meet upright edges in whole columns, and errs 3 to 5 times more.
@@ -21,6 +22,7 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.scatter import scatter_to_receiver
+from warprrf.rf.absorption import air_of
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, SurfaceTable
 from warprrf.rf.paths import MirrorTracer, Paths
 from warprrf.rf.spectrum import (
@@ -89,6 +91,7 @@ class ExactEngine:
         shape: Rows and columns of the spectrum.
         beam_sigma_rad: Receiver beam width [rad].
         sub_pixels: Square root of the number of directions per pixel.
+        gas: Absorption of the air: see :meth:`Paths.with_gas`.
         device: Where rays are cast and beams spread.
     """
 
@@ -101,6 +104,7 @@ class ExactEngine:
         shape: tuple[int, int],
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         sub_pixels: int = SUB_PIXELS,
+        gas: Any = False,
         device: Any = None,
     ) -> None:
         if sub_pixels < 1:
@@ -108,6 +112,7 @@ class ExactEngine:
         self.shape = check_shape(shape)
         self.beam_sigma_rad = beam_sigma_rad
         self.sub_pixels = sub_pixels
+        self.air = air_of(gas)
         self.tracer = MirrorTracer(scene, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
         if self.tracer.table is None:
             raise TypeError(
@@ -153,12 +158,18 @@ class ExactEngine:
         _device.launch(scatter_to_receiver, count, inputs, device=self.device)
         power = radiance.numpy() * grid.solid_angles
         lit = np.flatnonzero(power > 0)
-        return DiffusePaths(grid.directions[lit], power[lit], range_m.numpy()[lit], lit)
+        direction, power, reach = grid.directions[lit], power[lit], range_m.numpy()[lit]
+        if self.air is not None:
+            way = receiver + reach[:, None] * direction - self.tracer.transmitter
+            power = power * self.air.transmittance(
+                self.tracer.frequency_hz, np.linalg.norm(way, axis=1) + reach
+            )
+        return DiffusePaths(direction, power, reach, lit)
 
     def receive(self, receiver: Any) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         point = _device.check_array("receiver", receiver, (3,))
-        specular = self.tracer.trace(point, 1)
+        specular = self.tracer.trace(point, 1).with_gas(self.air)
         scattered = self.diffuse(point)
         directions = np.concatenate([specular.arrival, scattered.direction])
         power = np.concatenate([specular.power, scattered.power])

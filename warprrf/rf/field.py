@@ -18,6 +18,9 @@ from warprrf.rf import field_files
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD
 
 if TYPE_CHECKING:
+    from typing import Self
+
+    from warprrf.rf.absorption import Air
     from warprrf.rf.dataset import SpectrumDataset
     from warprrf.rf.links import Links
     from warprrf.rf.paths import Paths
@@ -35,6 +38,7 @@ class RadioField(ABC):
         frequency_hz: carrier [Hz].
         shape: rows and columns of its spectra.
         mesh: what blocks; None if the geometry has no mesh.
+        air: absorption in its path gains, that of the data set it was fitted to; None for none.
         device: where it computes.
         report: how the fit went.
     """
@@ -43,6 +47,7 @@ class RadioField(ABC):
     frequency_hz: float
     shape: tuple[int, int]
     mesh: Mesh | None
+    air: Air | None
     device: Any
     report: dict[str, Any]
 
@@ -90,6 +95,18 @@ class RadioField(ABC):
         from warprrf.rf.harmonic import HarmonicField
 
         return HarmonicField.load(path, device=device)
+
+    @abstractmethod
+    def with_gas(self, gas: Any = True) -> Self:
+        """The same field with the absorption of ``gas`` over every path's length, in place of what it had.
+
+        Args:
+            gas: False for none, True for the standard atmosphere, :class:`Air`, or a :class:`Relevance`, which says
+                whether the absorption is worth its tolerance.
+
+        Raises:
+            ValueError: for a carrier outside ITU-R P.676; for an ``rf3dgs`` field, which has no lengths.
+        """
 
     @abstractmethod
     def spectrum(self, rx: Any, transmitter: Any = None) -> Spectrum:

@@ -31,6 +31,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.kernels import field as _kernels
 from warprrf.rf import field_files
 from warprrf.rf import transport as _transport
+from warprrf.rf.absorption import Air, air_of
 from warprrf.rf.field import RadioField
 from warprrf.rf.field_paths import View, near_line_of_sight, paths_of
 from warprrf.rf.field_targets import targets
@@ -67,6 +68,8 @@ class HarmonicField(RadioField):
             ``aod_x``, ``aod_y``, ``aod_z``.
         gain_unit: linear factor of the gain layer.
         delay_unit: seconds per unit of the delay layer.
+        air: absorption over every path's length, that of the data set it was fitted to; None for none. ``rf3dgs`` has
+            lengths for an explicit line of sight alone and learns it with the gain.
         report: how the fit went: seconds, pairs, losses, Gaussians seen.
     """
 
@@ -82,6 +85,7 @@ class HarmonicField(RadioField):
     layers: dict[str, np.ndarray] = field(repr=False)
     gain_unit: float
     delay_unit: float
+    air: Air | None = None
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: Any = field(default=None, repr=False)
     _uploaded: dict[str, wp.array] = field(default_factory=dict, init=False, repr=False)
@@ -180,6 +184,7 @@ class HarmonicField(RadioField):
             layers={},
             gain_unit=1.0,
             delay_unit=1.0,
+            air=getattr(ds, "air", None),
             device=device,
         )
         listed = None
@@ -248,6 +253,16 @@ class HarmonicField(RadioField):
             },
         )
 
+    def with_gas(self, gas: Any = True) -> HarmonicField:
+        """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
+        air = air_of(gas, self.frequency_hz)
+        if air != self.air and self.options.model == "rf3dgs":
+            raise ValueError(
+                f"gas: got {gas!r}, but an rf3dgs field knows no lengths and holds what absorption its spectra had; "
+                'fit model="rf3dgs+", or fit again'
+            )
+        return replace(self, air=air)
+
     def spectrum(self, rx: Any, transmitter: Any = None, *, transport: Transport | None = None) -> Spectrum:
         """The spatial spectrum at ``rx`` (3,) [m].
 
@@ -283,11 +298,14 @@ class HarmonicField(RadioField):
             raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
         positions = _transport.check_receiver("rx", rx, self.mesh)
         found = [
-            paths_of(
-                self._look(position, transmitter, None),
-                beam_sigma_rad=self.beam_sigma_rad,
-                frequency_hz=self.frequency_hz,
-                max_paths=max_paths,
+            replace(
+                paths_of(
+                    self._look(position, transmitter, None),
+                    beam_sigma_rad=self.beam_sigma_rad,
+                    frequency_hz=self.frequency_hz,
+                    max_paths=max_paths,
+                ),
+                air=self.air,
             )
             for position in np.atleast_2d(positions)
         ]
@@ -302,6 +320,7 @@ class HarmonicField(RadioField):
             tensors["mesh/vertices"], tensors["mesh/faces"] = self.mesh.vertices, self.mesh.faces
         tensors["transmitter"] = self.transmitter
         header = {name: getattr(self, name) for name in _PLAIN}
+        header |= {} if self.air is None else self.air.attributes
         field_files.write(path, tensors, {**header, "options": asdict(self.options), "report": self.report})
 
     @classmethod
@@ -329,6 +348,7 @@ class HarmonicField(RadioField):
                 transmitter=tensors["transmitter"],
                 options=FieldOptions(**header["options"]),
                 layers=layers,
+                air=Air.from_attributes(header),
                 report=header["report"],
                 device=device,
             )
@@ -348,6 +368,7 @@ class HarmonicField(RadioField):
             self.frequency_hz,
             self.beam_sigma_rad,
             self.device,
+            self.air,
         )
 
     def _blend(self, name: str, seen: Transport) -> np.ndarray:

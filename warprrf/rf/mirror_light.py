@@ -83,7 +83,7 @@ class MirrorLight:
         self._cosine = np.abs((toward * s.plane_normal[patch]).sum(axis=1))
         cos_in = np.maximum((toward * normal[face]).sum(axis=1), 0.0)
         share = s.mesh.areas[face] / s.element_area[s.element[face]]
-        self._irradiance = share * cos_in / np.maximum(length, NEAREST_M) ** 2
+        self._irradiance = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * tracer.through_air(length)
         pairs = np.unique(s.element[face].astype(np.int64) * len(level.depth) + chain)
         self._chains = pairs % len(level.depth)
         self._first = np.searchsorted(pairs // len(level.depth), np.arange(elements + 1))
@@ -142,6 +142,7 @@ class MirrorLight:
         low = np.maximum(cos_s - tracer.half_width, 0.01 * tracer.half_width)
         strength = EVERY * tracer.solid_angle[own[row[k]]] * cos_in[k]
         strength /= (4.0 * np.pi * np.maximum(length[k], NEAREST_M)) ** 2
+        strength *= tracer.through_air(length[k] + met.range_m.numpy()[rays[row[k]]])
         return self._pack(
             rays[row[k]] // tracer.sub_pixels**2,
             patch[k],

@@ -70,7 +70,7 @@ def save_paths(paths: Paths, path: str | os.PathLike[str]) -> None:
     if several.frequency_hz is not None:
         attributes["frequency_hz"] = several.frequency_hz
     if several.air is not None:
-        attributes |= {f"air_{name}": value for name, value in vars(several.air).items()}
+        attributes |= several.air.attributes
     data = xarray.Dataset(variables, attrs=attributes)
     write_whole(path, lambda temporary: data.to_netcdf(temporary, engine="h5netcdf"), suffix=".nc")
 
@@ -90,7 +90,6 @@ def load_paths(path: str | os.PathLike[str]) -> Paths:
             raise ValueError(f"path: {path} holds {data.attrs.get('format')!r}, expected {_FORMAT!r}")
         held = {name: np.asarray(data[name].values) for name in data.variables}
         attributes = dict(data.attrs)
-    air = {k.removeprefix("air_"): float(v) for k, v in attributes.items() if k.startswith("air_")}
     several = Paths(
         gain=held["gain_real"] + 1j * held["gain_imag"],
         vertices=held["vertices"],
@@ -100,7 +99,7 @@ def load_paths(path: str | os.PathLike[str]) -> Paths:
         frequency_hz=float(attributes["frequency_hz"]) if "frequency_hz" in attributes else None,
         transmitter=held.get("transmitter_position"),
         receiver=held.get("receiver_position"),
-        air=Air(**air) if air else None,
+        air=Air.from_attributes(attributes),
         **{name: held[name] for name in _UNITS},
     )
     return several[0] if int(attributes["single_receiver"]) else several

@@ -231,7 +231,8 @@ def relevance(
         tolerance_db: what all that is left out may change together [dB].
         floor: N0 of the dB images; by default a field's own, else 60 dB below the median peak of the full model.
         shape, beam_sigma_rad: of the spectra; a field's own if it is one.
-        gas_db_per_m: attenuation of the air; None for that of standard air (:func:`gas_attenuation_db_per_m`).
+        gas_db_per_m: attenuation of the air; None for that of a field's own air, else of standard air
+            (:func:`gas_attenuation_db_per_m`).
         device: where rays are cast.
         progress: called with the stage ``"relevance"``.
 
@@ -277,6 +278,8 @@ def relevances(
         frequency_hz, shape, beam_sigma_rad = own, geometry.shape, geometry.beam_sigma_rad
         transmitter = geometry.transmitter if transmitter is None else transmitter
         floor = geometry.floor if floor is None else floor
+        if gas_db_per_m is None and geometry.air is not None:
+            gas_db_per_m = geometry.air.attenuation_db_per_m(own)
     for name, value in (("transmitter", transmitter), ("frequency_hz", frequency_hz)):
         if value is None:
             raise ValueError(f"{name}: got None, expected it for anything but a fitted field")

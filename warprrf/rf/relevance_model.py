@@ -105,7 +105,7 @@ def full_field(
     if isinstance(geometry, BistaticField):
         terms = replace(geometry.terms, line_of_sight=True, diffuse=True, **further)
         return (
-            replace(geometry, terms=terms, transmitter=transmitter),
+            replace(geometry, terms=terms, transmitter=transmitter, air=None),  # judged as a part of its own
             _unknown_walls(geometry.surface.mesh),
             "fit",
         )

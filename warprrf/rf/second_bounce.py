@@ -46,6 +46,9 @@ class ElementLight:
             len(point), RAYS
         )
         self._meets = (face >= 0).reshape(len(point), RAYS)
+        self._between = np.broadcast_to(
+            tracer.through_air(self._met.range_m.numpy()), self._meets.size
+        ).reshape(self._meets.shape)
 
     def radiance(self, p: Parameters, *, mirrors: bool, diffuse: int) -> np.ndarray:
         """Radiance that each element sends on under parameters ``p``, shape ``(E,)`` [1/(m^2 sr)].
@@ -63,7 +66,8 @@ class ElementLight:
         if diffuse >= 2:
             before = total + self.mirrors.irradiance(p) if mirrors else total
             sent = share * before
-            total = total + np.pi * np.where(self._meets, sent[self._sees], 0.0).mean(axis=1)
+            seen = np.where(self._meets, sent[self._sees] * self._between, 0.0)
+            total = total + np.pi * seen.mean(axis=1)
         return share * total
 
     def reflectance(self, p: Parameters) -> np.ndarray:
@@ -107,14 +111,16 @@ def mirrored_scene(
     if sent is not None:
         second = again.face.numpy()
         radiance = np.where(second >= 0, sent[surface.element[np.maximum(second, 0)]], 0.0)
-        power += (wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * radiance
-    out[k] = share[k] * power
+        far = tracer.through_air(np.where(second >= 0, again.range_m.numpy(), 0.0))
+        power += (wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * radiance * far
+    out[k] = share[k] * power * tracer.through_air(t[k])
     return out.reshape(shape).sum(axis=-1)
 
 
 @dataclass(frozen=True)
 class SeenElements:
-    """Elements that a grid's rays meet: of each pixel and element the solid angle [sr], all shapes ``(K,)``."""
+    """Elements that a grid's rays meet: of each pixel and element the solid angle [sr], less what the air between
+    absorbs, all shapes ``(K,)``."""
 
     pixel: np.ndarray
     element: np.ndarray
@@ -129,7 +135,8 @@ class SeenElements:
         elements = len(tracer.surface.element_area)
         key = pixel * elements + tracer.surface.element[face[ray]]
         pairs, place = np.unique(key, return_inverse=True)
-        solid_angle = np.bincount(place.ravel(), tracer.solid_angle[ray], minlength=len(pairs))
+        seen = tracer.solid_angle[ray] * tracer.through_air(met.range_m.numpy()[ray])
+        solid_angle = np.bincount(place.ravel(), seen, minlength=len(pairs))
         return cls(pairs // elements, pairs % elements, solid_angle)
 
     def power(self, sent: np.ndarray, wavelength_m: float) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
+from warprrf.rf.absorption import air_of
 from warprrf.rf.dataset import SpectrumDataset, write_whole
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.fresnel import as_mesh, surface_table
@@ -43,6 +44,7 @@ def simulate(
     beam_sigma_rad: float = BEAM_SIGMA_RAD,
     refraction: bool = False,
     seed: int = 0,
+    gas: Any = False,
     roles: Any = None,
     floor: float | None = None,
     workspace: str | os.PathLike[str] | None = None,
@@ -64,6 +66,9 @@ def simulate(
         beam_sigma_rad: Receiver beam width, kappa = 1 / sigma^2 [rad].
         refraction: Whether Sionna's paths go through slabs.
         seed: Seed of Sionna's rays, and of the roles if none are given.
+        gas: Absorption of the air (ITU-R P.676) over every path's length: False for none, True for the standard
+            atmosphere, :class:`Air`, or a :class:`Relevance`, which says whether it is worth its tolerance. Attributes
+            ``air_...`` of the data set say which.
         roles: "train" or "test" for each receiver, shape ``(R,)``; an eighth is for test by default.
         floor: N0 [linear]; median over views of the view's maximum, less 60 dB, by default.
         workspace: Folder that keeps each finished receiver, so that a killed run goes on where it stopped.
@@ -72,7 +77,7 @@ def simulate(
 
     Raises:
         ValueError: on a position that is NaN, outside the scene, inside a solid or on a surface; on a frequency outside
-            a material's band; on an unknown engine.
+            a material's band, or P.676's with ``gas``; on an unknown engine.
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
     """
     if engine not in ENGINES:
@@ -87,6 +92,7 @@ def simulate(
     source = _device.check_array("transmitter", transmitter, (3,))
     frequency = check_frequency(frequency_hz)
     table = surface_table(scene.materials, frequency)
+    air = air_of(gas, frequency)
     check_positions(scene, source, points, device=device)
 
     common = {
@@ -98,6 +104,8 @@ def simulate(
     settings: dict[str, Any] = {"sub_pixels": SUB_PIXELS} if engine == "exact" else {}
     if engine == "sionna":
         settings = {"depth": depth, "samples": samples, "refraction": refraction, "seed": seed}
+    if air is not None:  # without, finished receivers of before go on counting
+        settings["gas"] = air
     versions = _versions(engine)
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     cache = (
@@ -119,7 +127,8 @@ def simulate(
     if progress is not None:
         progress("simulate", len(points), len(points))
     single = {"depth": 1} if engine == "exact" else {"refraction": int(refraction)}
-    kept = {name: value for name, value in settings.items() if name not in ("seed", "refraction")}
+    kept = {name: value for name, value in settings.items() if name not in ("seed", "refraction", "gas")}
+    kept |= {} if air is None else air.attributes
     return SpectrumDataset.from_spectra(
         receivers=points,
         transmitter=source,

@@ -1,7 +1,8 @@
 """What a single bounce costs: options of a field, path lengths, spreading loss, and the line of sight.
 
 The law of Song et al., eq. (4): (lambda / (4 pi (l_prev + l_vd)))^2 times the pixel's solid angle for ``rf3dgs+``; the
-solid angle alone for ``rf3dgs``. Line of sight comes from the mesh, with Friis gain.
+solid angle alone for ``rf3dgs``. Line of sight comes from the mesh, with Friis gain. Absorption by the air is that of
+the path's length; ``rf3dgs``, which has none, learns it with the gain.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf import transport as _transport
+from warprrf.rf.absorption import Air
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.spectrum import pixel_solid_angles, spread
 from warprrf.rf.transport import Lengths, Transport
@@ -64,6 +66,7 @@ class SingleBounce:
         shape: rows and columns of a spectrum.
         frequency_hz: carrier [Hz].
         beam_sigma_rad: receiver beam of an explicit line of sight [rad].
+        air: absorption by the air; None for none.
     """
 
     gaussians: Gaussians = field(repr=False)
@@ -73,6 +76,7 @@ class SingleBounce:
     frequency_hz: float
     beam_sigma_rad: float
     device: Any = None
+    air: Air | None = None
 
     @property
     def wavelength_m(self) -> float:
@@ -86,6 +90,7 @@ class SingleBounce:
             return np.where(np.isfinite(lengths.total), solid_angle, 0.0)
         with np.errstate(divide="ignore"):
             loss = (self.wavelength_m / (4 * np.pi * lengths.total)) ** 2
+        loss = self._through_air(loss, lengths.total)
         return np.where(np.isfinite(loss), solid_angle * loss, 0.0)
 
     def lengths(self, seen: Transport | StoredTransport, transmitter: np.ndarray) -> Lengths:
@@ -96,14 +101,19 @@ class SingleBounce:
         return _transport.path_lengths(points, transmitter, seen.receivers)
 
     def line_of_sight(self, receiver: np.ndarray, transmitter: np.ndarray) -> tuple[bool, float]:
-        """Whether the mesh lets them see each other, and their Friis gain."""
+        """Whether the mesh lets them see each other, and their Friis gain, less absorption."""
         distance = float(np.linalg.norm(receiver - transmitter))
         if distance == 0:
             raise ValueError("rx: got the transmitter's own position; expected them apart")
         visible = self.mesh is not None and bool(
             self.mesh.visible(receiver[None], transmitter[None], device=self.device)[0]
         )
-        return visible, (self.wavelength_m / (4 * np.pi * distance)) ** 2
+        friis = (self.wavelength_m / (4 * np.pi * distance)) ** 2
+        return visible, float(self._through_air(friis, distance))
+
+    def _through_air(self, gain: Any, length_m: Any) -> Any:
+        """``gain`` less what ``length_m`` [m] of air absorb."""
+        return gain if self.air is None else gain * self.air.transmittance(self.frequency_hz, length_m)
 
     def beam(self, receiver: np.ndarray, transmitter: np.ndarray) -> np.ndarray | None:
         """The explicit line of sight's beam on the grid, or None."""

@@ -2,7 +2,8 @@
 
 The scene's own material table is set in Python (an XML can't carry scattering patterns, and Sionna has no metal at
 300 GHz). Both transmit and both receive polarisations are solved at once: path gain is the mean over the former and
-the sum over the latter. One solve per receiver, because Sionna shares its cap on paths between all of them.
+the sum over the latter. One solve per receiver, because Sionna shares its cap on paths between all of them. Sionna has
+no absorption by the air; where asked for, every path is given that of its own length.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
+from warprrf.rf.absorption import air_of
 from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.llvm import select_llvm
@@ -150,6 +152,7 @@ class SionnaEngine:
         samples: Rays from the transmitter.
         refraction: Whether paths go through slabs.
         seed: Seed of the ray directions.
+        gas: Absorption of the air: see :meth:`Paths.with_gas`.
         device: Where beams are spread (Sionna takes its own: CUDA where there is a GPU).
 
     Raises:
@@ -169,6 +172,7 @@ class SionnaEngine:
         samples: int = 1_000_000,
         refraction: bool = False,
         seed: int = 0,
+        gas: Any = False,
         device: Any = None,
     ) -> None:
         self.shape = check_shape(shape)
@@ -176,6 +180,7 @@ class SionnaEngine:
         self.transmitter = _device.check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
         self.depth, self.samples, self.refraction, self.seed = depth, samples, refraction, seed
+        self.air = air_of(gas)
         self.device = device
         self._rt = sionna_rt()
         self._scene = load_sionna_scene(scene, frequency_hz=self.frequency_hz)
@@ -244,6 +249,9 @@ class SionnaEngine:
             "diffuse": (kinds == _DIFFUSE).any(axis=0)[valid],
             "bounces": (kinds != 0).sum(axis=0)[valid],
         }
+        if self.air is not None:
+            through = self.air.transmittance(self.frequency_hz, SPEED_OF_LIGHT * found["tau"])
+            found["power"] = found["power"] * through
         sharp = np.flatnonzero(~found["diffuse"])
         copies = sharp[repeated(*(found[name][sharp] for name in ("tau", "arrival", "aod", "bounces")))]
         return {name: np.delete(values, copies, axis=0) for name, values in found.items()}

@@ -1,0 +1,389 @@
+"""Absorption by the air in simulated spectra and in fields: closed forms of every path's length, files, and fits.
+
+At 380.2 GHz, on a line of water vapour, standard air takes 0.3 dB a metre: enough to see in any total.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+sys.path.insert(0, str(Path(__file__).parent))
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined  # noqa: E402
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.absorption import Air
+from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.bistatic_fit import Parameters
+from warprrf.rf.bistatic_training import trace
+from warprrf.rf.dataset import SpectrumDataset
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.field import RadioField
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.metrics import evaluate
+from warprrf.rf.paths import Paths
+from warprrf.rf.relevance_model import full_field
+from warprrf.rf.second_bounce import mirrored_scene
+from warprrf.rf.simulate import simulate
+from warprrf.rf.spectrum import to_db
+from warprrf.rf.surface import Surface
+
+F = 380.2e9
+WAVELENGTH = SPEED_OF_LIGHT / F
+SHAPE = (24, 48)
+TX = np.array([0.8, 0.9, 2.2])
+AIR = Air()
+LOSS = AIR.attenuation_db_per_m(F)  # dB a metre
+RECEIVERS = np.array(
+    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
+     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0]]
+)  # fmt: skip
+BLOCKED, SEEN = RECEIVERS[0], RECEIVERS[4]
+
+
+@pytest.fixture(scope="module")
+def scene() -> RadioScene:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+    )
+    walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4)
+    return RadioScene(mesh, part, [walls, SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)])
+
+
+def spectra(scene: RadioScene, **options: object) -> SpectrumDataset:
+    return simulate(
+        scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=np.radians(5.0), floor=1e-14,
+        **({"receivers": RECEIVERS} | options),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def dry(scene: RadioScene) -> SpectrumDataset:
+    return spectra(scene)
+
+
+@pytest.fixture(scope="module")
+def humid(scene: RadioScene) -> SpectrumDataset:
+    return spectra(scene, gas=True)
+
+
+def passed(length_m: np.ndarray | float) -> np.ndarray:
+    return 10.0 ** (-LOSS * np.asarray(length_m) / 10.0)
+
+
+def engine(scene: RadioScene, gas: object) -> ExactEngine:
+    return ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, gas=gas)
+
+
+# ------------------------------------------------------------------------------------------------ simulate
+
+
+def test_transmittance_is_attenuation_over_a_length() -> None:
+    assert 0.29 < LOSS < 0.31
+    assert AIR.transmittance(F, 3.0) == pytest.approx(10.0 ** (-0.3 * LOSS), rel=1e-12)
+    assert np.exp(-AIR.loss_per_m(F) * 3.0) == pytest.approx(10.0 ** (-0.3 * LOSS), rel=1e-12)
+
+
+def test_line_of_sight_is_friis_times_gas_and_mirrors_have_their_images_length(scene: RadioScene) -> None:
+    distance = np.linalg.norm(SEEN - TX)
+    totals, without = engine(scene, True).receive(SEEN).totals, engine(scene, False)
+    friis = (WAVELENGTH / (4.0 * np.pi * distance)) ** 2
+    assert totals["los"] == pytest.approx(friis * passed(distance), rel=1e-12)
+    mirrors = without.tracer.trace(SEEN, 1)
+    mirrors = mirrors.select(mirrors.kind == "mirror")
+    assert len(mirrors.gain) >= 6
+    expected = (mirrors.power * passed(mirrors.length_m)).sum()
+    assert totals["mirror"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_every_scattered_path_has_its_own_length(scene: RadioScene) -> None:
+    with_air, without = engine(scene, True).diffuse(BLOCKED), engine(scene, False).diffuse(BLOCKED)
+    np.testing.assert_array_equal(with_air.index, without.index)
+    point = BLOCKED + without.range_m[:, None] * without.direction
+    length = np.linalg.norm(point - TX, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
+    assert np.ptp(length) > 3.0
+    np.testing.assert_allclose(with_air.power, without.power * passed(length), rtol=1e-12)
+
+
+def test_off_is_off_and_files_say_which(
+    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset, tmp_path: Path
+) -> None:
+    some: dict = {"receivers": RECEIVERS[:2], "workspace": tmp_path}
+    off = spectra(scene, gas=False, **some)
+    np.testing.assert_array_equal(off.path_gain, dry.path_gain[:2])
+    assert off.air is None
+    assert not [name for name in off.attributes if name.startswith("air")]
+    # finished receivers of dry air are not taken for those of another
+    thick = Air(water_vapour_g_m3=15.0)
+    on = spectra(scene, gas=thick, **some)
+    assert (on.path_gain.sum(axis=(1, 2)) < humid.path_gain[:2].sum(axis=(1, 2))).all()
+    np.testing.assert_array_equal(spectra(scene, gas=thick, **some).path_gain, on.path_gain)
+    on.save(tmp_path / "on.nc")
+    assert SpectrumDataset.load(tmp_path / "on.nc").air == thick == on.subset([1, 0]).air
+
+
+def test_a_carrier_that_the_recommendation_does_not_know_is_refused(scene: RadioScene) -> None:
+    with pytest.raises(ValueError, match="frequency_hz: got 2000000000000"):
+        simulate(scene, transmitter=TX, receivers=[SEEN], frequency_hz=2e12, shape=SHAPE, gas=True)
+    with pytest.raises(TypeError, match="gas: got str"):
+        spectra(scene, gas="standard")
+
+
+def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:
+    from test_sionna_engine import sionna_or_skip, write_scene
+
+    sionna = sionna_or_skip()
+    common = {
+        "transmitter": [-5.0, 3.5, 2.7], "frequency_hz": F, "shape": SHAPE, "depth": 2, "samples": 20_000,
+    }  # fmt: skip
+    room = write_scene(tmp_path)
+    off, on = (sionna(room, gas=gas, **common).solve([3.0, 4.0, 1.4]) for gas in (False, True))
+    np.testing.assert_allclose(on["tau"], off["tau"], rtol=1e-12)
+    assert off["bounces"].max() == 2
+    np.testing.assert_allclose(on["power"], off["power"] * passed(SPEED_OF_LIGHT * off["tau"]), rtol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------ bistatic fields
+
+
+def test_a_field_of_line_of_sight_is_friis_times_gas(scene: RadioScene, humid: SpectrumDataset) -> None:
+    field = BistaticField.prior(scene, humid, terms=Terms(diffuse=False, mirror_order=0))
+    assert field.air == AIR
+    distance = np.linalg.norm(SEEN - TX)
+    expected = (WAVELENGTH / (4.0 * np.pi * distance)) ** 2 * passed(distance)
+    assert field.spectrum(SEEN).path_gain.sum() == pytest.approx(expected, rel=1e-5)  # the beam is float32
+    assert field.links(SEEN[None]).total_path_gain[0] == pytest.approx(expected, rel=1e-12)
+    paths = field.paths(SEEN)
+    assert paths.power.sum() == pytest.approx(expected, rel=1e-5)
+    assert paths.air == AIR
+    bare = paths.with_gas(False).power.sum()
+    assert bare == pytest.approx(expected / passed(distance), rel=1e-5)
+
+
+def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dry: SpectrumDataset) -> None:
+    field = BistaticField.prior(scene, dry, terms=Terms(mirror_order=2))
+    humid = field.with_gas()
+    sight = field.see(BLOCKED)
+    before, after = field.compose(sight), humid.compose(humid.see(BLOCKED))
+    lit = before.rays > 0
+    point = BLOCKED + sight.met.range_m.numpy()[lit, None] * field.tracer.directions[lit]
+    length = np.linalg.norm(point - TX, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
+    np.testing.assert_allclose(after.rays[lit], before.rays[lit] * passed(length), rtol=1e-5)
+    np.testing.assert_allclose(after.specular, before.specular * passed(sight.paths.length_m), rtol=1e-12)
+    # off again, nothing is left of it
+    np.testing.assert_array_equal(
+        humid.with_gas(False).spectrum(BLOCKED).path_gain, field.spectrum(BLOCKED).path_gain
+    )
+
+
+def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, dry: SpectrumDataset) -> None:
+    field = BistaticField.prior(scene, dry)
+    mesh, shape = field.surface.mesh, (12, 24)
+    images = []
+    for one in (field, field.with_gas()):
+        tracer = one.tracer_of(shape, 1)
+        images.append(mirrored_scene(tracer, SEEN, TX, one.parameters, WAVELENGTH, None).ravel())
+    d = tracer.directions
+    first = mesh.cast(SEEN, d)
+    normal = mesh.face_normals[first.face]
+    turned = d - 2.0 * (d * normal).sum(axis=1, keepdims=True) * normal
+    second = mesh.cast(first.point + 1e-4 * turned, turned)
+    length = first.t + second.t + np.linalg.norm(second.point - TX, axis=1)
+    lit = images[0] > 0
+    assert lit.sum() > 0.5 * len(lit)
+    # the second ray starts 2 cm off the mirror, which moves few of the points that it meets
+    ratio = images[1][lit] / (images[0][lit] * passed(length[lit]))
+    assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
+    # elements that send on evenly: two legs from them
+    sent = np.ones(len(field.surface.element_area))
+    dark = replace(field.parameters, log_weight=np.full_like(field.parameters.log_weight, -np.inf))
+    glow = [
+        mirrored_scene(one.tracer_of(shape, 1), SEEN, TX, dark, WAVELENGTH, sent).ravel()
+        for one in (field, field.with_gas())
+    ]
+    lit = glow[0] > 0
+    ratio = glow[1][lit] / (glow[0][lit] * passed(first.t + second.t)[lit])
+    assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
+
+
+def test_light_that_mirrors_throw_has_its_images_length(scene: RadioScene, dry: SpectrumDataset) -> None:
+    field = BistaticField.prior(scene, dry, terms=Terms(mirror_scatter=True))
+    surface, found = field.surface, []
+    for one in (field, field.with_gas()):
+        tracer = one.tracer_of((12, 24), 2)  # four rays a pixel, of which the first looks for mirrored light
+        met = tracer.meet(SEEN)
+        found.append(one.element_light(TX).mirrors.sight(SEEN, met, tracer))
+    before, after = found
+    ray = 4 * before.pixel
+    point = SEEN + met.range_m.numpy()[ray, None] * tracer.directions[ray]
+    normal, offset = surface.plane_normal[before.patch], surface.plane_offset[before.patch]
+    image = TX - 2.0 * (normal @ TX - offset)[:, None] * normal
+    length = np.linalg.norm(point - image, axis=1) + np.linalg.norm(point - SEEN, axis=1)
+    strength = before.lit.strength.numpy(), after.lit.strength.numpy()
+    assert (strength[0] > 0).sum() > 500
+    np.testing.assert_allclose(strength[1], strength[0] * passed(length), rtol=1e-5)
+
+
+def test_irradiance_by_a_mirror_has_its_images_length(dry: SpectrumDataset) -> None:
+    def sheet(z: float, up: bool) -> tuple[np.ndarray, np.ndarray]:
+        corners = np.array([[-4.0, -4, z], [4, -4, z], [4, 4, z], [-4, 4, z]])
+        faces = np.array([[0, 1, 2], [0, 2, 3]])
+        return corners, faces if up else faces[:, ::-1]
+
+    mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
+    field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
+    before, after = (
+        one.element_light(TX).mirrors.irradiance(field.parameters) for one in (field, field.with_gas())
+    )
+    centre = field.surface.element_centre
+    lid = (centre[:, 2] > 3.9) & (before > 0)
+    assert lid.sum() > 20
+    length = np.linalg.norm(centre[lid] - TX * [1, 1, -1], axis=1)
+    np.testing.assert_allclose(after[lid] / before[lid], passed(length), rtol=0.02)
+
+
+def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
+    """Chords of a sphere of radius R that a Lambertian surface sees are distributed as c / (2 R^2), and of them
+    exp(-a c) has the mean (1 - exp(-2 a R) (1 + 2 a R)) / (2 a^2 R^2)."""
+    radius = 2.0
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    surface = Surface.of(Mesh(ball.vertices, ball.faces[:, ::-1]))
+    groups = surface.groups
+    parameters = Parameters(
+        np.full((groups, 1), np.log(0.9)), np.full(groups, np.log(50.0)), np.full(groups, -60.0),
+        np.full(groups, -np.inf),
+    )  # fmt: skip
+    field = BistaticField(
+        surface=surface, transmitter=np.array([0.02, 0.0, 0.0]), frequency_hz=F, shape=SHAPE, floor=1e-20,
+        range_db=(-200.0, -80.0), beam_sigma_rad=np.radians(5.0), parameters=parameters, material=np.zeros(groups, int),
+        residual=np.zeros(len(surface.element_area)),
+        terms=Terms(line_of_sight=False, mirror_order=0, lobes=(0,), diffuse_order=2),
+    )  # fmt: skip
+    thrice = replace(field, terms=replace(field.terms, diffuse_order=3))
+    receiver = np.array([-0.02, 0.0, 0.0])
+
+    def further(one: BistaticField) -> float:
+        return float(one.further(one.see(receiver)).sum())
+
+    two = further(field.with_gas()) / further(field)
+    three = (further(thrice.with_gas()) - further(field.with_gas())) / (further(thrice) - further(field))
+    a = LOSS * np.log(10.0) / 10.0
+    chord = (1.0 - np.exp(-2 * a * radius) * (1.0 + 2 * a * radius)) / (2.0 * (a * radius) ** 2)
+    ends = passed(2.0 * radius)
+    assert two == pytest.approx(ends * chord, rel=0.01)
+    assert three == pytest.approx(ends * chord**2, rel=0.015)
+
+
+def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: SpectrumDataset) -> None:
+    terms = Terms(line_of_sight=False, diffuse=False, mirror_order=0, indirect=True)
+    field = BistaticField.prior(scene, dry, terms=terms)
+    field = replace(field, parameters=replace(field.parameters, log_indirect=np.zeros(field.surface.groups)))
+    humid = field.with_gas()
+    sight = field.see(SEEN)
+    rays = field.tracer.solid_angle * passed(sight.met.range_m.numpy())
+    expected = (WAVELENGTH / (4.0 * np.pi)) ** 2 * rays.sum()
+    assert humid.further(humid.see(SEEN)).sum() == pytest.approx(expected, rel=1e-9)
+    view = humid.view(humid.see(SEEN), np.arange(SHAPE[0] * SHAPE[1]))  # what a fit of it is made on
+    assert view.dark.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
+
+
+def test_links_with_gas_are_the_spectrums_sums(scene: RadioScene, humid: SpectrumDataset) -> None:
+    terms = Terms(mirror_order=2, mirror_scatter=True, scatter_mirror=True, diffuse_order=2)
+    field = BistaticField.prior(scene, humid, terms=terms)
+    total = field.links(RECEIVERS[[0, 4]]).total_path_gain
+    for k, place in enumerate(RECEIVERS[[0, 4]]):
+        expected = field.spectrum(place).total_path_gain
+        assert abs(10.0 * np.log10(total[k] / expected)) < 0.15
+        assert field.with_gas(False).spectrum(place).total_path_gain > 1.1 * expected
+
+
+def test_a_fit_takes_the_air_out_of_what_it_learns(
+    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset, tmp_path: Path
+) -> None:
+    train = humid.subset(np.arange(6))
+    field = RadioField.fit(scene, train, mirror_order=1, diffuse_order=1, indirect=False, residual=False)
+    test = np.arange(6, 8)
+    assert field.air == AIR
+    assert evaluate(humid.subset(test), field.spectrum)["psnr_db"] > 40
+    # materials are those of the scene: without the air they hold for measurements without it
+    bare = field.with_gas(False)
+    assert evaluate(dry.subset(test), bare.spectrum)["psnr_db"] > 40
+    assert evaluate(dry.subset(test), field.spectrum)["psnr_db"] < 37
+    field.save(tmp_path / "field.safetensors")
+    again = RadioField.load(tmp_path / "field.safetensors")
+    assert again.air == AIR
+    np.testing.assert_array_equal(again.spectrum(SEEN).path_gain, field.spectrum(SEEN).path_gain)
+    bare.save(tmp_path / "bare.safetensors")
+    assert RadioField.load(tmp_path / "bare.safetensors").air is None
+
+
+def test_what_was_traced_in_other_air_is_refused(
+    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset
+) -> None:
+    seen = trace(scene, dry.subset([0, 1]), mirror_order=1)
+    with pytest.raises(ValueError, match="air and lobes of this fit"):
+        RadioField.fit(scene, humid.subset([0, 1]), transport=seen)
+
+
+def test_relevance_judges_the_air_by_itself(scene: RadioScene, humid: SpectrumDataset) -> None:
+    field = BistaticField.prior(scene, humid)
+    full = full_field(
+        field, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=field.beam_sigma_rad, device=None
+    )[0]
+    assert full.air is None
+
+
+# ------------------------------------------------------------------------------------------------ harmonic fields
+
+
+@pytest.mark.parametrize("line_of_sight", [None, "explicit"])
+def test_a_harmonic_field_has_its_lengths_in_the_law(
+    scene: RadioScene, dry: SpectrumDataset, line_of_sight: str | None, tmp_path: Path
+) -> None:
+    field = RadioField.fit(
+        scene, dry.subset([0, 1]), model="rf3dgs+", iterations=2, line_of_sight=line_of_sight
+    )
+    humid = field.with_gas()
+    before, after = field.spectrum(SEEN), humid.spectrum(SEEN)
+    length = before.delay_s * SPEED_OF_LIGHT
+    if line_of_sight is None:
+        # around the transmitter delays are the line of sight's, power is the surface's behind it
+        own = np.linalg.norm(np.nan_to_num(length) - np.linalg.norm(SEEN - TX), axis=-1, keepdims=True) > 0
+        own = own & (np.abs(length - np.linalg.norm(SEEN - TX)) > 1e-9) & (before.path_gain > 0)
+        np.testing.assert_allclose(after.path_gain[own], (before.path_gain * passed(length))[own], rtol=1e-5)
+    else:
+        friis = (WAVELENGTH / (4.0 * np.pi * np.linalg.norm(SEEN - TX))) ** 2
+        paths = humid.paths(SEEN)
+        assert paths.power[paths.kind == "los"][0] == pytest.approx(
+            friis * passed(np.linalg.norm(SEEN - TX)), rel=1e-9
+        )
+        assert isinstance(paths, Paths)
+        assert paths.air == AIR
+    humid.save(tmp_path / "field.safetensors")
+    again = RadioField.load(tmp_path / "field.safetensors")
+    assert again.air == AIR
+    np.testing.assert_array_equal(again.spectrum(SEEN).path_gain, after.path_gain)
+
+
+def test_a_harmonic_fit_starts_from_gains_without_air(
+    scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset
+) -> None:
+    chosen = np.arange(6)
+    fields = [RadioField.fit(scene, ds.subset(chosen), model="rf3dgs+", iterations=60) for ds in (dry, humid)]
+    assert fields[1].air == AIR
+    there, here = (to_db(f.with_gas(False).spectrum(BLOCKED).path_gain, dry.floor) for f in fields)
+    with_air = to_db(fields[1].spectrum(BLOCKED).path_gain, dry.floor)
+    assert np.sqrt(np.mean((there - here) ** 2)) < 0.5 * np.sqrt(np.mean((there - with_air) ** 2))
+
+
+def test_a_field_without_lengths_keeps_the_air_that_it_learned(
+    scene: RadioScene, humid: SpectrumDataset
+) -> None:
+    field = RadioField.fit(scene, humid.subset([0, 1]), model="rf3dgs", iterations=2)
+    assert field.air == AIR
+    assert field.with_gas(AIR).air == AIR
+    with pytest.raises(ValueError, match="rf3dgs field knows no lengths"):
+        field.with_gas(False)
