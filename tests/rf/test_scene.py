@@ -55,6 +55,8 @@ def test_sionna_opens_the_scene_with_the_same_objects_and_materials(lobby: Scene
 def test_air_is_free_and_solids_are_not(lobby: Scene) -> None:
     points = np.array([[7.3, 5.0, 1.5], [9.2, 3.0, 1.5], [3.6, 3.3, 1.0], [7.5, 6.0, -0.1], [7.5, 6.0, 6.0]])
     np.testing.assert_array_equal(lobby.is_free(points, device="cpu"), [True, False, False, False, False])
+    behind = np.array([[-0.08, 1.38, 0.6]])  # in the west wall, 6 cm from where the sofa ends within it
+    np.testing.assert_array_equal(lobby.is_free(behind, device="cpu"), [False])
     near = np.array([[6.3 + 0.29, 2.0, 1.5], [6.3 + 0.31, 2.0, 1.5]])  # 0.29 and 0.31 m east of the partition
     np.testing.assert_array_equal(lobby.is_free(near, clearance_m=0.3, device="cpu"), [False, True])
 

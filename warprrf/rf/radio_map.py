@@ -227,6 +227,8 @@ def radio_map(
 ) -> RadioMap:
     """Links at the centres of cells over a floor plan.
 
+    Cells are left out that the field's mesh takes for solid; see :func:`in_the_air` for what it cannot know.
+
     Args:
         field: a fitted field with a mesh.
         height: of the receivers [m].
@@ -301,7 +303,8 @@ def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any
     """Whether ``points`` (N, 3) [m] lie in the air like ``known`` (3,) does, shape ``(N,)``.
 
     Three in four of 64 rays over the sphere must meet a surface from the side that most of those from ``known`` meet.
-    What lies on a surface does not count.
+    What lies on a surface does not count. This is the mesh's word: a solid whose back no photo shows may be air to it,
+    and air that no photo looked into (above a gallery, behind a desk) solid.
     """
     k = np.arange(_SIDE_RAYS) + 0.5  # a Fibonacci lattice: no direction along a wall
     zenith, azimuth = np.arccos(1.0 - 2.0 * k / _SIDE_RAYS), np.pi * (1.0 + np.sqrt(5.0)) * k

@@ -147,7 +147,8 @@ class Scene:
     def is_free(self, points: Any, *, clearance_m: float = 0.0, device: Any = None) -> np.ndarray:
         """Whether points lie in the air of a room of closed solids, shape ``(N,)``, bool.
 
-        A point is in the air if rays from it in three directions all first meet a surface from its outer side;
+        A point is in the air if rays from it in three directions all first meet a surface from its outer side, and no
+        solid of a closed mesh holds it (one solid may end within another);
         ``clearance_m`` asks for that distance [m] from every surface besides.
         """
         points = check_array("points", points, (None, 3))
@@ -157,6 +158,8 @@ class Scene:
             hit = self.mesh.cast(points, np.tile(unit, (len(points), 1)), device=device)
             outer = np.where(hit.face >= 0, self.mesh.face_normals[hit.face] @ unit < 0, False)
             free &= outer
+        if self.mesh.is_closed and free.any():
+            free[free] = self.mesh.winding_number(points[free]) < 0.5
         if clearance_m > 0 and free.any():
             near = free.copy()
             near[free] = self.mesh.distance(points[free], device=device) >= clearance_m
