@@ -50,6 +50,8 @@ _HOMES = {
     "load_sionna_scene": "rf.sionna_engine",
     "orientation_towards": "rf.arrays",
     "plane_wave_error": "rf.arrays",
+    "precoded_sinr": "rf.precoders",
+    "precoders": "rf.precoders",
     "reconstruct": "geometry.reconstruction",
     "relevance": "rf.relevance",
     "render": "geometry.render",
@@ -58,6 +60,7 @@ _HOMES = {
     "simulate": "rf.simulate",
     "steering_codebook": "rf.beams",
     "thz_channel": "rf.thz_channels",
+    "transmit_covariance": "rf.precoders",
     "trace_paths": "rf.paths",
     "write_deepmimo": "rf.deepmimo",
     "write_twin": "rf.twin",
@@ -97,6 +100,9 @@ if TYPE_CHECKING:
     from warprrf.rf.newrf import load_newrf as load_newrf
     from warprrf.rf.paths import Paths as Paths
     from warprrf.rf.paths import trace_paths as trace_paths
+    from warprrf.rf.precoders import precoded_sinr as precoded_sinr
+    from warprrf.rf.precoders import precoders as precoders
+    from warprrf.rf.precoders import transmit_covariance as transmit_covariance
     from warprrf.rf.radio_map import RadioMap as RadioMap
     from warprrf.rf.reflections import fit_reflections as fit_reflections
     from warprrf.rf.relevance import Relevance as Relevance
