@@ -14,6 +14,8 @@ from warprrf.bench.beams import report, run_beams
 from warprrf.bench.beams.links import BANDWIDTH_HZ, FREQUENCIES, Ends, Link, Links, ends, gains
 from warprrf.bench.beams.run import _over, straight
 from warprrf.bench.beams.search import hierarchical
+from warprrf.bench.beams.users import several_users
+from warprrf.bench.beams.users import table as users_table
 
 SCENE = Path(__file__).resolve().parents[2] / "data" / "lobby" / "scene.xml"
 TRANSMITTER = np.array([13.6, 11.2, 2.5])
@@ -156,3 +158,39 @@ def _dots(scene: wr.Scene) -> wr.Gaussians:
         middle, np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 3), 0.2), np.full(count, 0.9),
         np.zeros((count, 1, 3)),
     )  # fmt: skip
+
+
+def test_several_users_of_one_path_each_are_parted_by_whoever_knows_their_directions(
+    spectra: wr.SpectrumDataset,
+) -> None:
+    e = next(x for x in ends(spectra, (8,), (2, 2)) if x.swept == "tx")
+    rng = np.random.default_rng(2)
+    middle = spectra.receivers.mean(axis=0)
+    places = middle + rng.uniform([-3, -3, -0.5], [3, 3, 0.5], (5, 3))
+    aimed = [straight(spectra, p) for p in places]
+    amplitude = 1e-5
+    channels = [
+        amplitude * np.broadcast_to(e.tx.response(p.departure, 1.0), (FREQUENCIES, 1, 64)) for p in aimed
+    ]
+    worth = [gains(e, c).mean(axis=0) for c in channels]
+    noise = 1e-12
+    rows = several_users(
+        e, channels, worth, [{("transmitter", None): p} for p in aimed], noise, 0, counts=(2, 4, 8)
+    )
+    assert {r["users"] for r in rows} == {2, 4}  # eight there are not
+    assert {r["groups"] for r in rows if r["users"] == 2} == {2}
+    rate = {(r["users"], r["method"], r["choice"]): r["efficiency"] for r in rows}
+    assert ("alone" in {r["choice"] for r in rows if r["method"] == "channel"}) is False
+    for users in (2, 4):
+        # a path's direction is all that there is to know of a channel of one path
+        for how in ("mr", "zf", "slnr"):
+            tolerance = {"rel": 1e-6} if how != "slnr" else {"rel": 0.01}
+            assert rate[users, "transmitter", how] == pytest.approx(rate[users, "channel", how], **tolerance)
+        assert rate[users, "transmitter", "zf"] > rate[users, "transmitter", "mr"]
+    order = np.random.default_rng(0).permutation(5)[:4]
+    h = np.stack([channels[u][0, 0] for u in order])
+    own = 1.0 / np.diag(np.linalg.inv(h @ h.conj().T)).real
+    assert rate[4, "channel", "zf"] == pytest.approx(np.log2(1.0 + own / (4 * noise)).sum(), rel=1e-6)
+    text = "\n".join(users_table(rows, report.NAMES | {"channel": "true channel"}))
+    assert "### 4 users at once, tx 64 elements" in text
+    assert f"{rate[4, 'channel', 'zf']:.2f}" in text

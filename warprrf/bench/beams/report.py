@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from warprrf import device as _device
+from warprrf.bench.beams.users import KNOWN
+from warprrf.bench.beams.users import table as users_table
 from warprrf.bench.stages import write_atomically
 
 Row = dict[str, Any]
@@ -114,14 +116,7 @@ def _document(report: dict[str, Any]) -> list[str]:
                     f"{_both(row, 'efficiency')} | {_both(row, 'efficiency_without_pilots')} |"
                 )
         if "users" in found:
-            first = found["users"][0]
-            lines += ["", f"### {first['users']} users at once, {first['ends']} elements", ""]
-            lines += [f"Sum spectral efficiency [bit/s/Hz], mean of {first['groups']} groups.", ""]
-            lines += ["| method | spectra | each for itself | minding interference |", "|---|---|---|---|"]
-            sums = {(r["method"], r["n_train"], r["choice"]): r["efficiency"] for r in found["users"]}
-            for method, count in dict.fromkeys((m, n) for m, n, _ in sums):
-                alone, together = sums[method, count, "alone"], sums[method, count, "together"]
-                lines.append(f"| {NAMES[method]} | {count or '-'} | {alone:.2f} | {together:.2f} |")
+            lines += users_table(found["users"], NAMES | {KNOWN: "true channel of every element"})
         lines.append("")
     return lines
 

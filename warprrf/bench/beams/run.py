@@ -13,12 +13,13 @@ import warprrf as wr
 from warprrf.bench.beams.links import BANDWIDTH_HZ, Ends, Links, ends, gains
 from warprrf.bench.beams.report import write
 from warprrf.bench.beams.search import hierarchical
+from warprrf.bench.beams.users import several_users
 from warprrf.bench.bistatic.methods import source_of
 from warprrf.bench.machine import machine
 from warprrf.bench.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
 from warprrf.bench.stages import StagedRun, source, write_atomically, write_json
 from warprrf.device import Progress
-from warprrf.rf.beams import select_beams, select_beams_multiuser, signal_over_interference
+from warprrf.rf.beams import select_beams
 from warprrf.rf.bistatic import BistaticField
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.path_set import Paths
@@ -35,7 +36,6 @@ FRAME_PILOTS = 2000
 ms, in which a user walking at 1 m/s moves 2 cm."""
 PILOT_SYMBOLS = 10e-6 * BANDWIDTH_HZ  # correlated over
 MODELS = {"bistatic": "bistatic", "rf3dgs+": "rf3dgs+"}
-USERS = 4
 MULTI_USER_SIDE = 16
 WITHIN_DB = 1.0
 
@@ -158,7 +158,7 @@ def judge(
     ratio = 10.0 ** ((TX_POWER_DBM - NOISE_DBM) / 10.0)
 
     rows: dict[tuple[str, str, int | None], list[Outcome]] = {}
-    blocked, shared, guesses = [], [], []
+    blocked, shared, shared_worth, guesses = [], [], [], []
     group_ends = next((e for e in between if e.swept == "tx" and e.tx.rows == MULTI_USER_SIDE), None)
     for i, receiver in enumerate(test.receivers):
         link = links.link(i)
@@ -169,7 +169,8 @@ def judge(
             worth = gains(e, channel)
             whole = worth.mean(axis=0)
             if e is group_ends:
-                shared.append(whole)
+                shared.append(channel)
+                shared_worth.append(whole)
             found = hierarchical(e, channel, ratio * PILOT_SYMBOLS, rng)
             chosen: dict[tuple[str, int | None], tuple[int, int, int]] = {
                 ("exhaustive", None): (*_best(whole), whole.size),
@@ -195,8 +196,8 @@ def judge(
         progress("links", i + 1, len(test))
     report = {"links": _summaries(between, rows, np.array(blocked), ratio), "blocked": int(np.sum(blocked))}
     report |= {"receivers": len(test)}
-    if group_ends is not None and len(test) >= USERS:
-        report["users"] = _several_users(group_ends, shared, guesses, 1.0 / ratio, seed)
+    if group_ends is not None:
+        report["users"] = several_users(group_ends, shared, shared_worth, guesses, 1.0 / ratio, seed)
     return report
 
 
@@ -300,33 +301,3 @@ def _over(columns: dict[str, np.ndarray]) -> dict[str, float | None]:
         "efficiency": float(columns["efficiency"].mean()),
         "efficiency_without_pilots": float(columns["efficiency_without_pilots"].mean()),
     }
-
-
-def _several_users(
-    e: Ends,
-    worth: list[np.ndarray],
-    guesses: list[dict[tuple[str, int | None], Paths]],
-    noise: float,
-    seed: int,
-) -> list[dict[str, Any]]:
-    """Sum spectral efficiency of groups of users, by who knows what, each alone or minding the others."""
-    order = np.random.default_rng(seed).permutation(len(worth))
-    groups = [order[k : k + USERS] for k in range(0, len(order) - USERS + 1, USERS)]
-    found: dict[tuple[str, int | None, str], list[float]] = {}
-    for group in groups:
-        true = [worth[u] for u in group]
-        for key in guesses[0]:
-            seen = [guesses[u][key] for u in group]
-            alone = [select_beams(p, e.tx_book, e.rx_book) for p in seen]
-            together = select_beams_multiuser(seen, e.tx_book, e.rx_book, noise=noise)
-            for how, tx, rx in (
-                ("alone", [c.tx[0] for c in alone], [c.rx[0] for c in alone]),
-                ("together", together.tx, together.rx),
-            ):
-                sinr = signal_over_interference(true, tx, rx, noise)
-                found.setdefault((*key, how), []).append(float(np.log2(1.0 + sinr).sum()))
-    return [
-        {"ends": e.name, "users": USERS, "groups": len(groups), "method": m, "n_train": n, "choice": how,
-         "efficiency": float(np.mean(values))}
-        for (m, n, how), values in found.items()
-    ]  # fmt: skip
