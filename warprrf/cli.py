@@ -233,6 +233,7 @@ def _map(args: argparse.Namespace, bars: Bars) -> None:
         transmit_power_dbm=args.power_dbm,
         bandwidth_hz=args.bandwidth,
         noise_figure_db=args.noise_figure,
+        mirror_order=args.mirror_order,
         progress=bars,
     )
     bars.close()
@@ -580,6 +581,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     plan.add_argument(
         "--noise-figure", type=float, default=10.0, metavar="DB", help="of receivers (default 10)"
+    )
+    plan.add_argument(
+        "--mirror-order", type=int, choices=range(4), help="most mirrors on a path (default the field's own)"
     )
 
     twin = add("twin", _twin, "a field's digital twin: a scene for Sionna RT", HELP_TWIN)

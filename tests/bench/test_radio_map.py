@@ -1,6 +1,7 @@
 """The radio map's benchmark: its arithmetic, and a small run of both maps on the lobby."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,16 @@ def test_both_maps_of_the_lobby_agree_where_the_transmitter_is_seen(tmp_path: Pa
     assert RadioMap.load(tmp_path / "map.nc").free.sum() == report["cells"]
     assert "RadioMapSolver, 1e+05 samples" in (tmp_path / "map.md").read_text()
     kept = (tmp_path / "reference.npz").stat().st_mtime_ns
-    again = bench.run_map(tmp_path, **run)
+    assert [(r["rays"], r["mirrors"], r["average"]) for r in report["ours"]] == [
+        (200, 1, 1), (800, 1, 1), (200, 1, 4),
+    ]  # fmt: skip
+    longer = replace(field, terms=replace(field.terms, mirror_order=3))
+    again = bench.run_map(tmp_path, **run | {"field": longer})
+    assert [(r["rays"], r["mirrors"], r["average"]) for r in again["ours"]] == [
+        (200, 3, 1), (800, 3, 1), (200, 2, 1), (200, 2, 4),
+    ]  # fmt: skip
+    assert again["ours"][2]["rms_to_finest_db"] > again["ours"][0]["rms_to_finest_db"]
+    assert "200 rays, 2 mirrors, centre" in (tmp_path / "map.md").read_text()
     assert (tmp_path / "reference.npz").stat().st_mtime_ns == kept
     assert again["reference"] == report["reference"]
 

@@ -1,6 +1,7 @@
 """Radio maps and links without spectra: closed forms, the field's own spectra, walls and air, files, bad input."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -138,6 +139,20 @@ def test_more_rays_come_closer(whole: BistaticField) -> None:
     assert error[1] < 0.05
 
 
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_fewer_mirrors_are_those_of_a_field_with_fewer(whole: BistaticField, order: int) -> None:
+    fewer = replace(whole, terms=replace(whole.terms, mirror_order=order))
+    expected, found = fewer.links(PLACES), whole.links(PLACES, mirror_order=order)
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
+    lost = whole.links(PLACES).total_path_gain - found.total_path_gain
+    assert (lost > 0).any() if order < 2 else (lost == 0).all()
+    # more than the field has stay what it has
+    np.testing.assert_array_equal(
+        fewer.links(PLACES, mirror_order=3).total_path_gain, expected.total_path_gain
+    )
+
+
 def test_another_transmitter_moves_the_map(whole: BistaticField) -> None:
     other = np.array([4.3, 3.2, 2.0])
     m = whole.radio_map(1.2, 0.5, transmitter=other)
@@ -151,6 +166,10 @@ def test_a_harmonic_field_has_maps_too(scene: RadioScene) -> None:
         scene, PLACES, transmitter=TX, frequency_hz=F, shape=(12, 24), sigma=np.radians(10.0), sub_pixels=2
     )
     field = RadioField.fit(scene, ds, model="rf3dgs+", iterations=3)
+    with pytest.raises(
+        ValueError, match=r"mirror_order: got 1, but a field of model 'rf3dgs\+' has no mirrors"
+    ):
+        field.links(PLACES, mirror_order=1)
     m = field.radio_map(1.2, 1.5)
     assert 3 <= m.free.sum() <= 12
     for row, column in np.argwhere(m.free):
@@ -251,6 +270,7 @@ def test_progress_counts_cells(whole: BistaticField) -> None:
         ({"bandwidth_hz": 0}, "bandwidth_hz: got 0"),
         ({"transmitter": [1.0, 2.0]}, "transmitter: got shape"),
         ({"shape": (0, 4)}, "shape: got"),
+        ({"mirror_order": 4}, "mirror_order: got 4, expected 0 to 3"),
     ],
 )
 def test_bad_input_is_named(whole: BistaticField, change: dict, message: str) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from warprrf.rf.bounces import Met
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.links import BeamSearch, Links
+from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.second_bounce import mirrored_scene
 from warprrf.rf.specular import specular_paths
 
@@ -34,6 +35,7 @@ class LinkTracer:
         transmitter: position [m], shape ``(3,)``.
         beam_sigma_rad: width of the receiver's beam [rad].
         shape: rows and columns of the grid that rays fill, 4 a pixel.
+        mirror_order: most reflections on a mirror path; the field's own where that is fewer, and by default.
     """
 
     def __init__(
@@ -42,6 +44,7 @@ class LinkTracer:
         transmitter: np.ndarray,
         beam_sigma_rad: float,
         shape: tuple[int, int] = SHAPE,
+        mirror_order: int | None = None,
     ) -> None:
         self.field, self.transmitter, self.shape = field, transmitter, shape
         self._tracer = field.tracer_of(shape, SUB_PIXELS)
@@ -50,6 +53,12 @@ class LinkTracer:
         self._sent = field.sent(transmitter) if field.terms.diffuse else None
         lit_by_mirrors = field.terms.diffuse and field.terms.mirror_scatter
         self._mirrors = field.element_light(transmitter).mirrors if lit_by_mirrors else None
+        own = field.terms.mirror_order
+        self._order = own if mirror_order is None else min(own, mirror_order)
+        if self._order == own:
+            self._tree = field.mirror_tree(transmitter)
+        else:
+            self._tree = MirrorTree(field.surface, transmitter, self._order) if self._order > 1 else None
         self.batch = max(1, RAYS_AT_A_TIME // len(self._tracer.directions))
 
     def __call__(self, receivers: np.ndarray) -> Links:
@@ -60,8 +69,8 @@ class LinkTracer:
             self.transmitter,
             receivers,
             field.wavelength_m,
-            order=field.terms.mirror_order,
-            tree=field.mirror_tree(self.transmitter),
+            order=self._order,
+            tree=self._tree,
             device=field.device,
         )
         sharp = field.path_power(paths)

@@ -123,6 +123,7 @@ class RadioField(ABC):
         *,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         shape: tuple[int, int] | None = None,
+        mirror_order: int | None = None,
         progress: Progress | None = None,
     ) -> Links:
         """Total and best path gain, delay spread and best-beam gain at ``rx`` (R, 3) [m], without spectra.
@@ -135,6 +136,8 @@ class RadioField(ABC):
             transmitter: as for :meth:`spectrum`.
             beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
             shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models.
+            mirror_order: most reflections on a mirror path of a ``bistatic`` field, if fewer than it was fitted with:
+                chains of three mirrors take most of the time and carry little.
             progress: called as ``progress("links", done, total)``.
 
         Raises:
@@ -142,7 +145,7 @@ class RadioField(ABC):
         """
         from warprrf.rf.links import find_links
 
-        return find_links(self, rx, transmitter, beam_sigma_rad, shape, progress)
+        return find_links(self, rx, transmitter, beam_sigma_rad, shape, mirror_order, progress)
 
     def radio_map(
         self, height: float, cell: float = 0.25, transmitter: Any = None, **options: Any

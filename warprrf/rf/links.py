@@ -101,6 +101,7 @@ def find_links(
     transmitter: Any,
     beam_sigma_rad: float,
     shape: tuple[int, int] | None,
+    mirror_order: int | None,
     progress: Progress | None,
 ) -> Links:
     """See :meth:`RadioField.links`."""
@@ -115,10 +116,16 @@ def find_links(
         raise ValueError("rx: got the transmitter's own position; expected them apart")
     if not (np.isfinite(beam_sigma_rad) and beam_sigma_rad > 0):
         raise ValueError(f"beam_sigma_rad: got {beam_sigma_rad!r}, expected a positive beam width in radians")
+    if mirror_order is not None and mirror_order not in (0, 1, 2, 3):
+        raise ValueError(f"mirror_order: got {mirror_order!r}, expected 0 to 3, or None for the field's own")
     trace: Callable[[np.ndarray], Links]
     if isinstance(field, BistaticField):
-        tracer = LinkTracer(field, source, beam_sigma_rad, check_shape(shape or SHAPE))
+        tracer = LinkTracer(field, source, beam_sigma_rad, check_shape(shape or SHAPE), mirror_order)
         trace, batch = tracer, tracer.batch
+    elif mirror_order is not None:
+        raise ValueError(
+            f"mirror_order: got {mirror_order!r}, but a field of model {field.model!r} has no mirrors"
+        )
     else:
         search = BeamSearch(check_shape(shape or field.shape), beam_sigma_rad, device=field.device)
         trace, batch = lambda some: links_of([field.paths(r, transmitter) for r in some], search), 1

@@ -223,6 +223,7 @@ def radio_map(
     bandwidth_hz: float = 2.16e9,
     noise_figure_db: float = 10.0,
     shape: tuple[int, int] | None = None,
+    mirror_order: int | None = None,
     progress: Progress | None = None,
 ) -> RadioMap:
     """Links at the centres of cells over a floor plan.
@@ -241,6 +242,7 @@ def radio_map(
         bandwidth_hz: of the noise, k T B at 290 K; one channel of IEEE 802.15.3d by default.
         noise_figure_db: of the receiver.
         shape: rows and columns of the grid of rays; see :meth:`RadioField.links`.
+        mirror_order: most reflections on a mirror path; see there.
         progress: called as ``progress("links", done, total)``, cells in the air.
 
     Raises:
@@ -277,7 +279,12 @@ def radio_map(
     if not free.any():
         raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")
     links = field.links(
-        places[free], transmitter, beam_sigma_rad=beam_sigma_rad, shape=shape, progress=progress
+        places[free],
+        transmitter,
+        beam_sigma_rad=beam_sigma_rad,
+        shape=shape,
+        mirror_order=mirror_order,
+        progress=progress,
     )
     layers = {}
     for name in _LAYERS:
