@@ -17,7 +17,7 @@ from warprrf.rf.bounces import NEAREST_M, BounceTracer, Lit, Met, fresnel_curves
 from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.specular import unobstructed
 
-EVERY = 4  # of a pixel's rays, one in so many looks for mirrored light
+EVERY = 3  # of a pixel's rays, one in so many looks for mirrored light
 
 
 @dataclass(frozen=True)
