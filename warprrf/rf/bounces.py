@@ -117,8 +117,8 @@ def _lobe_tables(exponents: tuple[int, ...], device: str) -> tuple[wp.array, wp.
 class BeamOperator:
     """The receiver beam as a linear map of images: a pixel's power, even over the pixel, spread over the grid.
 
-    The grid's columns are shifts of each other, so that a Fourier transform over azimuth leaves one small matrix over the
-    rows for each frequency. Sums are kept.
+    The grid's columns are shifts of each other, so that a Fourier transform over azimuth leaves one small matrix over
+    the rows for each frequency. Sums are kept.
     """
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:

@@ -105,7 +105,8 @@ class MirrorLight:
         s, tracer = self.surface, tracer or self.tracer
         # About two rays of a pixel look for mirrored light; the stride takes all of their places in turn.
         every = tracer.sub_pixels**2 // 2 + 1
-        rays = np.arange(0, len(met.face), every)
+        grid = len(tracer.directions)
+        rays = np.add.outer(np.arange(0, len(met.face), grid), np.arange(0, grid, every)).ravel()
         face = met.face.numpy()[rays]
         rays, face = rays[face >= 0], face[face >= 0]
         element = s.element[face]

@@ -203,9 +203,10 @@ def strongest_rays(
     log_power = np.maximum(log_power, -1e301)  # what is dark stays below where the kernel starts
     top = log_power.reshape(rows * columns, -1).max(axis=1)
     best = wp.zeros(rows * columns, dtype=wp.int32, device=where)
+    widest = 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns)
     inputs = [
         directions, len(power) // (rows * columns), wp.array(log_power, dtype=wp.float64, device=where),
-        wp.array(top, dtype=wp.float64, device=where), wp.float64(top.max()), wp.float64(0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns)),
+        wp.array(top, dtype=wp.float64, device=where), wp.float64(top.max()), wp.float64(widest),
         grid.pixels, grid.half_widths, grid.kappa, grid.chord_limit, best,
     ]  # fmt: skip
     _device.launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
