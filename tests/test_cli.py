@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from warprrf import cli
-from warprrf.rf.radio_map import RadioMap
+from warprrf.rf.coverage.radio_map import RadioMap
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "data" / "lobby" / "scene.xml"

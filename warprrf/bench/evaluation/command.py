@@ -191,7 +191,7 @@ def _paper_law(stages: StagedRun, xml: Path, exact: Path, device: Any) -> Path:
     place = Geometry(stages.folder, xml, device)
     inputs = [
         exact, place.scene_mark,
-        source("rf/exact.py", "rf/paths.py", "kernels/scatter.py", "bench/evaluation/paper_law.py"),
+        source("rf/exact.py", "rf/paths.py", "rf/waves.py", "kernels/scatter.py", "bench/evaluation/paper_law.py"),
     ]  # fmt: skip
     stages.stage("paper-law", make, inputs=inputs, outputs=(file.name,))
     return file

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(folder) for folder in Path(__file__).parents[:2]]
 from path_makers import random_paths  # noqa: E402
 from radio_scenes import box_mesh  # noqa: E402
 
 from warprrf.geometry.mesh import Mesh  # noqa: E402
-from warprrf.rf.deepmimo import write_deepmimo  # noqa: E402
+from warprrf.rf.channel.deepmimo import write_deepmimo  # noqa: E402
+from warprrf.rf.channel.path_set import Paths  # noqa: E402
 from warprrf.rf.fresnel import SPEED_OF_LIGHT  # noqa: E402
 from warprrf.rf.materials import Material  # noqa: E402
-from warprrf.rf.path_set import Paths  # noqa: E402
 from warprrf.rf.paths import trace_paths  # noqa: E402
 from warprrf.rf.scene import Scene  # noqa: E402
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import warprrf as wr
-from warprrf.rf.beams import signal_over_interference
+from warprrf.rf.channel.beams import signal_over_interference
 from warprrf.rf.spectrum import angles_from_directions, pixel_directions
 
 F_HZ = 300e9

@@ -27,27 +27,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.rf.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
-from warprrf.rf.delay_sums import (
+from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
+from warprrf.rf.channel.lengths import (
+    PairLengths,
+    plane_lengths,
+    scattered_lengths,
+    spherical_lengths,
+)
+from warprrf.rf.channel.sums import (
     LEAST_FREQUENCIES,
     Sum,
     dense_sum,
     gridded_sum,
     squint_sum,
 )
-from warprrf.rf.element_lengths import (
-    PairLengths,
-    plane_lengths,
-    scattered_lengths,
-    spherical_lengths,
-)
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.path_set import Paths, carrier_phase
+from warprrf.rf.waves import carrier_phase
+
+if TYPE_CHECKING:
+    from warprrf.rf.channel.path_set import Paths
 
 DENSE_TERMS = 1e6
 """``method="auto"`` sums more terms than that (pairs x paths x frequencies) on a grid."""

@@ -9,15 +9,14 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from path_makers import random_directions  # noqa: E402
 
-from warprrf.rf.arrays import (  # noqa: E402
+from warprrf.rf.channel.arrays import (  # noqa: E402
     PATTERNS,
     PlanarArray,
     orientation_towards,
     plane_wave_error,
     rotation_matrix,
 )
-from warprrf.rf.path_set import transverse_basis  # noqa: E402
-from warprrf.rf.spectrum import pixel_directions, pixel_solid_angles  # noqa: E402
+from warprrf.rf.spectrum import pixel_directions, pixel_solid_angles, transverse_basis  # noqa: E402
 
 WAVELENGTH = 1e-3
 

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.dataset import write_whole
-from warprrf.rf.path_set import Paths
 from warprrf.rf.scene import Scene
 
 REFLECTION, SCATTERING = 1, 3

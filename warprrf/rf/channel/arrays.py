@@ -26,8 +26,7 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.rf.antenna import _sampled
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.path_set import transverse_basis
-from warprrf.rf.spectrum import angles_from_directions
+from warprrf.rf.spectrum import angles_from_directions, transverse_basis
 
 PATTERNS = ("isotropic", "dipole", "half_wave_dipole", "tr38901")
 SLANTS_RAD = {

@@ -12,8 +12,8 @@ from hypothesis.extra.numpy import arrays
 sys.path.insert(0, str(Path(__file__).parent))
 from path_makers import random_paths  # noqa: E402
 
-from warprrf.rf.dispersion import angular_spread, coherence_bandwidth, delay_spread  # noqa: E402
-from warprrf.rf.path_set import Paths  # noqa: E402
+from warprrf.rf.channel.dispersion import angular_spread, coherence_bandwidth, delay_spread  # noqa: E402
+from warprrf.rf.channel.path_set import Paths  # noqa: E402
 
 powers = arrays(np.float64, 6, elements=st.floats(1e-3, 1.0))
 delays = arrays(np.float64, 6, elements=st.floats(0.0, 1e-7))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from warprrf.rf.path_set import Paths
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.spectrum import angles_from_directions
 
 CARRIER = 287.28e9

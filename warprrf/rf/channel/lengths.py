@@ -8,10 +8,12 @@ from the element to the first interaction point, and from the last to the receiv
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warprrf.rf.path_set import Paths
+if TYPE_CHECKING:
+    from warprrf.rf.channel.path_set import Paths
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(folder) for folder in Path(__file__).parents[:2]]
 from path_makers import CARRIER, random_paths  # noqa: E402
 from radio_scenes import METAL, RadioScene, SlabMaterial  # noqa: E402
 
 from warprrf.geometry.mesh import Mesh  # noqa: E402
-from warprrf.rf import delay_sums  # noqa: E402
 from warprrf.rf.absorption import Air, gas_attenuation_db_per_m  # noqa: E402
-from warprrf.rf.arrays import PlanarArray  # noqa: E402
+from warprrf.rf.channel import sums  # noqa: E402
+from warprrf.rf.channel.arrays import PlanarArray  # noqa: E402
+from warprrf.rf.channel.band_plan import thz_channel  # noqa: E402
+from warprrf.rf.channel.path_set import Paths  # noqa: E402
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, slab_reflection  # noqa: E402
-from warprrf.rf.path_set import Paths  # noqa: E402
 from warprrf.rf.paths import trace_paths  # noqa: E402
-from warprrf.rf.thz_channels import thz_channel  # noqa: E402
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F
@@ -365,7 +365,7 @@ def test_small_blocks_change_nothing(monkeypatch, wave, squint, method):
     ask = {"tx_array": PlanarArray(3, 2), "rx_array": PlanarArray(2, 5), "diffuse": "given", "wave": wave}
     whole = p.cfr(f, squint=squint, method=method, **ask)
     taps = p.taps(1e9, 0, 20, squint=squint, **ask)
-    monkeypatch.setattr(delay_sums, "_BLOCK", 10)
+    monkeypatch.setattr(sums, "_BLOCK", 10)
     np.testing.assert_allclose(
         p.cfr(f, squint=squint, method=method, **ask), whole, atol=1e-12 * np.abs(whole).max()
     )

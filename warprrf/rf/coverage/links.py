@@ -8,22 +8,18 @@ pixels of a grid for what is diffuse.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warprrf import device as _device
-from warprrf.device import Progress
 from warprrf.rf.bounces import BeamOperator
-from warprrf.rf.dispersion import delay_spread
-from warprrf.rf.spectrum import check_shape, directions_from_angles, pixel_of, pixel_solid_angles
-from warprrf.rf.transport import check_receiver
+from warprrf.rf.channel.dispersion import delay_spread
+from warprrf.rf.spectrum import directions_from_angles, pixel_of, pixel_solid_angles
 
 if TYPE_CHECKING:
-    from warprrf.rf.field import RadioField
-    from warprrf.rf.path_set import Paths
+    from warprrf.rf.channel.path_set import Paths
 
 
 @dataclass(frozen=True)
@@ -93,43 +89,6 @@ class BeamSearch:
                 sharp = directivity(self.sigma, to @ to.T) @ power[own]
                 best[r] = max(best[r], (sharp + gain[r][pixel_of(to, self.shape)]).max())
         return best
-
-
-def find_links(
-    field: RadioField,
-    rx: Any,
-    transmitter: Any,
-    beam_sigma_rad: float,
-    shape: tuple[int, int] | None,
-    progress: Progress | None,
-) -> Links:
-    """See :meth:`RadioField.links`."""
-    from warprrf.rf.bistatic import BistaticField
-    from warprrf.rf.bistatic_links import SHAPE, LinkTracer
-
-    receivers = check_receiver("rx", _device.check_array("rx", rx, (None, 3)), field.mesh)
-    source = (
-        field.transmitter if transmitter is None else _device.check_array("transmitter", transmitter, (3,))
-    )
-    if (np.linalg.norm(receivers - source, axis=1) == 0).any():
-        raise ValueError("rx: got the transmitter's own position; expected them apart")
-    if not (np.isfinite(beam_sigma_rad) and beam_sigma_rad > 0):
-        raise ValueError(f"beam_sigma_rad: got {beam_sigma_rad!r}, expected a positive beam width in radians")
-    trace: Callable[[np.ndarray], Links]
-    if isinstance(field, BistaticField):
-        tracer = LinkTracer(field, source, beam_sigma_rad, check_shape(shape or SHAPE))
-        trace, batch = tracer, tracer.batch
-    else:
-        search = BeamSearch(check_shape(shape or field.shape), beam_sigma_rad, device=field.device)
-        trace, batch = lambda some: links_of([field.paths(r, transmitter) for r in some], search), 1
-    parts = []
-    for first in range(0, len(receivers), batch):
-        if progress is not None:
-            progress("links", first, len(receivers))
-        parts.append(trace(receivers[first : first + batch]))
-    if progress is not None:
-        progress("links", len(receivers), len(receivers))
-    return Links.joined(parts)
 
 
 def links_of(paths: Sequence[Paths], search: BeamSearch) -> Links:

@@ -14,15 +14,19 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.rf.arrays import PlanarArray
-from warprrf.rf.channel import channel_taps, frequency_response, impulse_response
-from warprrf.rf.path_set import Paths, carrier_phase
-from warprrf.rf.paths import check_frequency
-from warprrf.rf.sionna_engine import repeated
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.path_set import Paths
+from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.spectrum import directions_from_angles
+from warprrf.rf.waves import carrier_phase, check_frequency
 
 SPECULAR, DIFFUSE = 1, 2
 """``sionna.rt.InteractionType``."""
+SAME_LENGTH_M = (
+    5e-3  # paths nearer than this in length and direction are one: Sionna takes planes 1 cm apart for one
+)
+SAME_DIRECTION_RAD = 1e-3
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class SionnaPaths:
         """Frequency response ``(R, M, 1, N, T, F)`` at baseband ``frequencies`` (F,) [Hz], as ``sionna.rt.Paths.cfr``.
 
         ``normalize`` scales each link to unit mean energy; ``method`` is that of
-        :func:`~warprrf.rf.channel.frequency_response`.
+        :func:`~warprrf.rf.channel.response.frequency_response`.
         """
         f = self._paths.carrier_hz + _device.check_array("frequencies", frequencies, (None,))
         h = frequency_response(
@@ -126,7 +130,7 @@ def to_sionna(
 
     Args:
         tx_array, rx_array: One isotropic element without polarisation by default.
-        diffuse, seed: see :func:`~warprrf.rf.channel.frequency_response`.
+        diffuse, seed: see :func:`~warprrf.rf.channel.response.frequency_response`.
 
     Raises:
         ValueError: as there.
@@ -244,6 +248,28 @@ def from_sionna(
         )
         found.append(one.select(np.argsort(-np.abs(gain), kind="stable")))
     return Paths.stack(found)
+
+
+def repeated(tau: np.ndarray, arrival: np.ndarray, aod: np.ndarray, bounces: np.ndarray) -> np.ndarray:
+    """Which specular paths repeat an earlier one, shape ``(L,)`` bool.
+
+    Sionna tells mirrors apart by the rounded plane of the triangle met. Small triangles of one surface have planes that
+    differ by rounding, and each is then taken for a mirror of its own: one reflection is counted several times.
+
+    Args:
+        tau: delays [s], shape ``(L,)``.
+        arrival: unit directions of arrival, shape ``(L, 3)``.
+        aod: zenith and azimuth of departure [rad], shape ``(L, 2)``.
+        bounces: interactions, shape ``(L,)``.
+    """
+    departure = directions_from_angles(aod[:, 0], aod[:, 1])
+    same = (
+        (np.abs(tau[:, None] - tau) * SPEED_OF_LIGHT < SAME_LENGTH_M)
+        & (np.linalg.norm(arrival[:, None] - arrival, axis=-1) < SAME_DIRECTION_RAD)
+        & (np.linalg.norm(departure[:, None] - departure, axis=-1) < SAME_DIRECTION_RAD)
+        & (bounces[:, None] == bounces)
+    )
+    return np.asarray(np.tril(same, -1).any(axis=1))
 
 
 def _one_transmitter(h: np.ndarray) -> np.ndarray:

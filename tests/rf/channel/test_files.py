@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from path_makers import random_paths  # noqa: E402
 
-from warprrf.rf.path_set import Paths  # noqa: E402
+from warprrf.rf.channel.path_set import Paths  # noqa: E402
 
 
 def same(a, b):

@@ -10,8 +10,8 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.absorption import Air
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.dataset import write_whole
-from warprrf.rf.path_set import Paths
 
 KINDS = ("", "los", "mirror", "diffuse")
 """What the values 0, 1, ... of the variable ``kind`` mean."""

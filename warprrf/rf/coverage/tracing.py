@@ -1,29 +1,68 @@
-"""Links of many receivers in a bistatic field: its terms on few rays, several receivers in one launch, and no beam.
+"""Links of many receivers in a field: from their paths, or, in a bistatic field, traced several at a time.
 
-Line of sight and mirror paths are those of the full query, exactly. Scattering, whose power is a mean over rays, takes
-a coarser grid of them: 20 x 40 pixels of 4 rays (3200) instead of 115,200 at 60 x 120. Against the full query at ten
-blocked places of a lobby, rms: total path gain 0.04 dB, best beam of 2 degrees 0.4 dB (30 x 60: 0.05 and 0.2 dB).
+Tracing takes the field's terms on few rays, several receivers in one launch, and no beam. Line of sight and mirror
+paths are those of the full query, exactly. Scattering, whose power is a mean over rays, takes a coarser grid of them:
+20 x 40 pixels of 4 rays (3200) instead of 115,200 at 60 x 120. Against the full query at ten blocked places of a lobby,
+rms: total path gain 0.04 dB, best beam of 2 degrees 0.4 dB (30 x 60: 0.05 and 0.2 dB).
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
+from warprrf import device as _device
+from warprrf.device import Progress
+from warprrf.rf.bistatic import BistaticField
 from warprrf.rf.bounces import BounceTracer, Met
+from warprrf.rf.coverage.links import BeamSearch, Links, links_of
+from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.links import BeamSearch, Links
 from warprrf.rf.second_bounce import mirrored_scene
+from warprrf.rf.spectrum import check_shape
 from warprrf.rf.specular import specular_paths
-
-if TYPE_CHECKING:
-    from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.transport import check_receiver
 
 SHAPE = (20, 40)
 """Default grid of a link's rays."""
 SUB_PIXELS = 2  # square root of the rays per pixel
 RAYS_AT_A_TIME = 230_000  # of all receivers in one launch
+
+
+def find_links(
+    field: RadioField,
+    rx: Any,
+    transmitter: Any,
+    beam_sigma_rad: float,
+    shape: tuple[int, int] | None,
+    progress: Progress | None,
+) -> Links:
+    """See :meth:`RadioField.links`."""
+    receivers = check_receiver("rx", _device.check_array("rx", rx, (None, 3)), field.mesh)
+    source = (
+        field.transmitter if transmitter is None else _device.check_array("transmitter", transmitter, (3,))
+    )
+    if (np.linalg.norm(receivers - source, axis=1) == 0).any():
+        raise ValueError("rx: got the transmitter's own position; expected them apart")
+    if not (np.isfinite(beam_sigma_rad) and beam_sigma_rad > 0):
+        raise ValueError(f"beam_sigma_rad: got {beam_sigma_rad!r}, expected a positive beam width in radians")
+    trace: Callable[[np.ndarray], Links]
+    if isinstance(field, BistaticField):
+        tracer = LinkTracer(field, source, beam_sigma_rad, check_shape(shape or SHAPE))
+        trace, batch = tracer, tracer.batch
+    else:
+        search = BeamSearch(check_shape(shape or field.shape), beam_sigma_rad, device=field.device)
+        trace, batch = lambda some: links_of([field.paths(r, transmitter) for r in some], search), 1
+    parts = []
+    for first in range(0, len(receivers), batch):
+        if progress is not None:
+            progress("links", first, len(receivers))
+        parts.append(trace(receivers[first : first + batch]))
+    if progress is not None:
+        progress("links", len(receivers), len(receivers))
+    return Links.joined(parts)
 
 
 class LinkTracer:

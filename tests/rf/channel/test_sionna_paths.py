@@ -10,13 +10,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 from path_makers import CARRIER, random_paths  # noqa: E402
 
 from warprrf.rf import llvm  # noqa: E402
-from warprrf.rf.arrays import PlanarArray  # noqa: E402
-from warprrf.rf.path_set import Paths  # noqa: E402
+from warprrf.rf.channel.arrays import PlanarArray  # noqa: E402
+from warprrf.rf.channel.path_set import Paths  # noqa: E402
 from warprrf.rf.paths import trace_paths  # noqa: E402
 from warprrf.rf.scene import Scene  # noqa: E402
 from warprrf.rf.sionna_engine import load_sionna_scene  # noqa: E402
 
-LOBBY = Path(__file__).parents[2] / "data" / "lobby"
+LOBBY = Path(__file__).parents[3] / "data" / "lobby"
 TX = np.array([13.6, 11.2, 2.5])
 RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
 

@@ -22,11 +22,12 @@ import numpy as np
 from warprrf.rf.absorption import Air, air_of
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.spectrum import angles_from_directions, directions_from_angles
+from warprrf.rf.waves import carrier_phase
 
 if TYPE_CHECKING:
-    from warprrf.rf.arrays import PlanarArray
-    from warprrf.rf.dispersion import Dispersion
-    from warprrf.rf.sionna_paths import SionnaPaths
+    from warprrf.rf.channel.arrays import PlanarArray
+    from warprrf.rf.channel.dispersion import Dispersion
+    from warprrf.rf.channel.sionna_paths import SionnaPaths
 
 _PER_PATH = ("gain", "tau", "theta_r", "phi_r", "theta_t", "phi_t", "vertices", "kind", "valid", "jones")
 
@@ -183,32 +184,34 @@ class Paths:
     # ------------------------------------------------------------------------------- what is computed from paths
 
     def cir(self, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Impulse response, one coefficient a path; see :func:`warprrf.rf.channel.impulse_response`."""
-        from warprrf.rf.channel import impulse_response
+        """Impulse response, one coefficient a path; see :func:`warprrf.rf.channel.response.impulse_response`."""
+        from warprrf.rf.channel.response import impulse_response
 
         return impulse_response(self, **options)
 
     def cfr(self, frequencies_hz: Any, **options: Any) -> np.ndarray:
-        """Frequency response; see :func:`warprrf.rf.channel.frequency_response`."""
-        from warprrf.rf.channel import frequency_response
+        """Frequency response; see :func:`warprrf.rf.channel.response.frequency_response`."""
+        from warprrf.rf.channel.response import frequency_response
 
         return frequency_response(self, frequencies_hz, **options)
 
     def taps(self, bandwidth_hz: float, l_min: int, l_max: int, **options: Any) -> np.ndarray:
-        """Taps of the discrete baseband channel; see :func:`warprrf.rf.channel.channel_taps`."""
-        from warprrf.rf.channel import channel_taps
+        """Taps of the discrete baseband channel; see :func:`warprrf.rf.channel.response.channel_taps`."""
+        from warprrf.rf.channel.response import channel_taps
 
         return channel_taps(self, bandwidth_hz, l_min, l_max, **options)
 
     def diffuse_power(self, **options: Any) -> np.ndarray:
-        """Mean power that diffuse paths add to any pair of elements; see :func:`warprrf.rf.channel.diffuse_power`."""
-        from warprrf.rf.channel import diffuse_power
+        """Mean power that diffuse paths add to any pair of elements; see
+        :func:`warprrf.rf.channel.response.diffuse_power`."""
+        from warprrf.rf.channel.response import diffuse_power
 
         return diffuse_power(self, **options)
 
     def dispersion(self) -> Dispersion:
-        """Delay and angular spreads, K-factor and coherence bandwidth; see :func:`warprrf.rf.dispersion.dispersion`."""
-        from warprrf.rf.dispersion import dispersion
+        """Delay and angular spreads, K-factor and coherence bandwidth; see
+        :func:`warprrf.rf.channel.dispersion.dispersion`."""
+        from warprrf.rf.channel.dispersion import dispersion
 
         return dispersion(self)
 
@@ -218,28 +221,28 @@ class Paths:
         rx_array: PlanarArray | None = None,
         **options: Any,
     ) -> SionnaPaths:
-        """Arrays in the shapes and conventions of Sionna RT; see :func:`warprrf.rf.sionna_paths.to_sionna`."""
-        from warprrf.rf.sionna_paths import to_sionna
+        """Arrays in the shapes and conventions of Sionna RT; see :func:`warprrf.rf.channel.sionna_paths.to_sionna`."""
+        from warprrf.rf.channel.sionna_paths import to_sionna
 
         return to_sionna(self, tx_array, rx_array, **options)
 
     @staticmethod
     def from_sionna(paths: Any, **options: Any) -> Paths:
-        """Paths that Sionna RT solved; see :func:`warprrf.rf.sionna_paths.from_sionna`."""
-        from warprrf.rf.sionna_paths import from_sionna
+        """Paths that Sionna RT solved; see :func:`warprrf.rf.channel.sionna_paths.from_sionna`."""
+        from warprrf.rf.channel.sionna_paths import from_sionna
 
         return from_sionna(paths, **options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to a NetCDF-4 file; see :func:`warprrf.rf.path_files.save_paths`."""
-        from warprrf.rf.path_files import save_paths
+        """Write to a NetCDF-4 file; see :func:`warprrf.rf.channel.files.save_paths`."""
+        from warprrf.rf.channel.files import save_paths
 
         save_paths(self, path)
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Paths:
-        """Read what :meth:`save` wrote; see :func:`warprrf.rf.path_files.load_paths`."""
-        from warprrf.rf.path_files import load_paths
+        """Read what :meth:`save` wrote; see :func:`warprrf.rf.channel.files.load_paths`."""
+        from warprrf.rf.channel.files import load_paths
 
         return load_paths(path)
 
@@ -333,21 +336,6 @@ class Paths:
             **_common(parts),
             receiver=receiver,
         )
-
-
-def carrier_phase(frequency_hz: Any, tau: Any) -> np.ndarray:
-    """exp(-j 2 pi f tau); whole turns are dropped before the exponential, since f tau reaches 1e4 and more."""
-    return np.exp(-2j * np.pi * np.mod(np.asarray(frequency_hz) * np.asarray(tau), 1.0))
-
-
-def transverse_basis(directions: Any) -> np.ndarray:
-    """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
-    zenith, azimuth = angles_from_directions(directions)
-    up = np.stack(
-        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)], axis=-1
-    )
-    around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
-    return np.stack([up, around], axis=-2)
 
 
 def _deepen(vertices: np.ndarray, depth: int) -> np.ndarray:

@@ -37,7 +37,7 @@ from warprrf.kernels.delays import (
     spread_separable_delays,
     taps_vector,
 )
-from warprrf.rf.element_lengths import PairLengths
+from warprrf.rf.channel.lengths import PairLengths
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 
 OVERSAMPLING = 2

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warprrf.rf.thz_channels import HIGH_HZ, LOW_HZ, THZ_CHANNELS, UNIT_HZ, thz_channel
+from warprrf.rf.channel.band_plan import HIGH_HZ, LOW_HZ, THZ_CHANNELS, UNIT_HZ, thz_channel
 
 
 def test_69_channels_of_eight_bandwidths():

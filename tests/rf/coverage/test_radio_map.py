@@ -7,16 +7,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.coverage.links import BeamSearch, directivity, links_of
+from warprrf.rf.coverage.radio_map import QUANTITIES, RadioMap, in_the_air
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.links import BeamSearch, directivity, links_of
 from warprrf.rf.mirror_tree import MirrorTree
-from warprrf.rf.radio_map import QUANTITIES, RadioMap, in_the_air
 from warprrf.rf.spectrum import pixel_directions, pixel_solid_angles
 from warprrf.rf.surface import Surface
 

@@ -1,8 +1,8 @@
 """Beams chosen from a predicted field: codebooks, single-link and multi-user choice, without pilots.
 
 A beam is a vector of unit-norm weights w over an array's elements; between a beam at each end the received amplitude is
-w_r^T H w_t (:func:`warprrf.rf.channel.frequency_response` for H). Steered along its own direction a beam of N elements
-has gain N.
+w_r^T H w_t (:func:`warprrf.rf.channel.response.frequency_response` for H). Steered along its own direction a beam of N
+elements has gain N.
 
 Choices are made from predicted *power* per direction. Scattering has no phase in a field, and those of mirrors and line
 of sight turn once a wavelength (1 mm at 300 GHz), far below what geometry from photos knows. With phases independent
@@ -13,7 +13,7 @@ between paths the mean gain of a pair of beams is
 g the gain of a beam on one element's. What it cannot foresee is how paths that one beam cannot tell apart add up.
 
 Waves are plane: a beam of more than a thousand elements loses to that within a few metres
-(:func:`warprrf.rf.arrays.plane_wave_error`). :func:`steering_codebook` focuses on points.
+(:func:`warprrf.rf.channel.arrays.plane_wave_error`). :func:`steering_codebook` focuses on points.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.rf.arrays import ISOTROPIC, PlanarArray
-from warprrf.rf.path_set import Paths
+from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.spectrum import Spectrum, directions_from_angles, pixel_directions
 
 MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
