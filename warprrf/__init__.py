@@ -50,7 +50,7 @@ _HOMES = {
     "load_sionna_scene": "rf.sionna_engine",
     "orientation_towards": "rf.channel.arrays",
     "plane_wave_error": "rf.channel.arrays",
-    "reconstruct": "geometry.reconstruction",
+    "reconstruct": "geometry.from_photos",
     "relevance": "rf.relevance",
     "render": "geometry.render",
     "select_beams": "rf.channel.beams",
@@ -67,11 +67,11 @@ __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
     from warprrf.geometry.camera import Camera as Camera
+    from warprrf.geometry.from_photos import reconstruct as reconstruct
     from warprrf.geometry.gaussian_rays import GaussianRays as GaussianRays
     from warprrf.geometry.gaussians import Gaussians as Gaussians
     from warprrf.geometry.mesh import Mesh as Mesh
     from warprrf.geometry.reconstruction import Reconstruction as Reconstruction
-    from warprrf.geometry.reconstruction import reconstruct as reconstruct
     from warprrf.geometry.render import Blending as Blending
     from warprrf.geometry.render import BlendWeights as BlendWeights
     from warprrf.geometry.render import Rasterizer as Rasterizer
