@@ -7,16 +7,71 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from warprrf.cli_bars import Bars
-from warprrf.cli_help import (
-    HELP_BENCH,
-    HELP_BENCH_BEAMS,
-    HELP_BENCH_BISTATIC,
-    HELP_BENCH_ENGINE,
-    HELP_BENCH_EVALUATION,
-)
+from warprrf.cli.bars import Bars
+from warprrf.cli.inputs import Add
 
-Add = Callable[..., argparse.ArgumentParser]
+HELP_BENCH = """\
+Prints a table and writes it as JSON and Markdown.
+
+examples:
+  warprrf bench channel
+  warprrf bench relevance
+  warprrf bench newrf
+  warprrf bench newrf --data external/newrf --out runs/newrf
+  warprrf bench bistatic --truths exact --counts 10 50
+  warprrf bench engine
+  warprrf bench map --field field.safetensors
+  warprrf bench table1
+  warprrf bench sparsity
+  warprrf bench beams
+"""
+
+HELP_BENCH_BISTATIC = """\
+Fits the bistatic field, RF-3DGS+ and lookups on the same receivers and scores them on held-out ones; then ablation,
+stated uncertainty, delays, a second transmitter, Sionna against itself, Gauss-Newton against Adam. Every row is kept:
+a killed run loses one, and a row is made again only if its data, geometry, options or code changed.
+
+examples:
+  warprrf bench bistatic
+  warprrf bench bistatic --truths exact --counts 10 --every 4 --out runs/quick     a first look, in minutes
+  warprrf bench bistatic --data spectra_full.nc spectra_sionna_full.nc --geometry room
+"""
+
+HELP_BENCH_ENGINE = """\
+Turns each knob of the rasteriser (cutoff, clamp, top K, precision, resolution, number of Gaussians, interaction point,
+form of the response and of the exponential) and writes its time and its error as tables and pictures, with the settings
+that follow; then growth, mesh rays against Embree, blending against torch, and the transport of 800 receivers on disk.
+Each measurement is kept: a killed run loses one. For figures worth quoting leave the machine alone meanwhile.
+
+examples:
+  warprrf bench engine
+  warprrf bench engine --quick --out runs/engine-quick
+"""
+
+HELP_BENCH_EVALUATION = """\
+Every method on the same receivers: bistatic, RF-3DGS+ and RF-3DGS (opacity frozen and trained), NeRF2, a conditional
+GAN, Sionna RT with assumed and with calibrated materials, lookups. Both commands share one folder: a finished run is
+kept in a file of its own, a killed sweep loses the run at work, and a run is done again only if its data, geometry,
+options or code changed. The truth `paper-law` is made: scattering that falls with the whole path's length, as the
+paper's law has it. Needs the extras plots, baselines, sionna and cluster; --workers 0 does without the last.
+
+examples:
+  warprrf bench table1
+  warprrf bench sparsity --workers 0
+  warprrf bench table1 --methods bistatic rf3dgs+ rf3dgs --counts 10 --every 10      a first look, in minutes
+  warprrf bench table1 --scale paper --data spectra_full.nc spectra_sionna_full.nc --scheduler tcp://lab:8786
+"""
+
+HELP_BENCH_BEAMS = """\
+Fits the bistatic field and RF-3DGS+, picks each test receiver's beam without pilots, and compares received SNR and
+spectral efficiency on the true channel with exhaustive and hierarchical search, the nearest training receiver's beam,
+pointing at the transmitter, zero spectra and random beams. Fitted fields are kept: a killed run continues.
+
+examples:
+  warprrf bench beams
+  warprrf bench beams --truths exact --counts 10 --every 4 --sides 4 16 --out runs/quick     a first look
+  warprrf bench beams --data spectra_full.nc spectra_sionna_full.nc --geometry room
+"""
 
 
 def add_benches(add: Add) -> None:
