@@ -41,7 +41,7 @@ def field_code(*, bistatic: bool, harmonic: bool) -> tuple[str, ...]:
     other = {*_NEITHER, *(() if bistatic else _BISTATIC), *(() if harmonic else _HARMONIC)}
     folder = Path(wr.__file__).parent / "rf"
     files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in other]
-    return ("device.py", "kernels", "geometry", *files)
+    return ("device.py", "kernels", "geometry", *files, "rf/channel", "rf/coverage")
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,16 @@ def angles_from_directions(directions: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]), np.where(azimuth == -np.pi, np.pi, azimuth)
 
 
+def transverse_basis(directions: Any) -> np.ndarray:
+    """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
+    zenith, azimuth = angles_from_directions(directions)
+    up = np.stack(
+        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)], axis=-1
+    )
+    around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
+    return np.stack([up, around], axis=-2)
+
+
 def pixel_of(directions: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the pixel that each direction ``(..., 3)`` falls in."""
     rows, columns = check_shape(shape)

@@ -236,7 +236,7 @@ def _sionna(scene: Scene, task: Task) -> Fitted:
 _METRICS = ("rf/metrics.py", "rf/spectrum.py", "rf/dataset.py", "kernels/beam.py")
 _NETWORKS = ("rf/baselines", *_METRICS)
 _LOOKUPS = ("rf/lookups.py", *_METRICS)
-_SIONNA = ("rf/sionna_engine.py", "rf/scene.py", "rf/materials.py", *_METRICS)
+_SIONNA = ("rf/sionna_engine.py", "rf/channel/sionna_paths.py", "rf/scene.py", "rf/materials.py", *_METRICS)
 _HARMONIC = field_code(bistatic=False, harmonic=True)
 _BISTATIC = field_code(bistatic=True, harmonic=False)
 _MISJUDGED = f"permittivity off by a factor {PERMITTIVITY_OFF}, roughness by {ROUGHNESS_OFF}, up or down"
