@@ -70,14 +70,23 @@ class Fitted:
 
 
 def fit_bistatic(
-    geometry: Geometry, train: SpectrumDataset, *, progress: Progress | None = None, **options: Any
+    geometry: Geometry,
+    train: SpectrumDataset,
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    **options: Any,
 ) -> Fitted:
-    """The bistatic field on the reconstruction."""
-    rays = geometry.rays(train, progress=progress)
+    """The bistatic field on the reconstruction; a quick one traces its own, fewer rays."""
+    rays = None if quick else geometry.rays(train, progress=progress)
     found = wr.RadioField.fit(
-        geometry.reconstruction, train, transport=rays, device=geometry.device, progress=progress, **options
+        geometry.reconstruction, train, transport=rays, quick=quick, device=geometry.device, progress=progress,
+        **options,
+    )  # fmt: skip
+    spent = found.report
+    return Fitted(
+        found.spectrum, transport_s=spent["transport_time_s"], fit_s=spent["fit_time_s"], field=found
     )
-    return Fitted(found.spectrum, transport_s=rays.seconds, fit_s=found.report["fit_time_s"], field=found)
 
 
 def fit_harmonic(

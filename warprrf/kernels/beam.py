@@ -122,21 +122,21 @@ def strongest_rays(
     log_power: wp.array(dtype=wp.float64),
     top: wp.array(dtype=wp.float64),
     highest: wp.float64,
-    spread: wp.float64,
     pixels: wp.array2d(dtype=wp.vec3d),
     half_widths: wp.array2d(dtype=wp.int32),
+    first_row: wp.array(dtype=wp.int32),
+    least_fall: wp.array3d(dtype=wp.float32),
     kappa: wp.float64,
     chord_limit: wp.float64,
     strongest: wp.array(dtype=wp.int32),
 ):
     """Which ray's beam gives a pixel the most (-1: none), for ``per_pixel`` rays in every pixel's cell.
 
-    ``top`` is the largest ``log_power`` of a cell, ``highest`` of all, ``spread`` the longest chord from a pixel centre
-    to one of its rays: together they bound what a cell, or all cells of a row beyond some column, can give. Rows are
-    looked at from the own one outwards, and few cells need a closer look.
+    ``top`` is the largest ``log_power`` of a cell, ``highest`` of all, ``least_fall`` by how much the beam lowers any
+    ray of a cell at least: of the pixel's row, of the cell's row from ``first_row`` on, of the distance in columns.
+    Most cells need no closer look.
     """
     k = offset + wp.tid()
-    rows = pixels.shape[0]
     columns = pixels.shape[1]
     row = k / columns
     column = k - row * columns
@@ -144,43 +144,37 @@ def strongest_rays(
     half_kappa = wp.float64(0.5) * kappa
     best_value = wp.float64(-1.0e300)
     best = int(-1)
-    for ring in range(2 * rows - 1):
-        cell_row = row + (ring + 1) / 2
-        if ring % 2 == 1:
-            cell_row = row - (ring + 1) / 2
-        half = int(-1)
-        if cell_row >= 0 and cell_row < rows:
-            half = half_widths[row, cell_row]
-        if half >= 0:
-            # The nearest cell of the row is the one in the own column; farther ones can't be beyond ``reach``.
-            q = pixels[cell_row, column]
-            near = wp.length(q - p)
-            reach = spread + wp.sqrt(wp.max(highest - best_value, wp.float64(0.0)) / half_kappa)
-            if near > reach or highest <= best_value:
-                half = -1
-            else:
-                across = wp.float64(4.0) * wp.sqrt((p[0] * p[0] + p[1] * p[1]) * (q[0] * q[0] + q[1] * q[1]))
-                square = reach * reach - near * near
-                if square < across:
-                    turn = wp.float64(2.0) * wp.asin(wp.sqrt(square / across))
-                    half = wp.min(half, int(turn * wp.float64(columns) / wp.float64(2.0 * wp.pi)) + 1)
-        if half >= 0:
-            start = column_start(column, half, columns)
-            for step in range(window_width(half, columns)):
-                cell_column = start + step
+    # The own cell first: it is most often the answer.
+    for j in range(per_pixel):
+        m = k * per_pixel + j
+        value = log_power[m] - half_kappa * wp.length_sq(directions[m] - p)
+        if value > best_value:
+            best_value = value
+            best = m
+    first = first_row[row]
+    for r in range(wp.min(least_fall.shape[1], pixels.shape[0] - first)):
+        half = wp.min(half_widths[row, first + r], columns / 2)
+        base = (first + r) * columns
+        for apart in range(half + 1):
+            # Farther cells of the row can only give less.
+            fall = wp.float64(least_fall[row, r, apart])
+            if highest - fall <= best_value:
+                break
+            for side in range(2):
+                cell_column = column + apart
+                if side == 1:
+                    cell_column = column - apart
                 if cell_column >= columns:
                     cell_column = cell_column - columns
-                n = cell_row * columns + cell_column
-                bound = wp.float64(-1.0e300)
-                if top[n] > best_value:
-                    gap = wp.max(wp.length(pixels[cell_row, cell_column] - p) - spread, wp.float64(0.0))
-                    bound = top[n] - half_kappa * gap * gap
-                if bound > best_value:
+                if cell_column < 0:
+                    cell_column = cell_column + columns
+                n = base + cell_column
+                if top[n] - fall > best_value:
                     for j in range(per_pixel):
                         m = n * per_pixel + j
                         c = wp.length_sq(directions[m] - p)
                         value = log_power[m] - half_kappa * c
-                        if (c <= chord_limit or n == k) and value > best_value:
+                        if c <= chord_limit and value > best_value:
                             best_value = value
                             best = m
     strongest[k] = best

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress, check_array
 from warprrf.rf import bistatic_fit as _fit
@@ -45,6 +46,11 @@ MORE: tuple[tuple[str, Any], ...] = (
     ("scatter_mirror", True),
 )
 """Bounces that may be added to single ones, in the order in which they are tried."""
+QUICK: dict[str, Any] = {
+    "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": True,
+    "residual": False, "sub_pixels": 1,
+}  # fmt: skip
+"""What a quick fit takes for given: light of more than one bounce is even, and one ray a pixel."""
 FEW_MATERIALS = 30
 REGROUPED = 3  # rounds of deciding what is of one material, and fitting
 OUTER = 2  # rounds of further bounces and groups in turn
@@ -131,6 +137,7 @@ def train(
     indirect: bool | None = None,
     residual: bool | None = None,
     sub_pixels: int | None = None,
+    quick: bool = False,
     gain_offset: bool = False,
     iterations: int = _fit.MAX_STEPS,
     transport: BistaticTransport | None = None,
@@ -157,6 +164,7 @@ def train(
         residual: a gain for each surface element.
         sub_pixels: square root of the rays per pixel (None: 3, which no error in the lobby tells from 4; 2 costs 0.2
             dB of PSNR there and halves the time).
+        quick: try no term: what is not given here is taken from :data:`QUICK`.
         gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
         iterations: most steps of the groups' fit.
         transport: what :func:`trace` found for exactly these receivers.
@@ -182,6 +190,10 @@ def train(
         fixed = {name: value and ruled[name] for name, value in fixed.items()}
         wanted = {name: ruled[name] if value is None else value for name, value in wanted.items()}
         lobes = ruled["lobes"] if lobes is None else lobes
+    if quick:
+        wanted = {name: QUICK[name] if value is None else value for name, value in wanted.items()}
+        if sub_pixels is None and transport is None:
+            sub_pixels = QUICK["sub_pixels"]
     given = _chosen(**wanted)
     Terms(**fixed, **_chosen(lobes=lobes, sub_pixels=sub_pixels), **given)
     check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float32)
@@ -192,7 +204,9 @@ def train(
         geometry, ds, lobes=lobes, mirror_order=order, sub_pixels=sub_pixels, device=device, progress=progress
     )
     _check_transport(seen, ds, lobes, sub_pixels)
-    return _Training(seen, ds, gain_offset, int(iterations), seed, device, progress).run(fixed, wanted)
+    # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
+    with threadpool_limits(1, user_api="blas"):
+        return _Training(seen, ds, gain_offset, int(iterations), seed, device, progress).run(fixed, wanted)
 
 
 class _Training:

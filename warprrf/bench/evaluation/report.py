@@ -271,16 +271,23 @@ def _ahead_text(ahead: Sequence[Row]) -> str:
             cells.append("-" if r is None else f"{form.format(r['margin'])} ({METHODS[r['method']][0]})")
         ratios = [cell(row.get(k), "{:.2g}") for k in ("train_ratio", "spectrum_ratio")]
         where = TRUTHS[row["truth"]] + ("" if row["split"] == "random" else ", region")
-        lines.append([where, str(row["count"]), *cells, *ratios])
+        lines.append([where, str(row["count"]), METHODS[row["ours"]][0], *cells, *ratios])
     behind = [
-        f"{TRUTHS[row['truth']]}, {row['split']}, {row['count']} receivers: {title} behind "
+        f"{METHODS[row['ours']][0]}, {TRUTHS[row['truth']]}, {row['split']}, {row['count']} receivers: {title} behind "
         f"{METHODS[row[key]['method']][0]}"
         for row in ahead
         for (key, _), title in zip(AHEAD, titles, strict=True)
         if row.get(key) is not None and not row[key]["ahead"]
     ]
     verdict = "Behind no other method in any figure." if not behind else "Behind: " + "; ".join(behind) + "."
-    head = ["truth", "receivers", *titles, "trains faster than RF-3DGS+, times", "infers faster, times"]
+    head = [
+        "truth",
+        "receivers",
+        "ours",
+        *titles,
+        "trains faster than RF-3DGS+, times",
+        "infers faster, times",
+    ]
     text = "Ours less the best of the other methods in each figure, which is named."
     return "\n\n".join([text, table(head, lines), verdict])
 
