@@ -244,7 +244,7 @@ plt.show()
 # `select_beams_multiuser` lets users choose in turn until nobody's change raises the predicted sum of rates.
 
 # %%
-from warprrf.rf.beams import signal_over_interference
+from warprrf.rf.channel.beams import signal_over_interference
 
 e = between["tx 256"]
 sums = {"each for itself": [], "minding the others": []}

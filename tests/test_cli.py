@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from warprrf import cli
-from warprrf.rf.radio_map import RadioMap
+from warprrf.cli.inputs import read_positions, read_receivers
+from warprrf.cli.views import _look_at
+from warprrf.rf.coverage.radio_map import RadioMap
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
@@ -42,6 +46,19 @@ def test_top_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> Non
         cli.main(["--help"])
     text = capsys.readouterr().out
     assert [command for command in COMMANDS if not re.search(rf"^    {command}\s", text, re.MULTILINE)] == []
+
+
+@pytest.mark.parametrize("module", ["warprrf", "warprrf.cli"])
+def test_runs_as_a_module(module: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", module, "fit", "none", "none.nc", "-o", "none.safetensors"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=300,
+    )
+    assert done.returncode == 2
+    assert done.stderr == "warprrf: error: none: no such file or folder\n"
 
 
 SIMULATE = ["simulate", "{scene}", "-o", "{tmp}/x.nc", "--transmitter", "2", "3", "3", "--receivers"]
@@ -150,7 +167,7 @@ def test_known_positions_from_json_and_csv_agree(suffix: str, tmp_path: Path) ->
         if suffix == "json"
         else "file,x,y,z\na.jpg,1,2.5,3\nb.jpg,4,5,6\n"
     )
-    assert cli._read_positions(path) == {"a.jpg": (1.0, 2.5, 3.0), "b.jpg": (4.0, 5.0, 6.0)}
+    assert read_positions(path) == {"a.jpg": (1.0, 2.5, 3.0), "b.jpg": (4.0, 5.0, 6.0)}
 
 
 def test_receivers_from_file_and_words_agree(tmp_path: Path) -> None:
@@ -158,11 +175,11 @@ def test_receivers_from_file_and_words_agree(tmp_path: Path) -> None:
     (tmp_path / "r.csv").write_text("x,y,z\n1,2,1.5\n3,4,1.5\n")
     np.save(tmp_path / "r.npy", expected)
     for words in (["1,2,1.5", "3,4,1.5"], [str(tmp_path / "r.csv")], [str(tmp_path / "r.npy")]):
-        np.testing.assert_array_equal(cli._read_receivers(words), expected)
+        np.testing.assert_array_equal(read_receivers(words), expected)
 
 
 def test_look_at_puts_the_target_in_the_middle_with_z_up() -> None:
-    camera = cli._look_at((1.0, 2.0, 1.5), (4.0, 6.0, 1.0), (640, 480), 90.0)
+    camera = _look_at((1.0, 2.0, 1.5), (4.0, 6.0, 1.0), (640, 480), 90.0)
     pose = camera.world_to_camera
     target, above = (pose @ (*point, 1.0) for point in ((4.0, 6.0, 1.0), (4.0, 6.0, 1.2)))
     np.testing.assert_allclose(target[:3], [0.0, 0.0, np.sqrt(3**2 + 4**2 + 0.5**2)], atol=1e-12)

@@ -20,49 +20,49 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Air": "rf.absorption",
-    "BeamChoice": "rf.beams",
+    "BeamChoice": "rf.channel.beams",
     "Blending": "geometry.render",
     "BlendWeights": "geometry.render",
     "Camera": "geometry.camera",
-    "Codebook": "rf.beams",
+    "Codebook": "rf.channel.beams",
     "GaussianRays": "geometry.gaussian_rays",
     "Gaussians": "geometry.gaussians",
     "Material": "rf.materials",
     "Mesh": "geometry.mesh",
-    "Paths": "rf.paths",
-    "PlanarArray": "rf.arrays",
+    "Paths": "rf.channel.path_set",
+    "PlanarArray": "rf.channel.arrays",
     "RadioField": "rf.field",
-    "RadioMap": "rf.radio_map",
+    "RadioMap": "rf.coverage.radio_map",
     "Rasterizer": "geometry.render",
     "Relevance": "rf.relevance",
     "Reconstruction": "geometry.reconstruction",
     "Scene": "rf.scene",
     "Spectrum": "rf.spectrum",
     "SpectrumDataset": "rf.dataset",
-    "THZ_CHANNELS": "rf.thz_channels",
-    "beam_gains": "rf.beams",
+    "THZ_CHANNELS": "rf.channel.band_plan",
+    "beam_gains": "rf.channel.beams",
     "blend_weights": "geometry.render",
-    "dft_codebook": "rf.beams",
+    "dft_codebook": "rf.channel.beams",
     "evaluate": "rf.metrics",
     "fit_reflections": "rf.reflections",
     "gas_attenuation_db_per_m": "rf.absorption",
     "load_newrf": "rf.newrf",
     "load_sionna_scene": "rf.sionna_engine",
-    "orientation_towards": "rf.arrays",
-    "plane_wave_error": "rf.arrays",
-    "precoded_sinr": "rf.precoders",
-    "precoders": "rf.precoders",
-    "reconstruct": "geometry.reconstruction",
+    "orientation_towards": "rf.channel.arrays",
+    "plane_wave_error": "rf.channel.arrays",
+    "precoded_sinr": "rf.channel.precoders",
+    "precoders": "rf.channel.precoders",
+    "reconstruct": "geometry.from_photos",
     "relevance": "rf.relevance",
     "render": "geometry.render",
-    "select_beams": "rf.beams",
-    "select_beams_multiuser": "rf.beams",
+    "select_beams": "rf.channel.beams",
+    "select_beams_multiuser": "rf.channel.beams",
     "simulate": "rf.simulate",
-    "steering_codebook": "rf.beams",
-    "thz_channel": "rf.thz_channels",
-    "transmit_covariance": "rf.precoders",
+    "steering_codebook": "rf.channel.beams",
+    "thz_channel": "rf.channel.band_plan",
+    "transmit_covariance": "rf.channel.precoders",
     "trace_paths": "rf.paths",
-    "write_deepmimo": "rf.deepmimo",
+    "write_deepmimo": "rf.channel.deepmimo",
     "write_twin": "rf.twin",
 }
 
@@ -70,11 +70,11 @@ __all__ = ["__version__", *_HOMES]
 
 if TYPE_CHECKING:
     from warprrf.geometry.camera import Camera as Camera
+    from warprrf.geometry.from_photos import reconstruct as reconstruct
     from warprrf.geometry.gaussian_rays import GaussianRays as GaussianRays
     from warprrf.geometry.gaussians import Gaussians as Gaussians
     from warprrf.geometry.mesh import Mesh as Mesh
     from warprrf.geometry.reconstruction import Reconstruction as Reconstruction
-    from warprrf.geometry.reconstruction import reconstruct as reconstruct
     from warprrf.geometry.render import Blending as Blending
     from warprrf.geometry.render import BlendWeights as BlendWeights
     from warprrf.geometry.render import Rasterizer as Rasterizer
@@ -82,28 +82,30 @@ if TYPE_CHECKING:
     from warprrf.geometry.render import render as render
     from warprrf.rf.absorption import Air as Air
     from warprrf.rf.absorption import gas_attenuation_db_per_m as gas_attenuation_db_per_m
-    from warprrf.rf.arrays import PlanarArray as PlanarArray
-    from warprrf.rf.arrays import orientation_towards as orientation_towards
-    from warprrf.rf.arrays import plane_wave_error as plane_wave_error
-    from warprrf.rf.beams import BeamChoice as BeamChoice
-    from warprrf.rf.beams import Codebook as Codebook
-    from warprrf.rf.beams import beam_gains as beam_gains
-    from warprrf.rf.beams import dft_codebook as dft_codebook
-    from warprrf.rf.beams import select_beams as select_beams
-    from warprrf.rf.beams import select_beams_multiuser as select_beams_multiuser
-    from warprrf.rf.beams import steering_codebook as steering_codebook
+    from warprrf.rf.channel.arrays import PlanarArray as PlanarArray
+    from warprrf.rf.channel.arrays import orientation_towards as orientation_towards
+    from warprrf.rf.channel.arrays import plane_wave_error as plane_wave_error
+    from warprrf.rf.channel.band_plan import THZ_CHANNELS as THZ_CHANNELS
+    from warprrf.rf.channel.band_plan import thz_channel as thz_channel
+    from warprrf.rf.channel.beams import BeamChoice as BeamChoice
+    from warprrf.rf.channel.beams import Codebook as Codebook
+    from warprrf.rf.channel.beams import beam_gains as beam_gains
+    from warprrf.rf.channel.beams import dft_codebook as dft_codebook
+    from warprrf.rf.channel.beams import select_beams as select_beams
+    from warprrf.rf.channel.beams import select_beams_multiuser as select_beams_multiuser
+    from warprrf.rf.channel.beams import steering_codebook as steering_codebook
+    from warprrf.rf.channel.deepmimo import write_deepmimo as write_deepmimo
+    from warprrf.rf.channel.path_set import Paths as Paths
+    from warprrf.rf.channel.precoders import precoded_sinr as precoded_sinr
+    from warprrf.rf.channel.precoders import precoders as precoders
+    from warprrf.rf.channel.precoders import transmit_covariance as transmit_covariance
+    from warprrf.rf.coverage.radio_map import RadioMap as RadioMap
     from warprrf.rf.dataset import SpectrumDataset as SpectrumDataset
-    from warprrf.rf.deepmimo import write_deepmimo as write_deepmimo
     from warprrf.rf.field import RadioField as RadioField
     from warprrf.rf.materials import Material as Material
     from warprrf.rf.metrics import evaluate as evaluate
     from warprrf.rf.newrf import load_newrf as load_newrf
-    from warprrf.rf.paths import Paths as Paths
     from warprrf.rf.paths import trace_paths as trace_paths
-    from warprrf.rf.precoders import precoded_sinr as precoded_sinr
-    from warprrf.rf.precoders import precoders as precoders
-    from warprrf.rf.precoders import transmit_covariance as transmit_covariance
-    from warprrf.rf.radio_map import RadioMap as RadioMap
     from warprrf.rf.reflections import fit_reflections as fit_reflections
     from warprrf.rf.relevance import Relevance as Relevance
     from warprrf.rf.relevance import relevance as relevance
@@ -111,8 +113,6 @@ if TYPE_CHECKING:
     from warprrf.rf.simulate import simulate as simulate
     from warprrf.rf.sionna_engine import load_sionna_scene as load_sionna_scene
     from warprrf.rf.spectrum import Spectrum as Spectrum
-    from warprrf.rf.thz_channels import THZ_CHANNELS as THZ_CHANNELS
-    from warprrf.rf.thz_channels import thz_channel as thz_channel
     from warprrf.rf.twin import write_twin as write_twin
 
 

@@ -25,7 +25,7 @@ from small_room import SHAPE, small_room  # noqa: E402
 import warprrf as wr  # noqa: E402
 from warprrf import cli  # noqa: E402
 from warprrf.bench import evaluation  # noqa: E402
-from warprrf.bench.evaluation import protocol, report, runs  # noqa: E402
+from warprrf.bench.evaluation import comparison, protocol, report, runs  # noqa: E402
 from warprrf.bench.evaluation.methods import METHODS, UNTAUGHT, Effort  # noqa: E402
 from warprrf.bench.evaluation.paper_law import paper_law_spectra  # noqa: E402
 from warprrf.bench.evaluation.protocol import Run, Setting  # noqa: E402
@@ -241,7 +241,7 @@ def test_the_better_variant_of_each_seed_counts_and_seeds_are_averaged() -> None
         row("rf3dgs+", 10, 1, "exp", psnr_db=26.0, psnr_db_min=12.0),
         row("rf3dgs+", 10, 1, "linear", psnr_db=25.0, psnr_db_min=2.0),
     ]
-    (found,) = report.summarise(rows)
+    (found,) = comparison.summarise(rows)
     assert (found["psnr_db"], found["psnr_db_min"], found["seeds"]) == (24.0, 9.0, 2)
     assert found["variants"] == ["exp", "linear"]
     assert (found["train_s"], found["model_mib"], found["lpips"]) == (3.0, 1.0, None)
@@ -249,7 +249,7 @@ def test_the_better_variant_of_each_seed_counts_and_seeds_are_averaged() -> None
 
 
 def test_finding_has_the_sign_that_was_found_and_margins_name_the_best_other() -> None:
-    rows = report.summarise(
+    rows = comparison.summarise(
         [
             row("rf3dgs+", 10, 0, "exp", psnr_db=21.0, fit_s=5.0, seconds_per_spectrum=0.4),
             row("rf3dgs", 10, 0, "exp", psnr_db=22.5),
@@ -258,9 +258,9 @@ def test_finding_has_the_sign_that_was_found_and_margins_name_the_best_other() -
             row("nearest", 50, 0, psnr_db=40.0),
         ]
     )
-    (finding,) = report.paper_finding(rows)
+    (finding,) = comparison.paper_finding(rows)
     assert finding["psnr_db"]["difference"] == -1.5
-    (ours,) = report.ours_against_all(rows)
+    (ours,) = comparison.ours_against_all(rows)
     assert (ours["psnr_db"]["method"], ours["psnr_db"]["margin"], ours["psnr_db"]["ahead"]) == (
         "zero",
         -1.0,

@@ -9,8 +9,8 @@ import pytest
 
 from warprrf.bench import radio_map as bench
 from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.coverage.radio_map import RadioMap
 from warprrf.rf.dataset import SpectrumDataset
-from warprrf.rf.radio_map import RadioMap
 from warprrf.rf.scene import Scene
 
 LOBBY = Path(__file__).resolve().parents[2] / "data" / "lobby"

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import warprrf as wr
-from warprrf.geometry.completion import complete, directions
+from warprrf.geometry.completion import complete
+from warprrf.geometry.completion.dividers import directions
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.patches import PlanarPatch, planar_patches
 

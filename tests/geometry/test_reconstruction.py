@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 import warprrf as wr
-from warprrf.geometry import reconstruction, sfm
+from warprrf.geometry import from_photos, sfm
+from warprrf.geometry.config import ReconstructionConfig
 from warprrf.geometry.discs import discs_on_mesh
+from warprrf.geometry.from_photos import reconstruct
 from warprrf.geometry.initial import initial_gaussians, plane_mesh, seen_cells
 from warprrf.geometry.planes import Plane, occupancy, plane_axes
-from warprrf.geometry.reconstruction import Reconstruction, ReconstructionConfig, reconstruct
+from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.refine import RefineConfig
 
 pytest.importorskip("open3d")
@@ -128,7 +130,7 @@ def test_without_a_survey_z_is_up_and_the_size_is_plausible():
     )
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     turn *= np.linalg.det(turn)
-    out = reconstruction._assumed_scale(sfm.transformed(sparse, 0.2, turn, np.ones(3)))
+    out = from_photos._assumed_scale(sfm.transformed(sparse, 0.2, turn, np.ones(3)))
     for camera in out.cameras.values():
         assert camera.rotation[1] @ [0, 0, 1] < -0.9  # the photo's down
     gap = [np.linalg.norm(p - c.position) for c in list(out.cameras.values())[::3] for p in out.points]
@@ -191,7 +193,7 @@ def test_a_killed_run_continues_to_the_same_result(whole):
         raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reconstruction, "fuse_gaussians", render_killed)
+        patch.setattr(from_photos, "fuse_gaussians", render_killed)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(photos, config=SMALL, **options)
     (workspace / "surface.safetensors.partial").write_bytes(b"half")

@@ -19,12 +19,12 @@ from warprrf.rf.absorption import Air
 from warprrf.rf.bistatic import BistaticField, Terms
 from warprrf.rf.bistatic_fit import Parameters
 from warprrf.rf.bistatic_training import trace
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.metrics import evaluate
-from warprrf.rf.paths import Paths
 from warprrf.rf.relevance_model import full_field
 from warprrf.rf.second_bounce import mirrored_scene
 from warprrf.rf.simulate import simulate

@@ -10,12 +10,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 from radio_scenes import box_mesh, joined  # noqa: E402
 
 from warprrf.rf import llvm
+from warprrf.rf.channel.sionna_paths import repeated
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.materials import Material
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import simulate
-from warprrf.rf.sionna_engine import repeated
 from warprrf.rf.spectrum import pixel_of
 
 F, SHAPE = 300e9, (30, 60)

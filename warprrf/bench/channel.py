@@ -21,14 +21,15 @@ from warprrf.bench.machine import machine
 from warprrf.bench.stages import write_atomically, write_json
 from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.arrays import PlanarArray, plane_wave_error
+from warprrf.rf.channel.arrays import PlanarArray, plane_wave_error
+from warprrf.rf.channel.band_plan import thz_channel
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, slab_reflection
 from warprrf.rf.materials import Material
-from warprrf.rf.path_set import Paths, carrier_phase
 from warprrf.rf.paths import MirrorTracer, trace_paths
 from warprrf.rf.scene import Scene
 from warprrf.rf.sionna_engine import load_sionna_scene, sionna_rt
-from warprrf.rf.thz_channels import thz_channel
+from warprrf.rf.waves import carrier_phase
 
 FREQUENCY_HZ = 300e9
 SCENE = "data/lobby/scene.xml"

@@ -41,7 +41,7 @@ def field_code(*, bistatic: bool, harmonic: bool) -> tuple[str, ...]:
     other = {*_NEITHER, *(() if bistatic else _BISTATIC), *(() if harmonic else _HARMONIC)}
     folder = Path(wr.__file__).parent / "rf"
     files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in other]
-    return ("device.py", "kernels", "geometry", *files)
+    return ("device.py", "kernels", "geometry", *files, "rf/channel", "rf/coverage")
 
 
 @dataclass(frozen=True)
@@ -70,14 +70,23 @@ class Fitted:
 
 
 def fit_bistatic(
-    geometry: Geometry, train: SpectrumDataset, *, progress: Progress | None = None, **options: Any
+    geometry: Geometry,
+    train: SpectrumDataset,
+    *,
+    quick: bool = False,
+    progress: Progress | None = None,
+    **options: Any,
 ) -> Fitted:
-    """The bistatic field on the reconstruction."""
-    rays = geometry.rays(train, progress=progress)
+    """The bistatic field on the reconstruction; a quick one traces its own, fewer rays."""
+    rays = None if quick else geometry.rays(train, progress=progress)
     found = wr.RadioField.fit(
-        geometry.reconstruction, train, transport=rays, device=geometry.device, progress=progress, **options
+        geometry.reconstruction, train, transport=rays, quick=quick, device=geometry.device, progress=progress,
+        **options,
+    )  # fmt: skip
+    spent = found.report
+    return Fitted(
+        found.spectrum, transport_s=spent["transport_time_s"], fit_s=spent["fit_time_s"], field=found
     )
-    return Fitted(found.spectrum, transport_s=rays.seconds, fit_s=found.report["fit_time_s"], field=found)
 
 
 def fit_harmonic(

@@ -11,6 +11,7 @@ from warprrf.device import require
 
 METHODS = {
     "bistatic": ("bistatic (ours)", "#b3123c"),
+    "bistatic-quick": ("bistatic, quick (ours)", "#e0567c"),
     "rf3dgs+": ("RF-3DGS+", "#0b6e99"),
     "rf3dgs+los": ("RF-3DGS+ with line of sight", "#4fb3d9"),
     "rf3dgs": ("RF-3DGS", "#c4570f"),

@@ -23,9 +23,9 @@ from warprrf.bench.stages import fingerprint, write_atomically, write_json
 from warprrf.device import Progress
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.coverage.radio_map import RadioMap
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field import RadioField
-from warprrf.rf.radio_map import RadioMap
 from warprrf.rf.scene import Scene
 from warprrf.rf.sionna_engine import SionnaMap
 

@@ -241,10 +241,8 @@ class RaySearch:
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [clearance, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu)]
         out = _given(sight, wp.int32, cpu)
-        starts = [
-            0,
-            *range(min(_PROBE, chunk), count, chunk),
-        ]  # a short first chunk says how the others will be
+        # A short first chunk says how the others will be, where there are enough of them.
+        starts = [0, *range(min(_PROBE, chunk), count, chunk)] if count > 8 * _PROBE else [0]
         mostly_free = False
         for first, end in zip(starts, [*starts[1:], count], strict=True):
             size = end - first

@@ -121,48 +121,59 @@ def strongest_rays(
     per_pixel: int,
     log_power: wp.array(dtype=wp.float64),
     top: wp.array(dtype=wp.float64),
-    spread: wp.float64,
+    highest: wp.float64,
     pixels: wp.array2d(dtype=wp.vec3d),
     half_widths: wp.array2d(dtype=wp.int32),
+    first_row: wp.array(dtype=wp.int32),
+    least_fall: wp.array3d(dtype=wp.float32),
     kappa: wp.float64,
     chord_limit: wp.float64,
     strongest: wp.array(dtype=wp.int32),
 ):
     """Which ray's beam gives a pixel the most (-1: none), for ``per_pixel`` rays in every pixel's cell.
 
-    ``top`` is the largest ``log_power`` of a cell, ``spread`` the longest chord from a pixel centre to one of its rays:
-    together they bound what a cell can give, and most cells need no closer look.
+    ``top`` is the largest ``log_power`` of a cell, ``highest`` of all, ``least_fall`` by how much the beam lowers any
+    ray of a cell at least: of the pixel's row, of the cell's row from ``first_row`` on, of the distance in columns.
+    Most cells need no closer look.
     """
     k = offset + wp.tid()
-    rows = pixels.shape[0]
     columns = pixels.shape[1]
     row = k / columns
     column = k - row * columns
     p = pixels[row, column]
+    half_kappa = wp.float64(0.5) * kappa
     best_value = wp.float64(-1.0e300)
     best = int(-1)
     # The own cell first: it is most often the answer.
     for j in range(per_pixel):
         m = k * per_pixel + j
-        value = log_power[m] - wp.float64(0.5) * kappa * wp.length_sq(directions[m] - p)
+        value = log_power[m] - half_kappa * wp.length_sq(directions[m] - p)
         if value > best_value:
             best_value = value
             best = m
-    for cell_row in range(rows):
-        half = half_widths[row, cell_row]
-        if half >= 0:
-            start = column_start(column, half, columns)
-            for step in range(window_width(half, columns)):
-                cell_column = start + step
+    first = first_row[row]
+    for r in range(wp.min(least_fall.shape[1], pixels.shape[0] - first)):
+        half = wp.min(half_widths[row, first + r], columns / 2)
+        base = (first + r) * columns
+        for apart in range(half + 1):
+            # Farther cells of the row can only give less.
+            fall = wp.float64(least_fall[row, r, apart])
+            if highest - fall <= best_value:
+                break
+            for side in range(2):
+                cell_column = column + apart
+                if side == 1:
+                    cell_column = column - apart
                 if cell_column >= columns:
                     cell_column = cell_column - columns
-                n = cell_row * columns + cell_column
-                gap = wp.max(wp.length(pixels[cell_row, cell_column] - p) - spread, wp.float64(0.0))
-                if top[n] - wp.float64(0.5) * kappa * gap * gap > best_value:
+                if cell_column < 0:
+                    cell_column = cell_column + columns
+                n = base + cell_column
+                if top[n] - fall > best_value:
                     for j in range(per_pixel):
                         m = n * per_pixel + j
                         c = wp.length_sq(directions[m] - p)
-                        value = log_power[m] - wp.float64(0.5) * kappa * c
+                        value = log_power[m] - half_kappa * c
                         if c <= chord_limit and value > best_value:
                             best_value = value
                             best = m

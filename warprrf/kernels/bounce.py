@@ -111,6 +111,7 @@ def light_surface(
     solid_angle: wp.array(dtype=wp.float32),
     half_width: float,
     nearest: float,
+    shadows: int,
     strength: wp.array(dtype=wp.float32),
     cos_in: wp.array(dtype=wp.float32),
     cos_mirror: wp.array(dtype=wp.float32),
@@ -121,6 +122,7 @@ def light_surface(
     Writes ``strength`` = Omega cos(theta_i) / (4 pi d1)^2 times visibility [sr/m^2], the cosine of incidence, of the
     angle between the scattered and the mirror direction, and the mean of 1 / cos(theta_s) over +-``half_width`` (what
     lies below the horizon left out). ``nearest`` [m] bounds d1 from below: an element at the source spans directions.
+    Without ``shadows`` whoever launches this finds out what the transmitter itself does not see.
     """
     k = offset + wp.tid()
     strength[k] = 0.0
@@ -141,9 +143,9 @@ def light_surface(
         cos_i = wp.dot(n, toward)
         if cos_i > 0.0 and d1 > 0.0:
             lit = bool(True)
-            if source.patch < 0:
+            if source.patch < 0 and shadows != 0:
                 lit = clear(surface, source.position, point, surface.clearance)
-            else:
+            elif source.patch >= 0:
                 # The ray towards the image must meet its patch first, and see the transmitter from there.
                 lit = False
                 start = local(point, surface.center) + surface.clearance * toward

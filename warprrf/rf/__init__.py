@@ -1,1 +1,5 @@
-"""Stage 2: spectra, propagation, materials, radio fields, paths and the lookups they are measured against."""
+"""Stage 2: spectra, propagation, materials, radio fields, paths and the lookups they are measured against.
+
+``channel`` is what is computed from paths, ``coverage`` what many receivers get of a field, ``baselines`` the learned
+methods that ours is compared with.
+"""

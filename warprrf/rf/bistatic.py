@@ -30,7 +30,7 @@ from warprrf.rf.bistatic_fit import NEPER, Layout, Parameters, View, jacobian, s
 from warprrf.rf.bounces import LOBES, SUB_PIXELS, BeamOperator, BounceTracer, Lit, Met
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.mirror_light import MirrorSight
+from warprrf.rf.mirror_light import MirrorLight, MirrorSight
 from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.paths import Paths
 from warprrf.rf.second_bounce import ElementLight, SeenElements, mirrored_scene
@@ -65,6 +65,7 @@ class Terms:
         diffuse_order: diffuse bounces on a path, 1 to 3.
         indirect: whether groups have an indirect radiance.
         residual: whether elements differ from their group.
+        sub_pixels: square root of the rays per pixel, 1 to 16.
     """
 
     line_of_sight: bool = True
@@ -76,11 +77,13 @@ class Terms:
     diffuse_order: int = 1
     indirect: bool = False
     residual: bool = False
+    sub_pixels: int = SUB_PIXELS
 
     def __post_init__(self) -> None:
-        for name, allowed in (("mirror_order", (0, 1, 2, 3)), ("diffuse_order", (1, 2, 3))):
+        whole = {"mirror_order": (0, 1, 2, 3), "diffuse_order": (1, 2, 3), "sub_pixels": range(1, 17)}
+        for name, allowed in whole.items():
             if getattr(self, name) not in allowed:
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {allowed}")
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {tuple(allowed)}")
         if not self.lobes or any(n != int(n) or n < 0 for n in self.lobes):
             raise ValueError(f"lobes: got {self.lobes!r}, expected exponents, whole numbers of at least 0")
         object.__setattr__(self, "lobes", tuple(int(n) for n in self.lobes))
@@ -101,8 +104,7 @@ class Sight:
         lit: how the transmitter lights that.
         paths: its line of sight and mirror paths.
         beams: unit beam of each, shape ``(L, H, W)`` float32.
-        elements: surface elements that its rays meet.
-        mirrored: what its rays see of mirrored light; None if that is not modelled.
+        tracer: whose rays they are.
     """
 
     receiver: np.ndarray
@@ -111,8 +113,19 @@ class Sight:
     lit: Lit
     paths: SpecularPaths
     beams: np.ndarray
-    elements: SeenElements
-    mirrored: MirrorSight | None = None
+    tracer: BounceTracer = field(repr=False)
+    _mirrored: list[MirrorSight] = field(default_factory=list, repr=False)
+
+    @cached_property
+    def elements(self) -> SeenElements:
+        """Surface elements that its rays meet."""
+        return SeenElements.of(self.tracer, self.met)
+
+    def mirrored(self, light: MirrorLight) -> MirrorSight:
+        """What its rays see of the light that mirrors throw on surfaces, traced once."""
+        if not self._mirrored:
+            self._mirrored.append(light.sight(self.receiver, self.met))
+        return self._mirrored[0]
 
 
 @dataclass(frozen=True)
@@ -307,11 +320,7 @@ class BistaticField(RadioField):
                 device=self.device,
             )
         beams = unit_beams(paths.arrival, self.shape, self.beam_sigma_rad)
-        mirrored = None
-        if self.terms.diffuse and self.terms.mirror_scatter:
-            mirrored = self.element_light(source).mirrors.sight(receiver, met)
-        elements = SeenElements.of(self.tracer, met)
-        return Sight(receiver, source, met, lit, paths, beams, elements, mirrored)
+        return Sight(receiver, source, met, lit, paths, beams, self.tracer)
 
     def compose(self, sight: Sight) -> Composed:
         """The spectrum of what is seen, by its parts."""
@@ -360,9 +369,9 @@ class BistaticField(RadioField):
             power = seen.power(sent, self.wavelength_m)
             lit = power > 0
             parts.append((seen.pixel[lit], self.surface.element_group[seen.element[lit]], power[lit]))
-        if self.terms.diffuse and self.terms.mirror_scatter and sight.mirrored is not None:
+        if self.terms.diffuse and self.terms.mirror_scatter:
             light = self.element_light(sight.transmitter).mirrors
-            mirrored = sight.mirrored
+            mirrored = sight.mirrored(light)
             power = light.power(mirrored, self.parameters, self.wavelength_m)
             parts.append((mirrored.pixel, self.surface.group[mirrored.face.numpy()], power))
         return parts
@@ -480,9 +489,9 @@ class BistaticField(RadioField):
     @cached_property
     def tracer(self) -> BounceTracer:
         """Rays of the grid on the surface."""
-        return self.tracer_of(self.shape)
+        return self.tracer_of(self.shape, self.terms.sub_pixels)
 
-    def tracer_of(self, shape: tuple[int, int], sub_pixels: int = SUB_PIXELS) -> BounceTracer:
+    def tracer_of(self, shape: tuple[int, int], sub_pixels: int) -> BounceTracer:
         """Rays of a grid of ``shape`` on the surface, ``sub_pixels`` squared a pixel."""
         loss = 0.0 if self.air is None else self.air.loss_per_m(self.frequency_hz)
         return BounceTracer(

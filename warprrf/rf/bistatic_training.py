@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress, check_array
 from warprrf.rf import bistatic_fit as _fit
 from warprrf.rf.absorption import Air
 from warprrf.rf.bistatic import BistaticField, Sight, Terms
 from warprrf.rf.bistatic_fit import NEPER, Fit, Parameters, View
-from warprrf.rf.bounces import LOBES
 from warprrf.rf.grouping import regroup
 from warprrf.rf.residuals import Shares, fit_residual, gather_shares
 from warprrf.rf.spectrum import to_db
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
     from warprrf.rf.relevance import Relevance
 
-ROWS = 30_000  # pixels that groups are fitted to, spread over the training receivers
+ROWS = 12_000  # pixels that groups are fitted to, spread over the training receivers
 LEAST_TO_HOLD_OUT = 4  # training receivers below which nothing is held out, so no term is chosen
 MOST_HELD_OUT = 10
 FEW_RECEIVERS = 20  # up to which errors are learned from every receiver, held out in turn
@@ -47,6 +47,11 @@ MORE: tuple[tuple[str, Any], ...] = (
     ("scatter_mirror", True),
 )
 """Bounces that may be added to single ones, in the order in which they are tried."""
+QUICK: dict[str, Any] = {
+    "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": True,
+    "residual": False, "sub_pixels": 1,
+}  # fmt: skip
+"""What a quick fit takes for given: light of more than one bounce is even, and one ray a pixel."""
 FEW_MATERIALS = 30
 REGROUPED = 3  # rounds of deciding what is of one material, and fitting
 OUTER = 2  # rounds of further bounces and groups in turn
@@ -61,6 +66,7 @@ class BistaticTransport:
         sights: one for each receiver.
         transmitter, frequency_hz, shape, beam_sigma_rad, air: what it was traced for.
         lobes: exponents of the lobes.
+        sub_pixels: square root of the rays per pixel.
         seconds: what it took.
     """
 
@@ -71,6 +77,7 @@ class BistaticTransport:
     shape: tuple[int, int]
     beam_sigma_rad: float
     lobes: tuple[int, ...]
+    sub_pixels: int
     seconds: float
     air: Air | None = None
 
@@ -85,6 +92,7 @@ def trace(
     *,
     lobes: tuple[int, ...] | None = None,
     mirror_order: int | None = None,
+    sub_pixels: int | None = None,
     device: Any = None,
     progress: Progress | None = None,
 ) -> BistaticTransport:
@@ -93,9 +101,8 @@ def trace(
     started = time.perf_counter()
     surface = geometry if isinstance(geometry, Surface) else Surface.of(geometry)
     receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
-    # everything that may be asked for
     order = MOST_MIRRORS if mirror_order is None else mirror_order
-    terms = Terms(mirror_order=order, mirror_scatter=True, lobes=LOBES if lobes is None else lobes)
+    terms = Terms(mirror_order=order, **_chosen(lobes=lobes, sub_pixels=sub_pixels))
     blank = _blank(surface, ds, terms, device)
     source = blank.transmitter
     found = specular_paths(
@@ -114,7 +121,7 @@ def trace(
             progress("transport", r + 1, len(receivers))
     return BistaticTransport(
         surface, sights, blank.transmitter, blank.frequency_hz, blank.shape, blank.beam_sigma_rad, blank.terms.lobes,
-        time.perf_counter() - started, blank.air,
+        blank.terms.sub_pixels, time.perf_counter() - started, blank.air,
     )  # fmt: skip
 
 
@@ -131,6 +138,8 @@ def train(
     diffuse_order: int | None = None,
     indirect: bool | None = None,
     residual: bool | None = None,
+    sub_pixels: int | None = None,
+    quick: bool = False,
     gain_offset: bool = False,
     iterations: int = _fit.MAX_STEPS,
     transport: BistaticTransport | None = None,
@@ -155,6 +164,9 @@ def train(
         diffuse_order: diffuse bounces on a path: 1, 2 or 3.
         indirect: a non-negative radiance of each group, constant in direction.
         residual: a gain for each surface element.
+        sub_pixels: square root of the rays per pixel (None: 3, which no error in the lobby tells from 4; 2 costs 0.2
+            dB of PSNR there and halves the time).
+        quick: try no term: what is not given here is taken from :data:`QUICK`.
         gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
         iterations: most steps of the groups' fit.
         transport: what :func:`trace` found for exactly these receivers.
@@ -180,15 +192,23 @@ def train(
         fixed = {name: value and ruled[name] for name, value in fixed.items()}
         wanted = {name: ruled[name] if value is None else value for name, value in wanted.items()}
         lobes = ruled["lobes"] if lobes is None else lobes
-    given: dict[str, Any] = {k: v for k, v in wanted.items() if v is not None}
-    Terms(**fixed, lobes=LOBES if lobes is None else lobes, **given)
+    if quick:
+        wanted = {name: QUICK[name] if value is None else value for name, value in wanted.items()}
+        if sub_pixels is None and transport is None:
+            sub_pixels = QUICK["sub_pixels"]
+    given = _chosen(**wanted)
+    Terms(**fixed, **_chosen(lobes=lobes, sub_pixels=sub_pixels), **given)
     check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float32)
     if len(ds.receivers) == 0 or not (ds.path_gain > ds.floor).any():
         raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     order = wanted["mirror_order"]
-    seen = transport or trace(geometry, ds, lobes=lobes, mirror_order=order, device=device, progress=progress)
-    _check_transport(seen, ds, lobes)
-    return _Training(seen, ds, gain_offset, int(iterations), seed, device, progress).run(fixed, wanted)
+    seen = transport or trace(
+        geometry, ds, lobes=lobes, mirror_order=order, sub_pixels=sub_pixels, device=device, progress=progress
+    )
+    _check_transport(seen, ds, lobes, sub_pixels)
+    # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
+    with threadpool_limits(1, user_api="blas"):
+        return _Training(seen, ds, gain_offset, int(iterations), seed, device, progress).run(fixed, wanted)
 
 
 class _Training:
@@ -221,7 +241,7 @@ class _Training:
             np.sort(rng.choice(pixels, min(pixels, max(200, ROWS // self.count)), replace=False))
             for _ in range(self.count)
         ]
-        blank = _blank(self.surface, ds, Terms(lobes=seen.lobes), device)
+        blank = _blank(self.surface, ds, Terms(lobes=seen.lobes, sub_pixels=seen.sub_pixels), device)
         self.blank = blank
         self.views = []
         for r in range(self.count):
@@ -230,7 +250,7 @@ class _Training:
         self.log: list[dict[str, Any]] = []
 
     def run(self, fixed: dict[str, Any], wanted: dict[str, Any]) -> BistaticField:
-        terms = Terms(**fixed, lobes=self.seen.lobes, **{k: v for k, v in wanted.items() if v is not None})
+        terms = replace(self.blank.terms, **fixed, **_chosen(**wanted))
         free = {name for name, value in wanted.items() if value is None} if len(self.held) else set()
         start = Parameters.prior(int(self.material.max()) + 1, len(self.seen.lobes))
         errors: ErrorModel | None = None
@@ -465,7 +485,14 @@ def _blank(surface: Surface, ds: SpectrumDataset, terms: Terms, device: Any) -> 
     return BistaticField.prior(surface, ds, terms=terms, device=device)
 
 
-def _check_transport(seen: BistaticTransport, ds: SpectrumDataset, lobes: tuple[int, ...] | None) -> None:
+def _chosen(**options: Any) -> dict[str, Any]:
+    """Those that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _check_transport(
+    seen: BistaticTransport, ds: SpectrumDataset, lobes: tuple[int, ...] | None, sub_pixels: int | None
+) -> None:
     same = (
         len(seen.sights) == len(ds.receivers)
         and seen.shape == tuple(ds.path_gain.shape[1:])
@@ -474,9 +501,11 @@ def _check_transport(seen: BistaticTransport, ds: SpectrumDataset, lobes: tuple[
         and seen.frequency_hz == ds.frequency_hz
         and seen.air == getattr(ds, "air", None)
         and (lobes is None or tuple(lobes) == seen.lobes)
+        and sub_pixels in (None, seen.sub_pixels)
     )
     if not same:
         raise ValueError(
-            f"transport: got what {len(seen.sights)} receivers see with lobes {seen.lobes}; expected exactly the "
-            f"{len(ds.receivers)} receivers, transmitter, carrier, grid, air and lobes of this fit"
+            f"transport: got what {len(seen.sights)} receivers see with lobes {seen.lobes} and "
+            f"{seen.sub_pixels**2} rays a pixel; expected exactly the {len(ds.receivers)} receivers, transmitter, "
+            "carrier, grid, air, lobes and rays of this fit"
         )

@@ -14,14 +14,16 @@ the air is that of each leg: lit rays hold those from the source to the ray's or
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
 from warprrf import device as _device
+from warprrf.geometry import o3d, raysearch
 from warprrf.kernels import bounce
 from warprrf.rf.exact import sub_pixel_directions
 from warprrf.rf.fresnel import lobe_norm, slab_reflection
@@ -30,8 +32,10 @@ from warprrf.rf.surface import Surface
 
 LOBES = (0, 2, 5, 12, 30)
 """Exponents of the lobe mix; 0 is Lambertian."""
-SUB_PIXELS = 4
+SUB_PIXELS = 3
 """Square root of the rays per pixel."""
+EVEN_SUB_PIXELS = 4  # square root of the directions that stand for a whole pixel's even power
+LEAST_M = 1e-6  # range of what is met at the ray's very start
 NEAREST_M = 0.05  # an element at the transmitter spans directions: d1 counts as no less
 _COSINES = 257  # entries of tables over the cosine of incidence
 _PERMITTIVITY = np.geomspace(0.05, 200.0, 97)  # of epsilon_r - 1; the last reflects like metal
@@ -114,41 +118,61 @@ def _lobe_tables(exponents: tuple[int, ...], device: str) -> tuple[wp.array, wp.
 class BeamOperator:
     """The receiver beam as a linear map of images: a pixel's power, even over the pixel, spread over the grid.
 
-    A sparse matrix, because a beam ends a few widths from its centre. Sums are kept.
+    The grid's columns are shifts of each other, so that a Fourier transform over azimuth leaves one small matrix over
+    the rows for each frequency. Sums are kept.
     """
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
-        rows, columns = shape
-        directions = sub_pixel_directions(shape, SUB_PIXELS)[0].reshape(rows, columns, -1, 3)
+        rows, columns = self.shape = shape
+        directions = sub_pixel_directions(shape, EVEN_SUB_PIXELS)[0].reshape(rows, columns, -1, 3)[:, 0]
+        even = np.full(directions.shape[1], 1.0 / directions.shape[1])
+        # what row i of column 0 gives to each pixel, shape (row, column, i)
+        self._kernel = np.stack([spread(d, even, shape, sigma, device=device) for d in directions], axis=-1)
+        transform = np.moveaxis(rfft(self._kernel, axis=1), 1, 0)
+        self._forward = np.concatenate([transform.real, transform.imag], axis=1)
+        back = np.swapaxes(transform, 1, 2).conj()
+        self._backward = np.concatenate([back.real, back.imag], axis=1)
+
+    @cached_property
+    def _matrix(self) -> csr_matrix:
+        """The map as a sparse matrix, because a beam ends a few widths from its centre, in single precision."""
+        rows, columns = self.shape
         out, own, value = [], [], []
         turn = np.arange(columns)
-        for i in range(rows):  # columns of the grid are shifts of each other
-            beams = directions[i, 0]
-            kernel = spread(beams, np.full(len(beams), 1.0 / len(beams)), shape, sigma, device=device)
-            m, j = np.nonzero(kernel)
+        for i in range(rows):
+            m, j = np.nonzero(self._kernel[..., i])
             out.append((m[:, None] * columns + (j[:, None] + turn) % columns).ravel())
             own.append(np.broadcast_to(i * columns + turn, (len(m), columns)).ravel())
-            value.append(np.repeat(kernel[m, j], columns))
-        pixels = rows * columns
-        self.shape = shape
-        self.matrix = csr_matrix(
-            (np.concatenate(value), (np.concatenate(out), np.concatenate(own))), shape=(pixels, pixels)
-        )
-        self._narrow = self.matrix.astype(np.float32)
-        self._transposed = self._narrow.T.tocsr()
+            value.append(np.repeat(self._kernel[m, j, i], columns))
+        places = (np.concatenate(out), np.concatenate(own))
+        return csr_matrix((np.concatenate(value).astype(np.float32), places), shape=(rows * columns,) * 2)
 
     def __call__(self, images: np.ndarray) -> np.ndarray:
-        """Spread ``images`` (H, W, ...), in their precision."""
-        matrix = self._narrow if images.dtype == np.float32 else self.matrix
-        return (matrix @ images.reshape(matrix.shape[1], -1)).reshape(images.shape)
+        """Spread ``images`` (H, W, ...), in their precision; what is below 1e-14 of the largest is rounding, and 0."""
+        return self._apply(self._forward, images)
 
     def adjoint(self, images: np.ndarray) -> np.ndarray:
-        """The transposed map of ``images`` (H, W, ...) float32."""
-        return (self._transposed @ images.reshape(self.matrix.shape[0], -1)).reshape(images.shape)
+        """The transposed map of ``images`` (H, W, ...)."""
+        return self._apply(self._backward, images)
+
+    def _apply(self, matrices: np.ndarray, images: np.ndarray) -> np.ndarray:
+        rows, columns = self.shape
+        # Double precision whatever comes: the errors of a transform are shared by pixels 100 dB apart.
+        flat = np.asarray(images, np.float64).reshape(rows, columns, -1)
+        count = flat.shape[2]
+        x = np.moveaxis(rfft(flat, axis=1), 1, 0)
+        product = matrices @ np.concatenate([x.real, x.imag], axis=2)
+        y = np.empty((len(x), rows, count), complex)
+        y.real = product[:, :rows, :count] - product[:, rows:, count:]
+        y.imag = product[:, :rows, count:] + product[:, rows:, :count]
+        out = irfft(np.moveaxis(y, 0, 1), n=columns, axis=1)
+        size = np.abs(out)
+        out[size < 1e-14 * size.max(axis=(0, 1), initial=0.0)] = 0.0
+        return out.reshape(images.shape).astype(images.dtype, copy=False)
 
     def at(self, pixels: np.ndarray, images: np.ndarray) -> np.ndarray:
         """``images`` (H W, C) spread, at ``pixels`` (N,) alone, in single precision, shape ``(N, C)``."""
-        return self._narrow[pixels] @ images.astype(np.float32, copy=False)
+        return self._matrix[pixels] @ images.astype(np.float32, copy=False)
 
 
 @dataclass(frozen=True)
@@ -208,6 +232,8 @@ class BounceTracer:
         self.surface, self.shape, self.lobes, self.sub_pixels = surface, shape, tuple(lobes), sub_pixels
         self.loss_per_m = float(loss_per_m)
         self.device = _device.resolve(device)
+        # On a CPU Embree is three times as fast as the search inside the kernels, and worth being loaded for a grid.
+        self._searches = self.device.is_cpu and o3d.installed()
         self.directions, self.solid_angle = sub_pixel_directions(shape, sub_pixels)
         self._directions = wp.array(self.directions, dtype=wp.vec3d, device=self.device)
         self._solid_angle = wp.array(self.solid_angle, dtype=wp.float32, device=self.device)
@@ -234,14 +260,48 @@ class BounceTracer:
         )
 
     def _meet(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array, count: int) -> Met:
+        starts = wp.array(origins, dtype=wp.vec3d, device=self.device)
+        if self._searches:
+            start = np.repeat(origins, count // len(origins), axis=0) if len(origins) > 1 else origins
+            toward = directions.numpy()
+            hit = self.surface.mesh.cast(
+                start,
+                np.tile(toward, (count // len(toward), 1)) if len(toward) < count else toward,
+                device=self.device,
+                backend=self._backend(count),
+            )
+            found = [
+                wp.array(a, device=self.device, copy=False) for a in (hit.face, np.maximum(hit.t, LEAST_M))
+            ]
+            return Met(starts, directions, solid_angle, *found)
         met = Met(
-            wp.array(origins, dtype=wp.vec3d, device=self.device), directions, solid_angle,
+            starts, directions, solid_angle,
             wp.empty(count, dtype=wp.int32, device=self.device), wp.empty(count, dtype=wp.float64, device=self.device),
         )  # fmt: skip
         _device.launch(
             bounce.meet_surface, count, [self.surface.on_device(self.device), *met.inputs], device=self.device
         )
         return met
+
+    @staticmethod
+    def _backend(count: int) -> str:
+        return "embree" if count >= raysearch.EMBREE_RAYS else "warp"
+
+    def _shadow(self, met: Met, lit: Lit, position: np.ndarray) -> None:
+        """Take away the light of what the transmitter at ``position`` does not see."""
+        strength = lit.strength.numpy()
+        ray = np.flatnonzero(strength > 0)
+        origins, directions = met.origins.numpy(), met.directions.numpy()
+        start = origins[ray // (len(strength) // len(origins))] if len(origins) > 1 else origins
+        point = start + met.range_m.numpy()[ray, None] * directions[ray % len(directions)]
+        free = self.surface.mesh.visible(
+            position,
+            point,
+            clearance=self.surface.skin_m,
+            device=self.device,
+            backend=self._backend(len(ray)),
+        )
+        strength[ray[~free]] = 0.0
 
     def light(
         self, met: Met, position: np.ndarray, *, real: np.ndarray | None = None, patch: int = -1
@@ -255,9 +315,11 @@ class BounceTracer:
         lit = Lit(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(4)))
         inputs = [
             self.surface.on_device(self.device), source, *met.inputs, met.solid_angle, float(self.half_width),
-            NEAREST_M,            *lit.inputs,
+            NEAREST_M, int(not (self._searches and patch < 0)), *lit.inputs,
         ]  # fmt: skip
         _device.launch(bounce.light_surface, count, inputs, device=self.device)
+        if self._searches and patch < 0:
+            self._shadow(met, lit, np.asarray(position, float))
         if self.loss_per_m:
             inputs = [source.position, self.loss_per_m, *met.inputs, lit.strength]
             _device.launch(bounce.absorb, count, inputs, device=self.device)

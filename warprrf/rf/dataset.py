@@ -18,8 +18,8 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.rf.absorption import Air
 from warprrf.rf.antenna import deembed_dataset
-from warprrf.rf.paths import check_frequency
 from warprrf.rf.spectrum import Spectrum, check_shape, default_floor, pixel_angles, to_db
+from warprrf.rf.waves import check_frequency
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from typing import Self
 
     from warprrf.rf.absorption import Air
+    from warprrf.rf.coverage.links import Links
+    from warprrf.rf.coverage.radio_map import RadioMap
     from warprrf.rf.dataset import SpectrumDataset
-    from warprrf.rf.links import Links
     from warprrf.rf.paths import Paths
-    from warprrf.rf.radio_map import RadioMap
     from warprrf.rf.spectrum import Spectrum
 
 MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
@@ -143,7 +143,7 @@ class RadioField(ABC):
         Raises:
             ValueError: as for :meth:`spectrum`, and for a beam width that is not positive.
         """
-        from warprrf.rf.links import find_links
+        from warprrf.rf.coverage.tracing import find_links
 
         return find_links(self, rx, transmitter, beam_sigma_rad, shape, mirror_order, progress)
 
@@ -151,8 +151,8 @@ class RadioField(ABC):
         self, height: float, cell: float = 0.25, transmitter: Any = None, **options: Any
     ) -> RadioMap:
         """Links over a floor plan, at ``height`` [m] in cells of ``cell`` [m]; see
-        :func:`warprrf.rf.radio_map.radio_map`."""
-        from warprrf.rf.radio_map import radio_map
+        :func:`warprrf.rf.coverage.radio_map.radio_map`."""
+        from warprrf.rf.coverage.radio_map import radio_map
 
         return radio_map(self, height, cell, transmitter, **options)
 

@@ -17,8 +17,6 @@ from warprrf.rf.bounces import NEAREST_M, BounceTracer, Lit, Met, fresnel_curves
 from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.specular import unobstructed
 
-EVERY = 4  # of a pixel's rays, one in so many looks for mirrored light
-
 
 @dataclass(frozen=True)
 class MirrorSight:
@@ -105,7 +103,10 @@ class MirrorLight:
             tracer: whose rays they are, if another's of the same surface.
         """
         s, tracer = self.surface, tracer or self.tracer
-        rays = np.arange(0, len(met.face), EVERY)
+        # About two rays of a pixel look for mirrored light; the stride takes all of their places in turn.
+        every = tracer.sub_pixels**2 // 2 + 1
+        grid = len(tracer.directions)
+        rays = np.add.outer(np.arange(0, len(met.face), grid), np.arange(0, grid, every)).ravel()
         face = met.face.numpy()[rays]
         rays, face = rays[face >= 0], face[face >= 0]
         element = s.element[face]
@@ -140,7 +141,7 @@ class MirrorLight:
         cos_s = np.maximum((normal[k] * look[k]).sum(axis=1), 0.0)
         high = cos_s + tracer.half_width
         low = np.maximum(cos_s - tracer.half_width, 0.01 * tracer.half_width)
-        strength = EVERY * tracer.solid_angle[own[row[k]]] * cos_in[k]
+        strength = every * tracer.solid_angle[own[row[k]]] * cos_in[k]
         strength /= (4.0 * np.pi * np.maximum(length[k], NEAREST_M)) ** 2
         strength *= tracer.through_air(length[k] + met.range_m.numpy()[rays[row[k]]])
         return self._pack(

@@ -19,7 +19,8 @@ from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.mirror_chains import mirror_chains
-from warprrf.rf.paths import MirrorTracer, check_frequency
+from warprrf.rf.paths import MirrorTracer
+from warprrf.rf.waves import check_frequency
 
 RAYS_FILE = "newrf_conference.npz"
 MESH_FILE = "conferenceroom.stl"

@@ -14,8 +14,10 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, SurfaceTable, as_mesh, slab_reflection, surface_table
-from warprrf.rf.path_set import Paths, transverse_basis
+from warprrf.rf.spectrum import transverse_basis
+from warprrf.rf.waves import check_frequency
 
 # Faces belong to one patch if they share an edge, their normals agree to 1.4e-3 rad and their corners lie this close to
 # the common plane [m]: float32 STL files need it.
@@ -354,18 +356,6 @@ class MirrorTracer:
         back = np.einsum("nij,nkj->nik", first, transverse_basis(legs[:, 0]))
         size = np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2)))
         return friis * size * phase, "mirror", friis[:, None, None] * (out @ jones @ back)
-
-
-def check_frequency(frequency_hz: Any) -> float:
-    """``frequency_hz`` as a positive float.
-
-    Raises:
-        ValueError: if it is not a positive finite number.
-    """
-    value = float(_device.check_array("frequency_hz", frequency_hz, ()))
-    if value <= 0:
-        raise ValueError(f"frequency_hz: got {value!r}, expected a positive frequency in hertz")
-    return value
 
 
 def _cross_plane(start: np.ndarray, end: np.ndarray, height: np.ndarray, below: np.ndarray) -> np.ndarray:

@@ -17,9 +17,9 @@ from warprrf.rf.absorption import air_of
 from warprrf.rf.dataset import SpectrumDataset, write_whole
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.fresnel import as_mesh, surface_table
-from warprrf.rf.paths import check_frequency
 from warprrf.rf.sionna_engine import SionnaEngine
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
+from warprrf.rf.waves import check_frequency
 
 ENGINES = ("exact", "sionna")
 WALL_CLEARANCE_M = 1e-4

@@ -15,21 +15,18 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.absorption import air_of
+from warprrf.rf.channel.sionna_paths import repeated
 from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.llvm import select_llvm
-from warprrf.rf.paths import check_frequency
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
+from warprrf.rf.waves import check_frequency
 
 # Sionna's default cap of 1e6 paths truncates silently; each sample can give one path a bounce.
 _PATHS_PER_SAMPLE_AND_BOUNCE = 1
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
-SAME_LENGTH_M = (
-    5e-3  # paths nearer than this in length and direction are one: Sionna takes planes 1 cm apart for one
-)
-SAME_DIRECTION_RAD = 1e-3
 _DIFFUSE = 2  # sionna.rt.InteractionType.DIFFUSE
 _VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
 
@@ -115,28 +112,6 @@ def _select_variant() -> Any:
     if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
         mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
     return mitsuba
-
-
-def repeated(tau: np.ndarray, arrival: np.ndarray, aod: np.ndarray, bounces: np.ndarray) -> np.ndarray:
-    """Which specular paths repeat an earlier one, shape ``(L,)`` bool.
-
-    Sionna tells mirrors apart by the rounded plane of the triangle met. Small triangles of one surface have planes that
-    differ by rounding, and each is then taken for a mirror of its own: one reflection is counted several times.
-
-    Args:
-        tau: delays [s], shape ``(L,)``.
-        arrival: unit directions of arrival, shape ``(L, 3)``.
-        aod: zenith and azimuth of departure [rad], shape ``(L, 2)``.
-        bounces: interactions, shape ``(L,)``.
-    """
-    departure = directions_from_angles(aod[:, 0], aod[:, 1])
-    same = (
-        (np.abs(tau[:, None] - tau) * SPEED_OF_LIGHT < SAME_LENGTH_M)
-        & (np.linalg.norm(arrival[:, None] - arrival, axis=-1) < SAME_DIRECTION_RAD)
-        & (np.linalg.norm(departure[:, None] - departure, axis=-1) < SAME_DIRECTION_RAD)
-        & (bounces[:, None] == bounces)
-    )
-    return np.asarray(np.tril(same, -1).any(axis=1))
 
 
 class SionnaEngine:

@@ -59,6 +59,14 @@ def pixel_directions(shape: tuple[int, int]) -> np.ndarray:
     return directions_from_angles(zenith[:, None], azimuth[None, :])
 
 
+@lru_cache(maxsize=8)
+def _pixel_list(shape: tuple[int, int]) -> np.ndarray:
+    """:func:`pixel_directions` as rows, not to be written to."""
+    pixels = pixel_directions(shape).reshape(-1, 3)
+    pixels.setflags(write=False)
+    return pixels
+
+
 def pixel_solid_angles(shape: tuple[int, int]) -> np.ndarray:
     """Solid angle of one pixel of each row [sr], shape ``(H,)``; exact, so that all pixels sum to 4 pi."""
     rows, columns = check_shape(shape)
@@ -79,6 +87,16 @@ def angles_from_directions(directions: Any) -> tuple[np.ndarray, np.ndarray]:
     d = np.asarray(directions, dtype=np.float64)
     azimuth = np.arctan2(d[..., 1], d[..., 0])
     return np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]), np.where(azimuth == -np.pi, np.pi, azimuth)
+
+
+def transverse_basis(directions: Any) -> np.ndarray:
+    """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
+    zenith, azimuth = angles_from_directions(directions)
+    up = np.stack(
+        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)], axis=-1
+    )
+    around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
+    return np.stack([up, around], axis=-2)
 
 
 def pixel_of(directions: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -203,10 +221,11 @@ def strongest_rays(
     log_power = np.maximum(log_power, -1e301)  # what is dark stays below where the kernel starts
     top = log_power.reshape(rows * columns, -1).max(axis=1)
     best = wp.zeros(rows * columns, dtype=wp.int32, device=where)
+    first_row, least_fall = _least_falls((rows, columns), float(sigma), str(where))
     inputs = [
         directions, len(power) // (rows * columns), wp.array(log_power, dtype=wp.float64, device=where),
-        wp.array(top, dtype=wp.float64, device=where), wp.float64(0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns)),
-        grid.pixels, grid.half_widths, grid.kappa, grid.chord_limit, best,
+        wp.array(top, dtype=wp.float64, device=where), wp.float64(top.max()), grid.pixels, grid.half_widths, first_row,
+        least_fall, grid.kappa, grid.chord_limit, best,
     ]  # fmt: skip
     _device.launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
     return best.numpy().reshape(rows, columns)
@@ -219,7 +238,7 @@ def unit_beams(directions: np.ndarray, shape: tuple[int, int], sigma: float) -> 
     """
     rows, columns = check_shape(shape)
     out = np.zeros((len(directions), rows * columns), np.float32)
-    pixels = pixel_directions(shape).reshape(-1, 3)
+    pixels = _pixel_list((rows, columns))
     solid_angle = np.repeat(pixel_solid_angles(shape), columns)
     limit = 4.0 * np.sin(0.5 * _cutoff(shape, sigma)) ** 2 * (1.0 + 1e-12)
     for k, d in enumerate(directions):
@@ -266,6 +285,30 @@ def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> _BeamGrid:
         half_widths=wp.array(half, dtype=wp.int32, device=device),
         kappa=wp.float64(1.0 / sigma**2),
         chord_limit=wp.float64(4.0 * np.sin(0.5 * cutoff) ** 2 * (1.0 + 1e-12)),
+    )
+
+
+@lru_cache(maxsize=8)
+def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.array, wp.array]:
+    """First row of cells that reach each row's pixels, and by how many nepers the beam of any ray in a cell falls there
+    at least: of the row, the cell's row after the first, and the columns between; infinite beyond the beam."""
+    rows, columns = shape
+    reaching = _beam_grid(shape, sigma, device).half_widths.numpy() >= 0
+    first, count = reaching.argmax(axis=1), int(reaching.sum(axis=1).max())
+    zenith = pixel_angles(shape)[0]
+    cell = np.minimum(first[:, None] + np.arange(count), rows - 1)
+    apart = np.cos(np.arange(columns // 2 + 1) * 2.0 * np.pi / columns)
+    cosine = np.cos(zenith)[:, None] * np.cos(zenith[cell])
+    sine = np.sin(zenith)[:, None] * np.sin(zenith[cell])
+    chord = np.sqrt(np.maximum(2.0 - 2.0 * (cosine[..., None] + sine[..., None] * apart), 0.0))
+    nearest = np.maximum(
+        chord - 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns), 0.0
+    )  # of a ray in the cell
+    fall = 0.5 * (nearest / sigma) ** 2 * (1.0 - 1e-6)
+    fall[nearest > 2.0 * np.sin(0.5 * _cutoff(shape, sigma)) * (1.0 + 1e-6)] = np.inf
+    return (
+        wp.array(first, dtype=wp.int32, device=device),
+        wp.array(fall.astype(np.float32), dtype=wp.float32, device=device),
     )
 
 

@@ -16,14 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.rf.arrays import PlanarArray, orientation_towards
-from warprrf.rf.beams import Codebook, dft_codebook
+from warprrf.rf.channel.arrays import PlanarArray, orientation_towards
+from warprrf.rf.channel.beams import Codebook, dft_codebook
+from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.exact import ExactEngine, sub_pixel_directions
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.path_set import Paths, carrier_phase
 from warprrf.rf.paths import MirrorTracer
 from warprrf.rf.spectrum import angles_from_directions, directions_from_angles, spread
+from warprrf.rf.waves import carrier_phase
 
 SUB_PIXELS = (
     3  # square root of the rays a pixel: 1 degree apart; beams of 64 x 64 elements are 1.8 degrees apart

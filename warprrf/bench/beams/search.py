@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from warprrf.bench.beams.links import OVERSAMPLING, Ends
-from warprrf.rf.arrays import PlanarArray
+from warprrf.rf.channel.arrays import PlanarArray
 
 
 class Found(NamedTuple):
@@ -63,7 +63,7 @@ def _descend(
 
 
 def _beam(beams: int, k: int, active: int) -> np.ndarray:
-    """Beam k of ``beams`` of a line of ``active`` elements, as :func:`warprrf.rf.beams.dft_codebook` has it."""
+    """Beam k of ``beams`` of a line of ``active`` elements, as :func:`warprrf.rf.channel.beams.dft_codebook` has it."""
     frequency = (k + 0.5) / beams - 0.5
     return np.exp(-2j * np.pi * frequency * (np.arange(active) - 0.5 * (active - 1))) / np.sqrt(active)
 

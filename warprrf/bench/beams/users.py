@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from warprrf.bench.beams.links import Ends
-from warprrf.rf.beams import select_beams, select_beams_multiuser, signal_over_interference
-from warprrf.rf.path_set import Paths
-from warprrf.rf.precoders import precoded_sinr, precoders, transmit_covariance
+from warprrf.rf.channel.beams import select_beams, select_beams_multiuser, signal_over_interference
+from warprrf.rf.channel.path_set import Paths
+from warprrf.rf.channel.precoders import precoded_sinr, precoders, transmit_covariance
 
 USERS = (2, 4, 8, 16)
 CHOICES = {

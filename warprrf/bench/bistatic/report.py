@@ -22,6 +22,7 @@ from warprrf.bench.bistatic.plots import (
     psnr_curves,
     reliability,
 )
+from warprrf.bench.markdown import cell, table
 from warprrf.bench.pictures import METHODS, spectrum_rows
 from warprrf.bench.stages import write_atomically
 from warprrf.rf.uncertainty import OUTLIERS
@@ -114,7 +115,7 @@ def summary_text(found: dict[str, Any]) -> str:
     parts = [
         _about(found),
         "### Asked and measured",
-        _table(("figure", "asked", "measured", ""), asked(found)),
+        table(("figure", "asked", "measured", ""), asked(found)),
     ]
     for truth in found["data"]:
         rows = [row for row in found["rows"] if row["truth"] == truth]
@@ -219,9 +220,9 @@ def _about(found: dict[str, Any]) -> str:
 def _method_table(rows: list[Row]) -> str:
     lines = []
     for row in rows:
-        cells = [_cell(row.get(key), form) for key, _, form in COLUMNS]
+        cells = [cell(row.get(key), form) for key, _, form in COLUMNS]
         lines.append([str(row["n_train"]), _name(row), *cells])
-    return _table(("receivers", "method", *(name for _, name, _ in COLUMNS)), lines)
+    return table(("receivers", "method", *(name for _, name, _ in COLUMNS)), lines)
 
 
 def _margin_table(rows: list[Row]) -> str:
@@ -235,7 +236,7 @@ def _margin_table(rows: list[Row]) -> str:
         lines.append([TRUTH_NAMES[row["truth"]], str(row["n_train"]), f"{row['psnr_db']:.2f}", *cells])
     bases = [METHODS[base][0] for base in ("rf3dgs+", "rf3dgs+los")]
     head = [h for base in bases for h in (f"{base} [dB]", "margin [dB]", "asked")]
-    return _table(("truth", "receivers", "bistatic [dB]", *head), lines)
+    return table(("truth", "receivers", "bistatic [dB]", *head), lines)
 
 
 def _repeat_text(rows: list[Row]) -> str:
@@ -246,11 +247,11 @@ def _repeat_text(rows: list[Row]) -> str:
                 TRUTH_NAMES[row["truth"]],
                 str(row["receivers"]),
                 " and ".join(map(str, row["seeds"])),
-                *(_cell(row.get(key), form) for key, _, form in COLUMNS[:11]),
+                *(cell(row.get(key), form) for key, _, form in COLUMNS[:11]),
             ]
         )
     head = ("truth", "receivers", "seeds", *(name for _, name, _ in COLUMNS[:11]))
-    return "Two solves with different seeds: no prediction can be expected to score better.\n\n" + _table(
+    return "Two solves with different seeds: no prediction can be expected to score better.\n\n" + table(
         head, lines
     )
 
@@ -267,7 +268,7 @@ def _second_table(rows: list[Row]) -> str:
             f"{row['seen']['psnr_db']:.2f}",
             f"{row['psnr_db']:.2f}",
             f"{row['first_range']['psnr_db']:.2f}",
-            *(_cell(row.get(key), form) for key, _, form in COLUMNS[1:11]),
+            *(cell(row.get(key), form) for key, _, form in COLUMNS[1:11]),
         ]
         for row in rows
     ]
@@ -278,7 +279,7 @@ def _second_table(rows: list[Row]) -> str:
         "PSNR, first range [dB]",
         *(n for _, n, _ in COLUMNS[1:11]),
     )
-    return f"{text}\n\n{_table(head, lines)}"
+    return f"{text}\n\n{table(head, lines)}"
 
 
 def _ablation_table(rows: list[Row]) -> str:
@@ -291,10 +292,10 @@ def _ablation_table(rows: list[Row]) -> str:
                 f"{TRUTH_NAMES[row['truth']]}, {row['n_train']}",
                 "the whole model" if row["model"] == WHOLE else row["model"],
                 f"{row['psnr_db'] - whole[row['truth']]:+.2f}",
-                *(_cell(row.get(key), form) for key, _, form in chosen),
+                *(cell(row.get(key), form) for key, _, form in chosen),
             ]
         )
-    return _table(("truth, receivers", "model", "change [dB]", *(name for _, name, _ in chosen)), lines)
+    return table(("truth, receivers", "model", "change [dB]", *(name for _, name, _ in chosen)), lines)
 
 
 def _calibration_table(rows: list[Row]) -> str:
@@ -305,17 +306,17 @@ def _calibration_table(rows: list[Row]) -> str:
                 TRUTH_NAMES[row["truth"]],
                 str(row["n_train"]),
                 *(
-                    _cell(row.get(f"within_{k}_sigma{b}"), "{:.1%}")
+                    cell(row.get(f"within_{k}_sigma{b}"), "{:.1%}")
                     for k in (1, 2)
                     for b in ("", "_lit", "_blocked")
                 ),
-                _cell(row.get("nll"), "{:.3f}"),
-                _cell(row.get("nll_constant"), "{:.3f}"),
-                _cell(row.get("nll_gaussian"), "{:.2f}")
+                cell(row.get("nll"), "{:.3f}"),
+                cell(row.get("nll_constant"), "{:.3f}"),
+                cell(row.get("nll_gaussian"), "{:.2f}")
                 + " / "
-                + _cell(row.get("nll_gaussian_constant"), "{:.2f}"),
-                _cell(row.get("sigma_median_db"), "{:.2f}"),
-                _cell(row.get("rms_error_db"), "{:.2f}"),
+                + cell(row.get("nll_gaussian_constant"), "{:.2f}"),
+                cell(row.get("sigma_median_db"), "{:.2f}"),
+                cell(row.get("rms_error_db"), "{:.2f}"),
             ]
         )
     wanted = "; ".join(f"{low:.0%} to {high:.0%} within {k} sigma" for k, (low, high) in ASKED_WITHIN.items())
@@ -328,7 +329,7 @@ def _calibration_table(rows: list[Row]) -> str:
         f"Asked: {wanted}. `lit`: pixels whose truth or prediction is above the floor. Negative log likelihood of a "
         f"pixel [nat], a share of {OUTLIERS:g} of the pixels taken to be outliers."
     )
-    return f"{text}\n\n{_table(head, lines)}"
+    return f"{text}\n\n{table(head, lines)}"
 
 
 def _optimiser_table(found: Row) -> str:
@@ -346,7 +347,7 @@ def _optimiser_table(found: Row) -> str:
         [name, str(r["steps"]), f"{r['seconds']:.2f}", f"{r['objective']:.4f}"]
         for name, r in (("Gauss-Newton", found["gauss_newton"]), ("Adam", found["adam"]))
     ]
-    return f"{text}\n\n{_table(('optimiser', 'steps', 'time [s]', 'objective a pixel [dB^2]'), lines)}"
+    return f"{text}\n\n{table(('optimiser', 'steps', 'time [s]', 'objective a pixel [dB^2]'), lines)}"
 
 
 def _delay_table(rows: list[Row]) -> str:
@@ -355,9 +356,9 @@ def _delay_table(rows: list[Row]) -> str:
         cells = []
         for kind in ("line_of_sight", "mirror"):
             r = row[kind]
-            cells += [f"{_cell(r['found'], '{:.0%}')} of {r['paths']}", _pair(r)]
+            cells += [f"{cell(r['found'], '{:.0%}')} of {r['paths']}", _pair(r)]
         cells += [str(row["scattering"]["pixels"]), _pair(row["scattering"])]
-        cells.append(_cell(row["scattering"]["median_by_power_ns"], "{:.2g}"))
+        cells.append(cell(row["scattering"]["median_by_power_ns"], "{:.2g}"))
         lines.append([TRUTH_NAMES[row["truth"]], str(row["n_train"]), *cells])
     head = (
         "truth", "receivers", "line of sight found", "median / 90 % [ns]", "mirror found", "median / 90 % [ns]",
@@ -366,7 +367,7 @@ def _delay_table(rows: list[Row]) -> str:
     return (
         "Paths of the true scene (image method, at most one reflection) above the floor, found within 3 degrees; "
         "pixels away from those, delay of the data set. `-`: no delay is predicted at that quantile.\n\n"
-        + _table(head, lines)
+        + table(head, lines)
     )
 
 
@@ -383,12 +384,3 @@ def _name(row: Row) -> str:
     variant = row.get("variant") or ""
     said = AVERAGE_NAMES if row["method"] == "idw" else VARIANT_NAMES
     return f"{name} ({said[variant]})" if variant else name
-
-
-def _cell(value: Any, form: str) -> str:
-    return "-" if value is None else form.format(value)
-
-
-def _table(head: Any, lines: list[list[str]]) -> str:
-    rows = [list(head), ["---"] * len(head), *lines]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)

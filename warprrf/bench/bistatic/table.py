@@ -314,7 +314,9 @@ class _Bench:
                     count,
                     self.geometry.scene_mark,
                     self.checks,
-                    source("rf/sionna_engine.py", "rf/simulate.py", "rf/metrics.py"),
+                    source(
+                        "rf/sionna_engine.py", "rf/channel/sionna_paths.py", "rf/simulate.py", "rf/metrics.py"
+                    ),
                 ],
             )
             rows.append({"truth": truth.name, **row})

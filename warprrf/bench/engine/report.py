@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from warprrf.bench.engine import blend, plots, transport
 from warprrf.bench.engine.form_kernels import STRIP
 from warprrf.bench.engine.forms import RASTERISER
+from warprrf.bench.markdown import table
 from warprrf.bench.stages import write_atomically
 from warprrf.geometry.render import RADIO
 from warprrf.rf.single_bounce import FieldOptions
@@ -153,11 +154,11 @@ def summary_text(found: Row) -> str:
         f"{found['sizes']['shape'][0]} x {found['sizes']['shape'][1]} pixels, dB images "
         "60 dB deep; time is the shortest of the repeats.",
         "### Asked and measured",
-        _table(("figure", "asked", "measured", ""), asked(found)),
+        table(("figure", "asked", "measured", ""), asked(found)),
         "### Settings that follow",
         f"The cheapest setting with an rms error of at most {TOLERANCE_DB} dB and no pixel off by more than "
         f"{WORST_DB} dB; for points, within {1e3 * POINT_TOLERANCE_M:g} mm.",
-        _table(
+        table(
             ("setting", "will do", "the library's", "why"),
             [[r["name"], _shown(r["knob"], r["value"]), r["library"], r["why"]] for r in choices(found)],
         ),
@@ -311,11 +312,6 @@ def _shown(knob: str, value: Any) -> str:
     return "-" if value is None else LABELS.get(knob, str)(value)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def _knob_table(knob: str, rows: list[Row]) -> str:
     head = ["setting", "ms", "rms error [dB]", "worst pixel [dB]", "sum over pixels [dB]"]
     more = knob == "top_k"
@@ -327,7 +323,7 @@ def _knob_table(knob: str, rows: list[Row]) -> str:
         ]
         for r in rows
     ]  # fmt: skip
-    return _table([*head, *(["pairs a pixel", "weight dropped, mean"] if more else [])], body)
+    return table([*head, *(["pairs a pixel", "weight dropped, mean"] if more else [])], body)
 
 
 def _counts_table(rows: list[Row]) -> str:
@@ -339,7 +335,7 @@ def _counts_table(rows: list[Row]) -> str:
         "segments per s",
         "hierarchy [s]",
     )
-    return _table(
+    return table(
         head,
         [
             [
@@ -367,11 +363,11 @@ def _growth_text(found: Row) -> str:
                 f"{1e3 * points[0][1]:.3g} to {1e3 * points[-1][1]:.4g}", f"{slope(points):.2f}",
             ]
         )  # fmt: skip
-    return _table(("over", "from, to", "ms", "exponent of the last three"), lines)
+    return table(("over", "from, to", "ms", "exponent of the last three"), lines)
 
 
 def _points_table(rows: list[Row]) -> str:
-    return _table(
+    return table(
         ("point", "length error, median [mm]", "90 % [mm]", "delay error, median [ns]", "ms a receiver"),
         [
             [
@@ -385,7 +381,7 @@ def _points_table(rows: list[Row]) -> str:
 
 
 def _responses_table(rows: list[Row]) -> str:
-    return _table(
+    return table(
         ("regime", "form", "mean error", "largest error", "q below zero", "ns a pair"),
         [
             [
@@ -398,7 +394,7 @@ def _responses_table(rows: list[Row]) -> str:
 
 
 def _exponentials_table(rows: list[Row]) -> str:
-    return _table(
+    return table(
         ("form", "largest error", "largest relative error", "ns a value"),
         [
             [
@@ -419,7 +415,7 @@ def _rays_table(rows: list[Row]) -> str:
         for runner, key in (("chosen", "over_bare"), ("chosen", "over_arrays"), ("warp", "over_bare")):
             line.append(f"{r[runner][key]:.2f}" if key in r[runner] else "-")
         body.append(line)
-    return _table(
+    return table(
         (
             "mesh", "faces", "rays", "Mesh [M/s]", "Warp's [M/s]", "bare Embree [M/s]", "Mesh over bare",
             "Mesh over Embree from arrays", "Warp's over bare",
@@ -454,4 +450,4 @@ def _transport_table(t: Row) -> str:
             f"average, {t['dropped_max']:.2f} at worst",
         ],
     ]
-    return _table(("", ""), rows)
+    return table(("", ""), rows)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.bench.evaluation import report
+from warprrf.bench.evaluation import comparison, report
 from warprrf.bench.evaluation.methods import METHODS, Effort
 from warprrf.bench.evaluation.paper_law import paper_law_spectra
 from warprrf.bench.evaluation.protocol import SCALES, SPLITS, TRUTHS, Scale, Setting, changed, plan, truth_of
@@ -110,7 +110,7 @@ def run(
             raise ValueError("counts, methods: nothing is left to do; expected counts that the data hold")
         store = Store(folder)
         rows = sweep(runs, setting, store, scheduler=scheduler, workers=workers, progress=progress)
-        summary = report.summarise(rows.values())
+        summary = comparison.summarise(rows.values())
         coarse = any(
             a < b for d in about.values() for a, b in zip(d["shape"], chosen.least_shape, strict=True)
         )
@@ -120,8 +120,8 @@ def run(
             "coarse": chosen.least_shape if coarse else None,
             "rows": summary,
             "published": [dict(row) for row in report.PUBLISHED],
-            "finding": report.paper_finding(summary),
-            "ahead": report.ours_against_all(summary),
+            "finding": comparison.paper_finding(summary),
+            "ahead": comparison.ours_against_all(summary),
             "data": about,
             "effort": asdict(chosen.effort),
             "machine": machine(device),
@@ -191,7 +191,7 @@ def _paper_law(stages: StagedRun, xml: Path, exact: Path, device: Any) -> Path:
     place = Geometry(stages.folder, xml, device)
     inputs = [
         exact, place.scene_mark,
-        source("rf/exact.py", "rf/paths.py", "kernels/scatter.py", "bench/evaluation/paper_law.py"),
+        source("rf/exact.py", "rf/paths.py", "rf/waves.py", "kernels/scatter.py", "bench/evaluation/paper_law.py"),
     ]  # fmt: skip
     stages.stage("paper-law", make, inputs=inputs, outputs=(file.name,))
     return file

@@ -107,8 +107,8 @@ class Method:
     note: str = ""
 
 
-def _bistatic(task: Task) -> Fitted:
-    return fit_bistatic(task.geometry, task.train, progress=task.progress)
+def _bistatic(quick: bool = False) -> Callable[[Task], Fitted]:
+    return lambda task: fit_bistatic(task.geometry, task.train, quick=quick, progress=task.progress)
 
 
 def _harmonic(model: str, train_opacity: bool = False) -> Callable[[Task], Fitted]:
@@ -236,13 +236,18 @@ def _sionna(scene: Scene, task: Task) -> Fitted:
 _METRICS = ("rf/metrics.py", "rf/spectrum.py", "rf/dataset.py", "kernels/beam.py")
 _NETWORKS = ("rf/baselines", *_METRICS)
 _LOOKUPS = ("rf/lookups.py", *_METRICS)
-_SIONNA = ("rf/sionna_engine.py", "rf/scene.py", "rf/materials.py", *_METRICS)
+_SIONNA = ("rf/sionna_engine.py", "rf/channel/sionna_paths.py", "rf/scene.py", "rf/materials.py", *_METRICS)
 _HARMONIC = field_code(bistatic=False, harmonic=True)
 _BISTATIC = field_code(bistatic=True, harmonic=False)
 _MISJUDGED = f"permittivity off by a factor {PERMITTIVITY_OFF}, roughness by {ROUGHNESS_OFF}, up or down"
 
 METHODS: dict[str, Method] = {
-    "bistatic": Method(_bistatic, code=_BISTATIC, traces="rays"),
+    "bistatic": Method(_bistatic(), code=_BISTATIC, traces="rays"),
+    "bistatic-quick": Method(
+        _bistatic(quick=True),
+        code=_BISTATIC,
+        note="no term is tried: single bounces and even light, one ray a pixel",
+    ),
     "rf3dgs+": Method(_harmonic("rf3dgs+"), GAINS, _HARMONIC, "weights", note="opacity frozen"),
     "rf3dgs": Method(
         _harmonic("rf3dgs"),
@@ -278,6 +283,8 @@ METHODS: dict[str, Method] = {
 }
 UNTAUGHT = ("sionna", "transmitter", "zero")
 """Methods that see no spectrum: one run for all numbers of training receivers."""
+OURS = ("bistatic", "bistatic-quick")
+"""Our own model."""
 AFTER = {"sionna-calibrated": "bistatic"}
 """Methods that are given the seconds of another one's run, and so come after it."""
 

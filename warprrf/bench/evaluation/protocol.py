@@ -67,6 +67,7 @@ class Scale:
         table_counts: training receivers of the table.
         curve_counts: training receivers of the sparsity curves.
         network_counts: those of them that NeRF2 and the GAN are trained on.
+        network_truths: truths that they are trained on.
         opacity_counts: those of them that opacity is trained on, too.
         seeds, truths, splits: which.
         region_counts: training receivers of the region split.
@@ -79,6 +80,7 @@ class Scale:
     table_counts: tuple[int, ...]
     curve_counts: tuple[int, ...]
     network_counts: tuple[int, ...]
+    network_truths: tuple[str, ...]
     opacity_counts: tuple[int, ...]
     seeds: tuple[int, ...]
     truths: tuple[str, ...]
@@ -96,6 +98,7 @@ SCALES = {
         table_counts=(10, 50, 400),
         curve_counts=(10, 15, 20, 25, 50, 100, 200, 400),
         network_counts=(10, 50, 400),
+        network_truths=("exact",),
         opacity_counts=(10, 50),
         seeds=(0,),
         truths=("exact", "paper-law"),
@@ -112,6 +115,7 @@ SCALES = {
         table_counts=PUBLISHED_COUNTS,
         curve_counts=PUBLISHED_COUNTS,
         network_counts=PUBLISHED_COUNTS,
+        network_truths=("exact", "sionna"),
         opacity_counts=PUBLISHED_COUNTS,
         seeds=(0, 1, 2),
         truths=("exact", "sionna", "paper-law"),
@@ -154,7 +158,7 @@ def plan(
             for seed in scale.seeds:
                 for count in counts:
                     for method in (m for m in own if m not in UNTAUGHT):
-                        if not _wanted(method, split, count, scale):
+                        if not _wanted(method, truth, split, count, scale):
                             continue
                         runs += [Run(truth, split, count, seed, method, v) for v in METHODS[method].variants]
             for method in (m for m in own if m in UNTAUGHT):
@@ -163,10 +167,10 @@ def plan(
     return runs
 
 
-def _wanted(method: str, split: str, count: int, scale: Scale) -> bool:
+def _wanted(method: str, truth: str, split: str, count: int, scale: Scale) -> bool:
     """Whether a costly method is asked for this set."""
     if METHODS[method].network:
-        return split == "random" and count in scale.network_counts
+        return split == "random" and truth in scale.network_truths and count in scale.network_counts
     return method not in OPACITY_METHODS or (split == "random" and count in scale.opacity_counts)
 
 

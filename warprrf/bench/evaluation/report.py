@@ -1,24 +1,26 @@
 """The evaluation as tables and pictures, drawn from the kept runs alone.
 
-``table1`` sets every method beside the published figures; ``sparsity`` is the paper's figure. Both say what the paper's
-finding, RF-3DGS+ ahead of RF-3DGS, comes to here, and how ours stands to the others.
+``table1`` sets every method beside the published figures; ``sparsity`` is the paper's figure. Both say what
+:mod:`~warprrf.bench.evaluation.comparison` found.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from warprrf.bench.evaluation.comparison import AHEAD
 from warprrf.bench.evaluation.methods import METHODS as KNOWN
 from warprrf.bench.evaluation.plots import law_bars, sparsity_curves, spectra_grid, speed_against_error
 from warprrf.bench.evaluation.protocol import TRUTHS, Run, Scale
-from warprrf.bench.evaluation.runs import SPREAD, Row, Store
+from warprrf.bench.evaluation.runs import Row, Store
+from warprrf.bench.markdown import cell, table
 from warprrf.bench.pictures import METHODS
 from warprrf.bench.stages import write_atomically
 
@@ -74,118 +76,12 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("peak_gpu_gib", "peak GPU memory [GiB]", "{:.2f}"),
     ("model_mib", "model [MiB]", "{:.3g}"),
 )
-PAIRS = {"rf3dgs+": "rf3dgs", "rf3dgs+alpha": "rf3dgs-alpha"}
-"""What the paper's finding compares: with lengths, and without."""
-AHEAD = (
-    ("psnr_db", 1), ("ssim", 1), ("rmse_db", -1), ("direction_within_3deg", 1), ("beam_gain_loss_db", -1),
-    ("psnr_db_blocked", 1), ("ssim_blocked", 1), ("rmse_db_blocked", -1), ("direction_within_3deg_blocked", 1),
-    ("beam_gain_loss_db_blocked", -1),
-)  # fmt: skip
-"""Figures in which ours is compared with the best of the others, and the sign of better."""
-
 LAW_TEXT = """\
 What decides is the distance law. Light that a surface scatters arrives with a power per solid angle that does not
 fall with the distance to the receiver, because the footprint of a pixel grows as fast as the power falls: it goes as
 1 / d1^2 alone, d1 from the transmitter to the surface. RF-3DGS has no distances: a Gaussian sends the same to every
 receiver in a direction, which is this law. RF-3DGS+ multiplies by (d1 + d2)^-2, which holds for mirror reflections and
 line of sight, and must unlearn it from receiver to receiver."""
-
-
-def summarise(rows: Iterable[Row]) -> list[Row]:
-    """One row a truth, split, count and method: the better variant of each seed, then the mean over seeds.
-
-    Of smallest and largest values the smallest and largest over seeds are kept.
-    """
-    seeds: dict[tuple[Any, ...], dict[int, Row]] = {}
-    for row in rows:
-        place = seeds.setdefault((row["truth"], row["split"], row["count"], row["method"]), {})
-        if row["seed"] not in place or row["psnr_db"] > place[row["seed"]]["psnr_db"]:
-            place[row["seed"]] = row
-    return [_mean(list(group.values())) for group in seeds.values()]
-
-
-def _mean(group: list[Row]) -> Row:
-    first = group[0]
-    merged: Row = {name: first[name] for name in ("truth", "split", "count", "method", "note")}
-    merged |= {
-        "variants": sorted({row["variant"] for row in group}),
-        "seeds": len(group),
-        "keys": [row["key"] for row in group],
-        "lpips_reason": first.get("lpips_reason"),
-        "receivers": first["receivers"],
-        "receivers_blocked": first["receivers_blocked"],
-        "devices": sorted({f"{row['device']}, {row['cores']} cores, {row['processor']}" for row in group}),
-    }
-    ends = {f"{name}_{end}": fold for name in SPREAD for end, fold in (("min", min), ("max", max))}
-    for name in first:
-        values = [row.get(name) for row in group]
-        numbers = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
-        if name not in merged and len(numbers) + values.count(None) == len(values):
-            merged[name] = ends.get(name, np.mean)(numbers) if numbers else None
-    spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in group]
-    merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
-    merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
-    on_gpu = [row["peak_gpu_bytes"] for row in group if row.get("peak_gpu_bytes") is not None]
-    merged["peak_gpu_gib"] = max(on_gpu) / 2**30 if on_gpu else None
-    merged["model_mib"] = None if merged.get("model_bytes") is None else merged["model_bytes"] / 2**20
-    return {k: v for k, v in merged.items() if k not in ("per_receiver", "details", "shown", "seed")}
-
-
-def paper_finding(rows: Sequence[Row]) -> list[Row]:
-    """RF-3DGS+ less RF-3DGS on every subset, a row a truth, split, count and whether opacity was trained."""
-    known = {(r["truth"], r["split"], r["count"], r["method"]): r for r in rows}
-    found = []
-    for (truth, split, count, method), plus in known.items():
-        other = known.get((truth, split, count, PAIRS.get(method, "")))
-        if other is None:
-            continue
-        line: Row = {"truth": truth, "split": split, "count": count, "opacity": method != "rf3dgs+"}
-        for key in ("psnr_db", "psnr_db_blocked", "ssim", "rmse_db"):
-            a, b = plus.get(key), other.get(key)
-            difference = None if a is None or b is None else a - b
-            line[key] = {"rf3dgs+": a, "rf3dgs": b, "difference": difference}
-        found.append(line)
-    order = list(TRUTHS)
-    return sorted(
-        found, key=lambda line: (line["opacity"], order.index(line["truth"]), line["split"], line["count"])
-    )
-
-
-def ours_against_all(rows: Sequence[Row]) -> list[Row]:
-    """Ours less the best of the others in each figure, a row a truth, split and count.
-
-    ``train_ratio`` and ``spectrum_ratio`` are how many times faster than RF-3DGS+ ours is.
-    """
-    found = []
-    for ours in (row for row in rows if row["method"] == "bistatic"):
-        place = (ours["truth"], ours["split"], ours["count"])
-        others = [
-            row
-            for row in rows
-            if (row["truth"], row["split"]) == place[:2]
-            and row["count"] in (0, ours["count"])
-            and row is not ours
-        ]
-        line: Row = dict(zip(("truth", "split", "count"), place, strict=True))
-        for key, sign in AHEAD:
-            rated = [row for row in others if row.get(key) is not None]
-            if ours.get(key) is None or not rated:
-                continue
-            best = max(rated, key=lambda row: sign * float(row[key]))
-            margin = float(ours[key]) - float(best[key])
-            line[key] = {
-                "ours": ours[key],
-                "best": best[key],
-                "method": best["method"],
-                "margin": margin,
-                "ahead": bool(sign * margin >= 0),
-            }
-        plus = next((row for row in others if row["method"] == "rf3dgs+"), None)
-        if plus is not None:
-            line["train_ratio"] = plus["train_s"] / ours["train_s"]
-            line["spectrum_ratio"] = plus["seconds_per_spectrum"] / ours["seconds_per_spectrum"]
-        found.append(line)
-    return found
 
 
 # ------------------------------------------------------------------------------------------------------- the text
@@ -222,8 +118,8 @@ def method_table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         count = "published" if row.get("published") else str(row["count"]) if row["count"] else "none"
-        lines.append([count, name_of(row), *(_cell(row.get(key), form) for key, _, form in COLUMNS)])
-    return _table(["receivers", "method", *(name for _, name, _ in COLUMNS)], lines)
+        lines.append([count, name_of(row), *(cell(row.get(key), form) for key, _, form in COLUMNS)])
+    return table(["receivers", "method", *(name for _, name, _ in COLUMNS)], lines)
 
 
 def name_of(row: Row) -> str:
@@ -303,7 +199,7 @@ def _curve_table(rows: Sequence[Row], key: str) -> str:
                     form.format(row[key], row[f"{key}_min"], row[f"{key}_max"]) if ready and row else "-"
                 )
             lines.append([TRUTHS[truth], METHODS[method][0], *cells])
-    return _table(["truth", "method", *map(str, counts)], lines)
+    return table(["truth", "method", *map(str, counts)], lines)
 
 
 def _finding_text(finding: Sequence[Row]) -> str:
@@ -315,12 +211,12 @@ def _finding_text(finding: Sequence[Row]) -> str:
                 TRUTHS[row["truth"]] + ("" if row["split"] == "random" else ", region"),
                 "trained" if row["opacity"] else "frozen",
                 str(row["count"]),
-                _cell(psnr["rf3dgs+"], "{:.2f}"),
-                _cell(psnr["rf3dgs"], "{:.2f}"),
-                _cell(psnr["difference"], "{:+.2f}"),
-                _cell(blocked["difference"], "{:+.2f}"),
-                _cell(ssim["difference"], "{:+.3f}"),
-                _cell(row["rmse_db"]["difference"], "{:+.2f}"),
+                cell(psnr["rf3dgs+"], "{:.2f}"),
+                cell(psnr["rf3dgs"], "{:.2f}"),
+                cell(psnr["difference"], "{:+.2f}"),
+                cell(blocked["difference"], "{:+.2f}"),
+                cell(ssim["difference"], "{:+.3f}"),
+                cell(row["rmse_db"]["difference"], "{:+.2f}"),
             ]
         )
     head = [
@@ -335,7 +231,7 @@ def _finding_text(finding: Sequence[Row]) -> str:
             f"mean ({min(own):+.2f} to {max(own):+.2f})."
         )
     verdict = " ".join(said) + " Published: ahead on all of them."
-    return "\n\n".join([_table(head, lines), verdict, f"{LAW_TEXT} {_law_worth(finding)}".strip()])
+    return "\n\n".join([table(head, lines), verdict, f"{LAW_TEXT} {_law_worth(finding)}".strip()])
 
 
 def _law_worth(finding: Sequence[Row]) -> str:
@@ -373,29 +269,27 @@ def _ahead_text(ahead: Sequence[Row]) -> str:
             r = row.get(key)
             form = "{:+.3f}" if key.startswith("ssim") else "{:+.0%}" if "within" in key else "{:+.2f}"
             cells.append("-" if r is None else f"{form.format(r['margin'])} ({METHODS[r['method']][0]})")
-        ratios = [_cell(row.get(k), "{:.2g}") for k in ("train_ratio", "spectrum_ratio")]
+        ratios = [cell(row.get(k), "{:.2g}") for k in ("train_ratio", "spectrum_ratio")]
         where = TRUTHS[row["truth"]] + ("" if row["split"] == "random" else ", region")
-        lines.append([where, str(row["count"]), *cells, *ratios])
+        lines.append([where, str(row["count"]), METHODS[row["ours"]][0], *cells, *ratios])
     behind = [
-        f"{TRUTHS[row['truth']]}, {row['split']}, {row['count']} receivers: {title} behind "
+        f"{METHODS[row['ours']][0]}, {TRUTHS[row['truth']]}, {row['split']}, {row['count']} receivers: {title} behind "
         f"{METHODS[row[key]['method']][0]}"
         for row in ahead
         for (key, _), title in zip(AHEAD, titles, strict=True)
         if row.get(key) is not None and not row[key]["ahead"]
     ]
     verdict = "Behind no other method in any figure." if not behind else "Behind: " + "; ".join(behind) + "."
-    head = ["truth", "receivers", *titles, "trains faster than RF-3DGS+, times", "infers faster, times"]
+    head = [
+        "truth",
+        "receivers",
+        "ours",
+        *titles,
+        "trains faster than RF-3DGS+, times",
+        "infers faster, times",
+    ]
     text = "Ours less the best of the other methods in each figure, which is named."
-    return "\n\n".join([text, _table(head, lines), verdict])
-
-
-def _cell(value: Any, form: str) -> str:
-    return "-" if value is None else form.format(value)
-
-
-def _table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    rows = [list(head), ["---"] * len(head), *map(list, lines)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return "\n\n".join([text, table(head, lines), verdict])
 
 
 # --------------------------------------------------------------------------------------------------------- files

@@ -27,8 +27,9 @@ from warprrf.bench.lobby.spectra import FILES as TRUTHS
 from warprrf.bench.machine import machine
 from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
 from warprrf.device import Progress
+from warprrf.geometry.config import ReconstructionConfig
+from warprrf.geometry.from_photos import read_photo
 from warprrf.geometry.meshio import write_mesh
-from warprrf.geometry.reconstruction import ReconstructionConfig, read_photo
 from warprrf.rf import lookups, metrics
 from warprrf.rf.spectrum import to_db
 from warprrf.rf.transport import Transport, transport

@@ -1,0 +1,239 @@
+"""Beams: codebooks keep power, a beam steered along its direction gains N, choices follow the paths and the users."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+import warprrf as wr
+from warprrf.rf.channel.beams import signal_over_interference
+from warprrf.rf.spectrum import angles_from_directions, pixel_directions
+
+F_HZ = 300e9
+WAVELENGTH_M = 299792458.0 / F_HZ
+
+
+def random_directions(count: int, seed: int = 0) -> np.ndarray:
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def paths_along(arrival: np.ndarray, departure: np.ndarray, gain: np.ndarray) -> wr.Paths:
+    """Mirror paths of one receiver with given unit directions."""
+    theta_r, phi_r = angles_from_directions(arrival)
+    theta_t, phi_t = angles_from_directions(departure)
+    count = len(gain)
+    return wr.Paths(
+        gain=np.asarray(gain, complex),
+        tau=np.full(count, 1e-8),
+        theta_r=theta_r,
+        phi_r=phi_r,
+        theta_t=theta_t,
+        phi_t=phi_t,
+        vertices=np.zeros((count, 1, 3)),
+        kind=np.full(count, "mirror", dtype="<U7"),
+        valid=np.ones(count, dtype=bool),
+        frequency_hz=F_HZ,
+    )
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(1, 1), (4, 4), (3, 8)])
+def test_dft_beams_are_orthonormal(rows: int, cols: int) -> None:
+    weights = wr.dft_codebook(wr.PlanarArray(rows, cols, orientation=(0.3, -0.2, 0.1))).weights
+    np.testing.assert_allclose(weights @ weights.conj().T, np.eye(rows * cols), atol=1e-12)
+
+
+def test_orthonormal_beams_together_receive_all_power_of_any_direction() -> None:
+    array = wr.PlanarArray(4, 6, orientation=(0.5, 0.1, 0.0))
+    power = np.abs(wr.dft_codebook(array).amplitude(random_directions(50))) ** 2
+    np.testing.assert_allclose(power.sum(axis=0), array.elements, rtol=1e-12)
+
+
+def test_dft_beam_looks_along_the_cosines_that_are_stated() -> None:
+    array = wr.PlanarArray(4, 8)  # axes of the array are those of the world: y across, z up
+    book = wr.dft_codebook(array)
+    for across, down in itertools.product(range(2, 6), range(1, 3)):
+        y, z = ((across + 0.5) / 8 - 0.5) / 0.5, -((down + 0.5) / 4 - 0.5) / 0.5
+        direction = np.array([[np.sqrt(1.0 - y**2 - z**2), y, z]])
+        gain = np.abs(book.amplitude(direction)[:, 0]) ** 2
+        assert gain.argmax() == across * 4 + down
+        np.testing.assert_allclose(gain.max(), 32.0, rtol=1e-12)
+        np.testing.assert_allclose(book.beam(across * 4 + down), book.weights[across * 4 + down], atol=1e-15)
+
+
+def test_steered_beam_gains_the_number_of_elements() -> None:
+    array = wr.PlanarArray(8, 8, orientation=(1.0, 0.2, -0.3))
+    directions = random_directions(20)
+    book = wr.steering_codebook(array, 3.0 * directions)
+    np.testing.assert_allclose(np.abs(np.diag(book.amplitude(directions))) ** 2, 64.0, rtol=1e-12)
+
+
+def test_beam_focused_on_a_near_point_loses_nothing_and_a_plane_one_does() -> None:
+    array = wr.PlanarArray(64, 64)
+    point = np.array([[0.4, 0.05, -0.1]])
+    true = array.spherical_response(point[0], WAVELENGTH_M)
+    whole = np.sum(np.abs(true) ** 2)
+    near = wr.steering_codebook(array, points=point, wavelength_m=WAVELENGTH_M)
+    plane = wr.steering_codebook(array, point)
+    np.testing.assert_allclose(np.abs(near.received(true)[0]) ** 2, whole, rtol=1e-12)
+    loss_db = wr.plane_wave_error(array, float(np.linalg.norm(point)), WAVELENGTH_M, point[0]).beam_loss_db
+    assert loss_db > 1.0
+    np.testing.assert_allclose(
+        np.abs(plane.received(true)[0]) ** 2, whole * 10.0 ** (-0.1 * loss_db), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("pattern", ["isotropic", "tr38901"])
+def test_received_superposed_and_dense_sums_agree(pattern: str) -> None:
+    array = wr.PlanarArray(3, 5, spacing=(0.5, 0.7), orientation=(0.4, 0.1, 0.2), pattern=pattern)
+    rng = np.random.default_rng(1)
+    d, c = random_directions(30), rng.normal(size=30) + 1j * rng.normal(size=30)
+    book = wr.dft_codebook(array, oversampling=2)
+    h = (array.response(d, 1.0) * np.sqrt(array.gain(d))[:, None] * c[:, None]).sum(axis=0)
+    expected = book.weights @ h
+    np.testing.assert_allclose(book.received(h), expected, atol=1e-10)
+    np.testing.assert_allclose(book.superposed(d, c), expected, atol=1e-10)
+    dense = wr.Codebook(array, (book.weights,))
+    np.testing.assert_allclose(dense.superposed(d, c), expected, atol=1e-10)
+    np.testing.assert_allclose(dense.power(d, np.abs(c) ** 2), book.power(d, np.abs(c) ** 2), rtol=1e-10)
+
+
+def test_one_path_is_met_by_the_beams_along_it() -> None:
+    tx, rx = wr.PlanarArray(8, 8, orientation=(0.3, 0, 0)), wr.PlanarArray(4, 4)
+    arrival, departure = random_directions(10, seed=2), random_directions(10, seed=3)
+    for a, d in zip(arrival, departure, strict=True):
+        paths = paths_along(a[None], d[None], np.array([0.01j]))
+        chosen = wr.select_beams(paths, tx, rx)
+        h = paths.cfr([F_HZ], tx_array=tx, rx_array=rx)[..., 0]
+        power = np.abs(wr.dft_codebook(rx).weights @ h @ wr.dft_codebook(tx).weights.T) ** 2
+        assert (chosen.rx[0], chosen.tx[0]) == np.unravel_index(power.argmax(), power.shape)
+        np.testing.assert_allclose(chosen.gain[0], power.max(), rtol=1e-9)
+
+
+def test_predicted_gain_is_the_mean_over_random_phases() -> None:
+    tx, rx = wr.PlanarArray(2, 2), wr.PlanarArray(2, 3)
+    rng = np.random.default_rng(5)
+    arrival, departure = random_directions(6, seed=6), random_directions(6, seed=7)
+    size = rng.uniform(0.5, 1.0, 6)
+    predicted = wr.beam_gains(paths_along(arrival, departure, size), tx, rx)
+    received, sent = wr.dft_codebook(rx), wr.dft_codebook(tx)
+    phases = np.exp(2j * np.pi * rng.random((20_000, 6)))
+    pairs = np.einsum("al,bl->abl", received.amplitude(arrival), sent.amplitude(departure)) * size
+    seen = np.mean(np.abs(phases @ pairs.reshape(-1, 6).T) ** 2, axis=0).reshape(predicted.shape)
+    # The share of fluctuation left of 20,000 draws is 1 / sqrt(20,000) = 0.7 %; 5 of them.
+    np.testing.assert_allclose(seen, predicted, rtol=0.035)
+
+
+def test_batched_paths_choose_as_each_receiver_does_and_best_come_first() -> None:
+    tx, rx = wr.PlanarArray(4, 4), wr.PlanarArray(4, 2)
+    lists = [
+        paths_along(random_directions(n, seed=n), random_directions(n, seed=n + 9), np.arange(1.0, n + 1))
+        for n in (2, 5)
+    ]
+    together = wr.select_beams(wr.Paths.stack(lists), tx, rx, count=7)
+    assert together.gain.shape == (2, 7) and (np.diff(together.gain, axis=1) <= 0).all()
+    for row, paths in enumerate(lists):
+        alone, gains = wr.select_beams(paths, tx, rx, count=7), wr.beam_gains(paths, tx, rx)
+        np.testing.assert_array_equal(together.tx[row], alone.tx)
+        np.testing.assert_array_equal(gains[alone.rx, alone.tx], alone.gain)
+        np.testing.assert_allclose(np.sort(gains.ravel())[::-1][:7], alone.gain)
+
+
+def test_spectrum_is_taken_as_powers_at_its_pixels() -> None:
+    shape = (12, 24)
+    gain, aod = np.zeros(shape), np.full((*shape, 2), np.nan)
+    gain[5, 3], gain[7, 20] = 1e-9, 3e-10
+    aod[5, 3], aod[7, 20] = (1.2, 0.4), (1.7, -0.8)
+    spectrum = wr.Spectrum(path_gain=gain, aod=aod)
+    tx, rx = wr.PlanarArray(4, 4), wr.PlanarArray(4, 4)
+    chosen = wr.select_beams(spectrum, tx, rx)
+    along = pixel_directions(shape)[5, 3]
+    best = np.abs(wr.dft_codebook(rx).amplitude(along[None])[:, 0]).argmax()
+    assert chosen.rx[0] == best
+    alone = wr.select_beams(wr.Spectrum(path_gain=gain), rx_array=rx)
+    assert alone.rx[0] == best and alone.tx[0] == 0
+    with pytest.raises(ValueError, match="source: got a spectrum without aod"):
+        wr.select_beams(wr.Spectrum(path_gain=gain), tx, rx)
+
+
+def test_receiver_without_paths_gets_gain_zero() -> None:
+    nothing = paths_along(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    assert wr.select_beams(nothing, wr.PlanarArray(2, 2), wr.PlanarArray(2, 2)).gain[0] == 0.0
+    assert wr.select_beams(nothing, rx_array=wr.PlanarArray(2, 2)).gain[0] == 0.0
+
+
+def test_users_in_one_direction_are_parted_over_other_paths() -> None:
+    """Two users behind one strong direction: alone both take it; together one has to go round by its weaker path."""
+    tx = wr.PlanarArray(8, 8)
+    shared, aside = (np.array([np.sqrt(1.0 - y**2 - 0.125**2), y, 0.125]) for y in (0.125, -0.625))
+    arrival = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    first = paths_along(arrival[:1], shared[None], np.array([1.0]))
+    second = paths_along(arrival, np.stack([shared, aside]), np.array([0.9, 0.5]))
+    alone = [wr.select_beams(p, tx) for p in (first, second)]
+    assert alone[0].tx[0] == alone[1].tx[0]
+    noise = 0.1
+    together = wr.select_beams_multiuser([first, second], tx, noise=noise)
+    gains = [wr.beam_gains(p, tx) for p in (first, second)]
+    sinr = signal_over_interference(gains, [alone[0].tx[0]] * 2, [0, 0], noise)
+    assert together.tx[0] == alone[0].tx[0]
+    assert together.tx[1] == wr.select_beams(paths_along(arrival[1:], aside[None], np.ones(1)), tx).tx[0]
+    assert together.spectral_efficiency > np.log2(1.0 + sinr).sum() + 3.0
+    np.testing.assert_allclose(
+        together.sinr, signal_over_interference(gains, together.tx, together.rx, noise), rtol=1e-12
+    )
+
+
+def test_multi_user_choice_is_as_good_as_trying_everything() -> None:
+    tx, rx = wr.PlanarArray(2, 3), wr.PlanarArray(1, 2)
+    users = [
+        paths_along(
+            random_directions(3, seed=s), random_directions(3, seed=50 + s), np.array([1.0, 0.6, 0.4])
+        )
+        for s in range(2)
+    ]
+    gains = [wr.beam_gains(p, tx, rx) for p in users]
+    best = max(
+        np.log2(1.0 + signal_over_interference(gains, [t0, t1], [r0, r1], 0.3)).sum()
+        for t0, t1, r0, r1 in itertools.product(range(6), range(6), range(2), range(2))
+    )
+    found = wr.select_beams_multiuser(wr.Paths.stack(users), tx, rx, noise=0.3)
+    np.testing.assert_allclose(found.spectral_efficiency, best, rtol=1e-12)
+
+
+def test_a_single_user_gets_its_best_pair() -> None:
+    tx, rx = wr.PlanarArray(4, 4), wr.PlanarArray(2, 2)
+    paths = paths_along(random_directions(4), random_directions(4, seed=1), np.array([1, 2, 3, 4]))
+    one, user = wr.select_beams(paths, tx, rx), wr.select_beams_multiuser(paths, tx, rx, noise=2.0)
+    assert (user.tx[0], user.rx[0]) == (one.tx[0], one.rx[0])
+    np.testing.assert_allclose(user.sinr, one.gain / 2.0)
+
+
+def test_bad_input_is_named() -> None:
+    array = wr.PlanarArray(2, 2)
+    paths = paths_along(np.eye(3)[:1], np.eye(3)[:1], np.ones(1))
+    with pytest.raises(ValueError, match="array: got polarisation 'V'"):
+        wr.dft_codebook(wr.PlanarArray(2, 2, polarisation="V"))
+    with pytest.raises(ValueError, match="rx_array: got polarisation 'V'"):
+        wr.select_beams(paths, array, wr.PlanarArray(2, 2, polarisation="V"))
+    with pytest.raises(ValueError, match="oversampling: got 0"):
+        wr.dft_codebook(array, 0)
+    with pytest.raises(ValueError, match="directions: got a vector of length zero"):
+        wr.steering_codebook(array, np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="either directions or points"):
+        wr.steering_codebook(array)
+    with pytest.raises(ValueError, match="wavelength_m: got None"):
+        wr.steering_codebook(array, points=np.ones((1, 3)))
+    with pytest.raises(ValueError, match="count: got 0"):
+        wr.select_beams(paths, array, count=0)
+    with pytest.raises(TypeError, match="source: got list"):
+        wr.select_beams([paths], array)
+    with pytest.raises(TypeError, match="tx_array: got int"):
+        wr.select_beams(paths, 4)
+    with pytest.raises(ValueError, match=r"channel: got shape \(3,\)"):
+        wr.dft_codebook(array).received(np.ones(3))
+    with pytest.raises(ValueError, match="noise: got 0"):
+        wr.select_beams_multiuser([paths], array, noise=0.0)
+    with pytest.raises(ValueError, match="sources: got none"):
+        wr.select_beams_multiuser([], array, noise=1.0)

@@ -1,0 +1,214 @@
+"""Precoders: what each must null or maximise, by SciPy and by closed form, and what a field's covariance means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+
+import warprrf as wr
+from warprrf.rf.channel.beams import signal_over_interference
+from warprrf.rf.spectrum import angles_from_directions
+
+F_HZ = 300e9
+USERS, ELEMENTS = 4, 12
+
+
+def rayleigh(users: int = USERS, elements: int = ELEMENTS, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return 1e-5 * (rng.normal(size=(users, elements)) + 1j * rng.normal(size=(users, elements)))
+
+
+def paths(seed: int, count: int = 5) -> wr.Paths:
+    rng = np.random.default_rng(seed)
+    arrival, departure = rng.normal(size=(2, count, 3))
+    theta_r, phi_r = angles_from_directions(arrival)
+    theta_t, phi_t = angles_from_directions(departure)
+    return wr.Paths(
+        gain=1e-5 * np.exp(rng.normal(size=count) + 2j * np.pi * rng.random(count)),
+        tau=1e-8 * (1.0 + rng.random(count)),
+        theta_r=theta_r,
+        phi_r=phi_r,
+        theta_t=theta_t,
+        phi_t=phi_t,
+        vertices=np.zeros((count, 1, 3)),
+        kind=np.full(count, "diffuse", dtype="<U7"),
+        valid=np.ones(count, dtype=bool),
+        frequency_hz=F_HZ,
+    )
+
+
+def alike(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """|<a, b>| of rows of unit norm: 1 where they differ by a phase alone."""
+    return np.abs((a.conj() * b).sum(axis=1))
+
+
+def rank_one(h: np.ndarray) -> np.ndarray:
+    return h.conj()[:, :, None] * h[:, None, :]
+
+
+@pytest.mark.parametrize("method", ["mr", "zf", "slnr"])
+def test_weights_have_unit_norm_and_one_user_gets_maximum_ratio(method: str) -> None:
+    h = rayleigh()
+    for channels in (h, rank_one(h)):
+        w = wr.precoders(channels, method, noise=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(w, axis=1), 1.0, rtol=1e-12)
+        alone = wr.precoders(channels[:1], method, noise=1e-9)
+        gain = np.abs(h[0] @ alone[0]) ** 2
+        assert gain == pytest.approx(np.linalg.norm(h[0]) ** 2, rel=1e-10)
+        assert wr.precoded_sinr(h[:1], alone, noise=1e-9)[0] == pytest.approx(gain / 1e-9, rel=1e-10)
+
+
+def test_zero_forcing_nulls_interference_and_gives_what_the_inverse_gram_says() -> None:
+    h = rayleigh()
+    for channels in (h, rank_one(h)):
+        heard = np.abs(h @ wr.precoders(channels, "zf", noise=1e-9).T)
+        own = np.diag(heard)
+        assert (heard - np.diag(own)).max() < 1e-10 * own.min()
+        # |h_u^T w_u|^2 = 1 / [(H H^H)^-1]_uu
+        np.testing.assert_allclose(own**2, 1.0 / np.diag(np.linalg.inv(h @ h.conj().T)).real, rtol=1e-9)
+
+
+def test_zero_forcing_nulls_the_channel_that_paths_predict() -> None:
+    array = wr.PlanarArray(4, 4)
+    h = np.stack([paths(seed).cfr([F_HZ], tx_array=array, diffuse="given")[0, :, 0] for seed in range(3)])
+    heard = np.abs(h @ wr.precoders(h, "zf", noise=1e-9).T)
+    assert (heard - np.diag(np.diag(heard))).max() < 1e-10 * np.diag(heard).min()
+
+
+def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder() -> None:
+    h, noise = rayleigh(), 3e-10
+    w = wr.precoders(h, "slnr", noise=noise)
+    loaded = USERS * noise * np.eye(ELEMENTS)
+    for u in range(USERS):
+        others = np.delete(h, u, axis=0)
+        leaked = np.einsum("vi,vj->ij", others.conj(), others) + loaded
+        values, vectors = eigh(np.outer(h[u].conj(), h[u]), leaked)
+        best = vectors[:, -1:].T / np.linalg.norm(vectors[:, -1])
+        assert alike(w[u : u + 1], best)[0] == pytest.approx(1.0, abs=1e-10)
+        reached = np.abs(h[u] @ w[u]) ** 2 / (np.abs(others @ w[u]) ** 2).sum().clip(0)
+        signal, lost = np.abs(h[u] @ w[u]) ** 2, (w[u].conj() @ leaked @ w[u]).real
+        assert signal / lost == pytest.approx(values[-1], rel=1e-9)
+        assert reached > signal / lost
+    mmse = h.conj().T @ np.linalg.inv(h @ h.conj().T + USERS * noise * np.eye(USERS))
+    np.testing.assert_allclose(alike(w, mmse.T / np.linalg.norm(mmse.T, axis=1)[:, None]), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(alike(w, wr.precoders(rank_one(h), "slnr", noise=noise)), 1.0, rtol=1e-9)
+
+
+def test_slnr_of_covariances_leaves_nothing_better() -> None:
+    array, noise = wr.PlanarArray(3, 4), 1e-11
+    covariances = wr.transmit_covariance([paths(seed) for seed in range(3)], array)
+    w = wr.precoders(covariances, "slnr", noise=noise)
+    rng = np.random.default_rng(0)
+    for u in range(3):
+        leaked = covariances.sum(axis=0) - covariances[u] + 3 * noise * np.eye(12)
+
+        def ratio(x: np.ndarray, own: np.ndarray = covariances[u], leaked: np.ndarray = leaked) -> float:
+            return float(((x.conj() @ own @ x) / (x.conj() @ leaked @ x)).real)
+
+        for size in (1e-3, 0.1, 1.0):
+            for _ in range(50):
+                assert ratio(w[u] + size * (rng.normal(size=12) + 1j * rng.normal(size=12))) < ratio(w[u])
+
+
+def test_slnr_lies_between_maximum_ratio_and_zero_forcing() -> None:
+    h = rayleigh()
+    for channels in (h, rank_one(h)):
+        loud, quiet = (wr.precoders(channels, "slnr", noise=n) for n in (1.0, 1e-18))
+        np.testing.assert_allclose(alike(loud, wr.precoders(h, "mr", noise=1.0)), 1.0, rtol=1e-9)
+        np.testing.assert_allclose(alike(quiet, wr.precoders(h, "zf", noise=1.0)), 1.0, rtol=1e-6)
+    for noise in (1e-11, 1e-9, 1e-7):
+        rate = {}
+        for method in ("mr", "zf", "slnr"):
+            rates = []
+            for seed in range(40):
+                h = rayleigh(users=8, seed=seed)
+                w = wr.precoders(h, method, noise=noise)
+                rates.append(np.log2(1.0 + wr.precoded_sinr(h, w, noise=noise)).sum())
+            rate[method] = np.mean(rates)
+        assert rate["slnr"] > max(rate["mr"], rate["zf"]) - 1e-9
+
+
+def test_covariance_gives_every_pair_of_beams_its_mean_gain() -> None:
+    tx = wr.dft_codebook(wr.PlanarArray(4, 4, pattern="tr38901"))
+    rx = wr.dft_codebook(wr.PlanarArray(2, 2, orientation=(0.4, 0.1, 0.0)))
+    users = [paths(seed) for seed in range(3)]
+    chosen = np.array([3, 0, 2])
+    found = wr.transmit_covariance(users, tx, rx, rx=chosen)
+    gains = np.stack([wr.beam_gains(p, tx, rx)[beam] for p, beam in zip(users, chosen, strict=True)])
+    power = np.einsum("bn,unm,bm->ub", tx.weights.conj(), found, tx.weights).real
+    np.testing.assert_allclose(power, gains, rtol=1e-10)
+    stacked = wr.transmit_covariance(wr.Paths.stack(users), tx, rx, rx=chosen)
+    np.testing.assert_allclose(stacked, found, rtol=1e-12)
+    one = wr.transmit_covariance(users[0], wr.PlanarArray(1, 1))
+    assert one.shape == (1, 1, 1)
+    assert one[0, 0, 0].real == pytest.approx(users[0].power.sum(), rel=1e-12)
+
+
+def test_covariance_is_the_mean_over_phases() -> None:
+    array = wr.PlanarArray(2, 3)
+    user = paths(1)
+    drawn = np.stack(
+        [user.cfr([F_HZ], tx_array=array, diffuse="random_phase", seed=s)[0, :, 0] for s in range(3000)]
+    )
+    mean = np.einsum("si,sj->ij", drawn.conj(), drawn) / len(drawn)
+    found = wr.transmit_covariance(user, array)[0]
+    assert np.linalg.norm(mean - found) < 0.05 * np.linalg.norm(found)
+
+
+def test_sinr_of_beams_is_that_of_the_multi_user_choice() -> None:
+    book = wr.dft_codebook(wr.PlanarArray(3, 4))
+    h = rayleigh()
+    gains = [np.abs(book.received(row))[None] ** 2 for row in h]
+    sent = np.array([1, 5, 7, 2])
+    expected = signal_over_interference(gains, sent, np.zeros(USERS, int), 1e-9)
+    for channels in (h, rank_one(h)):
+        sinr = wr.precoded_sinr(channels, 3.0 * book.weights[sent], noise=1e-9)
+        np.testing.assert_allclose(sinr, expected, rtol=1e-9)
+
+
+def test_two_users_on_orthogonal_beams_do_not_hear_each_other() -> None:
+    array = wr.PlanarArray(1, 8)
+    book = wr.dft_codebook(array)
+    h = 1e-5 * np.sqrt(8.0) * book.weights[[2, 5]].conj()
+    for method in ("mr", "zf", "slnr"):
+        sinr = wr.precoded_sinr(h, wr.precoders(h, method, noise=1e-10), noise=1e-10)
+        np.testing.assert_allclose(sinr, 8e-10 / 2e-10, rtol=1e-9)
+
+
+def test_bad_input_is_named() -> None:
+    h, array = rayleigh(), wr.PlanarArray(2, 2)
+    for change, message in (
+        ({"method": "dpc"}, "method: got 'dpc'"),
+        ({"noise": 0.0}, "noise: got 0.0"),
+        ({"channels": h[0]}, "channels: got shape"),
+        ({"channels": h * np.nan}, "channels: got NaN"),
+        ({"channels": rank_one(h) + 1e-10j}, "not Hermitian"),
+        ({"channels": np.vstack([h[:2], 0 * h[:1]])}, r"users \[2\] get no power"),
+        ({"channels": h[[0, 1, 1]], "method": "zf"}, "cannot part 3 users by 12 elements.*rank 2"),
+        ({"channels": rayleigh(5, 4), "method": "zf"}, "cannot part 5 users by 4 elements"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            wr.precoders(**({"channels": h, "method": "slnr", "noise": 1e-9} | change))
+    with pytest.raises(ValueError, match="weights: got shape"):
+        wr.precoded_sinr(h, h[:2], noise=1e-9)
+    with pytest.raises(ValueError, match="rx: got None, expected the index of a beam for each of 1 users"):
+        wr.transmit_covariance(paths(0), array, array)
+    with pytest.raises(ValueError, match=r"rx: got \[4\], expected beams 0 to 3"):
+        wr.transmit_covariance(paths(0), array, array, rx=[4])
+    with pytest.raises(ValueError, match="sources: got none"):
+        wr.transmit_covariance([], array)
+    with pytest.raises(ValueError, match="without a departure angle"):
+        wr.transmit_covariance(replace(paths(0), theta_t=np.full(5, np.nan)), array)
+
+
+def test_a_user_without_power_counts_as_dark_where_rates_are_reckoned() -> None:
+    h = rayleigh()
+    w = wr.precoders(h, "zf", noise=1e-9)
+    dark = h.copy()
+    dark[1] = 0.0
+    sinr = wr.precoded_sinr(dark, w, noise=1e-9)
+    assert sinr[1] == 0.0
+    assert (np.delete(sinr, 1) > 0).all()

@@ -1,0 +1,374 @@
+"""Channels against closed forms, brute sums and identities."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+sys.path[:0] = [str(folder) for folder in Path(__file__).parents[:2]]
+from path_makers import CARRIER, random_paths  # noqa: E402
+from radio_scenes import METAL, RadioScene, SlabMaterial  # noqa: E402
+
+from warprrf.geometry.mesh import Mesh  # noqa: E402
+from warprrf.rf.absorption import Air, gas_attenuation_db_per_m  # noqa: E402
+from warprrf.rf.channel import sums  # noqa: E402
+from warprrf.rf.channel.arrays import PlanarArray  # noqa: E402
+from warprrf.rf.channel.band_plan import thz_channel  # noqa: E402
+from warprrf.rf.channel.path_set import Paths  # noqa: E402
+from warprrf.rf.fresnel import SPEED_OF_LIGHT, slab_reflection  # noqa: E402
+from warprrf.rf.paths import trace_paths  # noqa: E402
+
+F = 300e9
+WAVELENGTH = SPEED_OF_LIGHT / F
+BAND = thz_channel(69)
+
+
+def far_square(material, half=200.0):
+    """A floor in the plane z = 0."""
+    vertices = np.array([[-half, -half, 0], [half, -half, 0], [half, half, 0], [-half, half, 0]])
+    return RadioScene(Mesh(vertices, [[0, 1, 2], [0, 2, 3]]), np.zeros(2, np.int32), [material])
+
+
+def turned(length, frequency=F):
+    return np.exp(-2j * np.pi * ((frequency / SPEED_OF_LIGHT * length) % 1.0))
+
+
+def close(found, expected):
+    """Gain to 1e-6, phase to 1e-3 rad."""
+    assert abs(abs(found) / abs(expected) - 1) < 1e-6
+    assert abs(np.angle(found / expected)) < 1e-3
+
+
+def test_friis_at_100_m():
+    tx, rx = np.array([0, 0, 30.0]), np.array([100.0, 3.0, 31.0])
+    scene = far_square(METAL)
+    p = trace_paths(scene, transmitter=tx, receivers=rx, frequency_hz=F, mirror_order=0)
+    d = np.linalg.norm(tx - rx)
+    for f in (F, 310e9):
+        h = p.cfr([f], amplitude="friis")[0, 0, 0]
+        close(h, SPEED_OF_LIGHT / (4 * np.pi * f * d) * turned(d, f))
+    assert abs(p.cfr([310e9])[0, 0, 0]) == pytest.approx(WAVELENGTH / (4 * np.pi * d), rel=1e-12)
+
+
+@pytest.mark.parametrize("material", [METAL, SlabMaterial(thickness_m=np.inf), SlabMaterial(scattering=0.6)])
+def test_two_rays_at_100_m(material):
+    h1, h2, across = 2.0, 1.5, 100.0
+    tx, rx = np.array([0, 0, h1]), np.array([across, 0, h2])
+    p = trace_paths(far_square(material), transmitter=tx, receivers=rx, frequency_hz=F)
+    direct, bounced = np.hypot(across, h1 - h2), np.hypot(across, h1 + h2)
+    te, tm = slab_reflection((h1 + h2) / bounced, material.permittivity(F), material.thickness_m, WAVELENGTH)
+    smooth = np.sqrt(1 - material.scattering**2)
+    # Vertical dipoles' field lies along the zenith unit vectors, horizontal ones' across the plane of incidence.
+    for polarisation, reflection in (("V", tm), ("H", te)):
+        a = PlanarArray(1, 1, polarisation=polarisation)
+        f = 305e9
+        h = p.cfr([f], tx_array=a, rx_array=a)[0, 0, 0]
+        # Azimuth unit vectors of departure and arrival are opposite; at the ground, so are the zenith's.
+        sign = 1.0 if polarisation == "V" else -1.0
+        expected = sign * (
+            WAVELENGTH
+            / (4 * np.pi)
+            * (turned(direct, f) / direct + reflection * smooth * turned(bounced, f) / bounced)
+        )
+        close(h, expected)
+
+
+def test_image_method_in_a_corner():
+    """Two mirrors at a right angle: the double reflection comes from the image through the edge."""
+    s = 300.0
+    walls = np.array([[0, 0, -s], [s, 0, -s], [s, 0, s], [0, 0, s], [0, s, -s], [0, s, s]])
+    mesh = Mesh(walls, [[0, 1, 2], [0, 2, 3], [0, 5, 4], [0, 3, 5]])
+    tx, rx = np.array([70.0, 20.0, 3.0]), np.array([25.0, 65.0, -4.0])
+    p = trace_paths(mesh, transmitter=tx, receivers=rx, frequency_hz=F, mirror_order=2)
+    images = [tx, tx * [1, -1, 1], tx * [-1, 1, 1], tx * [-1, -1, 1]]
+    lengths = np.array([np.linalg.norm(i - rx) for i in images])
+    expected = (WAVELENGTH / (4 * np.pi * lengths) * turned(lengths)).sum()
+    close(p.cfr([F])[0, 0, 0], expected)
+
+
+@pytest.mark.parametrize("squint", [False, True])
+@pytest.mark.parametrize("method", ["dense", "grid"])
+def test_response_is_the_sum_over_paths(squint, method):
+    p = random_paths(200)
+    f = BAND.frequencies_hz(64)
+    tx, rx = PlanarArray(2, 3, orientation=(0.4, 0.1, 0)), PlanarArray(3, 2, spacing=0.7, pattern="tr38901")
+    h = p.cfr(f, tx_array=tx, rx_array=rx, squint=squint, method=method)
+    lam = SPEED_OF_LIGHT / CARRIER
+    longer = -np.einsum("mi,pi->mp", rx.positions(lam), p.arrival)[:, None]
+    longer = longer - np.einsum("ni,pi->np", tx.positions(lam), p.departure)
+    a = p.gain * np.sqrt(rx.gain(p.arrival))
+    expected = np.empty_like(h)
+    for k, one in enumerate(f):
+        at = one if squint else CARRIER
+        waves = np.exp(-2j * np.pi * ((one - CARRIER) * p.tau + at * longer / SPEED_OF_LIGHT))
+        expected[:, :, k] = (a * waves).sum(axis=-1)
+    largest = np.abs(expected).max()
+    np.testing.assert_allclose(h, expected, atol=(1e-11 if method == "dense" else 1e-6) * largest)
+
+
+@pytest.mark.parametrize("count", [16, 17, 63, 256])
+@pytest.mark.parametrize("descending", [False, True])
+def test_grid_matches_dense_for_any_count_and_order(count, descending):
+    p = random_paths(50, latest=3e-6)  # delays wrap round the grid many times
+    f = BAND.frequencies_hz(count)[:: -1 if descending else 1]
+    a = PlanarArray(2, 2)
+    for squint in (False, True):
+        dense, grid = (p.cfr(f, tx_array=a, squint=squint, method=m) for m in ("dense", "grid"))
+        assert np.abs(grid - dense).max() < 2e-6 * np.abs(dense).max()
+
+
+def spherical_truth(tx, rx, image, sending, receiving, f):
+    """Green's function between every pair: the transmitting elements mirrored with their centre."""
+    mirror = np.diag([1.0, 1.0, -1.0]) if image else np.eye(3)
+    source = (tx + sending) @ mirror
+    d = np.linalg.norm((rx + receiving)[:, None] - source, axis=-1)
+    return SPEED_OF_LIGHT / (4 * np.pi * F * d) * np.exp(-2j * np.pi * f / SPEED_OF_LIGHT * d)
+
+
+@pytest.mark.parametrize("method", ["dense", "grid"])
+def test_spherical_waves_are_those_of_every_pair_of_elements(method):
+    """Line of sight and a mirror on a perfect reflector, 4 x 4 to 8 x 8 elements half a metre away."""
+    floor = Mesh([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]])
+    tx, rx = np.array([0.0, 0, 0.4]), np.array([0.5, 0.1, 0.3])
+    p = trace_paths(floor, transmitter=tx, receivers=rx, frequency_hz=F)
+    a, b = PlanarArray(4, 4, orientation=(0.3, 0.2, 0.1)), PlanarArray(8, 8, orientation=(2.9, 0, 0.4))
+    f = F + np.linspace(-5e9, 5e9, 32)
+    h = p.cfr(f, tx_array=a, rx_array=b, wave="spherical", method=method)
+    lam = SPEED_OF_LIGHT / F
+    places = a.positions(lam), b.positions(lam)
+    expected = np.stack(
+        [sum(spherical_truth(tx, rx, image, *places, one) for image in (False, True)) for one in f], axis=-1
+    )
+    assert np.abs(h - expected).max() < (1e-9 if method == "dense" else 2e-6) * np.abs(expected).max()
+    plane = p.cfr(f, tx_array=a, rx_array=b)
+    assert np.abs(plane - expected).max() > 0.03 * np.abs(expected).max()  # the near field matters here
+
+
+def test_spherical_waves_of_a_diffuse_path_run_through_its_point():
+    tx, rx, point = np.array([0.0, 0, 1]), np.array([1.0, 1, 1]), np.array([0.6, 0.2, 0.0])
+    p = Paths.from_points(tx, rx, point[None, None], np.array([2.0 + 0j]), np.array(["diffuse"]), F)
+    a, b = PlanarArray(3, 3), PlanarArray(4, 2)
+    lam = SPEED_OF_LIGHT / F
+    sending = np.linalg.norm(point - tx - a.positions(lam), axis=1)
+    receiving = np.linalg.norm(point - rx - b.positions(lam), axis=1)
+    d1, d2 = np.linalg.norm(point - tx), np.linalg.norm(point - rx)
+    expected = 2.0 * np.outer(turned(receiving) * d2 / receiving, turned(sending) * d1 / sending)
+    h = p.cfr([F], tx_array=a, rx_array=b, wave="spherical", diffuse="given")[..., 0]
+    np.testing.assert_allclose(h, expected, rtol=1e-8)
+    coefficient, tau = p.cir(tx_array=a, rx_array=b, wave="spherical", diffuse="given")
+    np.testing.assert_allclose(coefficient[..., 0], expected, rtol=1e-8)
+    np.testing.assert_allclose(tau[..., 0], (receiving[:, None] + sending) / SPEED_OF_LIGHT, rtol=1e-12)
+
+
+def test_spherical_waves_become_plane_far_away():
+    tx, a = np.zeros(3), PlanarArray(8, 8)
+    worst = []
+    for distance in (1.0, 10.0, 100.0):
+        p = trace_paths(
+            Mesh([[0, 0, 500], [1, 0, 500], [0, 1, 500]], [[0, 1, 2]]),
+            transmitter=tx,
+            receivers=[distance, 0, 0],
+            frequency_hz=F,
+            mirror_order=0,
+        )
+        plane, spherical = (p.cfr([F], rx_array=a, tx_array=a, wave=w) for w in ("plane", "spherical"))
+        worst.append(np.abs(plane - spherical).max() / np.abs(plane).max())
+    assert worst[0] > 5 * worst[1] > 25 * worst[2] and worst[2] < 1e-2
+
+
+def test_taps_hold_the_energy_of_the_band():
+    """Parseval: sum |h_l|^2 = 1 / W integral |H|^2 over the band, tails of the sinc past the last tap left out."""
+    p = random_paths(40, latest=20e-9)
+    width = 4.32e9
+    h = p.taps(width, -4000, 4000)[0, 0]
+    count = 8192
+    f = CARRIER + (np.arange(count) + 0.5) / count * width - 0.5 * width
+    energy = np.mean(np.abs(p.cfr(f)[0, 0]) ** 2)
+    assert np.sum(np.abs(h) ** 2) == pytest.approx(energy, rel=1e-3)
+
+
+def test_taps_are_the_transform_of_the_response():
+    p = random_paths(20, latest=10e-9)
+    width, count = 2e9, 4096
+    f = CARRIER + (np.arange(count) + 0.5) / count * width - 0.5 * width
+    response = p.cfr(f, tx_array=PlanarArray(2, 2))
+    lags = np.arange(0, 25)
+    # h_l = 1/W integral H(f) exp(j 2 pi (f - f_c) l / W)
+    expected = response @ np.exp(2j * np.pi * np.outer((f - CARRIER) / width, lags)) / count
+    # Squint turns the integrand little over 2 GHz; the midpoint rule errs by 1e-6 of it.
+    found = p.taps(width, 0, 24, tx_array=PlanarArray(2, 2))
+    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_relative_delays_turn_all_by_one_phase():
+    p = random_paths(30)
+    f = BAND.frequencies_hz(20)
+    first = p.tau.min()
+    h, shifted = p.cfr(f)[0, 0], p.cfr(f, normalize_delays=True)[0, 0]
+    np.testing.assert_allclose(shifted, h * np.exp(2j * np.pi * ((f * first) % 1.0)), rtol=1e-9)
+    a, tau = p.cir(normalize_delays=True)
+    assert tau.min() == 0.0
+    np.testing.assert_allclose(
+        (a[0, 0] * np.exp(-2j * np.pi * tau * (f[0] - CARRIER))).sum(), shifted[0], rtol=1e-9
+    )
+    lags = np.arange(-3, 300)
+    np.testing.assert_allclose(
+        p.taps(1e9, -3, 299, normalize_delays=True)[0, 0],
+        (a[0, 0] * np.sinc(lags[:, None] - 1e9 * tau)).sum(1),
+        rtol=1e-9,
+    )
+
+
+def test_several_receivers_are_each_alone():
+    parts = [random_paths(n, seed=n) for n in (7, 3, 12)]
+    both = Paths.stack(parts)
+    f = BAND.frequencies_hz(40)
+    a = PlanarArray(2, 2)
+    h = both.cfr(f, tx_array=a)
+    assert h.shape == (3, 1, 4, 40)
+    for k, p in enumerate(parts):
+        np.testing.assert_array_equal(h[k], p.cfr(f, tx_array=a))
+        np.testing.assert_array_equal(both[k].gain, p.gain)
+    coefficient, tau = both.cir(tx_array=a)
+    assert coefficient.shape == (3, 1, 4, 12) and tau.shape == (3, 12)
+    assert np.isnan(tau[1, 3:]).all() and not coefficient[1, ..., 3:].any()
+
+
+def test_receiver_without_paths_has_a_channel_of_zeros():
+    both = Paths.stack([random_paths(3), random_paths(3).select([])])
+    for squint in (False, True):
+        h = both.cfr(BAND.frequencies_hz(16), tx_array=PlanarArray(2, 2), squint=squint, method="grid")
+        assert h[0].any() and not h[1].any()
+    assert not both.taps(1e9, 0, 5)[1].any()
+
+
+def test_polarised_ports():
+    p = random_paths(20, jones=True)
+    one = PlanarArray(2, 2, polarisation="VH")
+    h = p.cfr([CARRIER], tx_array=one, rx_array=one)[..., 0]
+    assert h.shape == (8, 8)
+    coefficient, _ = p.cir(
+        tx_array=PlanarArray(1, 1, polarisation="VH"), rx_array=PlanarArray(1, 1, polarisation="VH")
+    )
+    np.testing.assert_allclose(np.moveaxis(coefficient, -1, 0), p.jones, rtol=1e-12)  # V is zenith, H azimuth
+    vertical = PlanarArray(2, 2, polarisation="V")
+    np.testing.assert_allclose(
+        p.cfr([CARRIER], tx_array=vertical, rx_array=vertical)[..., 0], h[:4, :4], rtol=1e-12
+    )
+    with pytest.raises(ValueError, match="rx_array"):
+        p.cfr([CARRIER], tx_array=vertical)
+    with pytest.raises(ValueError, match="polarised amplitudes"):
+        replace(p, jones=None).cfr([CARRIER], tx_array=vertical, rx_array=vertical)
+
+
+def test_traced_jones_matrices_hold_the_path_gain():
+    scene = far_square(SlabMaterial())
+    p = trace_paths(scene, transmitter=[0, 0, 2], receivers=[[5, 1, 1], [9, -2, 3]], frequency_hz=F)
+    half = 0.5 * (np.abs(p.jones) ** 2).sum(axis=(-2, -1))
+    np.testing.assert_allclose(half, p.power, rtol=1e-12)
+    assert (p.kind == [["los", "mirror"]] * 2).all()
+    bare = trace_paths(scene.mesh, transmitter=[0, 0, 2], receivers=[5, 1, 1], frequency_hz=F)
+    assert bare.jones is None
+
+
+def test_diffuse_phases_must_be_chosen():
+    p = Paths.concatenate([random_paths(3), random_paths(5000, seed=1, kind="diffuse")])
+    f = BAND.frequencies_hz(16)
+    with pytest.raises(ValueError, match="diffuse"):
+        p.cfr(f)
+    with pytest.raises(ValueError, match="diffuse"):
+        p.cfr(f, diffuse="both")
+    np.testing.assert_allclose(p.cfr(f, diffuse="power"), p.select(np.arange(3)).cfr(f), rtol=1e-12)
+    given = p.cfr(f, diffuse="given")
+    assert np.array_equal(p.cfr(f, diffuse="random_phase", seed=4), p.cfr(f, diffuse="random_phase", seed=4))
+    drawn = np.array([p.cfr([CARRIER], diffuse="random_phase", seed=s)[0, 0, 0] for s in range(400)])
+    assert not np.isclose(drawn[0], given[0, 0, 0])
+    # Mean power of a sum of random phases is the sum of powers; the mean of 400 exponential values errs by 5 %.
+    still = p.cfr([CARRIER], diffuse="power")[0, 0, 0]
+    assert np.mean(np.abs(drawn - still) ** 2) == pytest.approx(float(p.diffuse_power()), rel=0.2)
+    assert float(p.diffuse_power()) == pytest.approx(p.power[3:].sum())
+
+
+@pytest.mark.parametrize("method", ["dense", "grid"])
+@pytest.mark.parametrize("squint", [False, True])
+def test_absorption_follows_frequency(method, squint):
+    p = random_paths(30)
+    f = BAND.frequencies_hz(32)
+    tx = PlanarArray(2, 1)
+    h = p.with_gas().cfr(f, tx_array=tx, method=method, squint=squint)
+    loss = 10 ** (-np.multiply.outer(gas_attenuation_db_per_m(f), p.length_m) / 20)
+    for k in (0, 17, 31):
+        expected = replace(p, gain=p.gain * loss[k]).cfr([f[k]], tx_array=tx, squint=squint)[..., 0]
+        assert np.abs(h[..., k] - expected).max() < 1e-6 * np.abs(h).max()
+
+
+def test_gas_is_put_in_and_taken_out():
+    p = random_paths(5)
+    wet = p.with_gas(Air(water_vapour_g_m3=20))
+    assert (wet.power < p.power).all() and wet.air == Air(water_vapour_g_m3=20)
+    np.testing.assert_allclose(wet.with_gas(False).gain, p.gain, rtol=1e-12)
+    np.testing.assert_allclose(wet.with_gas().gain, p.with_gas(True).gain, rtol=1e-12)
+    db_per_m = gas_attenuation_db_per_m(CARRIER)
+    np.testing.assert_allclose(10 * np.log10(p.power / p.with_gas().power), db_per_m * p.length_m, rtol=1e-9)
+    assert p.with_gas(False) is p
+    with pytest.raises(TypeError, match="gas"):
+        p.with_gas("dry")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"frequencies_hz": [-1e9, 0]}, "frequencies_hz"),
+        ({"frequencies_hz": [3e11], "wave": "round"}, "wave"),
+        ({"frequencies_hz": [3e11], "amplitude": "loud"}, "amplitude"),
+        ({"frequencies_hz": [3e11, 3.1e11], "method": "grid"}, "frequencies_hz"),
+        ({"frequencies_hz": [3e11], "wave": "spherical"}, "interaction points"),
+    ],
+)
+def test_bad_requests_are_named(arguments, name):
+    with pytest.raises(ValueError, match=name):
+        random_paths(3).cfr(**arguments)
+    with pytest.raises(ValueError, match="frequency_hz"):
+        replace(random_paths(3), frequency_hz=None).cfr([3e11])
+    with pytest.raises(ValueError, match="delay"):
+        replace(random_paths(3), tau=np.array([1e-9, np.nan, 2e-9])).cfr([3e11])
+
+
+def test_relevance_decides_on_gas():
+    p = random_paths(4)
+    assert p.with_gas(SimpleNamespace(kept=("line_of_sight",))) is p
+    np.testing.assert_array_equal(p.with_gas(SimpleNamespace(kept=("gas",))).gain, p.with_gas(True).gain)
+
+
+def test_traced_paths_take_gas():
+    scene = far_square(METAL)
+    place = {"transmitter": [0, 0, 2], "receivers": [[5, 1, 1], [90, -2, 3]], "frequency_hz": F}
+    dry, wet = trace_paths(scene, **place), trace_paths(scene, gas=True, **place)
+    loss = gas_attenuation_db_per_m(F) * dry.length_m
+    np.testing.assert_allclose(10 * np.log10(dry.power / wet.power), loss, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(wet.jones / dry.jones)[0, 0, 0, 0], 10 ** (-loss[0, 0] / 20), rtol=1e-9)
+
+
+@pytest.mark.parametrize("wave", ["plane", "spherical"])
+@pytest.mark.parametrize("squint", [False, True])
+@pytest.mark.parametrize("method", ["dense", "grid"])
+def test_small_blocks_change_nothing(monkeypatch, wave, squint, method):
+    floor = Mesh([[-9, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]])
+    p = trace_paths(floor, transmitter=[0, 0, 2], receivers=[3.0, 1, 1], frequency_hz=F)
+    points = np.random.default_rng(0).uniform(-1, 1, (7, 1, 3)) * [4, 4, 0]
+    many = Paths.from_points(p.transmitter, p.receiver, points, np.full(7, 1e-5), np.full(7, "diffuse"), F)
+    p = Paths.concatenate([p, many])
+    f = F + np.linspace(-1e9, 1e9, 20)
+    ask = {"tx_array": PlanarArray(3, 2), "rx_array": PlanarArray(2, 5), "diffuse": "given", "wave": wave}
+    whole = p.cfr(f, squint=squint, method=method, **ask)
+    taps = p.taps(1e9, 0, 20, squint=squint, **ask)
+    monkeypatch.setattr(sums, "_BLOCK", 10)
+    np.testing.assert_allclose(
+        p.cfr(f, squint=squint, method=method, **ask), whole, atol=1e-12 * np.abs(whole).max()
+    )
+    np.testing.assert_allclose(
+        p.taps(1e9, 0, 20, squint=squint, **ask), taps, atol=1e-12 * np.abs(taps).max()
+    )

@@ -1,0 +1,95 @@
+"""The command line: every step of the library as a command, and the lobby as one.
+
+`main` parses, calls one public function and writes what came back; nothing is computed here. Bad input ends with one
+line on standard error and status 2 (`--debug` shows the traceback instead), an interrupt with 130.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import warprrf as wr
+from warprrf.cli.bars import Bars
+from warprrf.cli.bench import add_benches
+from warprrf.cli.lobby import add_data, add_lobby
+from warprrf.cli.steps import add_evaluate, add_fit, add_reconstruct, add_relevance, add_simulate
+from warprrf.cli.views import add_map, add_render, add_twin
+
+EPILOG = """\
+a walk through, in a checkout:
+  warprrf lobby                                    photos -> geometry -> radio -> evaluation, into runs/lobby/
+  warprrf reconstruct photos/ -o room --known-positions surveyed.json
+  warprrf simulate data/lobby/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv
+  warprrf fit room spectra.nc -o field.safetensors --model rf3dgs+
+  warprrf evaluate field.safetensors spectra.nc --train 50
+  warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
+  warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
+  warprrf twin field.safetensors -o twin           scene.xml and materials.json for Sionna RT
+
+Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status: 0 done, 2 bad input, 130 interrupted."""
+    parser = _parser()
+    args = parser.parse_args(argv)
+    try:
+        with Bars(quiet=args.quiet) as bars:
+            args.command(args, bars)
+    except KeyboardInterrupt:
+        print("warprrf: interrupted; what is finished is kept", file=sys.stderr)
+        return 130
+    except (ValueError, OSError, ImportError) as error:
+        if args.debug:
+            raise
+        print(f"warprrf: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _parser() -> argparse.ArgumentParser:
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--seed", type=int, default=0, help="every random choice follows from it (default 0)")
+    common.add_argument("--device", default=None, help="cpu or cuda:0 (default: the GPU where there is one)")
+    common.add_argument("--quiet", action="store_true", help="no progress bars")
+    common.add_argument("--debug", action="store_true", help="show the traceback of an error")
+
+    parser = argparse.ArgumentParser(
+        prog="warprrf",
+        description="Radio radiance fields from photos and a few radio measurements.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"warprrf {wr.__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def add(
+        name: str, run: Callable[..., None], line: str, text: str, to: Any = commands, options: bool = True
+    ) -> argparse.ArgumentParser:
+        one: argparse.ArgumentParser = to.add_parser(
+            name,
+            help=line,
+            description=f"{line[0].upper()}{line[1:]}.",
+            epilog=text,
+            parents=[common] if options else [],
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        one.set_defaults(command=run)
+        return one
+
+    for define in (
+        add_lobby, add_reconstruct, add_simulate, add_fit, add_relevance, add_render, add_evaluate, add_map, add_twin,
+        add_benches, add_data,
+    ):  # fmt: skip
+        define(add)
+    return parser

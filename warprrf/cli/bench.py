@@ -1,0 +1,332 @@
+"""`warprrf bench TABLE`: the commands that make the README's tables and pictures."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from warprrf.cli.bars import Bars
+from warprrf.cli.inputs import Add
+
+HELP_BENCH = """\
+Prints a table and writes it as JSON and Markdown.
+
+examples:
+  warprrf bench channel
+  warprrf bench relevance
+  warprrf bench newrf
+  warprrf bench newrf --data external/newrf --out runs/newrf
+  warprrf bench bistatic --truths exact --counts 10 50
+  warprrf bench engine
+  warprrf bench map --field field.safetensors
+  warprrf bench table1
+  warprrf bench sparsity
+  warprrf bench beams
+"""
+
+HELP_BENCH_BISTATIC = """\
+Fits the bistatic field, RF-3DGS+ and lookups on the same receivers and scores them on held-out ones; then ablation,
+stated uncertainty, delays, a second transmitter, Sionna against itself, Gauss-Newton against Adam. Every row is kept:
+a killed run loses one, and a row is made again only if its data, geometry, options or code changed.
+
+examples:
+  warprrf bench bistatic
+  warprrf bench bistatic --truths exact --counts 10 --every 4 --out runs/quick     a first look, in minutes
+  warprrf bench bistatic --data spectra_full.nc spectra_sionna_full.nc --geometry room
+"""
+
+HELP_BENCH_ENGINE = """\
+Turns each knob of the rasteriser (cutoff, clamp, top K, precision, resolution, number of Gaussians, interaction point,
+form of the response and of the exponential) and writes its time and its error as tables and pictures, with the settings
+that follow; then growth, mesh rays against Embree, blending against torch, and the transport of 800 receivers on disk.
+Each measurement is kept: a killed run loses one. For figures worth quoting leave the machine alone meanwhile.
+
+examples:
+  warprrf bench engine
+  warprrf bench engine --quick --out runs/engine-quick
+"""
+
+HELP_BENCH_EVALUATION = """\
+Every method on the same receivers: bistatic, RF-3DGS+ and RF-3DGS (opacity frozen and trained), NeRF2, a conditional
+GAN, Sionna RT with assumed and with calibrated materials, lookups. Both commands share one folder: a finished run is
+kept in a file of its own, a killed sweep loses the run at work, and a run is done again only if its data, geometry,
+options or code changed. The truth `paper-law` is made: scattering that falls with the whole path's length, as the
+paper's law has it. Needs the extras plots, baselines, sionna and cluster; --workers 0 does without the last.
+
+examples:
+  warprrf bench table1
+  warprrf bench sparsity --workers 0
+  warprrf bench table1 --methods bistatic rf3dgs+ rf3dgs --counts 10 --every 10      a first look, in minutes
+  warprrf bench table1 --scale paper --data spectra_full.nc spectra_sionna_full.nc --scheduler tcp://lab:8786
+"""
+
+HELP_BENCH_BEAMS = """\
+Fits the bistatic field and RF-3DGS+, picks each test receiver's beam without pilots, and compares received SNR and
+spectral efficiency on the true channel with exhaustive and hierarchical search, the nearest training receiver's beam,
+pointing at the transmitter, zero spectra and random beams. Fitted fields are kept: a killed run continues.
+
+examples:
+  warprrf bench beams
+  warprrf bench beams --truths exact --counts 10 --every 4 --sides 4 16 --out runs/quick     a first look
+  warprrf bench beams --data spectra_full.nc spectra_sionna_full.nc --geometry room
+"""
+
+
+def add_benches(add: Add) -> None:
+    """Define `bench` and its tables with ``add``, which makes one command."""
+    bench = add("bench", _bench, "one table of figures, from one command", HELP_BENCH, options=False)
+    tables = bench.add_subparsers(title="tables", metavar="TABLE", dest="name", required=True)
+    newrf = add("newrf", _bench, "rays and channels of NeWRF's conference room", HELP_BENCH, tables)
+    newrf.add_argument("--out", help="folder of the results (default runs/newrf)")
+    newrf.add_argument("--data", help="folder of its files")
+    worth = add(
+        "relevance", _bench, "what each effect is worth, at two bands and roughnesses", HELP_BENCH, tables
+    )
+    worth.add_argument("--out", help="folder of the results (default runs/relevance)")
+    worth.add_argument("--data", help="folder of the scene (default data/lobby)")
+    ours = add("bistatic", _bench, "the bistatic field beside other systems", HELP_BENCH_BISTATIC, tables)
+    ours.add_argument("--out", help="folder of the results (default runs/bistatic)")
+    ours.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    ours.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    ours.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    ours.add_argument("--second", metavar="FILE", help="spectra under another transmitter (default: made)")
+    ours.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (10 50 400)")
+    ours.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
+    ours.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
+    ours.add_argument(
+        "--repeat", type=int, default=10, metavar="N", help="receivers of Sionna's second solve (10; 0: none)"
+    )
+    ours.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+    engine = add("engine", _bench, "the engine's speed against error", HELP_BENCH_ENGINE, tables)
+    engine.add_argument("--out", help="folder of the results (default runs/engine)")
+    engine.add_argument("--scene", default="data/lobby/scene.xml", help="scene that rays are cast at (XML)")
+    engine.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, in a minute")
+    engine.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+    radio = add(
+        "channel",
+        _bench,
+        "channels: closed forms, Sionna RT, wide responses, the near field",
+        HELP_BENCH,
+        tables,
+    )
+    radio.add_argument("--out", help="folder of the results (default runs/channel)")
+    radio.add_argument("--scene", metavar="XML", help="scene compared with Sionna RT (default the lobby)")
+    radio.add_argument(
+        "--small", action="store_true", help="leave out 1e5 paths between 1024 and 16 elements"
+    )
+    radio.add_argument("--no-sionna", action="store_true", help="leave out the comparison with Sionna RT")
+    plan = add("map", _bench, "the radio map beside Sionna RT's RadioMapSolver", HELP_BENCH, tables)
+    plan.add_argument("--out", help="folder of the results (default runs/map)")
+    plan.add_argument("--field", metavar="FILE", help="bistatic field (default: fitted to 50 spectra)")
+    plan.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    plan.add_argument("--scene", metavar="XML", help="true scene (default the lobby)")
+    plan.add_argument("--spectra", metavar="FILE", help="what the field is fitted to (default the lobby's)")
+    plan.add_argument("--cell", type=float, metavar="M", help="width of a cell (default 0.25)")
+    plan.add_argument(
+        "--reference", type=float, metavar="N", help="samples of Sionna's reference (default 1e8)"
+    )
+    for name, line in (
+        ("table1", "every method of the paper's table, and more, side by side"),
+        ("sparsity", "PSNR and SSIM over the number of training receivers"),
+    ):
+        _add_evaluation(add(name, _bench, line, HELP_BENCH_EVALUATION, tables))
+    beams = add("beams", _bench, "beams chosen from the field, beside pilots", HELP_BENCH_BEAMS, tables)
+    beams.add_argument("--out", help="folder of the results (default runs/beams)")
+    beams.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    beams.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    beams.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    beams.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (5 10 50)")
+    beams.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
+    beams.add_argument(
+        "--sides", nargs="+", type=int, metavar="N", help="elements a side of an array (4 8 16 32 64)"
+    )
+    beams.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
+    beams.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+
+
+def _add_evaluation(one: argparse.ArgumentParser) -> None:
+    one.add_argument(
+        "--scale", choices=("small", "paper"), default="small",
+        help="small: within an hour on two cores; paper: full schedules, all subsets and seeds (default small)",
+    )  # fmt: skip
+    one.add_argument("--out", help="folder of the results of both commands (default runs/evaluation)")
+    one.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    one.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    one.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    one.add_argument("--methods", nargs="+", metavar="METHOD", help="only these")
+    one.add_argument("--truths", nargs="+", metavar="TRUTH", help="exact, sionna, paper-law (the scale's)")
+    one.add_argument("--splits", nargs="+", metavar="SPLIT", help="random, region (the scale's)")
+    one.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (the scale's)")
+    one.add_argument("--seeds", nargs="+", type=int, metavar="S", help="orders of the training receivers")
+    one.add_argument("--every", type=int, metavar="K", help="each K-th test receiver (the scale's)")
+    one.add_argument("--scheduler", metavar="ADDRESS", help="of a dask scheduler, such as tcp://lab:8786")
+    one.add_argument(
+        "--workers", type=int, default=1, metavar="N",
+        help="processes of a local cluster without --scheduler (default 1; 0: in this process)",
+    )  # fmt: skip
+    one.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+
+
+def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import newrf
+
+    report = newrf.run(args.out or "runs/newrf", args.data or newrf.DATA, device=args.device, progress=bars)
+    bars.close()
+    print(newrf.summary_text(report))
+
+
+def _bench_bistatic(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import bistatic
+
+    out = args.out or "runs/bistatic"
+    report = bistatic.run(
+        out,
+        every=args.every,
+        repeat=args.repeat,
+        seed=args.seed,
+        fresh=args.fresh,
+        device=args.device,
+        progress=bars,
+        **_given(args, "data", "geometry", "scene", "second", "counts", "truths"),
+    )
+    bars.close()
+    print(bistatic.summary_text(report))
+    print(f"\n{Path(out) / 'bistatic.md'}: the tables with pictures; bistatic.json: every figure")
+
+
+def _bench_relevance(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import relevance
+
+    report = relevance.run(
+        args.out or "runs/relevance", args.data or relevance.DATA, device=args.device, progress=bars
+    )
+    bars.close()
+    print(relevance.summary_text(report))
+
+
+def _bench_engine(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import engine
+
+    out = args.out or "runs/engine"
+    sizes = engine.QUICK if args.quick else engine.Sizes()
+    report = engine.run_engine(
+        out,
+        scene=args.scene,
+        sizes=sizes,
+        seed=args.seed,
+        device=args.device,
+        fresh=args.fresh,
+        progress=bars,
+    )
+    bars.close()
+    print(engine.summary_text(report))
+    print(f"\n{Path(out) / 'engine.md'}: the tables with pictures; engine.json: every figure")
+
+
+def _bench_channel(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import channel
+
+    report = channel.run_channel(
+        args.out or "runs/channel",
+        scene=args.scene or channel.SCENE,
+        large=not args.small,
+        sionna=not args.no_sionna,
+        device=args.device,
+        progress=bars,
+    )
+    bars.close()
+    print(channel.table(report))
+
+
+def _bench_map(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import radio_map
+
+    named = _given(args, "field", "geometry", "scene", "spectra", "cell")
+    if args.reference is not None:
+        named["reference"] = int(args.reference)
+    report = radio_map.run_map(
+        args.out or "runs/map",
+        seed=args.seed,
+        device=args.device,
+        progress=bars,
+        **named,
+    )
+    bars.close()
+    print(radio_map.table(report))
+
+
+def _bench_evaluation(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import evaluation
+
+    out = args.out or "runs/evaluation"
+    given = _given(
+        args, "data", "geometry", "scene", "methods", "truths", "splits", "counts", "seeds", "every"
+    )
+    if args.seed and "seeds" not in given:
+        given["seeds"] = [args.seed]
+    report = evaluation.run(
+        args.name,
+        out,
+        scale=args.scale,
+        scheduler=args.scheduler,
+        workers=args.workers,
+        device=args.device,
+        fresh=args.fresh,
+        progress=bars,
+        **given,
+    )
+    bars.close()
+    print(evaluation.markdown(args.name, report))
+    print(f"\n{Path(out) / args.name}.md: the tables with pictures; .csv and .json: every figure")
+
+
+def _bench_beams(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.bench import beams
+
+    out = args.out or "runs/beams"
+    report = beams.run_beams(
+        out,
+        every=args.every,
+        seed=args.seed,
+        fresh=args.fresh,
+        device=args.device,
+        progress=bars,
+        **_given(args, "data", "geometry", "scene", "counts", "truths", "sides"),
+    )
+    bars.close()
+    print(beams.summary_text(report))
+    print(f"\n{Path(out) / 'beams.md'}: the tables with pictures; beams.json: every figure")
+
+
+def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the options that were given; one file or folder of data by itself."""
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    if len(given.get("data", ())) == 1:
+        given["data"] = given["data"][0]
+    return given
+
+
+BENCHES: dict[str, Callable[[argparse.Namespace, Bars], None]] = {
+    "newrf": _bench_newrf,
+    "bistatic": _bench_bistatic,
+    "relevance": _bench_relevance,
+    "engine": _bench_engine,
+    "channel": _bench_channel,
+    "map": _bench_map,
+    "table1": _bench_evaluation,
+    "sparsity": _bench_evaluation,
+    "beams": _bench_beams,
+}
+"""Benchmarks by name: what `warprrf bench NAME` runs."""
+
+
+def _bench(args: argparse.Namespace, bars: Bars) -> None:
+    BENCHES[args.name](args, bars)

@@ -1,0 +1,83 @@
+"""What the commands are given: files that exist, positions, receivers, geometry."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warprrf as wr
+
+Add = Callable[..., argparse.ArgumentParser]
+"""Defines one command: name, what runs it, a line and a text of help."""
+
+
+def existing(path: str | os.PathLike[str]) -> Path:
+    """``path``, which must exist."""
+    path = Path(path)
+    if not path.exists():
+        raise ValueError(f"{path}: no such file or folder")
+    return path
+
+
+def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float, float]]:
+    """`{file: (x, y, z)}` from JSON of that form or CSV rows `file,x,y,z`; metres."""
+    path = existing(path)
+    try:
+        if path.suffix == ".json":
+            content = json.loads(path.read_text())
+            rows = [(name, *position) for name, position in content.items()]
+        else:
+            with path.open(newline="") as lines:
+                rows = [tuple(row) for row in csv.reader(lines) if row and not row[0].startswith("#")]
+            if rows and rows[0][0] == "file":
+                rows = rows[1:]
+        return {str(name): (float(x), float(y), float(z)) for name, x, y, z in rows}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f'{path}: expected camera positions in metres, JSON {{"file.jpg": [x, y, z]}} or CSV file,x,y,z ({error})'
+        ) from error
+
+
+def read_receivers(values: Sequence[str]) -> np.ndarray:
+    """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
+    if len(values) == 1 and "," not in values[0]:
+        path = existing(values[0])
+        try:
+            if path.suffix == ".npy":
+                found = np.load(path, allow_pickle=False)
+            else:
+                found = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "x"))
+        except ValueError as error:
+            raise ValueError(f"{path}: expected rows x,y,z in metres ({error})") from error
+        if found.ndim != 2 or found.shape[1] != 3:
+            raise ValueError(f"{path}: got shape {found.shape}, expected (R, 3): rows x,y,z in metres")
+        return np.asarray(found, dtype=np.float64)
+    rows = [word.split(",") for word in values]
+    for word, row in zip(values, rows, strict=True):
+        if len(row) != 3:
+            raise ValueError(f"--receivers: got {word!r}, expected x,y,z in metres or one CSV/NPY file")
+    try:
+        return np.array(rows, dtype=np.float64)
+    except ValueError as error:
+        raise ValueError(
+            f"--receivers: got {' '.join(values)!r}, expected numbers x,y,z in metres"
+        ) from error
+
+
+def load_geometry(path: str, mesh: str | None) -> Any:
+    """A saved reconstruction (folder), splats (PLY, optionally with a mesh), or a scene (XML: its true mesh)."""
+    source = existing(path)
+    if source.is_dir():
+        return wr.Reconstruction.load(source)
+    if source.suffix == ".xml":
+        return wr.Scene.load(source)
+    if source.suffix == ".ply":
+        return wr.Reconstruction.from_files(source, mesh=existing(mesh) if mesh else None)
+    raise ValueError(f"{source}: expected a reconstruction's folder, splats (.ply) or a scene (.xml)")

@@ -1,0 +1,276 @@
+"""The main job's steps, one at a time: `warprrf reconstruct`, `simulate`, `fit`, `evaluate`, and `relevance`."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warprrf as wr
+from warprrf.bench.stages import write_atomically, write_json
+from warprrf.cli.bars import Bars
+from warprrf.cli.inputs import Add, existing, load_geometry, read_positions, read_receivers
+from warprrf.cli.tables import table
+
+HELP_RECONSTRUCT = """\
+The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
+their depth is fused into a mesh. Photos know no scale: name the measured positions of at least three cameras.
+
+examples:
+  warprrf reconstruct photos/ -o room --known-positions surveyed.json
+  where surveyed.json holds {"view_000.jpg": [1.20, 0.85, 1.60], ...} in metres
+Overlap matters most: every surface in five photos or more, loops that look across the room.
+"""
+
+HELP_SIMULATE = """\
+`exact` evaluates line of sight, mirror reflections and one diffuse bounce without sampling noise, on Warp's mesh rays.
+`sionna` asks Sionna RT's PathSolver (extra: sionna) for line of sight, mirror and diffuse paths up to --depth.
+A killed run continues: finished receivers wait in OUT.receivers/. An eighth of the receivers is marked for test.
+A spectrum is path gain per pixel over the full sphere, spread by the receiver beam; its sum is the total path gain.
+
+examples:
+  warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5
+  warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
+"""
+
+HELP_FIT = """\
+Geometry stays frozen; blending weights are computed once per receiver, then the radio part is fitted on them.
+
+  bistatic  line of sight, mirrors and scattering lobes of material groups; holds for other transmitters too
+  rf3dgs+   directional gain per Gaussian times the path-length law; delay and departure angle from geometry
+  rf3dgs    directional gain without lengths; delay and departure angle as trained channels of their own
+
+examples:
+  warprrf fit room spectra.nc -o field.safetensors
+  warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
+"""
+
+HELP_EVALUATE = """\
+Whole receivers are held out, the same for every method; beside the field stand lookups that know no geometry (nearest
+measurement, inverse distance, a constant, the mean image). `blocked` counts receivers without line of sight alone.
+
+examples:
+  warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
+"""
+
+HELP_RELEVANCE = """\
+Each effect is left out of the full model in turn: line of sight, mirrors, diffuse bounces, lobes, what no receiver
+sees, and, as estimates, the air, diffraction and transmission. What it is worth is the larger of the changes of the dB
+image and of the total path gain, rms over receivers. The smallest model within the tolerance follows; a fit can use it.
+
+examples:
+  warprrf relevance data/lobby/scene.xml --spectra data/lobby/spectra.nc -o relevance.json
+  warprrf relevance data/lobby/scene.xml --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5 --frequency 140e9
+  warprrf relevance field.safetensors --receivers receivers.csv --tolerance 0.5
+  warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
+"""
+
+
+def add_reconstruct(add: Add) -> None:
+    """Define `reconstruct`."""
+    rec = add(
+        "reconstruct", _reconstruct, "photos -> cameras, Gaussians, mesh and planar patches", HELP_RECONSTRUCT
+    )
+    rec.add_argument("photos", help="folder of JPEG or PNG photos of one static room")
+    rec.add_argument("-o", "--out", required=True, help="folder of the result")
+    rec.add_argument(
+        "--known-positions", metavar="FILE", help="surveyed camera positions, JSON or CSV: sets metres"
+    )
+    rec.add_argument("--workspace", help="where unfinished work lives (default OUT/workspace)")
+
+
+def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
+    known = read_positions(args.known_positions) if args.known_positions else None
+    photos = existing(args.photos)
+    workspace = args.workspace or Path(args.out) / "workspace"
+    reconstruction = wr.reconstruct(
+        photos, workspace=workspace, known_positions=known, seed=args.seed, progress=bars, device=args.device
+    )
+    reconstruction.save(args.out)
+    print(
+        f"{args.out}: {len(reconstruction.cameras)} cameras, {len(reconstruction.gaussians.means)} Gaussians, "
+        f"{len(reconstruction.mesh.faces)} triangles"
+    )
+
+
+def add_simulate(add: Add) -> None:
+    """Define `simulate`."""
+    sim = add("simulate", _simulate, "radio spectra of a scene at given receivers", HELP_SIMULATE)
+    sim.add_argument("scene", help="scene XML (Mitsuba/Sionna RT), with materials.json beside it")
+    sim.add_argument("-o", "--out", required=True, help="NetCDF file")
+    sim.add_argument(
+        "--transmitter", nargs=3, type=float, required=True, metavar=("X", "Y", "Z"), help="metres"
+    )
+    sim.add_argument(
+        "--receivers", nargs="+", required=True, help="CSV or NPY file of x,y,z rows, or x,y,z words"
+    )
+    sim.add_argument("--frequency", type=float, default=300e9, metavar="HZ", help="carrier (default 300e9)")
+    sim.add_argument(
+        "--shape", nargs=2, type=int, default=(90, 180), metavar=("H", "W"), help="pixels (90 180)"
+    )
+    sim.add_argument("--engine", choices=("exact", "sionna"), default="exact", help="default exact")
+    sim.add_argument(
+        "--depth", type=int, default=3, help="most interactions (sionna; exact has one; default 3)"
+    )
+    sim.add_argument(
+        "--samples", type=int, default=1_000_000, help="rays per transmitter (sionna; default 1e6)"
+    )
+    sim.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receiver beam (default 2 degrees)")
+    sim.add_argument("--refraction", action="store_true", help="transmission through walls (sionna)")
+    sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
+
+
+def _simulate(args: argparse.Namespace, bars: Bars) -> None:
+    unfinished = Path(f"{args.out}.receivers")
+    dataset = wr.simulate(
+        wr.Scene.load(existing(args.scene)),
+        transmitter=np.array(args.transmitter, dtype=np.float64),
+        receivers=read_receivers(args.receivers),
+        frequency_hz=args.frequency,
+        shape=tuple(args.shape),
+        engine=args.engine,
+        depth=args.depth,
+        samples=args.samples,
+        beam_sigma_rad=np.deg2rad(args.beam_sigma_deg),
+        refraction=args.refraction,
+        gas=args.gas,
+        seed=args.seed,
+        workspace=unfinished,
+        progress=bars,
+        device=args.device,
+    )
+    dataset.save(args.out)
+    shutil.rmtree(unfinished)  # the finished receivers of a killed run are not needed any more
+    print(f"{args.out}: {len(dataset)} spectra of {args.shape[0]} x {args.shape[1]} pixels, {args.engine}")
+
+
+def add_fit(add: Add) -> None:
+    """Define `fit`."""
+    fit = add("fit", _fit, "a radio field from geometry and measured spectra", HELP_FIT)
+    fit.add_argument("geometry", help="a reconstruction's folder, splats (.ply) or a scene (.xml)")
+    fit.add_argument("spectra", help="NetCDF file of spectra")
+    fit.add_argument("-o", "--out", required=True, help="field file (.safetensors)")
+    fit.add_argument(
+        "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
+    )
+    fit.add_argument(
+        "--train", type=int, metavar="N", help="receivers of the nested training subset (default: all)"
+    )
+    fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is a .ply")
+    fit.add_argument(
+        "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: terms ruled out are off"
+    )
+    fit.add_argument("--iterations", type=int, help="optimiser steps (default: the model's)")
+
+
+def _fit(args: argparse.Namespace, bars: Bars) -> None:
+    geometry = load_geometry(args.geometry, args.mesh)
+    dataset = wr.SpectrumDataset.load(existing(args.spectra))
+    if args.train is not None:
+        dataset = dataset.split(args.train, seed=args.seed)[0]
+    ruled = {} if args.relevance is None else {"relevance": wr.Relevance.load(existing(args.relevance))}
+    if ruled and args.model != "bistatic":
+        raise ValueError(f"--relevance: only the bistatic model takes it, got --model {args.model}")
+    field = wr.RadioField.fit(
+        geometry,
+        dataset,
+        model=args.model,
+        seed=args.seed,
+        progress=bars,
+        device=args.device,
+        **({} if args.iterations is None else {"iterations": args.iterations}),
+        **ruled,
+    )
+    field.save(args.out)
+    print(f"{args.out}: {args.model} fitted on {len(dataset.receivers)} receivers")
+
+
+def add_evaluate(add: Add) -> None:
+    """Define `evaluate`."""
+    eva = add("evaluate", _evaluate, "a field's errors on receivers it was not fitted on", HELP_EVALUATE)
+    eva.add_argument("field", help="field file (.safetensors)")
+    eva.add_argument("spectra", help="NetCDF file of spectra with held-out receivers")
+    eva.add_argument(
+        "--train", type=int, default=50, metavar="N", help="what the lookups may see (default 50)"
+    )
+    eva.add_argument("--no-lookups", dest="lookups", action="store_false", help="the field alone")
+    eva.add_argument("-o", "--out", help="JSON file of the figures")
+
+
+def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
+    from warprrf.rf import lookups, metrics
+
+    field = wr.RadioField.load(existing(args.field))
+    dataset = wr.SpectrumDataset.load(existing(args.spectra))
+    train, test = dataset.split(args.train, seed=args.seed)
+    methods: dict[str, Any] = {field.model: field.spectrum}
+    if args.lookups:
+        known = (lookups.nearest, lookups.idw, lookups.constant, lookups.mean)
+        methods |= {lookup.name: lookup for lookup in (build(train) for build in known)}
+    figures: dict[str, dict[str, Any]] = {}
+    for count, (name, predictor) in enumerate(methods.items()):
+        bars("evaluate", count, len(methods))
+        figures[name] = metrics.evaluate(test, predictor)
+    bars("evaluate", len(methods), len(methods))
+    bars.close()
+    print(table(figures))
+    if args.out:
+        write_json(args.out, figures)
+
+
+def add_relevance(add: Add) -> None:
+    """Define `relevance`."""
+    rel = add(
+        "relevance",
+        _relevance,
+        "what each effect is worth in a scene, and the smallest model",
+        HELP_RELEVANCE,
+    )
+    rel.add_argument(
+        "source", help="scene (.xml), reconstruction's folder, splats (.ply) or field (.safetensors)"
+    )
+    rel.add_argument("-o", "--out", help="JSON file; the table goes beside it as Markdown")
+    rel.add_argument("--spectra", help="NetCDF file whose transmitter, carrier and receivers are used")
+    rel.add_argument("--transmitter", nargs=3, type=float, metavar=("X", "Y", "Z"), help="metres")
+    rel.add_argument("--receivers", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")
+    rel.add_argument("--frequency", type=float, metavar="HZ", help="carrier (a field's own)")
+    rel.add_argument("--tolerance", type=float, default=0.1, metavar="DB", help="default 0.1")
+    rel.add_argument(
+        "--most", type=int, default=12, metavar="N", help="receivers used, drawn by --seed (default 12)"
+    )
+    rel.add_argument("--mesh", help="mesh for line of sight, where SOURCE is a .ply")
+
+
+def _relevance(args: argparse.Namespace, bars: Bars) -> None:
+    source = existing(args.source)
+    given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
+    receivers = None if args.receivers is None else read_receivers(args.receivers)
+    if args.spectra is not None:
+        dataset = wr.SpectrumDataset.load(existing(args.spectra))
+        measured = {"transmitter": dataset.transmitter, "frequency_hz": float(dataset.frequency_hz)}
+        given = {name: measured[name] if value is None else value for name, value in given.items()}
+        receivers = dataset.receivers if receivers is None else receivers
+    if receivers is None:
+        raise ValueError(
+            "--receivers: none given, expected positions, or --spectra with a file that holds some"
+        )
+    if len(receivers) > args.most:
+        receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
+    fitted = source.suffix == ".safetensors"
+    found = wr.relevance(
+        wr.RadioField.load(source) if fitted else load_geometry(args.source, args.mesh),
+        receivers=receivers,
+        tolerance_db=args.tolerance,
+        progress=bars,
+        device=args.device,
+        **given,
+    )
+    bars.close()
+    print(found.table())
+    if args.out:
+        found.save(args.out)
+        text = found.table() + "\n"
+        write_atomically(Path(args.out).with_suffix(".md"), lambda name: Path(name).write_text(text))

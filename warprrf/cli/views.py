@@ -1,0 +1,203 @@
+"""`warprrf render`, `map`, `twin`: what a field or a reconstruction gives to look at and to take elsewhere."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warprrf as wr
+from warprrf.bench.stages import write_atomically
+from warprrf.cli.bars import Bars
+from warprrf.cli.inputs import Add, existing
+from warprrf.cli.tables import aligned
+from warprrf.device import require
+
+HELP_RENDER = """\
+examples:
+  warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
+  warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.npz       path_gain, delay_s, aod as arrays
+  warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
+"""
+
+HELP_MAP = """\
+Total path gain, the strongest path's gain, delay spread and the SNR of the receiver's best beam, at the centres of
+cells; NaN inside solids and outside the room, as the field's mesh has them. A NetCDF file gets a picture beside it.
+
+examples:
+  warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
+  warprrf map field.safetensors -o corner.png --bounds 0 0 5 4 --cell 0.1 --transmitter 2 3 3.2
+"""
+
+HELP_TWIN = """\
+Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
+opens the scene as it is, all lobes Lambertian; `warprrf.load_sionna_scene` sets the scattering patterns too, and
+`warprrf simulate` takes it as any scene. A material has one curve and one lobe: what the projection misses is printed.
+
+examples:
+  warprrf twin field.safetensors -o twin
+  warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
+"""
+
+
+def add_render(add: Add) -> None:
+    """Define `render`."""
+    ren = add("render", _render, "a picture from Gaussians, or a spectrum from a radio field", HELP_RENDER)
+    ren.add_argument("source", help="Gaussians (.ply) or a radio field (.safetensors)")
+    ren.add_argument("-o", "--out", required=True, help="picture (.png), or for a spectrum also .npz")
+    ren.add_argument(
+        "--receiver", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where the spectrum is taken"
+    )
+    ren.add_argument(
+        "--position", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where the camera stands"
+    )
+    ren.add_argument("--look-at", nargs=3, type=float, metavar=("X", "Y", "Z"), help="a point it looks at")
+    ren.add_argument(
+        "--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help="pixels (640 480)"
+    )
+    ren.add_argument("--field-of-view", type=float, default=75.0, help="horizontal, degrees (default 75)")
+
+
+def _render(args: argparse.Namespace, bars: Bars) -> None:
+    source = existing(args.source)
+    if source.suffix == ".safetensors":
+        if args.receiver is None:
+            raise ValueError("--receiver: none given, expected three coordinates in metres for a radio field")
+        spectrum = wr.RadioField.load(source).spectrum(np.array(args.receiver, dtype=np.float64))
+        _write_spectrum(spectrum, Path(args.out))
+        total = 10.0 * np.log10(max(float(np.sum(spectrum.path_gain, dtype=np.float64)), 1e-300))
+        print(f"{args.out}: total path gain {total:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}")
+        return
+    if args.position is None or args.look_at is None:
+        raise ValueError(
+            "--position and --look-at: both are needed to draw Gaussians (three coordinates each)"
+        )
+    gaussians = wr.Gaussians.load_ply(source)
+    camera = _look_at(args.position, args.look_at, tuple(args.size), args.field_of_view)
+    image = wr.render(gaussians, camera, device=args.device).features
+    from PIL import Image
+
+    pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    write_atomically(Path(args.out), lambda path: Image.fromarray(pixels).save(path))
+    print(f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians")
+
+
+def _write_spectrum(spectrum: Any, path: Path) -> None:
+    if path.suffix == ".npz":
+        arrays = {"path_gain": spectrum.path_gain, "delay_s": spectrum.delay_s, "aod": spectrum.aod}
+        write_atomically(path, lambda name: np.savez_compressed(name, **arrays))
+    elif path.suffix == ".png":
+        figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
+        spectrum.plot(ax=figure.add_subplot())
+        write_atomically(path, lambda name: figure.savefig(name, dpi=130))
+    else:
+        raise ValueError(f"{path}: expected .png (a picture) or .npz (path_gain, delay_s, aod)")
+
+
+def _look_at(
+    position: Sequence[float], target: Sequence[float], size: tuple[int, int], fov_deg: float
+) -> Any:
+    """A pinhole camera at `position` that looks at `target`, z up; `fov_deg` is horizontal."""
+    eye, goal = np.array(position, dtype=np.float64), np.array(target, dtype=np.float64)
+    forward = goal - eye
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError("--look-at: straight above or below --position (or equal to it); move it sideways")
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = rotation, -rotation @ eye
+    focal = 0.5 * size[0] / np.tan(0.5 * np.deg2rad(fov_deg))
+    return wr.Camera.pinhole(
+        *size, fx=focal, fy=focal, cx=0.5 * size[0], cy=0.5 * size[1], world_to_camera=world_to_camera
+    )
+
+
+def add_map(add: Add) -> None:
+    """Define `map`."""
+    plan = add("map", _map, "a field's radio map over the floor plan", HELP_MAP)
+    plan.add_argument("field", help="field file (.safetensors)")
+    plan.add_argument("-o", "--out", required=True, help="NetCDF file (.nc), or the picture alone (.png)")
+    plan.add_argument("--height", type=float, default=1.5, metavar="M", help="of receivers (default 1.5)")
+    plan.add_argument("--cell", type=float, default=0.25, metavar="M", help="width of a cell (default 0.25)")
+    plan.add_argument(
+        "--transmitter", nargs=3, type=float, metavar=("X", "Y", "Z"), help="if another than the fitted one"
+    )
+    plan.add_argument(
+        "--bounds", nargs=4, type=float, metavar=("X0", "Y0", "X1", "Y1"), help="part of the plan, metres"
+    )
+    plan.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receive beam (default 2 degrees)")
+    plan.add_argument("--power-dbm", type=float, default=20.0, help="isotropic transmitter (default 20)")
+    plan.add_argument(
+        "--bandwidth", type=float, default=2.16e9, metavar="HZ", help="of noise (default 2.16e9)"
+    )
+    plan.add_argument(
+        "--noise-figure", type=float, default=10.0, metavar="DB", help="of receivers (default 10)"
+    )
+    plan.add_argument(
+        "--mirror-order", type=int, choices=range(4), help="most mirrors on a path (default the field's own)"
+    )
+
+
+def _map(args: argparse.Namespace, bars: Bars) -> None:
+    path = Path(args.out)
+    if path.suffix not in (".nc", ".png"):
+        raise ValueError(f"{path}: expected .nc (NetCDF, a picture beside it) or .png (the picture alone)")
+    field = wr.RadioField.load(existing(args.field), device=args.device)
+    found = field.radio_map(
+        args.height,
+        args.cell,
+        transmitter=args.transmitter,
+        bounds=args.bounds,
+        beam_sigma_rad=np.deg2rad(args.beam_sigma_deg),
+        transmit_power_dbm=args.power_dbm,
+        bandwidth_hz=args.bandwidth,
+        noise_figure_db=args.noise_figure,
+        mirror_order=args.mirror_order,
+        progress=bars,
+    )
+    bars.close()
+    if path.suffix == ".nc":
+        found.save(path)
+    found.picture(path.with_suffix(".png"))
+    gain, snr = (found.shown(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))
+    print(
+        f"{path}: {found.free.sum()} cells in the air of {found.free.size}; median total path gain "
+        f"{np.median(gain):.1f} dB, median SNR of the best beam {np.median(snr):.1f} dB, lowest {snr.min():.1f} dB"
+    )
+
+
+def add_twin(add: Add) -> None:
+    """Define `twin`."""
+    twin = add("twin", _twin, "a field's digital twin: a scene for Sionna RT", HELP_TWIN)
+    twin.add_argument("field", help="field file (.safetensors) of model bistatic")
+    twin.add_argument(
+        "-o", "--out", required=True, help="folder of the twin: new, empty or an earlier twin's"
+    )
+
+
+def _twin(args: argparse.Namespace, bars: Bars) -> None:
+    twin = wr.write_twin(wr.RadioField.load(existing(args.field)), args.out)
+    rows = [["surface", "area m2", "permittivity", "S", "lobe", "lobe error dB"]]
+    for group in twin.groups:
+        rows.append(
+            [
+                group.name,
+                f"{group.area_m2:.1f}",
+                f"{group.permittivity.real:.3g}",
+                f"{group.scattering:.3f}",
+                f"{group.alpha_r}" if group.alpha_r else "Lambertian",
+                f"{group.lobe_error_db:.2f}",
+            ]
+        )
+    print(aligned(rows))
+    print(
+        f"\n{twin.xml}: {len(twin.groups)} materials; rms errors of the projection over area: scattered power "
+        f"{twin.scattering_error_db:.2f} dB, mirrored power {twin.mirror_error_db:.2f} dB, lobes "
+        f"{twin.lobe_error_db:.2f} dB"
+    )
+    for line in twin.left_out:
+        print(f"left out: {line}")

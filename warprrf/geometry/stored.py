@@ -1,0 +1,154 @@
+"""Geometry on disk: Gaussians, planes, patches and a mesh with a header, in one safetensors file, replaced at once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import check_array
+from warprrf.geometry.gaussians import Gaussians, replacing
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.patches import PlanarPatch
+from warprrf.geometry.planes import Plane
+
+_GAUSSIANS = ("means", "quaternions", "scales", "opacities", "sh")
+
+
+def write(
+    path: Path,
+    header: dict[str, Any],
+    *,
+    gaussians: Gaussians | None = None,
+    planes: Sequence[Plane] | None = None,
+    patches: Sequence[PlanarPatch] | None = None,
+    mesh: Mesh | None = None,
+) -> None:
+    """Write ``header`` (plain values) and what is given to ``path``."""
+    from safetensors.numpy import save_file
+
+    head = dict(header)
+    arrays: dict[str, np.ndarray] = {}
+    if gaussians is not None:
+        arrays |= {name: getattr(gaussians, name) for name in _GAUSSIANS}
+    if planes is not None:
+        head["planes"] = [
+            {
+                "normal": p.normal.tolist(), "offset": p.offset, "rms_m": p.rms_m, "axes": p.axes.tolist(),
+                "corner": p.corner.tolist(), "cell_m": p.cell_m,
+            }
+            for p in planes
+        ]  # fmt: skip
+        for k, plane in enumerate(planes):
+            arrays |= {f"plane_{k}_inliers": plane.inliers, f"plane_{k}_occupied": plane.occupied}
+    if patches is not None:
+        head["patches"] = [{"normal": p.normal.tolist(), "offset": p.offset, "area": p.area} for p in patches]
+        arrays |= {f"patch_{k}": p.faces.astype(np.int64) for k, p in enumerate(patches)}
+    if mesh is not None:
+        arrays |= {"vertices": mesh.vertices, "faces": mesh.faces}
+    with replacing(path) as temporary:
+        save_file(
+            {name: np.ascontiguousarray(values) for name, values in arrays.items()},
+            temporary,
+            metadata={"header": json.dumps(head)},
+        )
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a file holds; a part that it does not hold raises KeyError.
+
+    Attributes:
+        header: plain values.
+        arrays: all arrays, by name.
+    """
+
+    header: dict[str, Any]
+    arrays: dict[str, np.ndarray] = field(repr=False)
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians."""
+        return Gaussians(*(self.arrays[name] for name in _GAUSSIANS))
+
+    @property
+    def planes(self) -> list[Plane]:
+        """Planes detected among sparse points."""
+        return [
+            Plane(
+                np.array(p["normal"]),
+                p["offset"],
+                check_array("inliers", self.arrays[f"plane_{k}_inliers"], None, np.int64),
+                p["rms_m"],
+                np.array(p["axes"]),
+                np.array(p["corner"]),
+                p["cell_m"],
+                self.arrays[f"plane_{k}_occupied"],
+            )
+            for k, p in enumerate(self.header["planes"])
+        ]
+
+    @property
+    def patches(self) -> list[PlanarPatch]:
+        """Planar patches of the mesh."""
+        return [
+            PlanarPatch(np.array(p["normal"]), p["offset"], self.arrays[f"patch_{k}"], p["area"])
+            for k, p in enumerate(self.header["patches"])
+        ]
+
+    @property
+    def has_mesh(self) -> bool:
+        """Whether there is a mesh."""
+        return "faces" in self.arrays
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh."""
+        return Mesh(self.arrays["vertices"], self.arrays["faces"])
+
+
+def read(path: Path) -> Stored:
+    """What :func:`write` wrote.
+
+    Raises:
+        ValueError: if the file is damaged or none of these.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {})["header"])
+            return Stored(header, {k: file.get_tensor(k) for k in file.keys()})  # noqa: SIM118 (not a mapping)
+    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is damaged or not ours: {error}; delete it, or restore it") from error
+
+
+class Steps:
+    """Finished steps of a run: one file each, valid for one fingerprint."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def save(self, name: str, key: str, **parts: Any) -> None:
+        """Keep what step ``name`` made, the parts of :func:`write`, under fingerprint ``key``."""
+        write(self.folder / f"{name}.safetensors", {"key": key}, **parts)
+
+    def load(self, name: str, key: str) -> Stored | None:
+        """What step ``name`` made under fingerprint ``key``, or None."""
+        path = self.folder / f"{name}.safetensors"
+        if not path.is_file():
+            return None
+        found = read(path)
+        return found if found.header.get("key") == key else None
+
+    def only(self, name: str, pattern: str) -> Path:
+        """The path of ``name``; files of the same pattern that belong to other fingerprints are removed."""
+        for path in self.folder.glob(pattern):
+            if path.name != name:
+                path.unlink()
+        return self.folder / name

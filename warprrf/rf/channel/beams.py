@@ -1,0 +1,439 @@
+"""Beams chosen from a predicted field: codebooks, single-link and multi-user choice, without pilots.
+
+A beam is a vector of unit-norm weights w over an array's elements; between a beam at each end the received amplitude is
+w_r^T H w_t (:func:`warprrf.rf.channel.response.frequency_response` for H). Steered along its own direction a beam of N
+elements has gain N.
+
+Choices are made from predicted *power* per direction. Scattering has no phase in a field, and those of mirrors and line
+of sight turn once a wavelength (1 mm at 300 GHz), far below what geometry from photos knows. With phases independent
+between paths the mean gain of a pair of beams is
+
+    E |w_r^T H w_t|^2 = sum over paths of |gain|^2 g_r(w_r, arrival) g_t(w_t, departure),
+
+g the gain of a beam on one element's. What it cannot foresee is how paths that one beam cannot tell apart add up.
+
+Waves are plane: a beam of more than a thousand elements loses to that within a few metres
+(:func:`warprrf.rf.channel.arrays.plane_wave_error`). :func:`steering_codebook` focuses on points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
+from warprrf.rf.channel.path_set import Paths
+from warprrf.rf.spectrum import Spectrum, directions_from_angles, pixel_directions
+
+MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
+_TERMS = 1 << 18  # numbers held at once while paths are summed: what fits a cache
+
+
+@dataclass(frozen=True, eq=False)
+class Codebook:
+    """Beams of an array; make one with :func:`dft_codebook` or :func:`steering_codebook`.
+
+    Attributes:
+        array: The array.
+        factors: Weights ``(B, N)``; or those across and down the array, ``(Bc, cols)`` and ``(Br, rows)``, whose
+            products they are: beam ``c Br + r`` is the c-th across and the r-th down, as elements are numbered.
+    """
+
+    array: PlanarArray
+    factors: tuple[np.ndarray, ...] = field(repr=False)
+
+    def __len__(self) -> int:
+        return int(np.prod([len(f) for f in self.factors]))
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights of every beam, shape ``(B, N)``, complex, unit norm."""
+        return self.factors[0] if len(self.factors) == 1 else np.kron(*self.factors)
+
+    def beam(self, index: int) -> np.ndarray:
+        """Weights of one beam, shape ``(N,)``."""
+        if len(self.factors) == 1:
+            return self.factors[0][index]
+        across, down = np.divmod(index, len(self.factors[1]))
+        return np.kron(self.factors[0][across], self.factors[1][down])
+
+    def received(self, channel: Any) -> np.ndarray:
+        """w^T h of every beam for channels ``(..., N)``, shape ``(..., B)``."""
+        h = np.asarray(channel)
+        if h.shape[-1:] != (self.array.elements,):
+            raise ValueError(f"channel: got shape {h.shape}, expected (..., {self.array.elements})")
+        if len(self.factors) == 1:
+            return h @ self.factors[0].T
+        across, down = self.factors
+        grid = h.reshape(*h.shape[:-1], self.array.cols, self.array.rows)
+        return (across @ grid @ down.T).reshape(*h.shape[:-1], len(self))
+
+    def amplitude(self, directions: Any) -> np.ndarray:
+        """w^T a of every beam for plane waves along world ``directions`` (L, 3), shape ``(B, L)``, complex.
+
+        Elements' patterns count: |amplitude|^2 is the beam's power gain.
+        """
+        d = np.asarray(directions, dtype=np.float64)
+        size = np.sqrt(self.array.gain(d))
+        parts = self._waves(d)
+        if len(parts) == 1:
+            return parts[0] * size
+        return (parts[0][:, None] * (parts[1] * size)[None]).reshape(len(self), len(d))
+
+    def superposed(self, directions: Any, gains: Any) -> np.ndarray:
+        """w^T h of every beam for plane waves of complex ``gains`` (..., L) along ``directions`` (L, 3).
+
+        Returns:
+            Shape ``(..., B)``.
+        """
+        values = np.asarray(gains, dtype=complex)
+        d = np.asarray(directions, dtype=np.float64)
+        size = np.sqrt(self.array.gain(d))
+        return self._summed(d, values * size, lambda waves: waves)
+
+    def power(self, directions: Any, powers: Any) -> np.ndarray:
+        """Mean |w^T h|^2 of every beam for waves of ``powers`` (..., L) and independent phases, shape ``(..., B)``."""
+        values = np.asarray(powers, dtype=np.float64)
+        d = np.asarray(directions, dtype=np.float64)
+        return self._summed(d, values * self.array.gain(d), _squared)
+
+    def _summed(
+        self, d: np.ndarray, values: np.ndarray, measure: Callable[[np.ndarray], np.ndarray]
+    ) -> np.ndarray:
+        """Sum of ``values`` (..., L) times ``measure`` of what each beam receives of unit waves along ``d`` (L, 3)."""
+        rows = values.reshape(int(np.prod(values.shape[:-1])), len(d))
+        total = np.zeros((len(rows), len(self)), dtype=values.dtype)
+        for part in _chunks(len(d), sum(len(f) for f in self.factors)):
+            waves = [measure(w) for w in self._waves(d[part])]
+            for out, row in zip(total, rows, strict=True):
+                weighted = waves[-1] * row[part]
+                out += weighted.sum(axis=1) if len(waves) == 1 else (waves[0] @ weighted.T).ravel()
+        return total.reshape(*values.shape[:-1], len(self))
+
+    def _waves(self, d: np.ndarray) -> list[np.ndarray]:
+        """What each factor receives of unit plane waves, shapes ``(B, L)``, without the elements' pattern."""
+        if len(self.factors) == 1:
+            return [self.factors[0] @ self.array.response(d, 1.0).T]
+        across, down = np.broadcast_to(np.asarray(self.array.spacing, np.float64), (2,))[::-1]
+        local = d @ self.array.rotation
+        # Down the array z falls from element to element.
+        return [
+            self.factors[0] @ _steps(across * local[:, 1], self.array.cols),
+            self.factors[1] @ _steps(-down * local[:, 2], self.array.rows),
+        ]
+
+
+def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
+    """Beams at equally spaced spatial frequencies, across and down the array; orthonormal without oversampling.
+
+    Beam k of B along a side of n elements, B = ``oversampling`` n, looks along the cosine ((k + 1/2) / B - 1/2) /
+    spacing to +y across the array and to -z down it. Beams 2 k and 2 k + 1 of a side twice as long halve what it
+    covers. At half-wavelength spacing those of the corners, where both cosines are large, point nowhere.
+
+    Raises:
+        ValueError: for a polarised array, or oversampling below 1.
+    """
+    _unpolarised("array", array)
+    if isinstance(oversampling, bool) or int(oversampling) != oversampling or oversampling < 1:
+        raise ValueError(f"oversampling: got {oversampling!r}, expected a whole number of at least 1")
+    return Codebook(array, (_dft(array.cols, int(oversampling)), _dft(array.rows, int(oversampling))))
+
+
+def steering_codebook(
+    array: PlanarArray, directions: Any = None, *, points: Any = None, wavelength_m: float | None = None
+) -> Codebook:
+    """Beams conj(a) / |a| matched to plane waves along ``directions``, or to sources at ``points``.
+
+    Args:
+        directions: World directions away from the array, shape ``(B, 3)``, normalised here.
+        points: Places [m] from the array's centre, shape ``(B, 3)``: spherical waves, for the near field.
+        wavelength_m: Of the carrier; needed for points.
+
+    Raises:
+        ValueError: naming the argument; for a polarised array.
+    """
+    _unpolarised("array", array)
+    if (directions is None) == (points is None):
+        raise ValueError("directions: expected either directions or points, and got both or neither")
+    name, given = ("directions", directions) if points is None else ("points", points)
+    v = _device.check_array(name, given, (None, 3))
+    length = np.linalg.norm(v, axis=1, keepdims=True)
+    if not (length > 0).all():
+        raise ValueError(f"{name}: got a vector of length zero, expected ones with a length")
+    if points is None:
+        response = array.response(v / length, 1.0)
+    elif wavelength_m is None or not (np.isfinite(wavelength_m) and wavelength_m > 0):
+        raise ValueError(
+            f"wavelength_m: got {wavelength_m!r}, expected a positive number of metres with points"
+        )
+    else:
+        response = array.spherical_response(v, wavelength_m)
+    return Codebook(array, (response.conj() / np.linalg.norm(response, axis=1, keepdims=True),))
+
+
+@dataclass(frozen=True)
+class BeamChoice:
+    """Pairs of beams, best first, of one receiver ``(K,)`` or several ``(R, K)``.
+
+    Attributes:
+        tx: Index of the transmitter's beam.
+        rx: Index of the receiver's beam.
+        gain: Predicted mean |w_r^T H w_t|^2 [linear]; 0 for a receiver that no path reaches: any choice.
+    """
+
+    tx: np.ndarray
+    rx: np.ndarray
+    gain: np.ndarray
+
+
+def beam_gains(source: Any, tx_array: Any = None, rx_array: Any = None) -> np.ndarray:
+    """Predicted mean |w_r^T H w_t|^2 of every pair of beams; arguments and errors as for :func:`select_beams`.
+
+    Returns:
+        Shape ``(Br, Bt)`` or ``(R, Br, Bt)``.
+    """
+    tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
+    found = [_pair_gains(rays, tx, rx) for rays in _rays(source, tx)]
+    return np.stack(found) if _several(source) else found[0]
+
+
+def select_beams(source: Any, tx_array: Any = None, rx_array: Any = None, *, count: int = 1) -> BeamChoice:
+    """The pairs of beams with the largest predicted mean gain: no pilot is sent.
+
+    A spectrum is taken as powers at pixel centres. For beams narrower than its pixels give paths, whose line of sight
+    and mirrors have their own directions. Its pixels without a departure angle count only where the transmitter has a
+    single element.
+
+    Args:
+        source: A :class:`Spectrum`, or :class:`Paths` of one receiver or several.
+        tx_array: Transmitting :class:`PlanarArray`, whose DFT codebook is searched, or a :class:`Codebook`; a single
+            isotropic element by default.
+        rx_array: Of the receiver, likewise.
+        count: Pairs to return, at most as many as there are.
+
+    Raises:
+        TypeError: for another source or array.
+        ValueError: for a polarised array, a count below 1, or a spectrum without departure angles for a transmitting
+            array.
+    """
+    if isinstance(count, bool) or int(count) != count or count < 1:
+        raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
+    tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
+    rows = []
+    for rays in _rays(source, tx):
+        gains = _pair_gains(rays, tx, rx)
+        best = _largest(gains.ravel(), int(count))
+        rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
+    if not _several(source):
+        return BeamChoice(*rows[0])
+    return BeamChoice(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+
+@dataclass(frozen=True)
+class MultiUserChoice:
+    """One beam at each end for every user served at once.
+
+    Attributes:
+        tx: Index of the transmitter's beam of each user, shape ``(U,)``.
+        rx: Index of the user's own beam, shape ``(U,)``.
+        sinr: Predicted signal over interference and noise [linear], shape ``(U,)``.
+    """
+
+    tx: np.ndarray
+    rx: np.ndarray
+    sinr: np.ndarray
+
+    @property
+    def spectral_efficiency(self) -> float:
+        """Predicted sum over users of log2(1 + SINR) [bit/s/Hz]."""
+        return float(np.log2(1.0 + self.sinr).sum())
+
+
+def select_beams_multiuser(
+    sources: Any, tx_array: Any = None, rx_array: Any = None, *, noise: float
+) -> MultiUserChoice:
+    """Beams for several users at once, so that the sum of their predicted rates is large.
+
+    Power is shared equally; what one user's beam brings another is interference. Users choose one after another, the
+    strongest first, the pair that adds most to the sum; then each in turn may change its pair while the others keep
+    theirs, until nobody's change raises the sum (a local optimum: with one user the best pair).
+
+    Args:
+        sources: A sequence of spectra or paths, one a user, or paths of several receivers.
+        tx_array, rx_array: as for :func:`select_beams`; all users have the same array.
+        noise: Noise power of a user over the total transmitted power [linear].
+
+    Raises:
+        TypeError, ValueError: as for :func:`select_beams`; without users, or for noise that is not positive.
+    """
+    if not (np.isfinite(noise) and noise > 0):
+        raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")
+    tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
+    given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | Paths) else sources
+    gains = [_pair_gains(rays, tx, rx) for source in given for rays in _rays(source, tx)]
+    if not gains:
+        raise ValueError("sources: got none, expected a spectrum or paths for every user")
+    served = _search(gains, noise * len(gains))
+    received, sent = (np.array([served[u][k] for u in range(len(gains))]) for k in (0, 1))
+    return MultiUserChoice(sent, received, signal_over_interference(gains, sent, received, noise))
+
+
+def signal_over_interference(gains: Sequence[Any], tx: Any, rx: Any, noise: float) -> np.ndarray:
+    """SINR of users [linear], shape ``(U,)``, power shared equally.
+
+    Args:
+        gains: |w_r^T H w_t|^2 of every pair of beams of each user, ``(Br, Bt)``.
+        tx, rx: Beams of the users, shape ``(U,)``.
+        noise: Noise power over the total transmitted power.
+    """
+    heard = np.array([np.asarray(g)[r, np.asarray(tx)] for g, r in zip(gains, rx, strict=True)])
+    signal = np.diag(heard)
+    return signal / (heard.sum(axis=1) - signal + noise * len(heard))
+
+
+# ------------------------------------------------------------------------------------------------------- pieces
+
+
+def _search(gains: list[np.ndarray], noise: float) -> dict[int, tuple[int, int]]:
+    """Receiving and transmitting beam of each user, by ascent on the sum of rates."""
+    served: dict[int, tuple[int, int]] = {}
+    order = sorted(range(len(gains)), key=lambda u: -gains[u].max())
+    for _ in range(1 + MAX_ROUNDS):
+        before = dict(served)
+        for u in order:
+            others = {v: pair for v, pair in served.items() if v != u}
+            rates = _sum_rates(gains, u, others, noise)
+            best = int(rates.argmax())
+            pair = int(best // rates.shape[1]), int(best % rates.shape[1])
+            kept = served.get(u)
+            # A change must gain more than rounding, or ties would go round for ever.
+            if kept is None or rates[pair] > rates[kept] * (1.0 + 1e-12) + 1e-12:
+                served[u] = pair
+        if served == before:
+            break
+    return served
+
+
+def _sum_rates(
+    gains: list[np.ndarray], user: int, others: dict[int, tuple[int, int]], noise: float
+) -> np.ndarray:
+    """Sum of rates if ``user`` takes each pair of beams while ``others`` keep theirs, shape ``(Br, Bt)``."""
+    own = gains[user]
+    sent = [pair[1] for pair in others.values()]
+    rates = np.log2(1.0 + own / (noise + own[:, sent].sum(axis=1, keepdims=True)))
+    for v, (received, transmitted) in others.items():
+        heard = gains[v][received]
+        rest = noise + sum(heard[t] for w, (_, t) in others.items() if w != v)
+        rates = rates + np.log2(1.0 + heard[transmitted] / (rest + heard))[None]
+    return rates
+
+
+_Rays = tuple[np.ndarray | None, np.ndarray, np.ndarray]
+
+
+def _rays(source: Any, tx: Codebook) -> Iterator[_Rays]:
+    """Departure (None if it does not matter), arrival and power of what reaches each receiver of ``source``."""
+    directed = tx.array.elements > 1 or not _isotropic(tx.array)
+    if isinstance(source, Paths):
+        for paths in source.each():
+            kept = paths.select(np.flatnonzero(paths.power > 0))
+            departure = kept.departure
+            if directed and not np.isfinite(departure).all():
+                raise ValueError("source: got paths without a departure angle, expected one with a tx_array")
+            yield departure if directed else None, kept.arrival, kept.power
+    elif isinstance(source, Spectrum):
+        power = np.asarray(source.path_gain, np.float64)
+        lit = power > 0
+        departure = None
+        if directed:
+            if source.aod is None:
+                raise ValueError(
+                    "source: got a spectrum without aod, expected departure angles with a tx_array"
+                )
+            lit &= np.isfinite(source.aod).all(axis=-1)
+            departure = directions_from_angles(source.aod[lit][:, 0], source.aod[lit][:, 1])
+        yield departure, pixel_directions(source.shape)[lit], power[lit]
+    else:
+        raise TypeError(f"source: got {type(source).__name__}, expected a Spectrum or Paths")
+
+
+def _pair_gains(rays: _Rays, tx: Codebook, rx: Codebook) -> np.ndarray:
+    departure, arrival, power = rays
+    if departure is None:
+        return rx.power(arrival, power)[:, None] * _squared(tx.weights[:, 0])
+    if rx.array.elements == 1:
+        return tx.power(departure, power * rx.array.gain(arrival))[None] * _squared(rx.weights[:, :1])
+    total = np.zeros((len(rx), len(tx)))
+    for part in _chunks(len(power), len(rx) + len(tx)):
+        received = _squared(rx.amplitude(arrival[part]))
+        total += (received * power[part]) @ _squared(tx.amplitude(departure[part])).T
+    return total
+
+
+def _steps(turns: np.ndarray, count: int) -> np.ndarray:
+    """exp(2 pi j turns n) of ``count`` elements n about their middle, shape ``(count, L)``, by products."""
+    waves = np.empty((count, len(turns)), dtype=complex)
+    waves[0] = np.exp(-2j * np.pi * turns * (0.5 * (count - 1)))
+    done = 1
+    while done < count:
+        more = min(done, count - done)
+        np.multiply(waves[:more], np.exp(2j * np.pi * turns * done), out=waves[done : done + more])
+        done += more
+    return waves
+
+
+def _dft(count: int, oversampling: int) -> np.ndarray:
+    """Beams ``(oversampling count, count)`` of a line of elements about its centre."""
+    beams = oversampling * count
+    frequency = (np.arange(beams) + 0.5) / beams - 0.5
+    place = np.arange(count) - 0.5 * (count - 1)
+    return np.exp(-2j * np.pi * frequency[:, None] * place) / np.sqrt(count)
+
+
+def _codebook(name: str, value: Any) -> Codebook:
+    if value is None:
+        return Codebook(ISOTROPIC, (np.ones((1, 1), dtype=complex),))
+    if isinstance(value, PlanarArray):
+        _unpolarised(name, value)
+        return dft_codebook(value)
+    if isinstance(value, Codebook):
+        return value
+    raise TypeError(f"{name}: got {type(value).__name__}, expected a PlanarArray or a Codebook")
+
+
+def _unpolarised(name: str, array: PlanarArray) -> None:
+    if not isinstance(array, PlanarArray):
+        raise TypeError(f"{name}: got {type(array).__name__}, expected a PlanarArray")
+    if array.polarisation is not None:
+        raise ValueError(
+            f"{name}: got polarisation {array.polarisation!r}, expected None: beams are chosen from powers"
+        )
+
+
+def _isotropic(array: PlanarArray) -> bool:
+    return isinstance(array.pattern, str) and array.pattern == "isotropic"
+
+
+def _several(source: Any) -> bool:
+    return isinstance(source, Paths) and source.batched
+
+
+def _largest(values: np.ndarray, count: int) -> np.ndarray:
+    """Indices of the ``count`` largest, largest first; the lower index first among equals."""
+    count = min(count, len(values))
+    least = np.partition(values, len(values) - count)[len(values) - count]
+    near = np.flatnonzero(values >= least)
+    return near[np.argsort(-values[near], kind="stable")][:count]
+
+
+def _squared(values: np.ndarray) -> np.ndarray:
+    return values.real**2 + values.imag**2
+
+
+def _chunks(count: int, width: int) -> Iterator[slice]:
+    step = max(1, _TERMS // max(width, 1))
+    return (slice(k, k + step) for k in range(0, count, step))

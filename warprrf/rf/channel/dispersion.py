@@ -1,0 +1,158 @@
+"""How paths spread in delay and angle: delay spread, K-factor, angular spread, coherence bandwidth.
+
+All are of path gains between isotropic antennas, diffuse paths included as the powers that they are. Sources: ITU-R
+P.1407 for the mean delay, the rms delay spread and the correlation bandwidth (the frequency shift at which the
+autocorrelation of the transfer function falls to a share of its maximum); 3GPP TR 38.901, annex A.1, eq. (A-1), for the
+angular spread, and its section 7.5 for the K-factor: power of the line of sight over that of all other paths.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf import device as _device
+
+if TYPE_CHECKING:
+    from warprrf.rf.channel.path_set import Paths
+
+COHERENCE = 0.5
+"""Default share of the maximum that defines the coherence bandwidth."""
+
+_STEPS = 16  # trials of the correlation over the shortest period that it can have
+_MOST_PERIODS = 4096  # searched for the first crossing
+_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class Dispersion:
+    """Spreads of the paths of one receiver, arrays ``()``, or of several, ``(R,)``; NaN where there is no path.
+
+    Attributes:
+        path_gain: Total path gain [linear].
+        mean_delay_s: Power-weighted mean delay, from zero [s].
+        delay_spread_s: Root mean square delay spread [s].
+        k_factor: Power of the line of sight over that of the rest [linear]; 0 without one, inf with nothing else.
+        azimuth_spread_arrival_rad: Angular spread of the azimuth of arrival [rad].
+        zenith_spread_arrival_rad: Of the zenith of arrival.
+        azimuth_spread_departure_rad: Of the azimuth of departure.
+        zenith_spread_departure_rad: Of the zenith of departure.
+        coherence_bandwidth_hz: Frequency shift at which correlation first falls to one half [Hz]; inf if it never does.
+    """
+
+    path_gain: np.ndarray
+    mean_delay_s: np.ndarray
+    delay_spread_s: np.ndarray
+    k_factor: np.ndarray
+    azimuth_spread_arrival_rad: np.ndarray
+    zenith_spread_arrival_rad: np.ndarray
+    azimuth_spread_departure_rad: np.ndarray
+    zenith_spread_departure_rad: np.ndarray
+    coherence_bandwidth_hz: np.ndarray
+
+
+def dispersion(paths: Paths) -> Dispersion:
+    """All measures of ``paths``.
+
+    Raises:
+        ValueError: if a path has no delay.
+    """
+    paths.check_delays()
+    mean, spread = delay_spread(paths.power, paths.tau)
+    total = paths.power.sum(axis=-1)
+    direct = np.where(paths.kind == "los", paths.power, 0.0).sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        k_factor = np.where(total > 0, direct / (total - direct), np.nan)
+    return Dispersion(
+        path_gain=total,
+        mean_delay_s=mean,
+        delay_spread_s=spread,
+        k_factor=k_factor,
+        azimuth_spread_arrival_rad=angular_spread(paths.power, paths.phi_r),
+        zenith_spread_arrival_rad=angular_spread(paths.power, paths.theta_r),
+        azimuth_spread_departure_rad=angular_spread(paths.power, paths.phi_t),
+        zenith_spread_departure_rad=angular_spread(paths.power, paths.theta_t),
+        coherence_bandwidth_hz=coherence_bandwidth(paths.power, paths.tau),
+    )
+
+
+def delay_spread(power: Any, tau: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Mean delay and rms delay spread [s] of powers at delays ``tau`` (..., L) [s], each ``(...)``.
+
+    Delays without power may be NaN; both are NaN where there is no power.
+    """
+    weight, delay = _weights(power, tau)
+    mean = (weight * delay).sum(axis=-1)
+    return mean, np.sqrt((weight * (delay - mean[..., None]) ** 2).sum(axis=-1))
+
+
+def angular_spread(power: Any, angle: Any) -> np.ndarray:
+    """sqrt(-2 ln |sum P exp(j angle)| / sum P) [rad] over the last axis; 3GPP TR 38.901, eq. (A-1)."""
+    weight, angle = _weights(power, angle)
+    resultant = np.abs((weight * np.exp(1j * angle)).sum(axis=-1))
+    with np.errstate(divide="ignore"):
+        return np.sqrt(np.maximum(-2.0 * np.log(np.minimum(resultant, 1.0)), 0.0))
+
+
+def coherence_bandwidth(power: Any, tau: Any, level: float = COHERENCE) -> np.ndarray:
+    """Least frequency shift at which |sum P exp(-j 2 pi shift tau)| falls to ``level`` of sum P [Hz], shape ``(...)``.
+
+    inf where it does not within 4096 periods of the longest difference of delays; NaN where there is no power.
+
+    Raises:
+        ValueError: if ``level`` is not between 0 and 1.
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level: got {level!r}, expected a share between 0 and 1")
+    weight, delay = _weights(power, tau)
+    shape = weight.shape[:-1]
+    found = [
+        _first_fall(w, t, level)
+        for w, t in zip(weight.reshape(-1, weight.shape[-1]), delay.reshape(-1, delay.shape[-1]), strict=True)
+    ]
+    return np.array(found).reshape(shape)
+
+
+def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
+    if np.isnan(weight).any():
+        return float("nan")
+    tau, weight = tau[weight > 0], weight[weight > 0]
+    tau = tau - tau.min(initial=np.inf)
+    longest = tau.max(initial=0.0)
+    # |R| cannot fall below the strongest weight less all others.
+    if longest == 0.0 or 2.0 * weight.max() - 1.0 > level:
+        return float("inf")
+
+    def over(shift: Any) -> np.ndarray:
+        waves = np.exp(-2j * np.pi * np.mod(np.multiply.outer(shift, tau), 1.0))
+        return np.abs(waves @ weight) - level
+
+    step = 1.0 / (longest * _STEPS)
+    for begin in range(0, _MOST_PERIODS * _STEPS, 256):
+        shifts = step * np.arange(begin, begin + 257)
+        below = np.flatnonzero(over(shifts) <= 0)
+        if len(below):
+            low, high = shifts[below[0] - 1], shifts[below[0]]
+            for _ in range(_HALVINGS):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if over(middle) > 0 else (low, middle)
+            return float(high)
+    return float("inf")
+
+
+def _weights(power: Any, values: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Shares of power that sum to one over the last axis (NaN without power), and values with 0 where there is none."""
+    p = _device.check_array("power", power)
+    v = _device.check_array("values", values, finite=False)
+    if p.shape != v.shape or p.ndim == 0:
+        raise ValueError(f"power: got shape {p.shape} for values of shape {v.shape}, expected the same")
+    if (p < 0).any():
+        raise ValueError("power: got negative values, expected linear power")
+    lit = p > 0
+    if not np.isfinite(v[lit]).all():
+        raise ValueError("values: got NaN or infinite ones where there is power")
+    total = p.sum(axis=-1, keepdims=True)
+    share = np.divide(p, total, out=np.full(p.shape, np.nan), where=total > 0)
+    return share, np.where(lit, v, 0.0)

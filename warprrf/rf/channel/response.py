@@ -1,0 +1,446 @@
+"""From paths to channels: impulse response, frequency response and taps between two antenna arrays.
+
+The channel between receiving port m and transmitting port n at frequency f is
+
+    H_mn(f) = sum over paths of a_mn exp(-j 2 pi (f - f_c) (tau + x_mn / c)),
+
+with a_mn the complex gain at the carrier f_c times element amplitudes and the array's phases, and x_mn the length that
+the elements' places add to the path. It is the passband transfer function, phase -2 pi f tau, in complex128: at 300 GHz
+a wavelength is 1 mm. Three choices are the caller's:
+
+- ``wave``: "plane" takes x_mn = -d_m . u_r - d_n . u_t for elements at d and directions u of arrival and departure
+  (Sionna RT's synthetic array); "spherical" takes every element's own distance: to the transmitter's image for line of
+  sight and mirrors, to the first and the last interaction point for diffuse paths, amplitudes changing with distance.
+  Element patterns and polarisations are those in the direction at the array's centre. :func:`plane_wave_error` says
+  what the plane wave costs.
+- ``squint``: whether x_mn counts as a delay, so that beams turn with frequency, or as a phase at the carrier alone, as
+  Sionna RT has it.
+- ``diffuse``: a diffuse path is the power of many scatterers, without a phase. "random_phase" turns each by a phase
+  drawn from ``seed``; "power" leaves them out of the sum, their power is :func:`diffuse_power`'s; "given" takes the
+  phases that are in the gains (those of a ray tracer). It must be stated where there are diffuse paths.
+
+Amplitudes hold at the carrier. Over a wide band, ``amplitude="friis"`` adds the factor f_c / f of free space between
+isotropic antennas. Absorption that is in the gains (:meth:`Paths.with_gas`) follows its own frequency dependence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
+from warprrf.rf.channel.lengths import (
+    PairLengths,
+    plane_lengths,
+    scattered_lengths,
+    spherical_lengths,
+)
+from warprrf.rf.channel.sums import (
+    LEAST_FREQUENCIES,
+    Sum,
+    dense_sum,
+    gridded_sum,
+    squint_sum,
+)
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.waves import carrier_phase
+
+if TYPE_CHECKING:
+    from warprrf.rf.channel.path_set import Paths
+
+DENSE_TERMS = 1e6
+"""``method="auto"`` sums more terms than that (pairs x paths x frequencies) on a grid."""
+
+_EVEN = 1e-9  # frequencies are equally spaced if they are so to this share of their step
+_SERIES = 1e-8  # where the series of the air's frequency dependence is cut
+
+
+def frequency_response(
+    paths: Paths,
+    frequencies_hz: Any,
+    *,
+    tx_array: PlanarArray | None = None,
+    rx_array: PlanarArray | None = None,
+    wave: str = "plane",
+    squint: bool = True,
+    diffuse: str | None = None,
+    seed: int = 0,
+    amplitude: str = "carrier",
+    normalize_delays: bool = False,
+    method: str = "auto",
+    device: Any = None,
+) -> np.ndarray:
+    """Channel frequency response at ``frequencies_hz`` (F,), absolute [Hz].
+
+    Args:
+        tx_array: Transmitting array about the transmitter; one isotropic element by default.
+        rx_array: Receiving array about every receiver; one isotropic element by default.
+        wave: "plane" or "spherical".
+        squint: Whether elements differ in delay or only in carrier phase.
+        diffuse: "random_phase", "power" or "given"; must be stated if there are diffuse paths.
+        seed: Of the random phases.
+        amplitude: "carrier", or "friis" for the factor carrier / f.
+        normalize_delays: Count delays (and phases) from each receiver's first path.
+        method: "dense", exact to rounding; "grid" for equally spaced frequencies, errs by about 1e-7 of the root of the
+            paths' power; "auto" takes the grid where the dense sum has more than :data:`DENSE_TERMS` terms.
+        device: Where the grid is filled.
+
+    Returns:
+        Shape ``(M, N, F)`` for paths of one receiver, ``(R, M, N, F)`` for several, complex128: M receiving and N
+        transmitting ports.
+
+    Raises:
+        ValueError: naming the argument; where ``diffuse`` or polarised amplitudes are needed and missing.
+    """
+    f = _device.check_array("frequencies_hz", frequencies_hz, (None,))
+    if not (len(f) and (f > 0).all()):
+        raise ValueError(
+            "frequencies_hz: expected at least one, all positive (absolute, not about the carrier)"
+        )
+    _choice("amplitude", amplitude, ("carrier", "friis"))
+    _choice("method", method, ("auto", "dense", "grid"))
+    even = len(f) >= LEAST_FREQUENCIES and _evenly_spaced(f)
+    if method == "grid" and not even:
+        raise ValueError(
+            f"frequencies_hz: method 'grid' needs at least {LEAST_FREQUENCIES} equally spaced ones; use 'dense'"
+        )
+
+    def one(link: _Link) -> np.ndarray:
+        terms = link.terms * len(f)
+        gridded = method == "grid" or (method == "auto" and even and terms > DENSE_TERMS)
+        h = np.zeros((*link.ports, len(f)), dtype=complex)
+        for index, ports, job in link.jobs():
+            h[ports] += _response(job, f, link, link.length_m[index], gridded, device)
+        if amplitude == "friis":
+            h = h * (link.carrier_hz / f)
+        return h if link.shift_s == 0.0 else h * carrier_phase(-f, link.shift_s)
+
+    return _each_receiver(paths, one, tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays)
+
+
+def channel_taps(
+    paths: Paths,
+    bandwidth_hz: float,
+    l_min: int,
+    l_max: int,
+    *,
+    center_hz: float | None = None,
+    tx_array: PlanarArray | None = None,
+    rx_array: PlanarArray | None = None,
+    wave: str = "plane",
+    squint: bool = True,
+    diffuse: str | None = None,
+    seed: int = 0,
+    normalize_delays: bool = False,
+) -> np.ndarray:
+    """Taps of the discrete baseband channel behind ideal low-pass filters of ``bandwidth_hz`` W.
+
+    h_l = sum of a exp(-j 2 pi f_0 tau) sinc(l - W tau) for l from ``l_min`` to ``l_max`` (Tse and Viswanath,
+    Fundamentals of Wireless Communication, eq. (2.34)), f_0 the centre of the band: the coefficients of the channel
+    sampled at W. Absorption is that at the carrier.
+
+    Args:
+        bandwidth_hz: Bandwidth W [Hz].
+        l_min, l_max: First and last tap. A path of delay tau falls on tap W tau: count delays from the first path
+            (``normalize_delays``) or let the taps reach that far.
+        center_hz: Centre of the band; the carrier by default.
+        tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays: see :func:`frequency_response`.
+
+    Returns:
+        Shape ``(M, N, L)`` or ``(R, M, N, L)``, complex128.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    if not (np.isfinite(bandwidth_hz) and bandwidth_hz > 0):
+        raise ValueError(f"bandwidth_hz: got {bandwidth_hz!r}, expected a positive number")
+    if l_max < l_min:
+        raise ValueError(f"l_max: got {l_max}, expected at least l_min, {l_min}")
+    lags = np.arange(l_min, l_max + 1)
+
+    def one(link: _Link) -> np.ndarray:
+        offset = (link.carrier_hz if center_hz is None else float(center_hz)) - link.carrier_hz
+
+        def basis(delay: np.ndarray, which: slice) -> np.ndarray:
+            since = delay - link.shift_s
+            pulse = np.sinc(lags[which] - bandwidth_hz * since[..., None])
+            return pulse if offset == 0.0 else pulse * carrier_phase(offset, delay)[..., None]
+
+        h = np.zeros((*link.ports, len(lags)), dtype=complex)
+        for _, ports, job in link.jobs():
+            h[ports] += dense_sum(job, basis, len(lags))
+        return h * carrier_phase(-(link.carrier_hz + offset), link.shift_s)
+
+    return _each_receiver(paths, one, tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays)
+
+
+def impulse_response(
+    paths: Paths,
+    *,
+    tx_array: PlanarArray | None = None,
+    rx_array: PlanarArray | None = None,
+    wave: str = "plane",
+    diffuse: str | None = None,
+    seed: int = 0,
+    normalize_delays: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Baseband impulse response: one coefficient a path and pair of ports, and the delays.
+
+    Args:
+        tx_array, rx_array, wave, diffuse, seed, normalize_delays: see :func:`frequency_response`.
+
+    Returns:
+        Coefficients, exp(-j 2 pi f_c tau) included, shape ``(M, N, L)`` or ``(R, M, N, L)``, complex128, 0 where padded
+        and for diffuse paths left out by "power"; delays [s], shape ``(L,)`` or ``(R, L)`` for plane waves, with the
+        elements' own, shape ``(M, N, L)`` or ``(R, M, N, L)``, for spherical ones, NaN where padded.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    count = paths.gain.shape[-1]
+
+    def one(link: _Link) -> tuple[np.ndarray, np.ndarray]:
+        a = np.zeros((*link.ports, count), dtype=complex)
+        each = np.full((*link.ports, count), np.nan)
+        for index, (received, sent), job in link.jobs():
+            longer, ratio = job.lengths.longer(slice(None))
+            delay = longer / SPEED_OF_LIGHT
+            place = received, sent, link.index[index]
+            turned = carrier_phase(link.carrier_hz, delay) * carrier_phase(-link.carrier_hz, link.shift_s)
+            a[place] = job.amplitude * ratio * turned
+            each[place] = delay + job.tau - link.shift_s
+        if wave == "spherical":
+            return a, each
+        tau = np.full(count, np.nan)
+        tau[link.index] = link.tau - link.shift_s
+        return a, tau
+
+    _choice("wave", wave, ("plane", "spherical"))
+    links = _links(paths, tx_array, rx_array, wave, False, diffuse, seed, normalize_delays)
+    found = [one(link) for link in links]
+    if not paths.batched:
+        return found[0]
+    return np.stack([a for a, _ in found]), np.stack([tau for _, tau in found])
+
+
+def diffuse_power(
+    paths: Paths, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
+) -> np.ndarray:
+    """Mean power that diffuse paths of random phase add to |H_mn|^2 of any pair of elements, shape ``()`` or ``(R,)``.
+
+    For arrays without polarisation. It is flat in frequency.
+
+    Raises:
+        ValueError: if an array is polarised.
+    """
+    tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
+    for name, array in (("tx_array", tx), ("rx_array", rx)):
+        if array.polarisation is not None:
+            raise ValueError(f"{name}: got polarisation {array.polarisation!r}, expected None")
+    scattered = np.where(paths.kind == "diffuse", paths.power, 0.0)
+    whole = scattered > 0
+    gains = np.zeros(scattered.shape)
+    gains[whole] = tx.gain(paths.departure[whole]) * rx.gain(paths.arrival[whole])
+    return (scattered * gains).sum(axis=-1)
+
+
+# --------------------------------------------------------------------------------------------- one receiver's link
+
+
+class _Link:
+    """Paths of one receiver between two arrays, ready to be summed."""
+
+    def __init__(
+        self,
+        paths: Paths,
+        tx: PlanarArray,
+        rx: PlanarArray,
+        wave: str,
+        squint: bool,
+        turn: np.ndarray | None,
+        normalize_delays: bool,
+    ) -> None:
+        kept = paths.valid if turn is not None else paths.valid & (paths.kind != "diffuse")
+        self.index = np.flatnonzero(kept)
+        chosen = paths.select(self.index)
+        chosen.check_delays()
+        self.carrier_hz = paths.carrier_hz
+        self.wavelength_m = SPEED_OF_LIGHT / self.carrier_hz
+        self.tau = chosen.tau
+        self.length_m = chosen.length_m
+        self.air = paths.air
+        self.squint = squint
+        self.amplitude = _amplitudes(chosen, tx, rx)
+        if turn is not None:
+            self.amplitude = self.amplitude * turn[self.index]
+        self.shift_s = float(self.tau.min()) if normalize_delays and len(self.tau) else 0.0
+        places = tx.positions(self.wavelength_m), rx.positions(self.wavelength_m)
+        self.groups: list[tuple[np.ndarray, PairLengths]] = []
+        if wave == "plane":
+            self.groups.append((np.arange(len(self.tau)), plane_lengths(chosen, *places)))
+        else:
+            scattered = chosen.kind == "diffuse"
+            for index, lengths in (
+                (np.flatnonzero(~scattered), spherical_lengths),
+                (np.flatnonzero(scattered), scattered_lengths),
+            ):
+                if len(index):
+                    self.groups.append((index, lengths(chosen.select(index), *places)))
+        self.ports = (rx.ports, tx.ports)
+
+    @property
+    def terms(self) -> float:
+        """Pairs of ports times paths."""
+        return float(self.ports[0] * self.ports[1]) * len(self.tau)
+
+    def jobs(self) -> Iterator[tuple[np.ndarray, tuple[slice, slice], Sum]]:
+        """Sums to add up: the paths that they are over, the ports that they belong to."""
+        for index, lengths in self.groups:
+            rows, columns = len(lengths.place), len(lengths.extra)
+            for a, received in enumerate(self.amplitude):
+                for b, amplitude in enumerate(received):
+                    ports = slice(a * rows, (a + 1) * rows), slice(b * columns, (b + 1) * columns)
+                    job = Sum(amplitude[index], self.tau[index], lengths, self.carrier_hz, self.squint)
+                    yield index, ports, job
+
+    def absorption(self, f: np.ndarray) -> np.ndarray | None:
+        """Loss per metre over that at the carrier [neper/m], shape ``(F,)``; None without air."""
+        if self.air is None:
+            return None
+        change = self.air.attenuation_db_per_m(f) - self.air.attenuation_db_per_m(self.carrier_hz)
+        return np.log(10.0) / 20.0 * change
+
+
+def _response(
+    job: Sum, f: np.ndarray, link: _Link, length_m: np.ndarray, gridded: bool, device: Any
+) -> np.ndarray:
+    if len(job.tau) == 0:
+        return np.zeros((*job.shape, len(f)), dtype=complex)
+    loss = link.absorption(f)
+    if gridded:
+        if loss is None:
+            return gridded_sum(job, f, device)
+        return _gridded_with_air(job, f, loss, length_m, device)
+    factor = None if loss is None else np.exp(-loss * length_m[:, None])
+    if job.squint and job.lengths.separable and not job.lengths.alone:
+        return squint_sum(job, f, factor)
+
+    def basis(delay: np.ndarray, which: slice) -> np.ndarray:
+        waves = carrier_phase(f[which] - job.carrier_hz, delay[..., None])
+        return waves if factor is None else waves * factor[:, which]
+
+    return dense_sum(job, basis, len(f))
+
+
+def _gridded_with_air(
+    job: Sum, f: np.ndarray, loss: np.ndarray, length_m: np.ndarray, device: Any
+) -> np.ndarray:
+    """exp(-loss L) as a series in L about its middle: one gridded sum a term."""
+    middle = 0.5 * (length_m.min() + length_m.max())
+    reach = max(0.5 * float(np.ptp(length_m)), 1e-12)
+    size = reach * np.abs(loss).max()
+    about = (length_m - middle) / reach
+    total, term, k = np.zeros((*job.shape, len(f)), dtype=complex), 1.0, 0
+    while term > _SERIES:
+        part = gridded_sum(replace(job, amplitude=job.amplitude * about**k), f, device)
+        total += part * ((-loss * reach) ** k / _factorial(k))
+        k += 1
+        term = size**k / _factorial(k)
+    return total * np.exp(-loss * middle)
+
+
+def _factorial(k: int) -> float:
+    return float(np.prod(np.arange(1.0, k + 1)))
+
+
+def _amplitudes(paths: Paths, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
+    """Amplitudes between elements at the arrays' centres, shape ``(Kr, Kt, P)``."""
+    if tx.polarisation is None and rx.polarisation is None:
+        return (paths.gain * np.sqrt(tx.gain(paths.departure) * rx.gain(paths.arrival)))[None, None]
+    if tx.polarisation is None or rx.polarisation is None:
+        raise ValueError(
+            f"rx_array: got polarisation {rx.polarisation!r} beside {tx.polarisation!r} of the transmitting array, "
+            f"expected both polarised ({', '.join(SLANTS_RAD)}) or neither"
+        )
+    if paths.jones is None or not np.isfinite(paths.jones).all():
+        raise ValueError(
+            "paths: polarised arrays need polarised amplitudes, but some paths hold powers alone; trace them in a "
+            "scene with materials, or use arrays without polarisation"
+        )
+    received, sent = rx.field(paths.arrival), tx.field(paths.departure)
+    return np.einsum("apx,pxy,bpy->abp", received, paths.jones, sent)
+
+
+def _each_receiver(
+    paths: Paths,
+    one: Callable[[_Link], np.ndarray],
+    tx_array: PlanarArray | None,
+    rx_array: PlanarArray | None,
+    wave: str,
+    squint: bool,
+    diffuse: str | None,
+    seed: int,
+    normalize_delays: bool,
+) -> np.ndarray:
+    found = [
+        one(link) for link in _links(paths, tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays)
+    ]
+    return np.stack(found) if paths.batched else found[0]
+
+
+def _links(
+    paths: Paths,
+    tx_array: PlanarArray | None,
+    rx_array: PlanarArray | None,
+    wave: str,
+    squint: bool,
+    diffuse: str | None,
+    seed: int,
+    normalize_delays: bool,
+) -> list[_Link]:
+    _choice("wave", wave, ("plane", "spherical"))
+    if diffuse is not None:
+        _choice("diffuse", diffuse, ("random_phase", "power", "given"))
+    elif (paths.valid & (paths.kind == "diffuse")).any():
+        raise ValueError(
+            "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
+            "(left out of the sum) or 'given' (phases as they are)"
+        )
+    tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
+    if not paths.batched:
+        turns = _turns(paths, diffuse, seed, 0)
+        return [_Link(paths, tx, rx, wave, squint, turns, normalize_delays)]
+    links = []
+    for k in range(len(paths.gain)):
+        one = paths.row(k)
+        links.append(_Link(one, tx, rx, wave, squint, _turns(one, diffuse, seed, k), normalize_delays))
+    return links
+
+
+def _turns(paths: Paths, diffuse: str | None, seed: int, receiver: int) -> np.ndarray | None:
+    """Factor of each path's amplitude; None if diffuse paths are left out."""
+    if diffuse == "power":
+        return None
+    factor = np.ones(len(paths.gain), dtype=complex)
+    if diffuse == "random_phase":
+        scattered = paths.kind == "diffuse"
+        drawn = np.random.default_rng([seed, receiver]).random(int(scattered.sum()))
+        factor[scattered] = np.exp(2j * np.pi * drawn)
+    return factor
+
+
+def _choice(name: str, value: Any, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(allowed)}")
+
+
+def _evenly_spaced(f: np.ndarray) -> bool:
+    step = np.diff(f)
+    mean = (f[-1] - f[0]) / (len(f) - 1)
+    return mean != 0 and bool(
+        np.abs(step - mean).max() <= max(_EVEN * abs(mean), 4e-16 * np.abs(f).max() * 4)
+    )

@@ -1,0 +1,26 @@
+"""Carriers and the phase that a delay gives them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import check_array
+
+
+def check_frequency(frequency_hz: Any) -> float:
+    """``frequency_hz`` as a positive float.
+
+    Raises:
+        ValueError: if it is not a positive finite number.
+    """
+    value = float(check_array("frequency_hz", frequency_hz, ()))
+    if value <= 0:
+        raise ValueError(f"frequency_hz: got {value!r}, expected a positive frequency in hertz")
+    return value
+
+
+def carrier_phase(frequency_hz: Any, tau: Any) -> np.ndarray:
+    """exp(-j 2 pi f tau); whole turns are dropped before the exponential, since f tau reaches 1e4 and more."""
+    return np.exp(-2j * np.pi * np.mod(np.asarray(frequency_hz) * np.asarray(tau), 1.0))
