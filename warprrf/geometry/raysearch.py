@@ -242,7 +242,7 @@ class RaySearch:
         given = [clearance, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu)]
         out = _given(sight, wp.int32, cpu)
         # A short first chunk says how the others will be, where there are enough of them.
-        starts = [0, *range(min(_PROBE, chunk), count, chunk)] if count > 8 * _PROBE else [0]
+        starts = [0, *range(min(_PROBE, chunk), count, chunk)] if count > 4 * _PROBE else [0]
         mostly_free = False
         for first, end in zip(starts, [*starts[1:], count], strict=True):
             size = end - first
@@ -270,7 +270,7 @@ class RaySearch:
                     out,
                 ]
                 _device.launch(judge_segments, len(packed), inputs, device=cpu, pieces=pieces)
-            mostly_free = np.count_nonzero(sight[first:end] == FREE) > _FREE_SHARE * size
+            mostly_free = int(np.count_nonzero(sight[first:end] == FREE)) > _FREE_SHARE * size
         again = np.flatnonzero(sight == AGAIN)
         if len(again):
             start = rows(a, again)
