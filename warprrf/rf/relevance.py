@@ -51,8 +51,10 @@ TITLES = {
     "unseen": "surface elements that no receiver sees",
     "gaussians": "Gaussians that no receiver sees",
 }
-OUTSIDE = ("gas", "diffraction", "transmission")
+OUTSIDE = ("diffraction", "transmission")
 """Effects that a bistatic field has no term for."""
+ESTIMATED = ("gas", *OUTSIDE)
+"""Effects that are estimated beside the model."""
 MATERIALS = {
     "scene": "materials of the scene",
     "fit": "fitted parameters",
@@ -318,7 +320,7 @@ def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
             _terms(full.terms, kept), 0.0, 0.0, model.spectrum_s, 0.0, model.unseen,
         )  # fmt: skip
         image, seconds = _spectra(chosen.reduce(full if "unseen" in kept else model.seen_only), places)
-        image += model.image(kept) - model.image(kept - set(OUTSIDE))
+        image += model.image(kept) - model.image(kept - set(ESTIMATED))
         loss = model.difference(np.maximum(image, 0.0))
         if decisive(loss) <= tolerance_db or not order:
             break
