@@ -311,10 +311,11 @@ class Rasterizer:
         whose, ids, masks = (wp.empty(max(entries, 1), dtype=int, device=device) for _ in range(3))
         starts = wp.zeros(tiles + 1, dtype=int, device=device)
         if entries:
+            wp.utils.array_scan(count, begins, inclusive=False)
             launch(
                 binning.emit_tiles,
                 len(order),
-                [order, span, ends, view.tiles_x, keys, slots, whose, begins],
+                [order, span, ends, view.tiles_x, keys, begins, slots, whose],
                 device=device,
             )
             wp.utils.radix_sort_pairs(keys, slots, entries, 0, tiles.bit_length())
