@@ -461,7 +461,7 @@ class Rasterizer:
             launch(
                 self.project_kernels.chain,
                 n,
-                [means, quaternions, scales, prepared.view, first, prepared.begins, prepared.count, sums,
+                [means, quaternions, scales, opacities, prepared.view, first, prepared.begins, prepared.count, sums,
                  _gradient(means), _gradient(quaternions), _gradient(scales), _gradient(opacities), feature_grad, seen],
                 device=device,
             )  # fmt: skip
