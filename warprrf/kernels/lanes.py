@@ -58,6 +58,15 @@ def build(real: Any) -> SimpleNamespace:
         ...
 
     @wp.func_native(f"""
+    int bits = 0;
+    for (int i = 0; i < {LANES}; ++i) bits |= x[i] > wp::{name}(0) ? 1 << i : 0;
+    return bits;
+    """)
+    def positive_bits(x: lanes) -> int:  # type: ignore[valid-type, empty-body]
+        """Bit i is set where lane i is above zero."""
+        ...
+
+    @wp.func_native(f"""
     wp::vec_t<{LANES}, wp::{name}> out;
     for (int i = 0; i < {LANES}; ++i) {{
         const wp::{name} yes = a[i], no = b[i];
@@ -168,6 +177,7 @@ def build(real: Any) -> SimpleNamespace:
         higher=higher,
         lower=lower,
         number=number,
+        positive_bits=positive_bits,
         read=read,
         roots=roots,
         spread=spread,

@@ -252,7 +252,7 @@ def build(real: Any) -> SimpleNamespace:
     coefficients = wp.types.vector(ROW, real)
     Rays = rays_of(real)
     of = lane_functions(real)
-    above, lower, higher = of.above, of.lower, of.higher
+    above, lower, higher, positive_bits = of.above, of.lower, of.higher, of.positive_bits
     total = wp.types.vector(GRADIENTS, wp.float64)
     unbounded = 1.0e30 if real is wp.float32 else 1.0e250
     faintest = 80.0 if real is wp.float32 else 1.0e250  # what `response` is made for: exp(-40)
@@ -375,9 +375,6 @@ def build(real: Any) -> SimpleNamespace:
         hw = rays.columns[x, 3]
         v = rays.rows[y, 0]
         hv = rays.rows[y, 1]
-        powers = lanes()
-        for b in range(wp.static(LANES)):
-            powers[b] = real(1 << b)
         count = lanes()
         for j in range(starts[tile], starts[tile + 1]):
             k = whose[slots[j]]
@@ -410,9 +407,9 @@ def build(real: Any) -> SimpleNamespace:
             bound = f + real(2.0) * slope + row[CUT] * wp.cw_mul(change, change)
             # From inside the ellipsoid every ray ahead counts.
             bound += lanes(wp.where(outside > real(0.0), real(0.0), real(wp.static(unbounded))))
-            hit = above(lower(bound, g0 + change), lanes(), lanes(real(1.0)), lanes())
-            count += hit
-            masks[j] = int(wp.dot(hit, powers))
+            reached = lower(bound, g0 + change)
+            count += above(reached, lanes(), lanes(real(1.0)), lanes())
+            masks[j] = positive_bits(reached)
         counts[tile] = count
 
     @wp.kernel(module="unique", enable_backward=False)
