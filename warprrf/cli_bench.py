@@ -49,6 +49,9 @@ def add_benches(add: Add) -> None:
     engine = add("engine", _bench, "the engine's speed against error", HELP_BENCH_ENGINE, tables)
     engine.add_argument("--out", help="folder of the results (default runs/engine)")
     engine.add_argument("--scene", default="data/lobby/scene.xml", help="scene that rays are cast at (XML)")
+    engine.add_argument(
+        "--opensplat", metavar="FOLDER", help="checkout of OpenSplat: its CPU rasteriser is a peer too"
+    )
     engine.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, in a minute")
     engine.add_argument("--fresh", action="store_true", help="start over instead of continuing")
     radio = add(
@@ -168,6 +171,7 @@ def _bench_engine(args: argparse.Namespace, bars: Bars) -> None:
         sizes=sizes,
         seed=args.seed,
         device=args.device,
+        opensplat=args.opensplat,
         fresh=args.fresh,
         progress=bars,
     )

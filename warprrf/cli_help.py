@@ -120,11 +120,13 @@ HELP_BENCH_ENGINE = """\
 Turns each knob of the rasteriser (cutoff, clamp, top K, precision, resolution, number of Gaussians, interaction point,
 form of the response and of the exponential) and writes its time and its error as tables and pictures, with the settings
 that follow; then growth, mesh rays against Embree, blending against torch, and the transport of 800 receivers on disk.
+--opensplat adds the CPU rasteriser of https://github.com/pierotofy/OpenSplat (AGPL), compiled from your own checkout.
 Each measurement is kept: a killed run loses one. For figures worth quoting leave the machine alone meanwhile.
 
 examples:
   warprrf bench engine
   warprrf bench engine --quick --out runs/engine-quick
+  warprrf bench engine --opensplat ../OpenSplat
 """
 
 HELP_BENCH_EVALUATION = """\

@@ -145,7 +145,9 @@ def _check_gaussians(means: Any, quaternions: Any, scales: Any, opacities: Any) 
          lambda: (opacities.detach() < 0) | (opacities.detach() > 1), "values in [0, 1]"),
     ):  # fmt: skip
         if not fits:
-            raise ValueError(f"{name}: got {int(misfits().sum())} values that do not fit, expected {expected}")
+            raise ValueError(
+                f"{name}: got {int(misfits().sum())} values that do not fit, expected {expected}"
+            )
 
 
 def _check(
@@ -168,7 +170,9 @@ def _check(
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected ({wanted})")
     if tensor.numel() == 0:
         return 0.0, 1.0
-    low, high = (float(bound) for bound in torch.aminmax(tensor.detach()))  # NaN if any is: one pass tells all
+    low, high = (
+        float(bound) for bound in torch.aminmax(tensor.detach())
+    )  # NaN if any is: one pass tells all
     if not math.isfinite(low) or not math.isfinite(high):
         raise ValueError(f"{name}: got values that are NaN or infinite, expected finite numbers")
     return low, high
@@ -198,7 +202,9 @@ def _functions() -> SimpleNamespace:
         for array, want in zip(arrays, wanted, strict=True):
             array.grad = wp.zeros_like(array, requires_grad=False) if want else None
         adjoint()
-        return [wp.to_torch(array.grad, requires_grad=False) if array.requires_grad else None for array in arrays]
+        return [
+            wp.to_torch(array.grad, requires_grad=False) if array.requires_grad else None for array in arrays
+        ]
 
     class Rasterize(torch.autograd.Function):
         @staticmethod
@@ -207,7 +213,10 @@ def _functions() -> SimpleNamespace:
             types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
             inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
             image, ctx.adjoint = r.blend_with_adjoint(
-                r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam), inputs[4], inputs[5], gradients=False
+                r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam),
+                inputs[4],
+                inputs[5],
+                gradients=False,
             )
             ctx.inputs, ctx.outputs = inputs, (image.features, image.alpha, image.depth)
             out = tuple(wp.to_torch(array, requires_grad=False) for array in ctx.outputs)

@@ -23,7 +23,8 @@ from typing import Any
 import warp as wp
 
 from warprrf.kernels.lanes import BLOCK as BLOCK
-from warprrf.kernels.lanes import LANES, VECTORISED, lanes_of
+from warprrf.kernels.lanes import LANES as LANES
+from warprrf.kernels.lanes import VECTORISED, lanes_of
 from warprrf.kernels.lanes import build as lane_functions
 
 TILE = 16  # pixels: tiles are TILE x TILE
