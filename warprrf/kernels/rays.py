@@ -50,6 +50,17 @@ def plane_row(source: wp.array(dtype=wp.vec4d), i: int) -> wp.vec4d:  # type: ig
     ...
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const int ahead = k + 16 < met.shape[0] ? met.data[k + 16] : -1;
+    if (ahead >= 0) __builtin_prefetch(planes.data + ahead);
+#endif
+""")
+def fetch_ahead(planes: wp.array(dtype=wp.vec4d), met: wp.array(dtype=wp.int32), k: int) -> None:
+    """Ask for the plane that will be wanted 16 rays later: incoherent rays find it in no cache."""
+    ...
+
+
 @wp.func_native("return source.data[i];")
 def name_at(source: wp.array(dtype=wp.int32), i: int) -> wp.int32:  # type: ignore[empty-body]
     """Element ``i >= 0`` of a contiguous array."""
@@ -271,6 +282,7 @@ def judge_segments(
     way = (ray_row(ends, i) - center) - origin
     length = wp.length(way)
     scale = rounding_scale(origin, radius)
+    fetch_ahead(planes, met, k)
     name = name_at(met, k)
     if name < 0:
         sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
@@ -341,6 +353,7 @@ def place_hits(
     i = first + k
     origin = ray_row(origins, i) - center
     direction = ray_row(directions, i)
+    fetch_ahead(planes, met, k)
     name = name_at(met, k)
     if name >= 0:
         if names.shape[0] > 0:
