@@ -69,7 +69,11 @@ def name_at(source: wp.array(dtype=wp.int32), i: int) -> wp.int32:  # type: igno
 
 @wp.func_native("distance.data[i] = t; face.data[i] = name;")
 def keep(
-    distance: wp.array(dtype=wp.float64), face: wp.array(dtype=wp.int32), i: int, t: wp.float64, name: wp.int32
+    distance: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.int32),
+    i: int,
+    t: wp.float64,
+    name: wp.int32,
 ) -> None:
     """Write a hit to contiguous arrays, ``i >= 0``."""
     ...
