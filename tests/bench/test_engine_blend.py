@@ -137,6 +137,26 @@ def test_an_input_changed_in_place_before_backward_is_noticed():
         image.sum().backward()
 
 
+def test_an_output_changed_in_place_before_backward_is_noticed():
+    image = interop.rasterize(*tensors(4, n=5)[:5], CAMERAS["spherical"])[0]
+    loss = image.sum()
+    with torch.no_grad():
+        image *= 2
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_gradients_are_the_same_whether_all_or_some_are_wanted():
+    values = tensors(4, n=20)
+    outputs = interop.rasterize(*values[:5], CAMERAS["spherical"], values[5])
+    every = torch.autograd.grad(outputs[0].square().sum(), values)
+    for k, value in enumerate(values):
+        alone = [v if v is value else v.detach() for v in values]
+        image = interop.rasterize(*alone[:5], CAMERAS["spherical"], alone[5])[0]
+        assert torch.equal(torch.autograd.grad(image.square().sum(), value)[0], every[k])
+        assert every[k].abs().max() > 0
+
+
 @pytest.mark.parametrize(
     ("place", "value", "name"),
     [

@@ -7,6 +7,11 @@ and scale. In the turned coordinates of the linear forms ``y = (-|M m| (g1^2 + g
 
 A thread of `blend` owns a block of 4 x 4 pixels and walks the block's list. A thread of `blend_adjoint` owns a tile:
 for each Gaussian it visits the blocks that the Gaussian reaches and reduces their sums over pixels once.
+
+Who adds where: a pair of Gaussian and tile has a slot of its own, `chain` adds up a Gaussian's slots, so no two tiles
+ever meet at an address. On a CPU one thread owns the slot and writes it. On a GPU sixteen threads share a tile, a block
+each, and add to the slot atomically: at most sixteen additions meet, those of one half warp that walks one list. A
+shuffle over the half warp would make them one; that has been run on no GPU yet, so it is not here.
 """
 
 from functools import cache
