@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import cache
 from itertools import pairwise
+from threading import local
 from types import ModuleType
 from typing import Any
 
@@ -94,30 +95,96 @@ def launch(
             count = min(PIECES_PER_THREAD * threads(), max(1, dim // grain))
         bounds = [dim * k // count for k in range(count + 1)]
     kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
+    recording: Recording | None = getattr(_recorder, "active", None)
     arguments = [bounds[0], *inputs]
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
-    if len(bounds) == 2:
-        size = bounds[1] - bounds[0]
+    size = bounds[-1] - bounds[0]
+    if recording is not None:
+        recording.kept.append(inputs)
+    if len(bounds) == 2 and (recording is None or device.is_cuda):
         wp.launch(kernel, dim=size, inputs=arguments, device=device, record_tape=False, **extra)
         return
     # Arguments are packed once; a piece differs in its offset and length.
     whole = wp.launch(
-        kernel, dim=dim, inputs=arguments, device=device, record_tape=False, record_cmd=True, **extra
+        kernel, dim=size, inputs=arguments, device=device, record_tape=False, record_cmd=True, **extra
     )
-    parts = iter([(low, high - low) for low, high in pairwise(bounds) if high > low])
+    pieces_of_whole = _cut(whole, bounds)
+    if recording is None:
+        _issue(pieces_of_whole)
+    else:
+        recording.launches.append(pieces_of_whole)
 
-    def work() -> None:
-        for start, size in parts:  # the threads share the iterator: each takes the next piece when it is free
+
+def _cut(whole: wp.Launch, bounds: Sequence[int]) -> list[wp.Launch]:
+    """A CPU launch as one for each stretch of its indices that is not empty."""
+    parts = []
+    for low, high in pairwise(bounds):
+        if high > low:
             part = copy(whole)
             part.params, part.fwd_args = list(whole.params), list(whole.fwd_args)
-            part.set_param_at_index(0, start)
-            part.set_dim(size)
+            part.set_param_at_index(0, low)
+            part.set_dim(high - low)
+            parts.append(part)
+    return parts
+
+
+def _issue(parts: Sequence[wp.Launch]) -> None:
+    """Run the parts of a launch on all cores: the threads share an iterator, each takes the next when it is free."""
+    waiting = iter(parts)
+
+    def work() -> None:
+        for part in waiting:
             part.launch()
 
-    others = [_pool().submit(work) for _ in range(min(threads(), len(bounds) - 1) - 1)]
+    others = [_pool().submit(work) for _ in range(min(threads(), len(parts)) - 1)]
     work()
     for other in others:
         other.result()
+
+
+class Recording:
+    """What ``work`` launches by :func:`launch`, to be issued again on whatever its arrays hold by then.
+
+    A launch packs its arguments, 15 to 50 us of Python; one that was recorded takes a few. On a CUDA device the
+    launches are captured as a graph, on a CPU kept packed and cut. ``work`` is run once, and once more to record it:
+    it may launch kernels on ``device`` only, with the same arrays each time, and not look at what they hold.
+
+    Args:
+        work: makes the launches.
+        device: where.
+
+    Raises:
+        RuntimeError: if another recording is being made in this thread.
+    """
+
+    def __init__(self, work: Callable[[], None], device: Any = None) -> None:
+        if getattr(_recorder, "active", None) is not None:
+            raise RuntimeError("work: a recording was begun while another is being made, expected launches")
+        self.launches: list[list[wp.Launch]] = []
+        self.kept: list[Sequence[Any]] = []  # arrays that are only pointers to a packed launch
+        on = resolve(device)
+        work()
+        _recorder.active = self
+        try:
+            if on.is_cuda:
+                with wp.ScopedCapture(on) as capture:
+                    work()
+                self._graph = capture.graph
+            else:
+                work()
+                self._graph = None
+        finally:
+            _recorder.active = None
+
+    def run(self) -> None:
+        """Issue all launches again."""
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+        for parts in self.launches:
+            _issue(parts)
+
+
+_recorder = local()
 
 
 def require(module: str, extra: str) -> ModuleType:

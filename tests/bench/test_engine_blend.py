@@ -10,6 +10,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from warprrf.bench.engine.blend import run_blend  # noqa: E402
+from warprrf.bench.engine.peers import Scene, take_turns  # noqa: E402
 from warprrf.bench.engine.torch_renderer import render_with_torch  # noqa: E402
 from warprrf.device import threads  # noqa: E402
 from warprrf.geometry import interop  # noqa: E402
@@ -136,6 +137,26 @@ def test_an_input_changed_in_place_before_backward_is_noticed():
         image.sum().backward()
 
 
+def test_an_output_changed_in_place_before_backward_is_noticed():
+    image = interop.rasterize(*tensors(4, n=5)[:5], CAMERAS["spherical"])[0]
+    loss = image.sum()
+    with torch.no_grad():
+        image *= 2
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
+def test_gradients_are_the_same_whether_all_or_some_are_wanted():
+    values = tensors(4, n=20)
+    outputs = interop.rasterize(*values[:5], CAMERAS["spherical"], values[5])
+    every = torch.autograd.grad(outputs[0].square().sum(), values)
+    for k, value in enumerate(values):
+        alone = [v if v is value else v.detach() for v in values]
+        image = interop.rasterize(*alone[:5], CAMERAS["spherical"], alone[5])[0]
+        assert torch.equal(torch.autograd.grad(image.square().sum(), value)[0], every[k])
+        assert every[k].abs().max() > 0
+
+
 @pytest.mark.parametrize(
     ("place", "value", "name"),
     [
@@ -163,9 +184,28 @@ def test_blend_benchmark_runs_small_and_its_two_images_are_one(tmp_path):
     assert json.loads((tmp_path / "blend.json").read_text())["gaussians"] == 300
     assert result["image_difference"]["quantile_99.9"] < result["asked"]["image_difference"]
     assert max(result["gradient_difference"].values()) < 1e-2
-    assert result["passing_pairs"] > 1000 and result["speedup"] > 0 and result["cpu_speedup"] > 0
+    assert result["passing_pairs"] > 1000
+    assert [run["threads"] for run in result["runs"]] == sorted({1, threads()})
+    for run in result["runs"]:
+        assert run["speedup"]["torch"] == pytest.approx(run["torch"]["seconds"] / run["ours"]["seconds"])
+        assert run["ours"]["seconds"] == run["ours"]["forward_s"] + run["ours"]["backward_s"] > 0
     # Both renderers count the same pairs, but for those on a cutoff.
     assert result["pairs"]["dense"]["passing_pairs"] == pytest.approx(result["passing_pairs"], rel=1e-3)
     assert result["pairs"]["sparse"]["forward_ns"] > 0
     assert result["spectrum"]["render_s"] > 0 and result["spectrum"]["gaussians"] == 1500
     assert threads() == 1 or result["cores"]["identical"]
+
+
+def _failing(scene, parameters):
+    raise FloatingPointError("planted")
+
+
+def test_a_renderer_that_fails_in_its_process_is_named(capfd):
+    with pytest.raises(RuntimeError, match="^bad: its process ended"):
+        take_turns({"bad": _failing}, Scene(10, 8, 8), threads=1, turns=1)
+    assert "planted" in capfd.readouterr().err
+
+
+def test_a_folder_that_is_no_checkout_of_opensplat_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"^opensplat: .* lacks project_gaussians.cpp"):
+        run_blend(opensplat=tmp_path)

@@ -27,9 +27,10 @@ from warprrf import cli  # noqa: E402
 from warprrf.bench import evaluation  # noqa: E402
 from warprrf.bench.evaluation import comparison, protocol, report, runs  # noqa: E402
 from warprrf.bench.evaluation.methods import METHODS, UNTAUGHT, Effort  # noqa: E402
-from warprrf.bench.evaluation.paper_law import paper_law_spectra  # noqa: E402
+from warprrf.bench.evaluation.paper_law import law_reach, paper_law_spectra  # noqa: E402
 from warprrf.bench.evaluation.protocol import Run, Setting  # noqa: E402
 from warprrf.bench.evaluation.runs import Store, sweep  # noqa: E402
+from warprrf.geometry.mesh import Mesh  # noqa: E402
 from warprrf.rf.fresnel import SPEED_OF_LIGHT  # noqa: E402
 from warprrf.rf.metrics import angle_deg  # noqa: E402
 from warprrf.rf.spectrum import pixel_directions  # noqa: E402
@@ -77,6 +78,22 @@ def test_every_method_has_a_row_that_is_filled(finished: tuple[Path, dict[str, A
     for method in ("rf3dgs+", "rf3dgs", "rf3dgs+alpha", "rf3dgs-alpha"):
         assert rows["exact", method]["loss_last"] < rows["exact", method]["loss_first"]
         assert rows["exact", method]["psnr_db"] > rows["exact", "constant"]["psnr_db"]
+
+
+def test_the_reach_of_the_papers_law_is_what_directions_leave() -> None:
+    wall = Mesh(np.array([[40.0, 0, 0], [41, 0, 0], [40, 1, 0]]), np.array([[0, 1, 2]]))
+    rng = np.random.default_rng(3)
+    around = rng.standard_normal((400, 3))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    point, transmitter = np.zeros((1, 3)), np.array([0.0, 0.0, 1.0])
+    # a length that is a polynomial of the direction has nothing left, one that is drawn at random everything
+    length = 10.0 ** (0.05 * (8.0 + around[:, 0] - 2.0 * around[:, 1] ** 3)) - 1.0
+    found = law_reach(wall, point, length[:, None] * around, transmitter)
+    assert found is not None and found["varies_db"] > 0.5 and found["left_db"] < 1e-9
+    length = 10.0 ** (0.05 * (8.0 + rng.standard_normal(400))) - 1.0
+    found = law_reach(wall, point, length[:, None] * around, transmitter)
+    assert found is not None and found["left_db"] > 0.9 * found["varies_db"]
+    assert law_reach(wall, point, around[:10], transmitter) is None
 
 
 def test_tables_state_what_was_published_and_where_ours_stands(finished: tuple[Path, dict[str, Any]]) -> None:

@@ -12,7 +12,7 @@ from warprrf.geometry import render as render_module
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.render import RADIO, Blending, Rasterizer, render
-from warprrf.kernels import binning, blend, project
+from warprrf.kernels import binning, blend, project, rays
 from warprrf.kernels.lanes import BLOCK, LANES
 from warprrf.kernels.lanes import build as lane_functions
 from warprrf.kernels.project import PRODUCT
@@ -208,7 +208,7 @@ def test_features_need_not_be_contiguous():
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this build of Warp has no CUDA compiler")
-@pytest.mark.parametrize("name", ["blend", "blend_adjoint", "block_masks", "fill_blocks"])
+@pytest.mark.parametrize("name", ["blend", "blend_adjoint", "block_masks", "fill_blocks", "place_hits"])
 def test_kernels_compile_for_cuda(name, tmp_path):
     """Their native snippets too; no GPU is needed for that."""
     kernels = {
@@ -216,6 +216,7 @@ def test_kernels_compile_for_cuda(name, tmp_path):
         "blend_adjoint": blend.build(wp.float32, PRODUCT, 3).blend_adjoint[0],
         "block_masks": project.build(wp.float32).block_masks,
         "fill_blocks": binning.fill_blocks,
+        "place_hits": rays.place_hits,
     }
     wp.compile_aot_module(kernels[name].module, device=None, arch=80, module_dir=tmp_path, use_ptx=True)
     assert list(tmp_path.glob("*.ptx"))

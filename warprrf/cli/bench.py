@@ -41,11 +41,13 @@ HELP_BENCH_ENGINE = """\
 Turns each knob of the rasteriser (cutoff, clamp, top K, precision, resolution, number of Gaussians, interaction point,
 form of the response and of the exponential) and writes its time and its error as tables and pictures, with the settings
 that follow; then growth, mesh rays against Embree, blending against torch, and the transport of 800 receivers on disk.
+--opensplat adds the CPU rasteriser of https://github.com/pierotofy/OpenSplat (AGPL), compiled from your own checkout.
 Each measurement is kept: a killed run loses one. For figures worth quoting leave the machine alone meanwhile.
 
 examples:
   warprrf bench engine
   warprrf bench engine --quick --out runs/engine-quick
+  warprrf bench engine --opensplat ../OpenSplat
 """
 
 HELP_BENCH_EVALUATION = """\
@@ -104,6 +106,9 @@ def add_benches(add: Add) -> None:
     engine = add("engine", _bench, "the engine's speed against error", HELP_BENCH_ENGINE, tables)
     engine.add_argument("--out", help="folder of the results (default runs/engine)")
     engine.add_argument("--scene", default="data/lobby/scene.xml", help="scene that rays are cast at (XML)")
+    engine.add_argument(
+        "--opensplat", metavar="FOLDER", help="checkout of OpenSplat: its CPU rasteriser is a peer too"
+    )
     engine.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, in a minute")
     engine.add_argument("--fresh", action="store_true", help="start over instead of continuing")
     radio = add(
@@ -223,6 +228,7 @@ def _bench_engine(args: argparse.Namespace, bars: Bars) -> None:
         sizes=sizes,
         seed=args.seed,
         device=args.device,
+        opensplat=args.opensplat,
         fresh=args.fresh,
         progress=bars,
     )

@@ -7,6 +7,7 @@ Derivatives are of first order; asking for a second one raises torch's error ins
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -132,20 +133,27 @@ def _check_gaussians(means: Any, quaternions: Any, scales: Any, opacities: Any) 
     torch = require("torch", "baselines")
     _check("means", means, (None, 3), None)
     n = len(means)
-    for name, tensor, shape in (
-        ("quaternions", quaternions, (n, 4)), ("scales", scales, (n, 3)), ("opacities", opacities, (n,)),
+    _check("quaternions", quaternions, (n, 4), means)
+    smallest, _ = _check("scales", scales, (n, 3), means)
+    lowest, highest = _check("opacities", opacities, (n,), means)
+    tiny = torch.finfo(torch.float32).tiny
+    for name, fits, misfits, expected in (
+        ("quaternions", bool(quaternions.detach().any(1).all()),
+         lambda: ~quaternions.detach().any(1), "wxyz rotations of a length above zero"),
+        ("scales", smallest >= tiny, lambda: scales.detach() < tiny, "positive metres, not denormal"),
+        ("opacities", 0 <= lowest and highest <= 1,
+         lambda: (opacities.detach() < 0) | (opacities.detach() > 1), "values in [0, 1]"),
     ):  # fmt: skip
-        _check(name, tensor, shape, means)
-    for name, fits, expected in (
-        ("quaternions", quaternions.detach().abs().amax(1) > 0, "wxyz rotations of a length above zero"),
-        ("scales", scales.detach() >= torch.finfo(torch.float32).tiny, "positive metres, not denormal"),
-        ("opacities", (opacities.detach() >= 0) & (opacities.detach() <= 1), "values in [0, 1]"),
-    ):
-        if not bool(fits.all()):
-            raise ValueError(f"{name}: got {int((~fits).sum())} values that do not fit, expected {expected}")
+        if not fits:
+            raise ValueError(
+                f"{name}: got {int(misfits().sum())} values that do not fit, expected {expected}"
+            )
 
 
-def _check(name: str, tensor: Any, shape: tuple[int | None, ...], like: torch.Tensor | None) -> None:
+def _check(
+    name: str, tensor: Any, shape: tuple[int | None, ...], like: torch.Tensor | None
+) -> tuple[float, float]:
+    """Refuse what is not a tensor of such numbers; returns the lowest and the highest (0 and 1 if it is empty)."""
     torch = require("torch", "baselines")
     if not isinstance(tensor, torch.Tensor):
         raise TypeError(f"{name}: got {type(tensor).__name__}, expected a torch.Tensor")
@@ -160,8 +168,14 @@ def _check(name: str, tensor: Any, shape: tuple[int | None, ...], like: torch.Te
     ):
         wanted = ", ".join("any" if s is None else str(s) for s in shape)
         raise ValueError(f"{name}: got shape {tuple(tensor.shape)}, expected ({wanted})")
-    if not bool(torch.isfinite(tensor.detach()).all()):
+    if tensor.numel() == 0:
+        return 0.0, 1.0
+    low, high = (
+        float(bound) for bound in torch.aminmax(tensor.detach())
+    )  # NaN if any is: one pass tells all
+    if not math.isfinite(low) or not math.isfinite(high):
         raise ValueError(f"{name}: got values that are NaN or infinite, expected finite numbers")
+    return low, high
 
 
 @cache
@@ -175,19 +189,22 @@ def _functions() -> SimpleNamespace:
         return Rasterizer(device=resolve(str(tensor.device)), blending=blending, real=real)
 
     def shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
-        """The tensor's memory as a Warp array; its gradient is summed into memory of Warp's own."""
-        array = wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
-        array.requires_grad = True
-        return array
+        """The tensor's memory as a Warp array, without a gradient yet."""
+        return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
-    def gradients(arrays: tuple[wp.array, ...]) -> list[torch.Tensor]:
-        """Copies: the next backward sums into the same arrays again."""
-        return [wp.to_torch(array.grad).clone() for array in arrays]
-
-    def seed(arrays: tuple[wp.array, ...], incoming: tuple[torch.Tensor, ...]) -> None:
-        """Copy torch's gradients in: a tensor that the caller may use again is never written."""
+    def seed(arrays: tuple[wp.array, ...], incoming: tuple[torch.Tensor | None, ...]) -> None:
+        """Let torch's gradients be those of the arrays; the adjoint reads them and nothing writes them."""
         for array, gradient in zip(arrays, incoming, strict=True):
-            array.grad.assign(wp.from_torch(gradient.detach().contiguous(), requires_grad=False))
+            array.grad = None if gradient is None else shared(gradient, array.dtype)
+
+    def gradients(arrays: tuple[wp.array, ...], wanted: tuple[bool, ...], adjoint: Any) -> list[Any]:
+        """What ``adjoint`` adds to new gradients of ``arrays``; None for those that nobody wants."""
+        for array, want in zip(arrays, wanted, strict=True):
+            array.grad = wp.zeros_like(array, requires_grad=False) if want else None
+        adjoint()
+        return [
+            wp.to_torch(array.grad, requires_grad=False) if array.requires_grad else None for array in arrays
+        ]
 
     class Rasterize(torch.autograd.Function):
         @staticmethod
@@ -196,28 +213,30 @@ def _functions() -> SimpleNamespace:
             types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
             inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
             image, ctx.adjoint = r.blend_with_adjoint(
-                r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam), inputs[4], inputs[5]
+                r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam),
+                inputs[4],
+                inputs[5],
+                gradients=False,
             )
             ctx.inputs, ctx.outputs = inputs, (image.features, image.alpha, image.depth)
-            ctx.save_for_backward(*tensors)
-            return tuple(wp.to_torch(array, requires_grad=False).clone() for array in ctx.outputs)
+            out = tuple(wp.to_torch(array, requires_grad=False) for array in ctx.outputs)
+            ctx.save_for_backward(*tensors, *out)  # the adjoint reads both
+            ctx.set_materialize_grads(False)
+            return out
 
         @staticmethod
         @once_differentiable
-        def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
-            _ = ctx.saved_tensors  # raises if an input was changed in place since forward
-            for array in ctx.inputs:
-                array.grad.zero_()
+        def backward(ctx: Any, *incoming: torch.Tensor | None) -> Any:
+            _ = ctx.saved_tensors  # raises if an input or an output was changed in place since forward
             seed(ctx.outputs, incoming)
-            ctx.adjoint()
-            return None, None, *gradients(ctx.inputs)
+            return None, None, *gradients(ctx.inputs, ctx.needs_input_grad[2:], ctx.adjoint)
 
     class Colors(torch.autograd.Function):
         @staticmethod
         def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
             r = raster(means)
             inputs = (shared(means, r.vector(3)), shared(sh, r.real))
-            out = wp.zeros((len(means), sh.shape[2]), dtype=r.real, device=r.device, requires_grad=True)
+            out = wp.zeros((len(means), sh.shape[2]), dtype=r.real, device=r.device)
             origin = r.colors_into(*inputs, cam, out)
             ctx.inputs, ctx.out = inputs, out
             ctx.adjoint = lambda: r.colors_adjoint(*inputs, origin, out)
@@ -228,11 +247,8 @@ def _functions() -> SimpleNamespace:
         @once_differentiable
         def backward(ctx: Any, incoming: torch.Tensor) -> Any:
             _ = ctx.saved_tensors  # raises if an input was changed in place since forward
-            for array in ctx.inputs:
-                array.grad.zero_()
-            seed((ctx.out,), (incoming,))
-            ctx.adjoint()
-            return None, *gradients(ctx.inputs)
+            seed((ctx.out,), (incoming.clone(),))  # Warp's own adjoint zeroes what it has read
+            return None, *gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
 
     class Rays(torch.autograd.Function):
         @staticmethod
@@ -257,10 +273,7 @@ def _functions() -> SimpleNamespace:
         @once_differentiable
         def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
             _ = ctx.saved_tensors  # raises if an input was changed in place since forward
-            for array in ctx.inputs:
-                array.grad.zero_()
             seed(ctx.outputs, tuple(g.double() for g in incoming[: len(ctx.outputs)]))
-            ctx.adjoint()
-            return None, *gradients(ctx.inputs)
+            return None, *gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
 
     return SimpleNamespace(rasterize=Rasterize, colors=Colors, rays=Rays)

@@ -311,10 +311,11 @@ class Rasterizer:
         whose, ids, masks = (wp.empty(max(entries, 1), dtype=int, device=device) for _ in range(3))
         starts = wp.zeros(tiles + 1, dtype=int, device=device)
         if entries:
+            wp.utils.array_scan(count, begins, inclusive=False)
             launch(
                 binning.emit_tiles,
                 len(order),
-                [order, span, ends, view.tiles_x, keys, slots, whose, begins],
+                [order, span, ends, view.tiles_x, keys, begins, slots, whose],
                 device=device,
             )
             wp.utils.radix_sort_pairs(keys, slots, entries, 0, tiles.bit_length())
@@ -374,10 +375,14 @@ class Rasterizer:
         return image
 
     def blend_with_adjoint(
-        self, prepared: Prepared, features: wp.array, background: Any = None
+        self, prepared: Prepared, features: wp.array, background: Any = None, *, gradients: bool = True
     ) -> tuple[Image, Callable[[], wp.array]]:
-        """Blend without a tape: the image, and the function that adds the inputs' gradients for the image's."""
-        image, kept = self._blend(prepared, features, background, requires_grad=True)
+        """Blend without a tape: the image, and the function that adds the inputs' gradients for the image's.
+
+        With ``gradients`` the image gets gradients of zero to write to; without, assign those that there are (they are
+        only read). An input without a gradient is left out.
+        """
+        image, kept = self._blend(prepared, features, background, requires_grad=gradients)
         return image, lambda: self.blend_adjoint(prepared, features, image, *kept)
 
     def _blend(
@@ -436,10 +441,10 @@ class Rasterizer:
             (len(bounds) or tiles) * kernels.LANES * blend_kernels.PER_BLOCK, dtype=lanes, device=device
         )
         background_sums = wp.empty(tiles * parts, dtype=lanes, device=device)
-        arrays = (out.features, out.alpha, out.depth, left, out.features.grad, out.alpha.grad, out.depth.grad)
-        flat = [a.flatten() for a in arrays]
+        slopes = [_gradient(array) for array in (out.features, out.alpha, out.depth)]
+        flat = [a.flatten() for a in (out.features, out.alpha, out.depth, left, *slopes)]
         flat_features = _flat(features)
-        with_range = int(out.depth.grad.numpy().any())
+        with_range = int(out.depth.requires_grad and out.depth.grad.numpy().any())
         for first in range(0, channels, kernels.CHANNELS):
             blend = self.kernels_for(channels - first)
             sums = (wp.empty if parts == 1 else wp.zeros)(len(prepared.ids), dtype=lanes, device=device)
@@ -456,7 +461,7 @@ class Rasterizer:
             launch(
                 self.project_kernels.chain,
                 n,
-                [means, quaternions, scales, prepared.view, first, prepared.begins, prepared.count, sums,
+                [means, quaternions, scales, opacities, prepared.view, first, prepared.begins, prepared.count, sums,
                  _gradient(means), _gradient(quaternions), _gradient(scales), _gradient(opacities), feature_grad, seen],
                 device=device,
             )  # fmt: skip
@@ -484,7 +489,7 @@ def _flat(array: wp.array) -> wp.array:
 
 
 def _gradient(array: wp.array) -> wp.array:
-    """Where an input's gradient goes; a scratch array if nobody asked for it."""
+    """An array's gradient; zeros that nobody keeps if it has none."""
     return array.grad if array.requires_grad else wp.zeros_like(array)
 
 

@@ -44,24 +44,26 @@ def emit_tiles(
     ends: wp.array(dtype=int),
     tiles_x: int,
     keys: wp.array(dtype=int),
+    begins: wp.array(dtype=int),
     values: wp.array(dtype=int),
     whose: wp.array(dtype=int),
-    begins: wp.array(dtype=int),
 ):
-    """Write (tile, own index) for every covered tile, Gaussians near to far; whose it is, and where each begins."""
+    """Write (tile, slot) for every covered tile, Gaussians near to far, and whose slot it is: a Gaussian's slots follow
+    one another from ``begins``."""
     i = offset + wp.tid()
     k = order[i]
     s = span[k]
+    slot = begins[k]
     at = int(0)
     if i > 0:
         at = ends[i - 1]
-    begins[k] = at
     for row in range(s[3]):
         for column in range(s[1]):
             keys[at] = (s[2] + row) * tiles_x + (s[0] + column) % tiles_x
-            values[at] = at
-            whose[at] = k
+            values[at] = slot
+            whose[slot] = k
             at += 1
+            slot += 1
 
 
 @wp.kernel(enable_backward=False)

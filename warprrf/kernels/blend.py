@@ -7,6 +7,11 @@ and scale. In the turned coordinates of the linear forms ``y = (-|M m| (g1^2 + g
 
 A thread of `blend` owns a block of 4 x 4 pixels and walks the block's list. A thread of `blend_adjoint` owns a tile:
 for each Gaussian it visits the blocks that the Gaussian reaches and reduces their sums over pixels once.
+
+Who adds where: a pair of Gaussian and tile has a slot of its own, `chain` adds up a Gaussian's slots, so no two tiles
+ever meet at an address. On a CPU one thread owns the slot and writes it. On a GPU sixteen threads share a tile, a block
+each, and add to the slot atomically: at most sixteen additions meet, those of one half warp that walks one list. A
+shuffle over the half warp would make them one; that has been run on no GPU yet, so it is not here.
 """
 
 from functools import cache
@@ -21,7 +26,6 @@ from warprrf.kernels.project import (
     CHANNELS,
     CUT,
     FLAT,
-    INVERSE,
     LIFT,
     OPACITY,
     REACH,
@@ -305,6 +309,10 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
             )
             for j in range(starts[tile], starts[tile + 1]):
                 mask = masks[j] & open
+                if mask == 0:
+                    if parts == 1:
+                        write(sums, slots[j], lanes())
+                    continue
                 k = ids[j]
                 s0 = lanes()
                 s1 = lanes()
@@ -371,19 +379,16 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                     slope = wp.cw_mul(wp.cw_mul(transmittance, value) - behind(goal, alpha), free)
                     left = thinned(transmittance, alpha, weight)
                     write(seeds, at + wp.static(LEFT), left)
-                    v = (real(-0.5) * row[OPACITY]) * slope  # dL/dq
-                    y0 = (-row[INVERSE]) * q
                     y1 = wp.cw_mul(lever, g1)
                     y2 = wp.cw_mul(lever, g2)
-                    p0 = wp.cw_mul(v, y0)
-                    p1 = wp.cw_mul(v, y1)
-                    p2 = wp.cw_mul(v, y2)
-                    s0 += wp.cw_mul(v, q)
+                    bent = wp.cw_mul(slope, q)
+                    p1 = wp.cw_mul(slope, y1)
+                    s0 += bent
                     s1 += p1
-                    s2 += p2
-                    s3 += wp.cw_mul(p0, y0)
-                    s4 += wp.cw_mul(p0, y1)
-                    s5 += wp.cw_mul(p0, y2)
+                    s2 += wp.cw_mul(slope, y2)
+                    s3 += wp.cw_mul(bent, q)
+                    s4 += wp.cw_mul(bent, y1)
+                    s5 += wp.cw_mul(bent, y2)
                     s6 += wp.cw_mul(p1, y1)
                     s7 += wp.cw_mul(p1, y2)
                     s9 += slope
@@ -395,9 +400,9 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                         h2 = row[TILT] * wp.cw_mul(half, g2)
                         s1 -= h1
                         s2 -= h2
-                        s3 -= real(2.0) * wp.cw_mul(h0, y0)
-                        s4 -= wp.cw_mul(h0, y1) + wp.cw_mul(h1, y0)
-                        s5 -= wp.cw_mul(h0, y2) + wp.cw_mul(h2, y0)
+                        s3 -= real(2.0) * wp.cw_mul(h0, q)
+                        s4 -= wp.cw_mul(h0, y1) + wp.cw_mul(h1, q)
+                        s5 -= wp.cw_mul(h0, y2) + wp.cw_mul(h2, q)
                         s6 -= real(2.0) * wp.cw_mul(h1, y1)
                         s7 -= wp.cw_mul(h1, y2) + wp.cw_mul(h2, y1)
                         s8 += h0

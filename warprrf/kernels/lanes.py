@@ -58,6 +58,15 @@ def build(real: Any) -> SimpleNamespace:
         ...
 
     @wp.func_native(f"""
+    int bits = 0;
+    for (int i = 0; i < {LANES}; ++i) bits |= x[i] > wp::{name}(0) ? 1 << i : 0;
+    return bits;
+    """)
+    def positive_bits(x: lanes) -> int:  # type: ignore[valid-type, empty-body]
+        """Bit i is set where lane i is above zero."""
+        ...
+
+    @wp.func_native(f"""
     wp::vec_t<{LANES}, wp::{name}> out;
     for (int i = 0; i < {LANES}; ++i) {{
         const wp::{name} yes = a[i], no = b[i];
@@ -168,6 +177,7 @@ def build(real: Any) -> SimpleNamespace:
         higher=higher,
         lower=lower,
         number=number,
+        positive_bits=positive_bits,
         read=read,
         roots=roots,
         spread=spread,
@@ -188,34 +198,57 @@ def _vector(name: str) -> str:
 """
 
 
+def _numbers(count: int, first: int = 0) -> str:
+    return ", ".join(str(first + k) for k in range(count))
+
+
+def _pixels(name: str, one: str, beside: str) -> str:
+    """C++ for the pixels of a block that lie in the image: ``one`` for pixel ``c`` of row ``r``; ``beside`` for all of
+    a whole block whose pixels lie side by side, where a CPU compiler has vectors of a row's ``quad``."""
+    return f"""
+    const bool whole = columns == {BLOCK} && rows == {BLOCK};
+#if defined(__clang__)
+    typedef wp::{name} quad __attribute__((vector_size({BLOCK} * sizeof(wp::{name})), aligned(4)));
+    if (whole && step == 1) {{
+        {beside}
+    }} else
+#endif
+    if (whole) {{
+        for (int r = 0; r < {BLOCK}; ++r)
+            for (int c = 0; c < {BLOCK}; ++c) {one}
+    }} else {{
+        for (int r = 0; r < rows; ++r)
+            for (int c = 0; c < columns; ++c) {one}
+    }}
+    """
+
+
 def _spread(name: str) -> str:
     """C++ that writes a block to part of an image."""
+    one = f"to[r * line + c * step] = x[r * {BLOCK} + c];"
+    beside = " ".join(
+        f"*(quad*)(to + {r} * line) = __builtin_shufflevector(x, x, {_numbers(BLOCK, BLOCK * r)});"
+        for r in range(BLOCK)
+    )
     return f"""{_vector(name)}
     const lanes x = *(const lanes*)&values;
     wp::{name}* to = target.data + at;
-    if (columns == {BLOCK} && rows == {BLOCK}) {{
-        for (int r = 0; r < {BLOCK}; ++r)
-            for (int c = 0; c < {BLOCK}; ++c) to[r * line + c * step] = x[r * {BLOCK} + c];
-    }} else {{
-        for (int r = 0; r < rows; ++r)
-            for (int c = 0; c < columns; ++c) to[r * line + c * step] = x[r * {BLOCK} + c];
-    }}
+    {_pixels(name, one, beside)}
     """
 
 
 def _collect(name: str) -> str:
     """C++ that reads part of an image as a block."""
+    one = f"x[r * {BLOCK} + c] = from[r * line + c * step];"
+    beside = f"""const quad a = *(const quad*)from, b = *(const quad*)(from + line);
+        const quad c = *(const quad*)(from + 2 * line), d = *(const quad*)(from + 3 * line);
+        x = __builtin_shufflevector(__builtin_shufflevector(a, b, {_numbers(2 * BLOCK)}),
+                                    __builtin_shufflevector(c, d, {_numbers(2 * BLOCK)}), {_numbers(LANES)});"""
     return f"""{_vector(name)}
     lanes x = {{}};
     wp::vec_t<{LANES}, wp::{name}> out;
     const wp::{name}* from = source.data + at;
-    if (columns == {BLOCK} && rows == {BLOCK}) {{
-        for (int r = 0; r < {BLOCK}; ++r)
-            for (int c = 0; c < {BLOCK}; ++c) x[r * {BLOCK} + c] = from[r * line + c * step];
-    }} else {{
-        for (int r = 0; r < rows; ++r)
-            for (int c = 0; c < columns; ++c) x[r * {BLOCK} + c] = from[r * line + c * step];
-    }}
+    {_pixels(name, one, beside)}
     *(lanes*)&out = x;
     return out;
     """

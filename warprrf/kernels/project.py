@@ -23,7 +23,8 @@ from typing import Any
 import warp as wp
 
 from warprrf.kernels.lanes import BLOCK as BLOCK
-from warprrf.kernels.lanes import LANES, VECTORISED, lanes_of
+from warprrf.kernels.lanes import LANES as LANES
+from warprrf.kernels.lanes import VECTORISED, lanes_of
 from warprrf.kernels.lanes import build as lane_functions
 
 TILE = 16  # pixels: tiles are TILE x TILE
@@ -34,11 +35,11 @@ G0, G1, G2 = 0, 3, 6  # linear forms; G1 and G2 times |M m|
 FLAT = 9  # 1 / |M m|^2
 CUT, OPACITY = 10, 11  # q at which alpha falls below alpha_min
 REACH = 12  # |m| |M m|: a range is REACH g0 / |g|^2 [m]
-LIFT, TILT = 13, 14  # smallest scale / 2 [m], and that over |M m|
-INVERSE = 15  # 1 / |M m|
+LIFT, TILT = 13, 14  # how a range's gradient joins the others in `blend_adjoint` [m]
 ROW = 16
 # Numbers per Gaussian that `blend_adjoint` sums: v q, Y1 without its first component 2, Y2 without its last 5, what
-# ranges take from the first component of Y1, opacity, features 4, blending weight.
+# ranges take from the first component of Y1, opacity, features 4, blending weight. The first nine lack the factor
+# -opacity/2 of v, and 1/|M m| for each first component of y but its sign: `chain` multiplies once.
 GRADIENTS = 15
 SUMS = 16
 # Stays finite where scales are near the smallest number: zero offset times infinity would be NaN.
@@ -252,7 +253,7 @@ def build(real: Any) -> SimpleNamespace:
     coefficients = wp.types.vector(ROW, real)
     Rays = rays_of(real)
     of = lane_functions(real)
-    above, lower, higher = of.above, of.lower, of.higher
+    above, lower, higher, positive_bits = of.above, of.lower, of.higher, of.positive_bits
     total = wp.types.vector(GRADIENTS, wp.float64)
     unbounded = 1.0e30 if real is wp.float32 else 1.0e250
     faintest = 80.0 if real is wp.float32 else 1.0e250  # what `response` is made for: exp(-40)
@@ -339,9 +340,8 @@ def build(real: Any) -> SimpleNamespace:
         row[wp.static(CUT)] = real(wp.min(cut, wp.float64(wp.static(faintest))))
         row[wp.static(OPACITY)] = real(opacity)
         row[wp.static(REACH)] = real(length)
-        row[wp.static(LIFT)] = real(wp.float64(0.5) * smin)
-        row[wp.static(TILT)] = real(wp.float64(0.5) * smin * flat)
-        row[wp.static(INVERSE)] = real(flat)
+        row[wp.static(LIFT)] = real(smin * steep / opacity)
+        row[wp.static(TILT)] = real(-smin * flat / opacity)
         rows[i] = row
 
     @wp.func
@@ -376,9 +376,6 @@ def build(real: Any) -> SimpleNamespace:
         hw = rays.columns[x, 3]
         v = rays.rows[y, 0]
         hv = rays.rows[y, 1]
-        powers = lanes()
-        for b in range(wp.static(LANES)):
-            powers[b] = real(1 << b)
         count = lanes()
         for j in range(starts[tile], starts[tile + 1]):
             k = whose[slots[j]]
@@ -411,9 +408,9 @@ def build(real: Any) -> SimpleNamespace:
             bound = f + real(2.0) * slope + row[CUT] * wp.cw_mul(change, change)
             # From inside the ellipsoid every ray ahead counts.
             bound += lanes(wp.where(outside > real(0.0), real(0.0), real(wp.static(unbounded))))
-            hit = above(lower(bound, g0 + change), lanes(), lanes(real(1.0)), lanes())
-            count += hit
-            masks[j] = int(wp.dot(hit, powers))
+            reached = lower(bound, g0 + change)
+            count += above(reached, lanes(), lanes(real(1.0)), lanes())
+            masks[j] = positive_bits(reached)
         counts[tile] = count
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -422,6 +419,7 @@ def build(real: Any) -> SimpleNamespace:
         means: wp.array(dtype=vec3),
         quaternions: wp.array(dtype=vec4),
         scales: wp.array(dtype=vec3),
+        opacities: wp.array(dtype=real),
         view: View,
         first: int,
         begins: wp.array(dtype=int),
@@ -465,7 +463,14 @@ def build(real: Any) -> SimpleNamespace:
         a = wp.cw_mul(smin * t, wp.transpose(r) * m)
         steep = wp.min(wp.length(a) / smin, wp.float64(wp.static(STEEPEST)))
         frame = whitened_frame(a)
-        y1 = frame * wp.vec3d(-y[0] / steep - y[8], y[1], y[2])
+        flat = wp.float64(-1.0) / steep
+        factor = wp.float64(-0.5) * wp.float64(opacities[i])
+        for k in range(9):
+            y[k] = factor * y[k]
+        for k in range(3, 6):
+            y[k] = flat * y[k]
+        y[3] = flat * y[3]
+        y1 = frame * wp.vec3d(flat * (y[0] - y[8]), y[1], y[2])
         y22 = y[0] - y[3] - y[6]  # the trace is the sum of dL/dq times q
         y2 = frame * wp.mat33d(y[3], y[4], y[5], y[4], y[6], y[7], y[5], y[7], y22) * wp.transpose(frame)
         dm = r * wp.cw_mul(y1, t)

@@ -37,6 +37,54 @@ _MOST_SQUARE = wp.constant(wp.float32(1e30))
 _STEPS = 8
 
 
+# Warp's own indexing allows for negative indices and strides, some six instructions an access.
+@wp.func_native("return source.data[i < source.shape[0] ? i : source.shape[0] - 1];")
+def ray_row(source: wp.array(dtype=wp.vec3d), i: int) -> wp.vec3d:  # type: ignore[empty-body]
+    """Row ``i >= 0`` of a contiguous array, or its last row."""
+    ...
+
+
+@wp.func_native("return source.data[i];")
+def plane_row(source: wp.array(dtype=wp.vec4d), i: int) -> wp.vec4d:  # type: ignore[empty-body]
+    """Row ``i >= 0`` of a contiguous array."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const int ahead = k + 16 < met.shape[0] ? met.data[k + 16] : -1;
+    if (ahead >= 0) __builtin_prefetch(planes.data + ahead);
+#endif
+""")
+def fetch_ahead(planes: wp.array(dtype=wp.vec4d), met: wp.array(dtype=wp.int32), k: int) -> None:
+    """Ask for the plane that will be wanted 16 rays later: incoherent rays find it in no cache."""
+    ...
+
+
+@wp.func_native("return source.data[i];")
+def name_at(source: wp.array(dtype=wp.int32), i: int) -> wp.int32:  # type: ignore[empty-body]
+    """Element ``i >= 0`` of a contiguous array."""
+    ...
+
+
+@wp.func_native("distance.data[i] = t; face.data[i] = name;")
+def keep(
+    distance: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.int32),
+    i: int,
+    t: wp.float64,
+    name: wp.int32,
+) -> None:
+    """Write a hit to contiguous arrays, ``i >= 0``."""
+    ...
+
+
+@wp.func_native("rays.data[2 * k] = start; rays.data[2 * k + 1] = way;")
+def put(rays: wp.array(dtype=wp.vec3), k: int, start: wp.vec3, way: wp.vec3) -> None:
+    """Write ray ``k >= 0`` to a contiguous array."""
+    ...
+
+
 @wp.func
 def narrow(p: wp.vec3d):
     """A position or direction in float32."""
@@ -201,16 +249,14 @@ def pack_segments(
     the end, longer by the rounding; a bad one or one that short meets nothing."""
     k = offset + wp.tid()
     i = first + k
-    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
-    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+    origin = ray_row(starts, i) - center
+    way = (ray_row(ends, i) - center) - origin
     length = wp.length(way)
     unit = way * (wp.float64(1.0) / length)
     step = _ROUNDING * rounding_scale(origin, radius)
-    rays[2 * k] = narrow(origin + (clearance - step) * unit)
     inner = length - wp.float64(2.0) * clearance
-    rays[2 * k + 1] = narrow(
-        wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan)) * unit
-    )
+    reach = wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan))
+    put(rays, k, narrow(origin + (clearance - step) * unit), narrow(reach * unit))
 
 
 @wp.kernel(enable_backward=False)
@@ -235,18 +281,19 @@ def judge_segments(
     k = offset + wp.tid()
     i = first + k
     if which.shape[0] > 0:
-        i = first + which[k]
-    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
-    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
+        i = first + name_at(which, k)
+    origin = ray_row(starts, i) - center
+    way = (ray_row(ends, i) - center) - origin
     length = wp.length(way)
     scale = rounding_scale(origin, radius)
-    name = met[k]
+    fetch_ahead(planes, met, k)
+    name = name_at(met, k)
     if name < 0:
         sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
         return
     if names.shape[0] > 0:
-        name = names[name]
-    plane = planes[name]
+        name = name_at(names, name)
+    plane = plane_row(planes, name)
     normal = wp.vec3d(plane[0], plane[1], plane[2])
     slope = wp.dot(normal, way)
     height = plane[3] - wp.dot(normal, origin)
@@ -275,8 +322,8 @@ def pack_rays(
     """
     k = offset + wp.tid()
     i = first + k
-    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
-    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    origin = ray_row(origins, i) - center
+    direction = ray_row(directions, i)
     near = narrow(origin)
     begin = wp.float32(clearance) - wp.float32(_ROUNDING) * (
         wp.float32(radius) + wp.abs(near[0]) + wp.abs(near[1]) + wp.abs(near[2])
@@ -284,8 +331,7 @@ def pack_rays(
     if start.shape[0] > 0:
         begin = wp.float32(start[i])
     unit = unit_narrow(direction)
-    rays[2 * k] = near + begin * unit
-    rays[2 * k + 1] = unit
+    put(rays, k, near + begin * unit, unit)
 
 
 @wp.kernel(enable_backward=False)
@@ -309,13 +355,14 @@ def place_hits(
     if it holds all."""
     k = offset + wp.tid()
     i = first + k
-    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
-    direction = directions[wp.min(i, directions.shape[0] - 1)]
-    name = met[k]
+    origin = ray_row(origins, i) - center
+    direction = ray_row(directions, i)
+    fetch_ahead(planes, met, k)
+    name = name_at(met, k)
     if name >= 0:
         if names.shape[0] > 0:
-            name = names[name]
-        plane = planes[name]
+            name = name_at(names, name)
+        plane = plane_row(planes, name)
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         square = wp.dot(direction, direction)
         slope = wp.dot(normal, direction)
@@ -325,8 +372,7 @@ def place_hits(
         ):
             t = height * wp.sqrt(square) / slope
             if t > clearance:  # nearly every ray: nothing is left to decide
-                distance[i] = t
-                face[i] = name
+                keep(distance, face, i, t, name)
                 return
     length = wp.length(direction)
     scale = rounding_scale(origin, radius)

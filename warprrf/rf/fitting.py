@@ -311,6 +311,7 @@ class Layer:
         p, k = problem, problem.kernels
         shape = (len(p.transport.receivers), p.pixels)
         self._scaled: dict[int, wp.array] = {}
+        self._recorded: dict[int, tuple[wp.array, _device.Recording]] = {}
         if opacity is not None:
             self.opacity_gradient = np.zeros(len(p.seen))
         self.images = np.asarray(target.image, p.precision).reshape(shape)
@@ -372,6 +373,30 @@ class Layer:
 
     def step(self, index: int, coefficients: wp.array, *, need_loss: bool = True) -> float:
         """Loss of batch ``index``; leaves its gradient in ``self.gradient`` (zero for Gaussians it does not see)."""
+        data, target = self.data[index], self.target
+        size = len(data.image)
+        total, _, absolute, score, adjoint = self.scalars
+        if self.opacity is not None or isinstance(self.problem.batches, _MappedBatches):
+            self._launch(index, coefficients)
+        else:  # every array stays where it is
+            recorded = self._recorded.get(index)
+            if recorded is None or recorded[0] is not coefficients:
+                recording = _device.Recording(lambda: self._launch(index, coefficients), self.problem.device)
+                self._recorded[index] = coefficients, recording
+            else:
+                recorded[1].run()
+        if self.opacity is not None:
+            self.opacity_gradient = self.opacity.gradient(index, self.contribution, total, adjoint)
+        if not need_loss:
+            return float("nan")
+        error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data.count
+        if data.mask is not None:
+            return error
+        similarity = float(np.mean(score.numpy()[:size], dtype=np.float64))
+        return (1 - target.ssim_share) * error + target.ssim_share * (1 - similarity)
+
+    def _launch(self, index: int, coefficients: wp.array) -> None:
+        """The kernels of a step."""
         p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
         weights = self.weights(index)
         target, size = self.target, len(data.image)
@@ -400,15 +425,6 @@ class Layer:
             k.coefficient_adjoint, batch.rows, self.kind, batch.row_gaussian, batch.row_start, batch.pair_pixel,
             batch.pair_direction, weights, p.basis, self.contribution, adjoint, self.gradient,
         )  # fmt: skip
-        if self.opacity is not None:
-            self.opacity_gradient = self.opacity.gradient(index, self.contribution, total, adjoint)
-        if not need_loss:
-            return float("nan")
-        error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data.count
-        if data.mask is not None:
-            return error
-        similarity = float(np.mean(score.numpy()[:size], dtype=np.float64))
-        return (1 - target.ssim_share) * error + target.ssim_share * (1 - similarity)
 
     def power(self, index: int, coefficients: wp.array) -> np.ndarray:
         """What the layer predicts for the receivers of batch ``index``: factor times blend plus extra."""

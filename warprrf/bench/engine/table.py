@@ -83,6 +83,7 @@ def run_engine(
     sizes: Sizes | None = None,
     seed: int = 0,
     device: Any = None,
+    opensplat: str | os.PathLike[str] | None = None,
     fresh: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -94,6 +95,7 @@ def run_engine(
         sizes: how much to measure; default: what the README quotes.
         seed: of scenes and rays.
         device: where to run.
+        opensplat: folder of a checkout of OpenSplat, whose CPU rasteriser is then compiled and measured too.
         fresh: start over instead of continuing.
         progress: ``progress(step, done, total)``.
 
@@ -103,7 +105,8 @@ def run_engine(
         ``blend`` (None without torch), ``transport``), ``machine`` and ``sizes``.
 
     Raises:
-        ValueError: on a broken ``out``, or another run at work there.
+        ValueError: on a broken ``out``, or another run at work there, or if ``opensplat`` is no checkout.
+        RuntimeError: if OpenSplat does not compile.
         ImportError: if the extra ``plots`` is missing.
     """
     size = sizes or Sizes()
@@ -125,10 +128,18 @@ def run_engine(
             found["blend"] = stages.figures(
                 "blend",
                 lambda tell: run_blend(
-                    n=n, width=width, height=height, repeats=size.repeats, seed=seed, progress=tell
+                    n=n,
+                    width=width,
+                    height=height,
+                    repeats=size.repeats,
+                    seed=seed,
+                    opensplat=opensplat,
+                    progress=tell,
                 ),
-                {"blend": size.blend, "repeats": size.repeats},
+                {"blend": size.blend, "repeats": size.repeats, "opensplat": opensplat and str(opensplat)},
                 "bench/engine/blend.py",
+                "bench/engine/opensplat.py",
+                "bench/engine/peers.py",
                 "bench/engine/torch_renderer.py",
             )
         n, measured, receivers = size.stored

@@ -13,7 +13,7 @@ import numpy as np
 
 from warprrf.bench.evaluation import comparison, report
 from warprrf.bench.evaluation.methods import METHODS, Effort
-from warprrf.bench.evaluation.paper_law import paper_law_spectra
+from warprrf.bench.evaluation.paper_law import law_reach, paper_law_spectra
 from warprrf.bench.evaluation.protocol import SCALES, SPLITS, TRUTHS, Scale, Setting, changed, plan, truth_of
 from warprrf.bench.evaluation.runs import Store, sweep
 from warprrf.bench.machine import machine
@@ -25,6 +25,7 @@ from warprrf.rf.dataset import SpectrumDataset
 KINDS = ("table1", "sparsity")
 OUT = "runs/evaluation"
 GEOMETRY = "runs/lobby/reconstruction"
+GAUSSIANS_DRAWN = 400  # that stand for all where the reach of the paper's law is found
 
 
 def run(
@@ -121,6 +122,7 @@ def run(
             "rows": summary,
             "published": [dict(row) for row in report.PUBLISHED],
             "finding": comparison.paper_finding(summary),
+            "law_reach": _law_reach(setting, device),
             "ahead": comparison.ours_against_all(summary),
             "data": about,
             "effort": asdict(chosen.effort),
@@ -195,6 +197,15 @@ def _paper_law(stages: StagedRun, xml: Path, exact: Path, device: Any) -> Path:
     ]  # fmt: skip
     stages.stage("paper-law", make, inputs=inputs, outputs=(file.name,))
     return file
+
+
+def _law_reach(setting: Setting, device: Any) -> dict[str, float] | None:
+    """What the paper's law can be worth to Gaussians drawn at random, over all receivers of the first truth."""
+    data = SpectrumDataset.load(setting.files[0][1])
+    known = Geometry(Path(setting.geometry), Path(setting.scene), device).reconstruction
+    centres = np.asarray(known.gaussians.means, float)
+    drawn = np.random.default_rng(0).choice(len(centres), min(GAUSSIANS_DRAWN, len(centres)), replace=False)
+    return law_reach(known.mesh, centres[drawn], data.receivers, data.transmitter, device=device)
 
 
 def _about(scale: Scale, setting: Setting) -> tuple[dict[str, Any], dict[tuple[str, str], tuple[int, ...]]]:

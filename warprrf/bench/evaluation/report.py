@@ -107,7 +107,7 @@ def markdown(kind: str, found: dict[str, Any]) -> str:
         for key, name in (("psnr_db", "PSNR [dB]"), ("ssim", "SSIM")):
             parts += [f"### {name}: mean (least to most over the test receivers)", _curve_table(rows, key)]
     if found["finding"]:
-        parts += ["### RF-3DGS+ against RF-3DGS", _finding_text(found["finding"])]
+        parts += ["### RF-3DGS+ against RF-3DGS", _finding_text(found["finding"], found["law_reach"])]
     if found["ahead"]:
         parts += ["### Ours against all", _ahead_text(found["ahead"])]
     return "\n\n".join(part for part in parts if part)
@@ -202,7 +202,7 @@ def _curve_table(rows: Sequence[Row], key: str) -> str:
     return table(["truth", "method", *map(str, counts)], lines)
 
 
-def _finding_text(finding: Sequence[Row]) -> str:
+def _finding_text(finding: Sequence[Row], reach: Row | None) -> str:
     lines = []
     for row in finding:
         psnr, blocked, ssim = row["psnr_db"], row["psnr_db_blocked"], row["ssim"]
@@ -231,7 +231,21 @@ def _finding_text(finding: Sequence[Row]) -> str:
             f"mean ({min(own):+.2f} to {max(own):+.2f})."
         )
     verdict = " ".join(said) + " Published: ahead on all of them."
-    return "\n\n".join([table(head, lines), verdict, f"{LAW_TEXT} {_law_worth(finding)}".strip()])
+    return "\n\n".join(
+        [table(head, lines), verdict, f"{LAW_TEXT} {_law_worth(finding)} {_reach_text(reach)}".strip()]
+    )
+
+
+def _reach_text(reach: Row | None) -> str:
+    """How little lengths can add to a function of the direction."""
+    if reach is None:
+        return ""
+    return (
+        f"In this room the factor has little to give either way: over the receivers that a Gaussian sees, "
+        f"20 log10(l_prev + l_vd) varies by {reach['varies_db']:.1f} dB (standard deviation, median of "
+        f"{reach['points']:.0f} Gaussians), and spherical harmonics of degree {reach['degree']:.0f} of the direction, "
+        f"which both models have, stand in for all but {reach['left_db']:.1f} dB of it."
+    )
 
 
 def _law_worth(finding: Sequence[Row]) -> str:
