@@ -11,17 +11,18 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
+from warprrf.geometry import o3d
 from warprrf.rf import bistatic_fit as fitting
 from warprrf.rf.bistatic import BistaticField, Terms
 from warprrf.rf.bistatic_training import trace
 from warprrf.rf.bounces import BeamOperator, BounceTracer, fresnel_curves
 from warprrf.rf.dataset import SpectrumDataset
-from warprrf.rf.exact import ExactEngine
+from warprrf.rf.exact import ExactEngine, sub_pixel_directions
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.lookups import nearest
 from warprrf.rf.metrics import evaluate
-from warprrf.rf.spectrum import to_db
+from warprrf.rf.spectrum import spread, to_db
 from warprrf.rf.specular import specular_paths
 from warprrf.rf.surface import Surface
 
@@ -312,6 +313,64 @@ def test_a_tracer_on_true_materials_matches_the_exact_engine(scene: RadioScene) 
     power = tracer.scatter(met, lit, weight, np.log([2.0, 5.0]), WAVELENGTH)
     engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
     assert power.sum() == pytest.approx(engine.diffuse(RECEIVERS[0]).power.sum(), rel=0.02)
+
+
+@pytest.mark.skipif(not o3d.installed(), reason="Open3D is not installed: there is one way to search")
+@pytest.mark.parametrize("count", [1, 3])
+def test_rays_by_embree_and_inside_kernels_see_the_same(
+    scene: RadioScene, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface = Surface.of(scene)
+    found = []
+    for installed in (True, False):
+        monkeypatch.setattr(o3d, "installed", lambda installed=installed: installed)
+        tracer = BounceTracer(surface, SHAPE)
+        met = tracer.meet(RECEIVERS[:count])
+        found.append(
+            (met, tracer.light(met, TX), tracer.light(met, surface.images(TX)[0][0], real=TX, patch=0))
+        )
+    (ours, lit, mirrored), (other, lit_2, mirrored_2) = found
+    assert (ours.face.numpy() >= 0).all() and len(ours.face) == count * SHAPE[0] * SHAPE[1] * 9
+    same = ours.face.numpy() == other.face.numpy()
+    assert same.mean() > 0.999  # on an edge either face may be named
+    np.testing.assert_allclose(ours.range_m.numpy()[same], other.range_m.numpy()[same], rtol=1e-6)
+    for a, b in ((lit, lit_2), (mirrored, mirrored_2)):
+        a, b = a.strength.numpy(), b.strength.numpy()
+        assert 0.02 < (a > 0).mean() < 0.98
+        assert ((a > 0) == (b > 0))[same].mean() > 0.998  # the border of a shadow
+        both = same & (a > 0) & (b > 0)
+        np.testing.assert_allclose(a[both], b[both], rtol=1e-5)
+
+
+def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:
+    beam = BeamOperator(SHAPE, SIGMA)
+    rng = np.random.default_rng(6)
+    directions = sub_pixel_directions(SHAPE, 4)[0].reshape(*SHAPE, -1, 3)[:, 0]
+    images = 10.0 ** rng.uniform(-12, -4, (*SHAPE, 2))
+    images[:3] = 0.0
+    expected = np.zeros_like(images)
+    for i in range(SHAPE[0]):
+        one = spread(directions[i], np.full(16, 1.0 / 16.0), SHAPE, SIGMA)  # of the row's first pixel
+        for j in range(SHAPE[1]):
+            expected += np.roll(one, j, axis=1)[..., None] * images[i, j]
+    found = beam(images)
+    np.testing.assert_allclose(found, expected, atol=1e-13 * expected.max())
+    pixels = np.array([5, 400, 777])
+    np.testing.assert_allclose(
+        beam.at(pixels, images.reshape(-1, 2)), expected.reshape(-1, 2)[pixels], rtol=1e-5
+    )
+
+
+def test_a_quick_fit_tries_nothing_and_is_near(scene: RadioScene, data: SpectrumDataset) -> None:
+    few, test = data.subset(np.arange(6)), data.subset(np.arange(6, 10))
+    quick = RadioField.fit(scene, few, quick=True)
+    assert quick.terms == Terms(mirror_order=1, indirect=True, sub_pixels=1)
+    assert {choice["term"] for choice in quick.report["choices"]} <= {"single bounces", "2 materials as 2"}
+    assert psnr(quick, test) > evaluate(test, nearest(few))["psnr_db"] + 8
+    finer = RadioField.fit(scene, few, quick=True, sub_pixels=2, mirror_order=2)
+    assert (finer.terms.sub_pixels, finer.terms.mirror_order) == (2, 2)
+    with pytest.raises(ValueError, match="sub_pixels"):
+        RadioField.fit(scene, few, sub_pixels=0)
 
 
 def test_terms_state_what_they_allow() -> None:
