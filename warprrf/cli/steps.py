@@ -164,6 +164,11 @@ def add_fit(add: Add) -> None:
         "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: terms ruled out are off"
     )
     fit.add_argument("--iterations", type=int, help="optimiser steps (default: the model's)")
+    fit.add_argument(
+        "--quick",
+        action="store_true",
+        help="bistatic: no term is tried, one ray a pixel; two or three dB less, in seconds",
+    )
 
 
 def _fit(args: argparse.Namespace, bars: Bars) -> None:
@@ -171,9 +176,14 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
     dataset = wr.SpectrumDataset.load(existing(args.spectra))
     if args.train is not None:
         dataset = dataset.split(args.train, seed=args.seed)[0]
-    ruled = {} if args.relevance is None else {"relevance": wr.Relevance.load(existing(args.relevance))}
-    if ruled and args.model != "bistatic":
-        raise ValueError(f"--relevance: only the bistatic model takes it, got --model {args.model}")
+    ruled: dict[str, Any] = (
+        {} if args.relevance is None else {"relevance": wr.Relevance.load(existing(args.relevance))}
+    )
+    if args.quick:
+        ruled["quick"] = True
+    for option in ruled:
+        if args.model != "bistatic":
+            raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
     field = wr.RadioField.fit(
         geometry,
         dataset,
