@@ -39,6 +39,7 @@ from warprrf.rf.fitting import KINDS, Problem, Rates, fit_layer, harmonics
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.opacity import OpacityTraining, list_responses
 from warprrf.rf.paths import Paths
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.single_bounce import FieldOptions, SingleBounce
 from warprrf.rf.spectrum import Spectrum, angles_from_directions
 from warprrf.rf.transport import Transport
@@ -157,7 +158,7 @@ class HarmonicField(RadioField):
             raise ValueError(f"iterations: got {iterations!r}, expected a whole number of steps, 0 or more")
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
-        _transport.check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), mesh)
+        check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), mesh)
         if mesh is None and (line_of_sight == "explicit" or interaction_point == "mesh"):
             raise ValueError(
                 'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
@@ -296,7 +297,7 @@ class HarmonicField(RadioField):
         """
         if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
             raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
-        positions = _transport.check_receiver("rx", rx, self.mesh)
+        positions = check_receiver("rx", rx, self.mesh)
         found = [
             replace(
                 paths_of(
@@ -395,7 +396,7 @@ class HarmonicField(RadioField):
 
     def _look(self, rx: Any, transmitter: Any, seen: Transport | None) -> View:
         """Spectrum at one receiver and what it was made of."""
-        receiver = _transport.check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
+        receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
         source = self._transmitter(transmitter)
         if seen is None:
             seen = _transport.transport(
