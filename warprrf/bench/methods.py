@@ -22,11 +22,10 @@ from warprrf.rf.bistatic.sight import Sight
 from warprrf.rf.bistatic.training import BistaticTransport
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.harmonic import HarmonicField
+from warprrf.rf.harmonic.field import HarmonicField
 from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
 
-# Files of one model alone: changing them leaves the other's rows as they are.
-_HARMONIC = ("harmonic", "fitting", "field_paths", "field_targets", "opacity", "single_bounce", "transport")
+# Files of no field: changing them leaves our rows as they are.
 _NEITHER = (
     "absorption", "antenna", "blockage", "llvm", "mirror_chains", "mitsuba_photos", "newrf", "reflections",
     "relevance", "relevance_choice", "relevance_model", "sionna_calibration", "sionna_engine", "twin",
@@ -35,11 +34,10 @@ _NEITHER = (
 
 def field_code(*, bistatic: bool, harmonic: bool) -> tuple[str, ...]:
     """Files and packages below ``warprrf/`` that the figures of our own fields, or of neither, depend on."""
-    other = {*_NEITHER, *(() if harmonic else _HARMONIC)}
     folder = Path(wr.__file__).parent / "rf"
-    files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in other]
-    own = ("rf/bistatic",) if bistatic else ()
-    return ("device.py", "kernels", "geometry", *files, "rf/channel", "rf/coverage", *own)
+    files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in _NEITHER]
+    models = [f"rf/{name}" for name, asked in (("bistatic", bistatic), ("harmonic", harmonic)) if asked]
+    return ("device.py", "kernels", "geometry", *files, "rf/channel", "rf/coverage", *models)
 
 
 @dataclass(frozen=True)

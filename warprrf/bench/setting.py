@@ -19,7 +19,7 @@ from warprrf.device import Progress
 from warprrf.rf.bistatic.training import BistaticTransport, trace
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field_files import fingerprint as fingerprint_arrays
-from warprrf.rf.transport import Transport, transport
+from warprrf.rf.harmonic.transport import Transport, transport
 
 DATA = "data/lobby"
 TRUTHS = tuple(FILES)

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "bistatic": ("bistatic.field", "BistaticField"),
-    "rf3dgs+": ("harmonic", "HarmonicField"),
-    "rf3dgs": ("harmonic", "HarmonicField"),
+    "rf3dgs+": ("harmonic.field", "HarmonicField"),
+    "rf3dgs": ("harmonic.field", "HarmonicField"),
 }
 MODELS = tuple(_HOMES)
 

@@ -9,7 +9,7 @@ An interaction point stands for the whole ray, as in the paper: the centre of th
 (``"centre"``), the peak of that Gaussian's response on the ray (``"peak"``), the blended mean of all peaks
 (``"expected"``), or the mesh hit (``"mesh"``). Lengths are float64 metres: at 300 GHz a wavelength is 1 mm.
 
-:func:`transport` keeps the weights in memory; :mod:`warprrf.rf.transport_store` keeps them on disk, a file a receiver,
+:func:`transport` keeps the weights in memory; :mod:`warprrf.rf.harmonic.store` keeps them on disk, a file a receiver,
 for as many receivers as the disk holds. Whoever fits takes either.
 """
 
@@ -32,7 +32,7 @@ from warprrf.rf.spectrum import check_shape, pixel_directions
 if TYPE_CHECKING:
     from warprrf.geometry.gaussians import Gaussians
     from warprrf.geometry.mesh import Mesh
-    from warprrf.rf.transport_store import StoredTransport
+    from warprrf.rf.harmonic.store import StoredTransport
 
 INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
 TRANSMITTANCE = ("product", "exp")
