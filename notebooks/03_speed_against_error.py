@@ -39,7 +39,8 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 import warprrf as wr
 from warprrf.bench.engine import knobs
-from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.exact import ExactEngine
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from warprrf.bench import radio_map as bench
-from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.coverage.radio_map import RadioMap
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.scene import Scene

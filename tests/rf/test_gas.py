@@ -16,9 +16,12 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined  # noqa: E40
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.absorption import Air
-from warprrf.rf.bistatic import BistaticField, Terms
-from warprrf.rf.bistatic_fit import Parameters
-from warprrf.rf.bistatic_training import trace
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.fit import Parameters
+from warprrf.rf.bistatic.second_bounce import mirrored_scene
+from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.bistatic.terms import Terms
+from warprrf.rf.bistatic.training import trace
 from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.exact import ExactEngine
@@ -26,10 +29,8 @@ from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.metrics import evaluate
 from warprrf.rf.relevance_model import full_field
-from warprrf.rf.second_bounce import mirrored_scene
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectrum import to_db
-from warprrf.rf.surface import Surface
 
 F = 380.2e9
 WAVELENGTH = SPEED_OF_LIGHT / F

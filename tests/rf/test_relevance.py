@@ -12,7 +12,8 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.absorption import gas_attenuation_db_per_m
-from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field import RadioField
 from warprrf.rf.materials import Material, roughness_scattering

@@ -15,7 +15,7 @@ from twin_fields import BLOCKED, LOBES, MATERIALS, SEES, SHAPE, SIGMA, TX, F, kn
 import warprrf as wr
 from warprrf import cli
 from warprrf.rf import twin as twins
-from warprrf.rf.bistatic import Terms
+from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fresnel import lobe, slab_reflection
 from warprrf.rf.spectrum import to_db

@@ -13,8 +13,8 @@ import numpy as np
 
 from warprrf.device import Progress, check_array
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf import transport as _transport
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.harmonic import transport as _transport
 from warprrf.rf.spectrum import pixel_directions
 
 REPEATS = 3  # the fastest of so many runs is quoted

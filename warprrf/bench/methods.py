@@ -17,19 +17,15 @@ import warprrf as wr
 from warprrf.bench.setting import Geometry
 from warprrf.device import Progress
 from warprrf.rf import lookups
-from warprrf.rf.bistatic import BistaticField, Sight
-from warprrf.rf.bistatic_training import BistaticTransport
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.sight import Sight
+from warprrf.rf.bistatic.training import BistaticTransport
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.harmonic import HarmonicField
+from warprrf.rf.harmonic.field import HarmonicField
 from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
 
-# Files of one model alone: changing them leaves the other's rows as they are.
-_BISTATIC = (
-    "bistatic", "bistatic_fit", "bistatic_training", "bounces", "grouping", "mirror_light", "mirror_tree", "residuals",
-    "second_bounce", "specular", "surface", "uncertainty",
-)  # fmt: skip
-_HARMONIC = ("harmonic", "fitting", "field_paths", "field_targets", "opacity", "single_bounce", "transport")
+# Files of no field: changing them leaves our rows as they are.
 _NEITHER = (
     "absorption", "antenna", "blockage", "llvm", "mirror_chains", "mitsuba_photos", "newrf", "reflections",
     "relevance", "relevance_choice", "relevance_model", "sionna_calibration", "sionna_engine", "twin",
@@ -38,10 +34,10 @@ _NEITHER = (
 
 def field_code(*, bistatic: bool, harmonic: bool) -> tuple[str, ...]:
     """Files and packages below ``warprrf/`` that the figures of our own fields, or of neither, depend on."""
-    other = {*_NEITHER, *(() if bistatic else _BISTATIC), *(() if harmonic else _HARMONIC)}
     folder = Path(wr.__file__).parent / "rf"
-    files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in other]
-    return ("device.py", "kernels", "geometry", *files, "rf/channel", "rf/coverage")
+    files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in _NEITHER]
+    models = [f"rf/{name}" for name, asked in (("bistatic", bistatic), ("harmonic", harmonic)) if asked]
+    return ("device.py", "kernels", "geometry", *files, "rf/channel", "rf/coverage", *models)
 
 
 @dataclass(frozen=True)

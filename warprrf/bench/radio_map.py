@@ -22,7 +22,7 @@ from warprrf.bench.machine import machine
 from warprrf.bench.stages import fingerprint, write_atomically, write_json
 from warprrf.device import Progress
 from warprrf.geometry.reconstruction import Reconstruction
-from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.coverage.radio_map import RadioMap
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field import RadioField

@@ -18,7 +18,7 @@ import numpy as np
 
 from warprrf.bench.stages import write_atomically, write_json
 from warprrf.device import Progress, require
-from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field import RadioField
 from warprrf.rf.metrics import evaluate, psnr, rmse_db, unit_image

@@ -16,10 +16,10 @@ import warprrf as wr
 from warprrf.bench.lobby.spectra import FILES
 from warprrf.bench.stages import fingerprint
 from warprrf.device import Progress
-from warprrf.rf.bistatic_training import BistaticTransport, trace
+from warprrf.rf.bistatic.training import BistaticTransport, trace
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field_files import fingerprint as fingerprint_arrays
-from warprrf.rf.transport import Transport, transport
+from warprrf.rf.harmonic.transport import Transport, transport
 
 DATA = "data/lobby"
 TRUTHS = tuple(FILES)

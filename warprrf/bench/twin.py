@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from warprrf.device import Progress
-from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.metrics import evaluate
 from warprrf.rf.scene import Scene

@@ -1,11 +1,12 @@
 """Radio fields: one way to fit, ask, save and load, whatever the model.
 
 ``bistatic`` obeys scattering physics (:mod:`warprrf.rf.bistatic`); ``rf3dgs+`` and ``rf3dgs`` hold spherical harmonics
-per Gaussian as published (:mod:`warprrf.rf.harmonic`).
+per Gaussian as published (:mod:`warprrf.rf.harmonic`). A model's package is loaded when its name is first asked for.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,12 @@ if TYPE_CHECKING:
     from warprrf.rf.paths import Paths
     from warprrf.rf.spectrum import Spectrum
 
-MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
+_HOMES = {
+    "bistatic": ("bistatic.field", "BistaticField"),
+    "rf3dgs+": ("harmonic.field", "HarmonicField"),
+    "rf3dgs": ("harmonic.field", "HarmonicField"),
+}
+MODELS = tuple(_HOMES)
 
 
 class RadioField(ABC):
@@ -71,13 +77,8 @@ class RadioField(ABC):
         """
         if model not in MODELS:
             raise ValueError(f"model: got {model!r}, expected one of {', '.join(MODELS)}")
-        if model == "bistatic":
-            from warprrf.rf.bistatic import BistaticField
-
-            return BistaticField.fit(geometry, ds, **options)
-        from warprrf.rf.harmonic import HarmonicField
-
-        return HarmonicField.fit(geometry, ds, model, **options)
+        chosen = {} if model == "bistatic" else {"model": model}
+        return _class_of(model).fit(geometry, ds, **chosen, **options)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> RadioField:
@@ -88,13 +89,8 @@ class RadioField(ABC):
             ValueError: if it is corrupt, or no radio field.
         """
         header = field_files.read(path)[1]
-        if header.get("model") == "bistatic":
-            from warprrf.rf.bistatic import BistaticField
-
-            return BistaticField.load(path, device=device)
-        from warprrf.rf.harmonic import HarmonicField
-
-        return HarmonicField.load(path, device=device)
+        model = "bistatic" if header.get("model") == "bistatic" else "rf3dgs+"  # which reads rf3dgs too
+        return _class_of(model).load(path, device=device)
 
     @abstractmethod
     def with_gas(self, gas: Any = True) -> Self:
@@ -159,3 +155,10 @@ class RadioField(ABC):
     @abstractmethod
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one safetensors file, in one go."""
+
+
+def _class_of(model: str) -> type[RadioField]:
+    """The class that fits and reads ``model``."""
+    module, name = _HOMES[model]
+    found: type[RadioField] = getattr(importlib.import_module(f"warprrf.rf.{module}"), name)
+    return found

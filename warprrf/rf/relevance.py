@@ -24,13 +24,14 @@ import numpy as np
 
 from warprrf.device import Progress, check_array
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.dataset import write_whole
 from warprrf.rf.field import RadioField
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.relevance_choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
 from warprrf.rf.relevance_model import FullModel, full_field, variant, with_lobes
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape
-from warprrf.rf.transport import check_receiver
 from warprrf.rf.waves import check_frequency
 
 SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds

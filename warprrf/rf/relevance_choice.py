@@ -11,8 +11,8 @@ import numpy as np
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.render import render
+from warprrf.rf.harmonic.transport import transport
 from warprrf.rf.relevance_model import FullModel
-from warprrf.rf.transport import transport
 
 ALL_LAYERS = 128  # Gaussians that may share a pixel and count as seen: more have no weight left
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides

@@ -17,14 +17,16 @@ import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.absorption import gas_attenuation_db_per_m
-from warprrf.rf.bistatic import BistaticField, Sight, Terms
-from warprrf.rf.bistatic_fit import Parameters
+from warprrf.rf.bistatic.bounces import LOBES, fresnel_curves
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.fit import Parameters
+from warprrf.rf.bistatic.sight import Sight
+from warprrf.rf.bistatic.specular import specular_paths
+from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.blockage import LIFT_M, SidePaths, diffracted, transmitted
-from warprrf.rf.bounces import LOBES, fresnel_curves
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection, surface_table
 from warprrf.rf.spectrum import default_floor, pixel_solid_angles, spread, to_db
-from warprrf.rf.specular import specular_paths
-from warprrf.rf.surface import Surface
 
 ASSUMED_PERMITTIVITY = 4.0 * (1.0 - 0.06j)
 """Of walls whose material is not known; loss as of plasterboard and wood at 300 GHz in ITU-R P.2040-4, table 3."""

@@ -17,7 +17,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
-from warprrf.rf.bounces import BeamOperator
+from warprrf.rf.beam import BeamOperator
 from warprrf.rf.materials import Material
 from warprrf.rf.scene import Scene
 from warprrf.rf.sionna_engine import SionnaEngine

@@ -12,14 +12,15 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.bistatic import BistaticField, Terms
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.coverage.links import BeamSearch, directivity, links_of
 from warprrf.rf.coverage.radio_map import QUANTITIES, RadioMap, in_the_air
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.spectrum import pixel_directions, pixel_solid_angles
-from warprrf.rf.surface import Surface
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F

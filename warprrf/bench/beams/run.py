@@ -19,7 +19,7 @@ from warprrf.bench.machine import machine
 from warprrf.bench.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
 from warprrf.bench.stages import StagedRun, source, write_atomically, write_json
 from warprrf.device import Progress
-from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.channel.beams import select_beams
 from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.dataset import SpectrumDataset

@@ -16,14 +16,15 @@ import numpy as np
 from warprrf.bench.bistatic.methods import sight_of
 from warprrf.bench.setting import Geometry, Truth
 from warprrf.device import Progress
-from warprrf.rf import bistatic_fit, metrics
-from warprrf.rf.bistatic import BistaticField
-from warprrf.rf.bistatic_training import ROWS
+from warprrf.rf import metrics
+from warprrf.rf.bistatic import fit as group_fit
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.training import ROWS
+from warprrf.rf.bistatic.uncertainty import negative_log_likelihood
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.paths import MirrorTracer
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectrum import pixel_directions, to_db
-from warprrf.rf.uncertainty import negative_log_likelihood
 
 ABLATION: dict[str, dict[str, Any]] = {
     "no line of sight": {"line_of_sight": False},
@@ -135,17 +136,17 @@ def optimisers(truth: Truth, count: int, geometry: Geometry, seed: int, progress
         progress("views", r + 1, len(rays.sights))
     surface = rays.surface
     area = np.bincount(surface.material[surface.group], surface.mesh.areas)
-    prior = bistatic_fit.Parameters.prior(len(area), len(start.terms.lobes))
-    bistatic_fit.objective(views, prior)  # tables are made on first use, which is no fit's time
+    prior = group_fit.Parameters.prior(len(area), len(start.terms.lobes))
+    group_fit.objective(views, prior)  # tables are made on first use, which is no fit's time
     times: list[float] = []
     began = time.perf_counter()
-    newton = bistatic_fit.fit_groups(
+    newton = group_fit.fit_groups(
         views, prior, area, progress=lambda *_: times.append(time.perf_counter() - began)
     )
     newton_s = time.perf_counter() - began
     progress("optimisers", 1, 2)
     began = time.perf_counter()
-    adam = bistatic_fit.fit_groups_adam(views, prior, area, steps=ADAM_STEPS)
+    adam = group_fit.fit_groups_adam(views, prior, area, steps=ADAM_STEPS)
     adam_s = time.perf_counter() - began
     progress("optimisers", 2, 2)
     losses = [adam.losses[0], *newton.losses]  # both start from the same parameters

@@ -25,7 +25,7 @@ from warprrf.bench.bistatic.plots import (
 from warprrf.bench.markdown import cell, table
 from warprrf.bench.pictures import METHODS, spectrum_rows
 from warprrf.bench.stages import write_atomically
-from warprrf.rf.uncertainty import OUTLIERS
+from warprrf.rf.bistatic.uncertainty import OUTLIERS
 
 ASKED_MARGIN_DB: dict[str, dict[str, dict[int, float]]] = {
     "exact": {"rf3dgs+": {10: 9.0, 50: 8.0, 400: 6.0}, "rf3dgs+los": {10: 7.0, 50: 6.0, 400: 5.0}},

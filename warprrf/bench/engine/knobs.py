@@ -28,8 +28,8 @@ from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.gaussian_rays import GaussianRays
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.render import RADIO, Blending, Rasterizer
+from warprrf.rf.harmonic.transport import transport
 from warprrf.rf.spectrum import pixel_directions, to_db
-from warprrf.rf.transport import transport
 
 DEPTH_DB = 60.0
 """The floor lies this far below the brightest pixel."""

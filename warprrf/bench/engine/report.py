@@ -19,8 +19,8 @@ from warprrf.bench.engine.forms import RASTERISER
 from warprrf.bench.markdown import table
 from warprrf.bench.stages import write_atomically
 from warprrf.geometry.render import RADIO
-from warprrf.rf.single_bounce import FieldOptions
-from warprrf.rf.transport import ALPHA_MIN, TOP_K
+from warprrf.rf.harmonic.single_bounce import FieldOptions
+from warprrf.rf.harmonic.transport import ALPHA_MIN, TOP_K
 
 Row = dict[str, Any]
 

@@ -156,9 +156,10 @@ def run_engine(
             ),
             {"stored": size.stored, "shape": size.shape},
             "bench/engine/transport.py",
-            "rf/transport.py",
-            "rf/transport_store.py",
-            "rf/fitting.py",
+            "rf/harmonic/transport.py",
+            "rf/harmonic/store.py",
+            "rf/harmonic/fitting.py",
+            "rf/receivers.py",
         )
         found["seconds"] = run.seconds()
     write_json(Path(out) / "engine.json", found)
@@ -198,7 +199,7 @@ def _knobs(stages: _Stages, size: Sizes, seed: int, device: Any, found: dict[str
         return known["room"]
 
     about = {"gaussians": size.gaussians, "shape": size.shape, "repeats": size.repeats}
-    code = ("bench/engine/knobs.py", "bench/engine/transport.py", "rf/transport.py")
+    code = ("bench/engine/knobs.py", "bench/engine/transport.py", "rf/harmonic/transport.py")
 
     def rows(name: str, work: Callable[[], list[dict[str, Any]]], **sizes: Any) -> None:
         def measure(tell: Progress) -> list[dict[str, Any]]:
@@ -246,7 +247,7 @@ def _knobs(stages: _Stages, size: Sizes, seed: int, device: Any, found: dict[str
 
 
 def _growth(stages: _Stages, size: Sizes, seed: int, device: Any, found: dict[str, Any]) -> None:
-    code = ("bench/engine/knobs.py", "bench/engine/blend.py", "rf/transport.py")
+    code = ("bench/engine/knobs.py", "bench/engine/blend.py", "rf/harmonic/transport.py")
     options: dict[str, Any] = {"repeats": min(3, size.repeats), "seed": seed, "device": device}
     for name, work in (("counts", knobs.count_row), ("growth", knobs.growth_row)):
         found[name] = [

@@ -21,9 +21,9 @@ from warprrf.bench.engine.scenes import ROOM, room
 from warprrf.device import Progress
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.rf import field_files
-from warprrf.rf.harmonic import HarmonicField
-from warprrf.rf.transport import transport
-from warprrf.rf.transport_store import FORMAT, HEADER, StoredTransport, store_transport
+from warprrf.rf.harmonic.field import HarmonicField
+from warprrf.rf.harmonic.store import FORMAT, HEADER, StoredTransport, store_transport
+from warprrf.rf.harmonic.transport import transport
 
 ASKED = {"receivers": 800, "shape": (90, 180), "gaussians": 1_000_000, "memory_gb": 8.0}
 BATCH = 10  # receivers a step of the fit, as by default

@@ -19,7 +19,7 @@ from warprrf.bench.methods import Fitted, field_code, fit_bistatic, fit_harmonic
 from warprrf.bench.setting import Geometry
 from warprrf.bench.stages import source
 from warprrf.device import Progress
-from warprrf.rf.bistatic import BistaticField
+from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.materials import Material
 from warprrf.rf.scene import Scene

@@ -31,8 +31,8 @@ from warprrf.geometry.config import ReconstructionConfig
 from warprrf.geometry.from_photos import read_photo
 from warprrf.geometry.meshio import write_mesh
 from warprrf.rf import lookups, metrics
+from warprrf.rf.harmonic.transport import Transport, transport
 from warprrf.rf.spectrum import to_db
-from warprrf.rf.transport import Transport, transport
 
 MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
 LOOKUPS = {"nearest": lookups.nearest, "idw": lookups.idw, "constant": lookups.constant, "mean": lookups.mean}

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warprrf.rf.bounces import BeamOperator
+from warprrf.rf.beam import BeamOperator
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.spectrum import directions_from_angles, pixel_of, pixel_solid_angles
 

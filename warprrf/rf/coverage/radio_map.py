@@ -20,8 +20,8 @@ from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.section import section
 from warprrf.rf.dataset import write_whole
+from warprrf.rf.receivers import ON_A_WALL_M
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD
-from warprrf.rf.transport import ON_A_WALL_M
 
 if TYPE_CHECKING:
     from warprrf.rf.field import RadioField

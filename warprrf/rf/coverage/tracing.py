@@ -15,16 +15,16 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
-from warprrf.rf.bistatic import BistaticField
-from warprrf.rf.bounces import Met
+from warprrf.rf.bistatic.bounces import Met
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.bistatic.second_bounce import mirrored_scene
+from warprrf.rf.bistatic.specular import specular_paths
 from warprrf.rf.coverage.links import BeamSearch, Links, links_of
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.mirror_tree import MirrorTree
-from warprrf.rf.second_bounce import mirrored_scene
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.spectrum import check_shape
-from warprrf.rf.specular import specular_paths
-from warprrf.rf.transport import check_receiver
 
 SHAPE = (20, 40)
 """Default grid of a link's rays."""

@@ -5,9 +5,9 @@ import pytest
 import warp as wp
 
 from warprrf.kernels.ssim import RADIUS, WINDOW
-from warprrf.rf.fitting import Layer, Problem, Rates, Target, fit_layer, weighted_means
+from warprrf.rf.harmonic.fitting import Layer, Problem, Rates, Target, fit_layer, weighted_means
+from warprrf.rf.harmonic.transport import Transport
 from warprrf.rf.spectrum import pixel_directions
-from warprrf.rf.transport import Transport
 
 SHAPE = (12, 24)
 GAUSSIANS = 9

@@ -15,7 +15,7 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.kernels.mirrors import Chains, find_chains, unfold_chains
-from warprrf.rf.surface import Surface
+from warprrf.rf.bistatic.surface import Surface
 
 SLACK_M = 0.1  # boxes of patches are widened by it: outlines of a reconstructed mesh are torn
 

@@ -3,9 +3,9 @@
 A fit needs a handful of receivers at once, so memory does not grow with their number. What a file holds per pair: the
 Gaussian (uint32) and its share of the pixel's weight (float16); per pixel: how many pairs, which of them is dominant
 (uint8 each), the sum of weights and the blended mean range (float32), and what top-K left out (float16): 6 bytes a pair
-and 12 a pixel. Shares are at least :data:`warprrf.rf.transport.MIN_WEIGHT`, which float16 holds to 2^-11; read back
-they are scaled to the sum, which is exact: a weight is off by at most 2^-10 of itself, 0.004 dB. Interaction points
-follow from the dominant Gaussian in float64 and directions from the grid, so neither is stored.
+and 12 a pixel. Shares are at least :data:`warprrf.rf.harmonic.transport.MIN_WEIGHT`, which float16 holds to 2^-11; read
+back they are scaled to the sum, which is exact: a weight is off by at most 2^-10 of itself, 0.004 dB. Interaction
+points follow from the dominant Gaussian in float64 and directions from the grid, so neither is stored.
 
 Files are written to a temporary name and renamed; a killed run goes on with the receivers that are missing.
 """
@@ -22,7 +22,7 @@ import numpy as np
 
 from warprrf.device import Progress, check_array
 from warprrf.rf import field_files
-from warprrf.rf.transport import TOP_K, Transport, View, joined, viewing
+from warprrf.rf.harmonic.transport import TOP_K, Transport, View, joined, viewing
 
 if TYPE_CHECKING:
     from warprrf.geometry.gaussians import Gaussians

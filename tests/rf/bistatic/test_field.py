@@ -8,14 +8,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.geometry import o3d
-from warprrf.rf import bistatic_fit as fitting
-from warprrf.rf.bistatic import BistaticField, Terms
-from warprrf.rf.bistatic_training import trace
-from warprrf.rf.bounces import BeamOperator, BounceTracer, fresnel_curves
+from warprrf.rf.beam import BeamOperator
+from warprrf.rf.bistatic import fit as fitting
+from warprrf.rf.bistatic.bounces import BounceTracer, fresnel_curves
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.specular import specular_paths
+from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.bistatic.terms import Terms
+from warprrf.rf.bistatic.training import trace
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.exact import ExactEngine, sub_pixel_directions
 from warprrf.rf.field import RadioField
@@ -23,8 +27,6 @@ from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.lookups import nearest
 from warprrf.rf.metrics import evaluate
 from warprrf.rf.spectrum import spread, to_db
-from warprrf.rf.specular import specular_paths
-from warprrf.rf.surface import Surface
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F

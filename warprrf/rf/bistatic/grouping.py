@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warprrf.rf.bistatic_fit import NEPER, Parameters, View, huber, predict, scattered_share, specular_power
-from warprrf.rf.bounces import fresnel_curves
+from warprrf.rf.bistatic.bounces import fresnel_curves
+from warprrf.rf.bistatic.fit import NEPER, Parameters, View, huber, predict, scattered_share, specular_power
 
 LOOK_COST = 3.0  # what one unit of difference in look, squared, counts as in the objective
 MOST_LOOK = 9.0
@@ -36,9 +36,9 @@ def regroup(
         views: of the training receivers, by groups.
         p: parameters of the materials.
         material: of each group now.
-        look: of each group, shape ``(G, 4)``; see :class:`warprrf.rf.surface.Surface`.
+        look: of each group, shape ``(G, 4)``; see :class:`warprrf.rf.bistatic.surface.Surface`.
         area: of each group [m^2].
-        noise_db: as in :func:`warprrf.rf.bistatic_fit.fit_groups`.
+        noise_db: as in :func:`warprrf.rf.bistatic.fit.fit_groups`.
     """
     material = material.copy()
     count = len(p.log_excess)

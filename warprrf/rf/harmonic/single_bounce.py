@@ -15,14 +15,14 @@ import numpy as np
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf import transport as _transport
 from warprrf.rf.absorption import Air
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.harmonic import transport as _transport
+from warprrf.rf.harmonic.transport import Lengths, Transport
 from warprrf.rf.spectrum import pixel_solid_angles, spread
-from warprrf.rf.transport import Lengths, Transport
 
 if TYPE_CHECKING:
-    from warprrf.rf.transport_store import StoredTransport
+    from warprrf.rf.harmonic.store import StoredTransport
 
 MODELS = ("rf3dgs+", "rf3dgs")
 GAINS = ("exp", "linear")

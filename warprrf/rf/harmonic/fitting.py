@@ -23,12 +23,12 @@ from warprrf.geometry.gaussians import replacing
 from warprrf.kernels import field as _kernels
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf.opacity import RATE as OPACITY_RATE
-from warprrf.rf.opacity import OpacityTraining
-from warprrf.rf.transport import Transport
+from warprrf.rf.harmonic.opacity import RATE as OPACITY_RATE
+from warprrf.rf.harmonic.opacity import OpacityTraining
+from warprrf.rf.harmonic.transport import Transport
 
 if TYPE_CHECKING:
-    from warprrf.rf.transport_store import StoredTransport
+    from warprrf.rf.harmonic.store import StoredTransport
 
 _BATCH_ARRAYS = (
     "row_gaussian", "row_start", "pair_pixel", "pair_direction", "pair_weight", "pixel_start", "pair_of_pixel",

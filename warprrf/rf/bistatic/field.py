@@ -2,10 +2,11 @@
 
 A pixel holds the power of every path of a scattering surface, spread by the receiver beam:
 
-- line of sight (Friis) and mirror reflections by the image method, blocking softened (:mod:`warprrf.rf.specular`);
+- line of sight (Friis) and mirror reflections by the image method, blocking softened
+  (:mod:`warprrf.rf.bistatic.specular`);
 - diffuse scattering (lambda / 4 pi)^2 Omega f_s |Gamma|^2 cos(theta_i) / (cos(theta_s) d1^2), f_s a non-negative mix of
-  normalised lobes (:mod:`warprrf.rf.bounces`);
-- what those light in turn (:mod:`warprrf.rf.second_bounce`), and an indirect radiance of each group.
+  normalised lobes (:mod:`warprrf.rf.bistatic.bounces`);
+- what those light in turn (:mod:`warprrf.rf.bistatic.second_bounce`), and an indirect radiance of each group.
 
 Where the data hold absorption by the air, every leg of a path has its own.
 
@@ -16,7 +17,7 @@ function of both directions and of the path's lengths, the field holds for a tra
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -24,21 +25,24 @@ import numpy as np
 
 from warprrf.device import check_array
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf import field_files
 from warprrf.rf.absorption import Air, air_of
-from warprrf.rf.bistatic_fit import NEPER, Layout, Parameters, View, jacobian, specular_power
-from warprrf.rf.bounces import LOBES, SUB_PIXELS, BeamOperator, BounceTracer, Lit, Met
+from warprrf.rf.beam import BeamOperator
+from warprrf.rf.bistatic import files
+from warprrf.rf.bistatic.bounces import BounceTracer
+from warprrf.rf.bistatic.fit import NEPER, Layout, Parameters, View, jacobian, specular_power
+from warprrf.rf.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.bistatic.paths import paths_of, strongest
+from warprrf.rf.bistatic.second_bounce import ElementLight, mirrored_scene
+from warprrf.rf.bistatic.sight import Composed, Sight
+from warprrf.rf.bistatic.specular import SpecularPaths, specular_paths
+from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.bistatic.terms import Terms
+from warprrf.rf.bistatic.uncertainty import ErrorModel
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.mirror_light import MirrorLight, MirrorSight
-from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.paths import Paths
-from warprrf.rf.second_bounce import ElementLight, SeenElements, mirrored_scene
-from warprrf.rf.spectrum import Spectrum, angles_from_directions, unit_beams
-from warprrf.rf.specular import SpecularPaths, specular_paths
-from warprrf.rf.surface import Surface
-from warprrf.rf.transport import check_receiver
-from warprrf.rf.uncertainty import ErrorModel
+from warprrf.rf.receivers import check_receiver
+from warprrf.rf.spectrum import Spectrum, unit_beams
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
@@ -47,102 +51,6 @@ MIRRORED_SUB_PIXELS = 2  # square root of the rays per pixel that look into mirr
 NEGLIGIBLE = (
     1e-3  # groups that bring a receiver less than this share of N0 at unit weight are not fitted to it
 )
-PATH_SHARE = (
-    1.0 / 200.0
-)  # a ray's part of the power that scattering brings to a pixel, at 64 rays a pixel and a beam of 3
-
-
-@dataclass(frozen=True)
-class Terms:
-    """What a bistatic field models; see :meth:`BistaticField.fit`.
-
-    Attributes:
-        line_of_sight, diffuse: whether there are such paths.
-        mirror_order: most mirror reflections on a path, 0 to 3.
-        lobes: exponents of the scattering lobes, 0 for Lambertian.
-        mirror_scatter: whether mirrors light surfaces.
-        scatter_mirror: whether mirrors show the lit scene.
-        diffuse_order: diffuse bounces on a path, 1 to 3.
-        indirect: whether groups have an indirect radiance.
-        residual: whether elements differ from their group.
-        sub_pixels: square root of the rays per pixel, 1 to 16.
-    """
-
-    line_of_sight: bool = True
-    diffuse: bool = True
-    mirror_order: int = 1
-    lobes: tuple[int, ...] = LOBES
-    mirror_scatter: bool = False
-    scatter_mirror: bool = False
-    diffuse_order: int = 1
-    indirect: bool = False
-    residual: bool = False
-    sub_pixels: int = SUB_PIXELS
-
-    def __post_init__(self) -> None:
-        whole = {"mirror_order": (0, 1, 2, 3), "diffuse_order": (1, 2, 3), "sub_pixels": range(1, 17)}
-        for name, allowed in whole.items():
-            if getattr(self, name) not in allowed:
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {tuple(allowed)}")
-        if not self.lobes or any(n != int(n) or n < 0 for n in self.lobes):
-            raise ValueError(f"lobes: got {self.lobes!r}, expected exponents, whole numbers of at least 0")
-        object.__setattr__(self, "lobes", tuple(int(n) for n in self.lobes))
-
-    @property
-    def further(self) -> bool:
-        """Whether elements send on what other surfaces scattered to them."""
-        return self.diffuse and self.diffuse_order > 1
-
-
-@dataclass(frozen=True)
-class Sight:
-    """What a receiver sees of the geometry under one transmitter, whatever the materials.
-
-    Attributes:
-        receiver, transmitter: positions [m].
-        met: what its rays meet.
-        lit: how the transmitter lights that.
-        paths: its line of sight and mirror paths.
-        beams: unit beam of each, shape ``(L, H, W)`` float32.
-        tracer: whose rays they are.
-    """
-
-    receiver: np.ndarray
-    transmitter: np.ndarray
-    met: Met
-    lit: Lit
-    paths: SpecularPaths
-    beams: np.ndarray
-    tracer: BounceTracer = field(repr=False)
-    _mirrored: list[MirrorSight] = field(default_factory=list, repr=False)
-
-    @cached_property
-    def elements(self) -> SeenElements:
-        """Surface elements that its rays meet."""
-        return SeenElements.of(self.tracer, self.met)
-
-    def mirrored(self, light: MirrorLight) -> MirrorSight:
-        """What its rays see of the light that mirrors throw on surfaces, traced once."""
-        if not self._mirrored:
-            self._mirrored.append(light.sight(self.receiver, self.met))
-        return self._mirrored[0]
-
-
-@dataclass(frozen=True)
-class Composed:
-    """A spectrum by its parts, path gain.
-
-    Attributes:
-        rays: of each diffuse ray, before the beam, shape ``(K,)``.
-        specular: of each line-of-sight and mirror path, shape ``(L,)``.
-        further: of what was sent on, per pixel before the beam, shape ``(H, W)``.
-        image: all, after the beam, shape ``(H, W)``.
-    """
-
-    rays: np.ndarray
-    specular: np.ndarray
-    further: np.ndarray
-    image: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,8 +95,8 @@ class BistaticField(RadioField):
 
     @classmethod
     def fit(cls, geometry: Any, ds: SpectrumDataset, **options: Any) -> BistaticField:  # type: ignore[override]
-        """Fit to the spectra of ``ds``; see :func:`warprrf.rf.bistatic_training.train`."""
-        from warprrf.rf.bistatic_training import train
+        """Fit to the spectra of ``ds``; see :func:`warprrf.rf.bistatic.training.train`."""
+        from warprrf.rf.bistatic.training import train
 
         return train(geometry, ds, **options)
 
@@ -250,7 +158,7 @@ class BistaticField(RadioField):
         """
         seen = sight or self.see(rx, transmitter)
         parts = self.compose(seen)
-        delay, aod = self._strongest(seen, parts)
+        delay, aod = strongest(self, seen, parts)
         spectrum = Spectrum(
             path_gain=parts.image.astype(np.float32),
             delay_s=delay,
@@ -278,11 +186,11 @@ class BistaticField(RadioField):
         if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
             raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
         positions = check_receiver("rx", rx, self.surface.mesh)
-        found = [self._paths(self.see(p, transmitter), max_paths) for p in np.atleast_2d(positions)]
+        found = [paths_of(self, self.see(p, transmitter), max_paths) for p in np.atleast_2d(positions)]
         return found[0] if positions.ndim == 1 else Paths.stack(found)
 
     def std_db(self, sight: Sight, parts: Composed) -> np.ndarray:
-        """Standard deviation of the dB image per pixel (H, W); see :mod:`warprrf.rf.uncertainty`."""
+        """Standard deviation of the dB image per pixel (H, W); see :mod:`warprrf.rf.bistatic.uncertainty`."""
         if self.errors is None:
             raise ValueError(
                 f"uncertainty: this field was fitted to {self.report.get('receivers', 0)} receivers, too few to hold "
@@ -386,7 +294,7 @@ class BistaticField(RadioField):
         )  # fmt: skip
 
     def view(self, sight: Sight, pixels: np.ndarray, target_db: np.ndarray | None = None) -> View:
-        """The sight as linear maps from group parameters to ``pixels`` (N,), for :mod:`warprrf.rf.bistatic_fit`."""
+        """The sight as linear maps from group parameters to ``pixels`` (N,), for :mod:`warprrf.rf.bistatic.fit`."""
         count, groups = self.shape[0] * self.shape[1], self.surface.groups
         lit, images = self.tracer.resolve(sight.met, sight.lit, self.wavelength_m)
         columns = self.beam.at(pixels, images.reshape(count, -1)) / np.float32(self.floor)
@@ -425,54 +333,12 @@ class BistaticField(RadioField):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one safetensors file, in one go: surface, parameters, terms, report."""
-        s, p = self.surface, self.parameters
-        tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
-        tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
-        tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
-        tensors |= {"residual": self.residual, "material": self.material, "transmitter": self.transmitter}
-        if self.errors is not None:
-            tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(self.errors).items()}
-        header = {name: getattr(self, name) for name in _PLAIN}
-        header |= {"model": "bistatic", "terms": asdict(self.terms), "report": self.report}
-        header |= {"log_gain": p.log_gain, "group_names": s.group_names, "skin_m": s.skin_m}
-        header |= {} if self.air is None else self.air.attributes
-        field_files.write(path, tensors, header)
+        files.write(self, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> BistaticField:
         """Read a field that :meth:`save` wrote; errors as for :meth:`RadioField.load`."""
-        tensors, header = field_files.read(path)
-        try:
-            surface = Surface(
-                mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
-                group_names=tuple(header["group_names"]),
-                skin_m=float(header["skin_m"]),
-                **{name: tensors[f"surface/{name}"] for name in _SURFACE},
-            )
-            parameters = Parameters(
-                **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS}, log_gain=header["log_gain"]
-            )
-            if len(surface.patch) != len(surface.mesh.faces) or len(parameters.log_excess) != surface.groups:
-                raise ValueError("its parameters do not fit its surface")
-            errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
-            plain = {name: header[name] for name in _PLAIN}
-            return cls(
-                **{**plain, "shape": tuple(plain["shape"]), "range_db": tuple(plain["range_db"])},
-                surface=surface,
-                transmitter=tensors["transmitter"],
-                terms=Terms(**header["terms"]),
-                parameters=parameters,
-                material=tensors["material"],
-                residual=tensors["residual"],
-                errors=ErrorModel(**errors) if errors else None,
-                air=Air.from_attributes(header),
-                report=header["report"],
-                device=device,
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{os.fspath(path)}: corrupt or no bistatic field of this version: {error}"
-            ) from error
+        return cls(**files.read(path), device=device)
 
     # ------------------------------------------------------------------------------------------ parts
 
@@ -567,79 +433,3 @@ class BistaticField(RadioField):
         known = paths.patch >= 0
         owner = self.surface.patch_group
         return np.where(known, owner[np.where(known, paths.patch, 0)] if len(owner) else -1, -1)
-
-    def _bounce_points(self, sight: Sight, rays: np.ndarray) -> np.ndarray:
-        """The point that each pixel's strongest ray meets (H, W, 3)."""
-        per_pixel = rays.reshape(-1, self.tracer.sub_pixels**2)
-        best = per_pixel.argmax(axis=1) + np.arange(len(per_pixel)) * per_pixel.shape[1]
-        range_m = sight.met.range_m.numpy()[best]
-        with np.errstate(invalid="ignore"):
-            point = sight.receiver + range_m[:, None] * self.tracer.directions[best]
-        return point.reshape(*self.shape, 3)
-
-    def _strongest(self, sight: Sight, parts: Composed) -> tuple[np.ndarray, np.ndarray]:
-        """Delay [s] and angles of departure [rad] of each pixel's strongest path through the receiver beam; NaN where
-        empty."""
-        ray = self.tracer.strongest(parts.rays, self.beam_sigma_rad)
-        dark = ray < 0
-        ray = np.maximum(ray, 0)
-        range_m = np.where(dark, np.nan, sight.met.range_m.numpy()[ray])
-        point = sight.receiver + range_m[..., None] * self.tracer.directions[ray]
-        outward = np.where(dark[..., None], 1.0, point - sight.transmitter)
-        length = np.where(dark, np.nan, np.linalg.norm(outward, axis=-1) + range_m)
-        if len(parts.specular):
-            beams = parts.specular[:, None, None] * sight.beams
-            which = beams.argmax(axis=0)
-            diffuse = np.maximum(parts.image - beams.sum(axis=0), 0.0)
-            direct = np.take_along_axis(beams, which[None], axis=0)[0] > PATH_SHARE * diffuse
-            first = sight.paths.point[:, 0]
-            first = np.where(np.isnan(first), sight.receiver, first) - sight.transmitter
-            outward = np.where(direct[..., None], first[which], outward)
-            length = np.where(direct, sight.paths.length_m[which], length)
-        length = np.where(np.isfinite(length), length, np.nan)
-        outward = np.where(np.isnan(length)[..., None], 1.0, outward)
-        aod = np.stack(angles_from_directions(outward), axis=-1)
-        return length / SPEED_OF_LIGHT, np.where(np.isnan(length)[..., None], np.nan, aod).astype(np.float32)
-
-    def _paths(self, sight: Sight, max_paths: int | None) -> Paths:
-        parts = self.compose(sight)
-        exact = np.flatnonzero(parts.specular > 0)
-        total = float(parts.image.sum())
-        p, s = sight.paths, parts.specular[exact]
-        kinds = np.where(p.order[exact] == 0, "los", "mirror").astype("<U7")
-        vertices = p.point[exact]
-        diffuse = parts.rays.reshape(*self.shape, -1).sum(axis=-1) + parts.further
-        point = self._bounce_points(sight, parts.rays + self._anything(sight, parts))
-        kept = diffuse > self.floor
-        if not kept.any() and diffuse.max() > 0:
-            kept = diffuse == diffuse.max()
-        power = diffuse[kept]
-        if len(power):
-            power = power * max(total - s.sum(), 0.0) / power.sum()
-        over = np.full((len(power), *vertices.shape[1:]), np.nan)
-        over[:, 0] = point[kept]
-        whole = np.isfinite(over[:, 0]).all(axis=1)
-        power, over = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)), over[whole]
-        found = Paths.from_points(
-            sight.transmitter,
-            sight.receiver,
-            np.concatenate([vertices, over]),
-            np.sqrt(np.concatenate([s, power])).astype(complex),
-            np.concatenate([kinds, np.full(len(power), "diffuse", dtype="<U7")]),
-            self.frequency_hz,
-        )
-        order = np.argsort(-np.abs(found.gain), kind="stable")[:max_paths]
-        return replace(found.select(order), air=self.air)
-
-    def _anything(self, sight: Sight, parts: Composed) -> np.ndarray:
-        """A trace of power for every ray that meets something, so that a pixel lit by further bounces has a point."""
-        met = sight.met.face.numpy() >= 0
-        return np.where(met, 1e-12 * self.floor * self.tracer.solid_angle, 0.0)
-
-
-_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
-_SURFACE = (
-    "normal", "patch", "plane_normal", "plane_offset", "group", "material", "look", "patch_group", "element",
-    "element_centre", "element_area", "element_group",
-)  # fmt: skip
-_PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")

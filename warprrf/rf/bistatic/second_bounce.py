@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.rf.bistatic_fit import Parameters, scattered_share
-from warprrf.rf.bounces import BounceTracer, Met, fresnel_curves
-from warprrf.rf.mirror_light import MirrorLight
-from warprrf.rf.surface import Surface
+from warprrf.rf.bistatic.bounces import BounceTracer, Met, fresnel_curves
+from warprrf.rf.bistatic.fit import Parameters, scattered_share
+from warprrf.rf.bistatic.mirror_light import MirrorLight
+from warprrf.rf.bistatic.surface import Surface
 
 RAYS = 128  # from each element, over its hemisphere
 LEAST_MIRROR = 1e-4  # reflected share of power below which a patch is no mirror

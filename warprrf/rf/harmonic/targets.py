@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warprrf.rf.fitting import Target, weighted_means
-from warprrf.rf.single_bounce import SingleBounce
+from warprrf.rf.harmonic.fitting import Target, weighted_means
+from warprrf.rf.harmonic.single_bounce import SingleBounce
+from warprrf.rf.harmonic.transport import Transport
 from warprrf.rf.spectrum import directions_from_angles, to_db
-from warprrf.rf.transport import Transport
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
-    from warprrf.rf.transport_store import StoredTransport
+    from warprrf.rf.harmonic.store import StoredTransport
 
 Y00 = 0.28209479177387814  # harmonic of degree 0
 DARK = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged

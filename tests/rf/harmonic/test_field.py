@@ -9,12 +9,12 @@ import pytest
 from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.field_paths import BEAM_REACH
-from warprrf.rf.harmonic import HarmonicField
+from warprrf.rf.harmonic.field import HarmonicField
+from warprrf.rf.harmonic.paths import BEAM_REACH
+from warprrf.rf.harmonic.single_bounce import FieldOptions
+from warprrf.rf.harmonic.transport import interaction_points, transport
 from warprrf.rf.metrics import psnr, unit_image
-from warprrf.rf.single_bounce import FieldOptions
 from warprrf.rf.spectrum import angles_from_directions, pixel_directions, pixel_solid_angles
-from warprrf.rf.transport import interaction_points, transport
 
 LIGHT = 299_792_458.0
 FREQUENCY = 300e9

@@ -19,10 +19,10 @@ from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.render import Blending, blend_weights
 from warprrf.kernels import opacity as _kernels
-from warprrf.rf.transport import Transport, cutoffs
+from warprrf.rf.harmonic.transport import Transport, cutoffs
 
 if TYPE_CHECKING:
-    from warprrf.rf.fitting import Problem
+    from warprrf.rf.harmonic.fitting import Problem
 
 THINNED = 0.5  # of each opacity, while lists are made
 LISTED = 32  # Gaussians kept per pixel

@@ -9,7 +9,7 @@ An interaction point stands for the whole ray, as in the paper: the centre of th
 (``"centre"``), the peak of that Gaussian's response on the ray (``"peak"``), the blended mean of all peaks
 (``"expected"``), or the mesh hit (``"mesh"``). Lengths are float64 metres: at 300 GHz a wavelength is 1 mm.
 
-:func:`transport` keeps the weights in memory; :mod:`warprrf.rf.transport_store` keeps them on disk, a file a receiver,
+:func:`transport` keeps the weights in memory; :mod:`warprrf.rf.harmonic.store` keeps them on disk, a file a receiver,
 for as many receivers as the disk holds. Whoever fits takes either.
 """
 
@@ -32,14 +32,13 @@ from warprrf.rf.spectrum import check_shape, pixel_directions
 if TYPE_CHECKING:
     from warprrf.geometry.gaussians import Gaussians
     from warprrf.geometry.mesh import Mesh
-    from warprrf.rf.transport_store import StoredTransport
+    from warprrf.rf.harmonic.store import StoredTransport
 
 INTERACTION_POINTS = ("centre", "peak", "expected", "mesh")
 TRANSMITTANCE = ("product", "exp")
 TOP_K = 16  # Gaussians kept per pixel
 ALPHA_MIN = 1e-3  # a fainter layer changes what lies behind it by less than 0.005 dB
 MIN_WEIGHT = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
-ON_A_WALL_M = 1e-4  # a receiver nearer to the mesh than this sits in the wall
 
 
 @dataclass(frozen=True)
@@ -151,35 +150,6 @@ def cutoffs(range_db: Any, rule: str = "product") -> Blending:
     depth = 10 ** (-(float(range_db[1]) - float(range_db[0])) / 10)
     leak = min(max(depth, 1e-6), 1e-2)
     return Blending(alpha_min=ALPHA_MIN, alpha_max=1.0 - leak, transmittance_min=leak, rule=rule)
-
-
-def check_receiver(name: str, position: Any, mesh: Mesh | None) -> np.ndarray:
-    """``position`` (3,) or (R, 3) [m] if spectra can be asked for there.
-
-    Raises:
-        ValueError: if it is not finite, outside the mesh's bounds, or on its surface.
-    """
-    array = check_array(name, position)
-    if array.ndim not in (1, 2) or array.shape[-1] != 3 or array.size == 0:
-        raise ValueError(f"{name}: got shape {array.shape}, expected (3,) or (R, 3) with R at least 1")
-    if mesh is None:
-        return array
-    points = np.atleast_2d(array)
-    low, high = mesh.bounds
-    outside = np.flatnonzero(((points < low) | (points > high)).any(axis=-1))
-    if len(outside):
-        raise ValueError(
-            f"{name}: got {points[outside[0]].tolist()}, which lies outside the scene's bounds {low.tolist()} to "
-            f"{high.tolist()} [m]; expected a position inside"
-        )
-    distance = mesh.distance(points)
-    touching = np.flatnonzero(distance < ON_A_WALL_M)
-    if len(touching):
-        raise ValueError(
-            f"{name}: got {points[touching[0]].tolist()}, which lies on a surface ({distance[touching[0]]:.1e} m); "
-            f"move it off by more than {ON_A_WALL_M} m"
-        )
-    return array
 
 
 def transport(

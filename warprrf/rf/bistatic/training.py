@@ -11,17 +11,19 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress, check_array
-from warprrf.rf import bistatic_fit as _fit
 from warprrf.rf.absorption import Air
-from warprrf.rf.bistatic import BistaticField, Sight, Terms
-from warprrf.rf.bistatic_fit import NEPER, Fit, Parameters, View
-from warprrf.rf.grouping import regroup
-from warprrf.rf.residuals import Shares, fit_residual, gather_shares
+from warprrf.rf.bistatic import fit as _fit
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.fit import NEPER, Fit, Parameters, View
+from warprrf.rf.bistatic.grouping import regroup
+from warprrf.rf.bistatic.residuals import Shares, fit_residual, gather_shares
+from warprrf.rf.bistatic.sight import Sight
+from warprrf.rf.bistatic.specular import MOST_MIRRORS, specular_paths
+from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.bistatic.terms import Terms
+from warprrf.rf.bistatic.uncertainty import ErrorModel, learn_errors
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.spectrum import to_db
-from warprrf.rf.specular import MOST_MIRRORS, specular_paths
-from warprrf.rf.surface import Surface
-from warprrf.rf.transport import check_receiver
-from warprrf.rf.uncertainty import ErrorModel, learn_errors
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset

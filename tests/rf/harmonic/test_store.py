@@ -6,10 +6,11 @@ import pytest
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.render import blend_weights
-from warprrf.rf import field_files, transport_store
-from warprrf.rf.fitting import Problem, Target, fit_layer, weighted_means
-from warprrf.rf.transport import cutoffs, interaction_points, transport
-from warprrf.rf.transport_store import StoredTransport, store_transport
+from warprrf.rf import field_files
+from warprrf.rf.harmonic import store
+from warprrf.rf.harmonic.fitting import Problem, Target, fit_layer, weighted_means
+from warprrf.rf.harmonic.store import StoredTransport, store_transport
+from warprrf.rf.harmonic.transport import cutoffs, interaction_points, transport
 
 SHAPE = (12, 24)
 RECEIVERS = np.random.default_rng(0).uniform(-0.5, 0.5, (23, 3))
@@ -125,14 +126,12 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_numbers(tmp_path, monkeypat
         store_transport(tmp_path / "cut", g, RECEIVERS[:5], SHAPE, device="cpu", progress=stop_after_two)
     with pytest.raises(ValueError, match="3 of 5 receivers are missing"):
         StoredTransport(tmp_path / "cut")
-    encode = transport_store._encoded
-    monkeypatch.setattr(transport_store, "_encoded", lambda view, k: done.append(1) or encode(view, k))
+    encode = store._encoded
+    monkeypatch.setattr(store, "_encoded", lambda view, k: done.append(1) or encode(view, k))
     store_transport(tmp_path / "cut", g, RECEIVERS[:5], SHAPE, device="cpu")
     assert len(done) == 3
     for file in sorted(whole.folder.iterdir()):
-        one, other = (
-            field_files.read(f, transport_store.FORMAT) for f in (file, tmp_path / "cut" / file.name)
-        )
+        one, other = (field_files.read(f, store.FORMAT) for f in (file, tmp_path / "cut" / file.name))
         assert one[1] == other[1] and one[0].keys() == other[0].keys()
         for name, values in one[0].items():
             assert values.tobytes() == other[0][name].tobytes()

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.rf.bistatic_fit import NEPER
-from warprrf.rf.bounces import BeamOperator
+from warprrf.rf.beam import BeamOperator
+from warprrf.rf.bistatic.fit import NEPER
 
 ROUNDS = 4
 CONJUGATE_STEPS = 12

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.rf.fitting import Layer, Problem, Target
-from warprrf.rf.harmonic import HarmonicField
-from warprrf.rf.opacity import Listed, OpacityTraining, list_responses
-from warprrf.rf.transport import Transport, transport
+from warprrf.rf.harmonic.field import HarmonicField
+from warprrf.rf.harmonic.fitting import Layer, Problem, Target
+from warprrf.rf.harmonic.opacity import Listed, OpacityTraining, list_responses
+from warprrf.rf.harmonic.transport import Transport, transport
 
 SHAPE = (12, 24)
 RANGE_DB = (-60.0, 0.0)

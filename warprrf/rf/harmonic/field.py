@@ -30,22 +30,24 @@ from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
 from warprrf.kernels import field as _kernels
 from warprrf.rf import field_files
-from warprrf.rf import transport as _transport
 from warprrf.rf.absorption import Air, air_of
 from warprrf.rf.field import RadioField
-from warprrf.rf.field_paths import View, near_line_of_sight, paths_of
-from warprrf.rf.field_targets import targets
-from warprrf.rf.fitting import KINDS, Problem, Rates, fit_layer, harmonics
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.opacity import OpacityTraining, list_responses
+from warprrf.rf.harmonic import transport as _transport
+from warprrf.rf.harmonic.checkpoint import Checkpoint
+from warprrf.rf.harmonic.fitting import KINDS, Problem, Rates, fit_layer, harmonics
+from warprrf.rf.harmonic.opacity import OpacityTraining, list_responses
+from warprrf.rf.harmonic.paths import View, near_line_of_sight, paths_of
+from warprrf.rf.harmonic.single_bounce import FieldOptions, SingleBounce
+from warprrf.rf.harmonic.targets import targets
+from warprrf.rf.harmonic.transport import Transport
 from warprrf.rf.paths import Paths
-from warprrf.rf.single_bounce import FieldOptions, SingleBounce
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.spectrum import Spectrum, angles_from_directions
-from warprrf.rf.transport import Transport
 
 if TYPE_CHECKING:
     from warprrf.rf.dataset import SpectrumDataset
-    from warprrf.rf.transport_store import StoredTransport
+    from warprrf.rf.harmonic.store import StoredTransport
 
 STEPS = 300  # optimiser steps; twice as many change the test PSNR by less than 0.1 dB
 CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that are nearly right
@@ -137,7 +139,7 @@ class HarmonicField(RadioField):
             batch: receivers per step.
             rates: learning rates and ridge.
             transport: blending weights of ``ds.receivers``, if they were computed before; stored ones are fitted from
-                disk (:func:`warprrf.rf.transport_store.store_transport`).
+                disk (:func:`warprrf.rf.harmonic.store.store_transport`).
             train_opacity: also train the opacities with the gain, as RF-3DGS does; the field then has Gaussians of its
                 own opacities. Needs the ``product`` transmittance.
             checkpoint: file to save progress to and go on from; removed when the fit is done.
@@ -157,7 +159,7 @@ class HarmonicField(RadioField):
             raise ValueError(f"iterations: got {iterations!r}, expected a whole number of steps, 0 or more")
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
-        _transport.check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), mesh)
+        check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), mesh)
         if mesh is None and (line_of_sight == "explicit" or interaction_point == "mesh"):
             raise ValueError(
                 'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
@@ -206,7 +208,7 @@ class HarmonicField(RadioField):
         identity = field_files.fingerprint(
             options, learned, seed, batch, steps, seen, train_opacity, *plan.layers.values()
         )
-        saver = field_files.Checkpoint(checkpoint, identity)
+        saver = Checkpoint(checkpoint, identity)
         layers, losses, done = {}, {}, 0
         for name, target in plan.layers.items():
             kept, opacity = saver.state(name), None
@@ -296,7 +298,7 @@ class HarmonicField(RadioField):
         """
         if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
             raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
-        positions = _transport.check_receiver("rx", rx, self.mesh)
+        positions = check_receiver("rx", rx, self.mesh)
         found = [
             replace(
                 paths_of(
@@ -395,7 +397,7 @@ class HarmonicField(RadioField):
 
     def _look(self, rx: Any, transmitter: Any, seen: Transport | None) -> View:
         """Spectrum at one receiver and what it was made of."""
-        receiver = _transport.check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
+        receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
         source = self._transmitter(transmitter)
         if seen is None:
             seen = _transport.transport(

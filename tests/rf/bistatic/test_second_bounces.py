@@ -7,20 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
-from warprrf.rf.bistatic import BistaticField, Terms
-from warprrf.rf.bistatic_fit import Layout, Parameters, View, fit_groups, jacobian, predict
-from warprrf.rf.bistatic_training import trace
-from warprrf.rf.bounces import BeamOperator, fresnel_curves
+from warprrf.rf.beam import BeamOperator
+from warprrf.rf.bistatic.bounces import fresnel_curves
+from warprrf.rf.bistatic.field import BistaticField
+from warprrf.rf.bistatic.fit import Layout, Parameters, View, fit_groups, jacobian, predict
+from warprrf.rf.bistatic.grouping import regroup
+from warprrf.rf.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.bistatic.specular import specular_paths
+from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.bistatic.terms import Terms
+from warprrf.rf.bistatic.training import trace
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.grouping import regroup
-from warprrf.rf.mirror_tree import MirrorTree
 from warprrf.rf.spectrum import to_db
-from warprrf.rf.specular import specular_paths
-from warprrf.rf.surface import Surface
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F
@@ -246,9 +248,9 @@ def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
     import trimesh
 
     from warprrf.geometry.mesh import Mesh
-    from warprrf.rf.bounces import BounceTracer
-    from warprrf.rf.second_bounce import SeenElements
-    from warprrf.rf.surface import Surface
+    from warprrf.rf.bistatic.bounces import BounceTracer
+    from warprrf.rf.bistatic.second_bounce import SeenElements
+    from warprrf.rf.bistatic.surface import Surface
 
     box = trimesh.creation.box((6.0, 4.0, 3.0))
     surface = Surface.of(Mesh(box.vertices, box.faces[:, ::-1]))

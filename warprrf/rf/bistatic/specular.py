@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.mirror_tree import SLACK_M, MirrorTree
-from warprrf.rf.surface import Surface
+from warprrf.rf.bistatic.mirror_tree import SLACK_M, MirrorTree
+from warprrf.rf.bistatic.surface import Surface
 
 _RINGS = ((0.0, 1), (0.5, 6), (0.9, 8))
 """Radii (share of the zone's) and numbers of the rays that fill it: about equal areas each."""
