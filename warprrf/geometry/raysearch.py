@@ -36,11 +36,11 @@ EMBREE_RAYS_TO_LOAD = 200_000
 """From this many rays on it is loaded for them: that takes one to three seconds, once a process."""
 
 # Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
-_EMBREE_CHUNK = 262_144
+_EMBREE_CHUNK = 524_288
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
 _FREE_SHARE = 0.5
-_PROBE = 8_192
+_PROBE = 2_048
 # Faces that block most, asked before the hierarchy: at most so many, each the first to block this share of segments at
 # least. Asking costs a segment 1 ns a face, and searching it 100 to 500.
 _BLOCKERS = 16
@@ -169,7 +169,7 @@ class RaySearch:
             ]  # fmt: skip
             _device.launch(cast_rays, count, inputs, device=where)
             t, face = distance.numpy(), found.numpy()
-        if (face == BAD).any():
+        if face.min(initial=0) == BAD:
             _refuse(o, d)
         return t, face
 
@@ -197,8 +197,8 @@ class RaySearch:
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
             inputs = [first, size, center, self._radius, planes, faces, *given, *hits, *out]
             _device.launch(place_hits, blocks, inputs, device=cpu, pieces=pieces)
-        again = np.flatnonzero(face == AGAIN)
-        if len(again):
+        if face.min() == AGAIN:
+            again = np.flatnonzero(face == AGAIN)
             t[again], face[again] = self._nearest_embree(
                 rows(o, again), rows(d, again), clearance, cpu, t[again]
             )
@@ -226,7 +226,7 @@ class RaySearch:
             inputs = [mesh.id, wp.vec3d(*self._center), self._radius, planes, clearance, *ends, found]
             _device.launch(look, count, inputs, device=where)
             sight = found.numpy()
-        if (sight == BAD).any():
+        if sight.min(initial=0) == BAD:
             _refuse(a, b, names=("a", "b"))
         return sight == FREE
 
@@ -270,8 +270,8 @@ class RaySearch:
             if first == 0 and end < count and len(which):
                 frequent = self._frequent_blockers(met[part[which] == BLOCKED], size)
             mostly_free = int(np.count_nonzero(part == FREE)) > _FREE_SHARE * size
-        again = np.flatnonzero(sight == AGAIN)
-        if len(again):
+        if sight.min() == AGAIN:
+            again = np.flatnonzero(sight == AGAIN)
             start = rows(a, again)
             way = rows(b, again) - start
             inner = np.linalg.norm(way, axis=1) - clearance

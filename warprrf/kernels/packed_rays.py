@@ -46,8 +46,9 @@ singles = lanes_of(wp.float32)
 integers = lanes_of(int)
 _of = lane_functions(wp.float64)
 _of_singles = lane_functions(wp.float32)
-above, positive_bits, roots = _of.above, _of.positive_bits, _of.roots
-positive_bits_of_singles, roots_of_singles = _of_singles.positive_bits, _of_singles.roots
+above, higher, lower, positive_bits, roots = _of.above, _of.higher, _of.lower, _of.positive_bits, _of.roots
+above_of_singles, positive_bits_of_singles = _of_singles.above, _of_singles.positive_bits
+roots_of_singles = _of_singles.roots
 
 _HALF = LANES // 2  # numbers of float64 that a register of 512 bits holds
 _AHEAD = 16  # blocks of 16 rows, 3 KiB
@@ -91,11 +92,18 @@ def _column(c: int) -> Any:
 
 def _column_at(c: int) -> Any:
     """Coordinate ``c`` of 16 rows anywhere; of the only row if there is one."""
+    # Number by number: a loop would become the processor's gathering, which is slower.
+    halves = " ".join(
+        f"to[{h}] = half_lanes{{{', '.join(f'from[which.data[k + {_HALF * h + j}]][{c}]' for j in range(_HALF))}}};"
+        for h in (0, 1)
+    )
 
-    @wp.func_native(f"""
+    @wp.func_native(f"""{_TYPES}
+    const wp::vec3d* from = source.data + first;
     if (source.shape[0] == 1) return wp::vec_t<{LANES}, wp::float64>(source.data[0][{c}]);
     wp::vec_t<{LANES}, wp::float64> out;
-    for (int j = 0; j < {LANES}; ++j) out[j] = source.data[first + which.data[k + j]][{c}];
+    half_lanes* to = (half_lanes*)&out;
+    {halves}
     return out;
     """)
     def column_at(
@@ -142,6 +150,16 @@ def _plane_number(c: int) -> Any:
 """)
 def fetch_rows(source: wp.array(dtype=wp.vec3d), i: int) -> None:
     """Ask for the rows that will be wanted some blocks after row ``i``: a processor reads less far ahead by itself."""
+    ...
+
+
+@wp.func_native(f"""
+    if (k + {LANES} * (3) <= which.shape[0] && source.shape[0] > 1)
+        for (int j = 0; j < {LANES}; ++j)
+            __builtin_prefetch(source.data + first + which.data[k + {LANES} * 2 + j]);
+""")
+def fetch_rows_at(source: wp.array(dtype=wp.vec3d), first: int, which: wp.array(dtype=int), k: int) -> None:
+    """Ask for the rows that will be wanted two blocks later."""
     ...
 
 
@@ -247,9 +265,9 @@ def faces_met(met: wp.array(dtype=wp.int32), k: int, names: wp.array(dtype=wp.in
 
 
 @wp.func_native(f"""
-    int bits = 0;
-    for (int j = 0; j < {LANES}; ++j) bits |= met.data[k + j] >= 0 ? 1 << j : 0;
-    return bits;
+    typedef wp::int32 lanes __attribute__((vector_size({LANES} * sizeof(wp::int32)), aligned(4)));
+    typedef bool yes __attribute__((ext_vector_type({LANES})));
+    return __builtin_bit_cast(unsigned short, __builtin_convertvector(*(const lanes*)(met.data + k) >= 0, yes));
 """)
 def met_bits(met: wp.array(dtype=wp.int32), k: int) -> int:  # type: ignore[empty-body]
     """Bit j is set where ray ``k + j`` met something."""
@@ -287,9 +305,31 @@ def keep(
     ...
 
 
+@wp.func_native(f"""{_TYPES}
+    // Which faces are asked does not change an answer, so neither do the roundings of a fused product and sum.
+    wp::vec_t<{LANES}, wp::float64> out;
+    half_lanes* to = (half_lanes*)&out;
+    const half_lanes *a = (const half_lanes*)&x, *b = (const half_lanes*)&y, *c = (const half_lanes*)&z;
+    for (int h = 0; h < 2; ++h)
+        to[h] = __builtin_elementwise_fma(
+            a[h], (half_lanes)(half_lanes{{}} + n.data[f]), __builtin_elementwise_fma(
+            b[h], (half_lanes)(half_lanes{{}} + n.data[f + 1]), c[h] * n.data[f + 2]));
+    return out;
+""")
+def along(
+    n: wp.array(dtype=wp.float64),
+    f: int,
+    x: doubles,  # type: ignore[valid-type]
+    y: doubles,  # type: ignore[valid-type]
+    z: doubles,  # type: ignore[valid-type]
+) -> doubles:  # type: ignore[valid-type, empty-body]
+    """Product of vectors with numbers ``f`` to ``f + 3``."""
+    ...
+
+
 @wp.func_native(f"""
     for (int j = 0; j < {LANES}; ++j)
-        sight.data[i + j] = (bad >> j) & 1 ? -2 : (blocked >> j) & 1;
+        sight.data[i + j] = (bad >> j) & 1 ? {BAD} : (blocked >> j) & 1 ? {BLOCKED} : {FREE};
 """)
 def tell(sight: wp.array(dtype=wp.int32), i: int, blocked: int, bad: int) -> None:
     """Write FREE, BLOCKED and BAD for segments ``i`` to ``i + 16``."""
@@ -297,13 +337,10 @@ def tell(sight: wp.array(dtype=wp.int32), i: int, blocked: int, bad: int) -> Non
 
 
 @wp.func_native(f"""
-    for (int j = 0; j < {LANES}; ++j)
-        if ((blocked >> j) & 1) sight.data[first + which.data[k + j]] = 1;
+    for (int j = 0; j < {LANES}; ++j) sight.data[first + which.data[k + j]] = {BLOCKED};
 """)
-def block(
-    sight: wp.array(dtype=wp.int32), first: int, which: wp.array(dtype=wp.int32), k: int, blocked: int
-) -> None:
-    """Write BLOCKED for segments ``first`` plus elements ``k`` to ``k + 16`` of ``which`` whose bit is set."""
+def block(sight: wp.array(dtype=wp.int32), first: int, which: wp.array(dtype=wp.int32), k: int) -> None:
+    """Write BLOCKED for segments ``first`` plus elements ``k`` to ``k + 16`` of ``which``."""
     ...
 
 
@@ -482,11 +519,11 @@ def place_hits(
         height = plane_w(planes, name) - (wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z))
         t = wp.cw_div(wp.cw_mul(height, roots(square)), slope)
         keep(distance, face, i, t, name)
-        steep = positive_bits(wp.cw_mul(slope, slope) - _STEEP_SQUARE * square)
         scale = doubles(radius) + magnitude(x) + magnitude(y) + magnitude(z)
-        off_start = positive_bits(magnitude(height) - _CLEAR * scale)
-        beyond = positive_bits(t - doubles(clearance))
-        rare = wp.static(_EVERY) - (met_bits(met, k) & steep & off_start & beyond)
+        # Of two numbers `lower` gives the second beside a NaN, and a ray that is not finite makes t one.
+        margin = lower(magnitude(height) - _CLEAR * scale, t - doubles(clearance))
+        margin = lower(wp.cw_mul(slope, slope) - _STEEP_SQUARE * square, margin)
+        rare = wp.static(_EVERY) - (met_bits(met, k) & positive_bits(margin))
     while rare != 0:
         j = lowest_bit(rare)
         rare = rare & (rare - 1)
@@ -523,15 +560,43 @@ def pack_segment(
 
 
 @wp.func
-def barycentric(
+def block_margin(
     blockers: wp.array(dtype=wp.float64),
     f: int,
     x: doubles,  # type: ignore[valid-type]
     y: doubles,  # type: ignore[valid-type]
     z: doubles,  # type: ignore[valid-type]
+    dx: doubles,  # type: ignore[valid-type]
+    dy: doubles,  # type: ignore[valid-type]
+    dz: doubles,  # type: ignore[valid-type]
+    square: doubles,  # type: ignore[valid-type]
+    length: doubles,  # type: ignore[valid-type]
+    scale: doubles,  # type: ignore[valid-type]
+    clearance: wp.float64,
 ):
-    """The coordinate of points that four numbers from ``f`` on give."""
-    return blockers[f] * x + blockers[f + 1] * y + blockers[f + 2] * z + doubles(blockers[f + 3])
+    """Above 0 where a face, numbers ``f`` on of ``blockers``, surely lies between the ends of a finite segment.
+
+    All is multiplied by the slope, so that nothing is divided.
+    """
+    slope = along(blockers, f, dx, dy, dz)
+    height = doubles(blockers[f + 3]) - along(blockers, f, x, y, z)
+    steep = magnitude(slope)
+    ahead = above(slope, doubles(), height, -height)  # t times the steepness, over the length
+    u = wp.cw_mul(along(blockers, f + 4, x, y, z) + doubles(blockers[f + 7]), steep) + wp.cw_mul(
+        along(blockers, f + 4, dx, dy, dz), ahead
+    )
+    v = wp.cw_mul(along(blockers, f + 8, x, y, z) + doubles(blockers[f + 11]), steep) + wp.cw_mul(
+        along(blockers, f + 8, dx, dy, dz), ahead
+    )
+    t = wp.cw_mul(ahead, length)
+    near = clearance * steep
+    edge = _INSIDE * steep
+    margin = lower(u - edge, v - edge)
+    margin = lower(steep - edge - u - v, margin)
+    margin = lower(wp.cw_mul(length, steep) - near - t, margin)
+    margin = lower(t - near, margin)
+    margin = lower(ahead - _CLEAR * scale, margin)
+    return lower(wp.cw_mul(slope, slope) - _STEEP_SQUARE * square, margin)
 
 
 @wp.kernel(module="unique", module_options=_OPTIONS, enable_backward=False)
@@ -570,40 +635,35 @@ def pack_segments(
     dy = (column_y(ends, i) - doubles(center[1])) - y
     dz = (column_z(ends, i) - doubles(center[2])) - z
     square = wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz)
-    length = roots(square)
-    inverse = wp.cw_div(doubles(wp.float64(1.0)), length)
     scale = doubles(radius) + magnitude(x) + magnitude(y) + magnitude(z)
-    step = ROUNDING * scale
-    inner = length - doubles(wp.float64(2.0) * clearance)
-    begin = wp.cw_mul(doubles(clearance) - step, inverse)
-    reach = above(inner, doubles(), inner + wp.float64(2.0) * step, doubles(wp.float64(wp.nan)))
-    reach = wp.cw_mul(reach, inverse)
+    sx = rounded(x)
+    sy = rounded(y)
+    sz = rounded(z)
+    wx = rounded(dx)
+    wy = rounded(dy)
+    wz = rounded(dz)
+    one = singles(wp.float32(1.0))
+    length = roots_of_singles(wp.cw_mul(wx, wx) + wp.cw_mul(wy, wy) + wp.cw_mul(wz, wz))
+    # Over the length: where the segment begins, and how much of it is left.
+    begin = wp.cw_div(rounded(doubles(clearance) - ROUNDING * scale), length)
+    left = above_of_singles(
+        length, singles(wp.float32(2.0) * wp.float32(clearance)), one, singles(wp.float32(wp.nan))
+    )
+    left = left - wp.float32(2.0) * begin
     put_rays(
-        rays, k,
-        rounded(x + wp.cw_mul(begin, dx)), rounded(y + wp.cw_mul(begin, dy)), rounded(z + wp.cw_mul(begin, dz)),
-        rounded(wp.cw_mul(reach, dx)), rounded(wp.cw_mul(reach, dy)), rounded(wp.cw_mul(reach, dz)),
+        rays, k, sx + wp.cw_mul(begin, wx), sy + wp.cw_mul(begin, wy), sz + wp.cw_mul(begin, wz),
+        wp.cw_mul(left, wx), wp.cw_mul(left, wy), wp.cw_mul(left, wz),
     )  # fmt: skip
     blocked = int(0)
-    for f in range(0, blockers.shape[0], wp.static(BLOCKER)):
-        slope = blockers[f] * dx + blockers[f + 1] * dy + blockers[f + 2] * dz
-        height = doubles(blockers[f + 3]) - (blockers[f] * x + blockers[f + 1] * y + blockers[f + 2] * z)
-        share = wp.cw_div(height, slope)
-        t = wp.cw_mul(share, length)
-        px = x + wp.cw_mul(share, dx)
-        py = y + wp.cw_mul(share, dy)
-        pz = z + wp.cw_mul(share, dz)
-        u = barycentric(blockers, f + 4, px, py, pz)
-        v = barycentric(blockers, f + 8, px, py, pz)
-        blocked = blocked | (
-            positive_bits(wp.cw_mul(slope, slope) - _STEEP_SQUARE * square)
-            & positive_bits(magnitude(height) - _CLEAR * scale)
-            & positive_bits(t - doubles(clearance))
-            & positive_bits(length - doubles(clearance) - t)
-            & positive_bits(u - doubles(_INSIDE))
-            & positive_bits(v - doubles(_INSIDE))
-            & positive_bits(doubles(wp.float64(1.0) - _INSIDE) - u - v)
-        )
-    finite = positive_bits(doubles(wp.float64(wp.inf)) - (scale + length))
+    if blockers.shape[0] > 0:
+        long = roots(square)
+        most = doubles()
+        for f in range(0, blockers.shape[0], wp.static(BLOCKER)):
+            most = higher(
+                block_margin(blockers, f, x, y, z, dx, dy, dz, square, long, scale, clearance), most
+            )
+        blocked = positive_bits(most)
+    finite = positive_bits(doubles(wp.float64(wp.inf)) - (scale + square))
     tell(sight, i, blocked, wp.static(_EVERY) - finite)
 
 
@@ -620,15 +680,17 @@ def judge_segment(
     met: int,
     sight: wp.array(dtype=wp.int32),
 ):
-    """Judge what segment ``i`` met; what met nothing stays as it is."""
+    """Judge what segment ``i`` met."""
+    origin = row(starts, i) - center
+    way = (row(ends, i) - center) - origin
+    length = wp.length(way)
+    scale = rounding_scale(origin, radius)
     if met < 0:
+        sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
         return
     name = met
     if names.shape[0] > 0:
         name = names[met]
-    origin = row(starts, i) - center
-    way = (row(ends, i) - center) - origin
-    length = wp.length(way)
     plane = planes[name]
     normal = wp.vec3d(plane[0], plane[1], plane[2])
     slope = wp.dot(normal, way)
@@ -636,7 +698,7 @@ def judge_segment(
     sight[i] = AGAIN
     if slope * slope > _STEEP_SQUARE * length * length:
         t = height * length / slope
-        if t > clearance and wp.abs(height) > _CLEAR * rounding_scale(origin, radius):
+        if t > clearance and wp.abs(height) > _CLEAR * scale:
             sight[i] = wp.where(t < length - clearance, BLOCKED, FREE)
 
 
@@ -669,6 +731,8 @@ def judge_segments(
         nx = plane_x(planes, name)
         ny = plane_y(planes, name)
         nz = plane_z(planes, name)
+        fetch_rows_at(starts, first, which, k)
+        fetch_rows_at(ends, first, which, k)
         x = column_x_at(starts, first, which, k) - doubles(center[0])
         y = column_y_at(starts, first, which, k) - doubles(center[1])
         z = column_z_at(starts, first, which, k) - doubles(center[2])
@@ -681,14 +745,11 @@ def judge_segments(
         height = plane_w(planes, name) - (wp.cw_mul(nx, x) + wp.cw_mul(ny, y) + wp.cw_mul(nz, z))
         t = wp.cw_div(wp.cw_mul(height, length), slope)
         scale = doubles(radius) + magnitude(x) + magnitude(y) + magnitude(z)
-        blocked = (
-            met_bits(met, k)
-            & positive_bits(wp.cw_mul(slope, slope) - _STEEP_SQUARE * square)
-            & positive_bits(magnitude(height) - _CLEAR * scale)
-            & positive_bits(t - doubles(clearance))
-            & positive_bits(length - doubles(clearance) - t)
-        )
-        block(sight, first, which, k, blocked)
+        margin = lower(t - doubles(clearance), length - doubles(clearance) - t)
+        margin = lower(magnitude(height) - _CLEAR * scale, margin)
+        margin = lower(wp.cw_mul(slope, slope) - _STEEP_SQUARE * square, margin)
+        blocked = met_bits(met, k) & positive_bits(margin)
+        block(sight, first, which, k)
         rare = wp.static(_EVERY) - blocked
     while rare != 0:
         j = lowest_bit(rare)
