@@ -249,6 +249,74 @@ def test_sight_in_many_chunks_is_that_of_single_rays(blockers, monkeypatch):
         mesh.visible(a, b, backend="embree", device="cpu")
 
 
+@no_embree
+@pytest.mark.parametrize("length", [1.0, 1e-12, 1e12, 1e-25, 1e25])
+@pytest.mark.parametrize("count", [1, 15, 16, 17, 47])
+def test_blocks_of_rays_and_what_is_left_over_are_placed_as_single_rays_are(count, length):
+    """Bit by bit, whether a ray is one of 16 or taken by itself, of whatever length, missing, or at a surface."""
+    mesh, rng = Mesh(sphere().vertices, sphere().faces[::2]), np.random.default_rng(15)
+    origin, d = rng.uniform(-2, 2, (count, 3)), length * directions(count, seed=16)
+    centroid = mesh.triangles[: (count + 2) // 3].mean(axis=1)
+    origin[::3] = centroid
+    found = mesh.cast(origin, d, backend="embree", device="cpu")
+    alone = [mesh.cast(o, w, backend="embree", device="cpu") for o, w in zip(origin, d, strict=True)]
+    np.testing.assert_array_equal(found.face, [hit.face[0] for hit in alone])
+    np.testing.assert_array_equal(found.t, [hit.t[0] for hit in alone])
+    assert count < 47 or (0.1 < found.valid.mean() < 0.9)
+    end = origin + d * (3.0 / length)
+    seen = mesh.visible(origin, end, backend="embree", device="cpu")
+    np.testing.assert_array_equal(seen, mesh.visible(origin, end, backend="warp", device="cpu"))
+
+
+@no_embree
+def test_rays_of_a_large_mesh_are_sorted_for_the_search_alone(monkeypatch):
+    mesh, rng = sphere(100, 200), np.random.default_rng(17)
+    origin, d = rng.uniform(-2, 2, (50_001, 3)), directions(50_001, seed=18)
+    a, b = rng.uniform(-6, 6, (2, 50_001, 3))
+    seen, packed = [], []
+    cast = raysearch.embree.EmbreeScene.cast
+    monkeypatch.setattr(
+        raysearch.embree.EmbreeScene, "cast", lambda self, r: packed.append(r.copy()) or cast(self, r)
+    )
+    for least in (len(mesh.faces) + 1, len(mesh.faces)):
+        monkeypatch.setattr(raysearch, "_FACES_TO_SORT", least)
+        hit = mesh.cast(origin, d, backend="embree", device="cpu")
+        seen.append((hit.t, hit.face, mesh.visible(a, b, backend="embree", device="cpu")))
+    for plain, in_order in zip(*seen, strict=True):
+        np.testing.assert_array_equal(plain, in_order)
+    turns = [np.count_nonzero(np.diff(np.signbit(r[:, 3:]), axis=0).any(axis=1)) for r in packed]
+    half = len(packed) // 2
+    assert turns[0] > 20_000 > 4_096 > turns[half]
+
+
+@no_embree
+def test_faces_that_block_most_are_asked_before_the_hierarchy_and_change_no_answer(monkeypatch):
+    rng = np.random.default_rng(19)
+    wall = np.array([[-0.1, -4.0, -4.0], [-0.1, 6.0, -4.0], [-0.1, -4.0, 6.0]]), np.array([[0, 1, 2]])
+    bits = [box(c - 0.1, c + 0.1) for c in rng.uniform(-2, 2, (20, 3))]
+    parts = [wall, *bits]
+    mesh = Mesh(
+        np.concatenate([v for v, _ in parts]),
+        np.concatenate([wall[1], *(f + 3 + 8 * k for k, (_, f) in enumerate(bits))]),
+    )
+    a, b = rng.uniform(-2, 2, (2, 40_000, 3))
+    a[:, 0], b[:, 0] = -np.abs(a[:, 0]), np.abs(b[:, 0]) - 0.5
+    b[::7, 0] = -0.1  # on the wall
+    answers, casts = [], []
+    cast = raysearch.embree.EmbreeScene.cast
+    monkeypatch.setattr(
+        raysearch.embree.EmbreeScene, "cast", lambda self, r: casts.append(len(r)) or cast(self, r)
+    )
+    for most in (0, raysearch._BLOCKERS):
+        monkeypatch.setattr(raysearch, "_BLOCKERS", most)
+        answers.append(mesh.visible(a, b, backend="embree", device="cpu"))
+        casts.append(-1)
+    one, other = casts[: casts.index(-1)], casts[casts.index(-1) + 1 : -1]
+    np.testing.assert_array_equal(*answers)
+    assert 0.2 < answers[0].mean() < 0.5 and sum(other) < 0.7 * sum(one)
+    np.testing.assert_array_equal(answers[0], mesh.visible(a, b, backend="warp", device="cpu"))
+
+
 def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypatch):
     cpu, choose = resolve("cpu"), raysearch.choose_backend
     monkeypatch.setattr(raysearch.o3d, "installed", lambda: True)

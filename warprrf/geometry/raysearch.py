@@ -16,7 +16,8 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.geometry import embree, o3d
 from warprrf.kernels.lanes import LANES
-from warprrf.kernels.packed_rays import judge_segments, pack_rays, pack_segments, pick_rays, place_hits
+from warprrf.kernels.packed_rays import pack_rays, pick_rays, place_hits
+from warprrf.kernels.packed_segments import judge_segments, pack_segments
 from warprrf.kernels.rays import (
     AGAIN,
     BAD,
@@ -37,7 +38,7 @@ EMBREE_RAYS_TO_LOAD = 200_000
 """From this many rays on it is loaded for them: that takes one to three seconds, once a process."""
 
 # Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
-_EMBREE_CHUNK = 524_288
+_EMBREE_CHUNK = 262_144
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
 _FREE_SHARE = 0.5
@@ -48,7 +49,7 @@ _BLOCKERS = 16
 _BLOCKER_SHARE = 0.01
 # From this many faces on, rays without order are put in order of start and direction before they are cast: the parts of
 # the hierarchy that they meet are then still in the cache.
-_FACES_TO_SORT = 20_000
+_FACES_TO_SORT = 100_000
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4

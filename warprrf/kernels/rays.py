@@ -28,6 +28,9 @@ GRAZING = 1e-7
 
 _GRAZING = wp.constant(wp.float64(GRAZING))
 _FAR = wp.constant(wp.float64(1e30))
+# Beyond these a hit is neither grazing nor at the ray's start, without a closer look.
+STEEP_SQUARE = wp.constant(wp.float64(1e-12))
+CLEAR = wp.constant(wp.float64(1e-9))
 _STEPS = 8
 
 
