@@ -1,6 +1,8 @@
 """From photos to geometry: initial Gaussians, resumed runs, files."""
 
 import json
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -202,6 +204,32 @@ def test_a_killed_run_continues_to_the_same_result(whole):
     assert stages == {"depth", "surface"}
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
+
+
+@pytest.mark.parametrize(
+    "changed, again",
+    [
+        ("start", {"planes", "refine", "depth", "surface"}),
+        ("refined", {"refine", "depth", "surface"}),
+        ("surface", {"depth", "surface"}),
+    ],
+)
+def test_a_step_of_other_code_is_done_again_and_those_after_it(
+    whole, changed, again, tmp_path, monkeypatch, caplog
+):
+    workspace, photos, known, rec = whole
+    shutil.copytree(workspace, tmp_path / "w", symlinks=True)
+    options = {"workspace": tmp_path / "w", "known_positions": known, "held_out": VIEWS[4:5], "device": "cpu"}
+    code_of = from_photos.code_of
+    monkeypatch.setattr(from_photos, "code_of", lambda step: "new code" if step == changed else code_of(step))
+    stages = set()
+    other = reconstruct(photos, config=SMALL, progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == again
+    assert len(caplog.messages) == 1 and re.search(rf"{changed}\..*other code", caplog.messages[0])
+    np.testing.assert_array_equal(other.mesh.vertices, rec.mesh.vertices)
+    stages.clear()
+    reconstruct(photos, config=SMALL, progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == set()
 
 
 def test_a_changed_setting_is_not_served_from_the_old_run(whole):

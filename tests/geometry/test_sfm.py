@@ -198,6 +198,35 @@ def test_other_photos_do_not_reuse_old_work(posed, lobby, tmp_path):
     assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:9])
 
 
+def test_work_of_other_code_is_done_again_and_says_so(posed, lobby, tmp_path, monkeypatch, caplog):
+    shutil.copytree(posed[0], tmp_path / "w", symlinks=True)
+    options = {"workspace": tmp_path / "w", "max_features": 1500}
+    stages = set()
+    monkeypatch.setattr(sfm, "code_mark", lambda *modules, packages: f"new code, {packages}")
+    sparse = sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == {"features", "matching", "mapping"}
+    assert len(caplog.messages) == 1 and "other code" in caplog.messages[0]
+    np.testing.assert_array_equal(sparse.points, posed[1].points)
+    # The same mark again: resumed. A workspace from before there were marks: done again.
+    stages.clear()
+    sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == set() and len(caplog.messages) == 1
+    stamp = tmp_path / "w" / "sfm" / "photos.json"
+    old = json.loads(stamp.read_text())
+    assert "pycolmap" in old.pop("code")
+    stamp.write_text(json.dumps(old))
+
+    class Begun(Exception):
+        pass
+
+    def begin(stage, done, total):
+        raise Begun(stage)
+
+    with pytest.raises(Begun, match="features"):
+        sfm.structure_from_motion(lobby[0], progress=begin, **options)
+    assert len(caplog.messages) == 2
+
+
 def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
     import pycolmap
 

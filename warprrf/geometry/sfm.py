@@ -25,6 +25,7 @@ import numpy as np
 
 from warprrf.device import Progress, check_array, require
 from warprrf.geometry.camera import Camera
+from warprrf.marks import code_mark, log_other_code
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -137,8 +138,8 @@ def structure_from_motion(
 ) -> SparseModel:
     """Camera poses and sparse points of ``photos``, in the model's own units (see :func:`align_to_known`).
 
-    Finished steps are kept in ``workspace`` and reused as long as photos and options stay the same, so that a stopped
-    run goes on where it was.
+    Finished steps are kept in ``workspace`` and reused as long as photos, options, pycolmap and this code stay the
+    same, so that a stopped run goes on where it was.
 
     Args:
         photos: a folder, or a sequence of image files, all of one size and from one undistorted camera.
@@ -169,7 +170,7 @@ def structure_from_motion(
     colmap = require("pycolmap", extra="photos")
     folder = Path(workspace) / "sfm"
     options = {"max_features": max_features, "camera_model": camera_model, "pairs": pairs, "seed": seed}
-    _open_workspace(folder, named, options)
+    _open_workspace(folder, named, options, code_mark(__name__, packages=("pycolmap",)))
     report = progress or (lambda stage, done, total: None)
     with _quiet(colmap):
         colmap.set_random_seed(seed)
@@ -348,15 +349,20 @@ def _quiet(colmap: ModuleType) -> Iterator[None]:
         colmap.logging.minloglevel = before
 
 
-def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any]) -> None:
-    """Make ``folder`` hold the work for these photos and options: what other photos or options left there goes."""
+def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any], code: str) -> None:
+    """Make ``folder`` hold the work of this code on these photos, with these options: what others left there goes."""
     state = {
         "options": options,
         "photos": {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in named.items()},
+        "code": code,
     }
     stamp = folder / "photos.json"
-    if stamp.is_file() and json.loads(stamp.read_text()) == state:
-        return
+    if stamp.is_file():
+        before = json.loads(stamp.read_text())
+        if before == state:
+            return
+        if before | {"code": code} == state:
+            log_other_code(folder)
     if folder.is_dir():
         for part in ("photos.json", "features.db", "matches.db", "working.db", "pairs.txt"):
             (folder / part).unlink(missing_ok=True)

@@ -28,8 +28,8 @@ from warprrf.bench.machine import machine
 from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
 from warprrf.device import Progress
 from warprrf.geometry.config import ReconstructionConfig
-from warprrf.geometry.from_photos import read_photo
 from warprrf.geometry.meshio import write_mesh
+from warprrf.geometry.photos import read_photo
 from warprrf.rf import lookups, metrics
 from warprrf.rf.harmonic.transport import Transport, transport
 from warprrf.rf.spectrum import to_db
