@@ -85,7 +85,7 @@ def fingerprint(parts: Iterable[Any]) -> str:
     return digest.hexdigest()
 
 
-def source(*modules: str) -> str:
+def source(*modules: str) -> str:  # of beams' bench alone: all others have `warprrf.marks.code_mark`
     """Fingerprint of the source below `warprrf/` of the named packages or files ("geometry", "device.py")."""
     root = Path(__file__).resolve().parent.parent
     digest = hashlib.sha256()

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.bench.evaluation.methods import AFTER, METHODS, UNTAUGHT, Task, code_mark
+from warprrf.bench.evaluation.methods import AFTER, METHODS, UNTAUGHT, Task, code_of
 from warprrf.bench.evaluation.protocol import Run, Setting, shown_receivers, truth_of
 from warprrf.bench.machine import processor_name
 from warprrf.bench.methods import Fitted
@@ -227,7 +227,7 @@ def mark_of(run: Run, setting: Setting) -> str:
     """Fingerprint of what a run's figures depend on."""
     return fingerprint(
         [run.key, setting.mark(run.truth), setting.geometry_mark, setting.every if run.split == "random" else 1,
-         _effort(run, setting), code_mark(run.method)]
+         _effort(run, setting), code_of(run.method)]
     )  # fmt: skip
 
 
