@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import warprrf as wr
-from warprrf.geometry import from_photos, sfm
+from warprrf.geometry import from_photos, sparse
 from warprrf.geometry.config import ReconstructionConfig
 from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.from_photos import reconstruct
@@ -127,12 +127,12 @@ def test_without_a_survey_z_is_up_and_the_size_is_plausible():
     cameras = {f"{k}": look([0.1 * k, 0.02 * k**2, 0.0], [1 + k, 2.0, 0.1]) for k in range(4)}
     rng = np.random.default_rng(0)
     points = rng.uniform(5, 6, (30, 3))
-    sparse = sfm.SparseModel(
+    model = sparse.SparseModel(
         cameras, points, points, np.ones(30), np.full(30, 2), np.arange(0, 61, 2), np.tile([0, 3], 30)
     )
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     turn *= np.linalg.det(turn)
-    out = from_photos._assumed_scale(sfm.transformed(sparse, 0.2, turn, np.ones(3)))
+    out = sparse.assume_scale(sparse.transformed(model, 0.2, turn, np.ones(3)))
     for camera in out.cameras.values():
         assert camera.rotation[1] @ [0, 0, 1] < -0.9  # the photo's down
     gap = [np.linalg.norm(p - c.position) for c in list(out.cameras.values())[::3] for p in out.points]

@@ -16,19 +16,18 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.geometry import sfm
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.config import ReconstructionConfig
 from warprrf.geometry.fusion import fuse_gaussians
-from warprrf.geometry.photos import read_photo
+from warprrf.geometry.photos import find_photos, match_names, read_photo
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.refine import refine
+from warprrf.geometry.sfm import structure_from_motion
+from warprrf.geometry.sparse import align_to_known, assume_scale
 from warprrf.geometry.start import start_of
 from warprrf.geometry.stored import Steps
 from warprrf.marks import code_mark
 
-# Without surveyed positions the scale is unknown: the median distance from a camera to a point it sees becomes this.
-ASSUMED_DISTANCE_M = 3.0
 STEP_CODE = {
     "start": (("warprrf.geometry.start", "warprrf.geometry.photos"), ("open3d", "PIL")),
     "refined": (("warprrf.geometry.refine", "warprrf.geometry.photos"), ("PIL",)),
@@ -65,18 +64,18 @@ def reconstruct(
 
     Raises:
         ValueError: for bad photos or positions (see :func:`~warprrf.geometry.sfm.structure_from_motion` and
-            :func:`~warprrf.geometry.sfm.align_to_known`).
+            :func:`~warprrf.geometry.sparse.align_to_known`).
         ImportError: if the extra ``photos`` is not installed.
     """
     config = config or ReconstructionConfig()
     if iterations is not None:
         config = replace(config, refine=replace(config.refine, iterations=iterations))
-    named = sfm.find_photos(photos)
-    skipped = set(sfm.match_names("held_out", held_out, list(named)))
+    named = find_photos(photos)
+    skipped = set(match_names("held_out", held_out, list(named)))
     if known_positions is not None:
-        sfm.match_names("known_positions", known_positions, list(named))
+        match_names("known_positions", known_positions, list(named))
 
-    sparse = sfm.structure_from_motion(
+    sparse = structure_from_motion(
         photos,
         workspace=workspace,
         max_features=config.max_features,
@@ -84,9 +83,7 @@ def reconstruct(
         seed=seed,
         progress=progress,
     )
-    sparse = (
-        sfm.align_to_known(sparse, known_positions) if known_positions is not None else _assumed_scale(sparse)
-    )
+    sparse = align_to_known(sparse, known_positions) if known_positions is not None else assume_scale(sparse)
     cameras = {n: c for n, c in sparse.cameras.items() if n not in skipped}
     if not cameras:
         raise ValueError(
@@ -162,19 +159,3 @@ def code_of(step: str) -> str:
     """Mark of the code of a step of :data:`STEP_CODE`."""
     modules, packages = STEP_CODE[step]
     return code_mark(*modules, packages=packages)
-
-
-def _assumed_scale(sparse: sfm.SparseModel) -> sfm.SparseModel:
-    """``sparse`` with z up and a plausible size, where nobody measured either."""
-    poses = list(sparse.cameras.values())
-    up = -np.mean([c.rotation[1] for c in poses], axis=0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
-    ahead = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
-    ahead /= np.linalg.norm(ahead)
-    rotation = np.stack([ahead, np.cross(up, ahead), up])
-    positions = np.array([c.position for c in poses])
-    gap = np.linalg.norm(
-        np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1
-    )
-    scale = ASSUMED_DISTANCE_M / float(np.median(gap)) if len(gap) else 1.0
-    return sfm.transformed(sparse, scale, rotation, -scale * rotation @ positions.mean(axis=0))

@@ -22,7 +22,7 @@ from warprrf.device import Progress, check_array, launch, resolve
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians, quaternions_of, replacing, rotations_of
 from warprrf.geometry.planes import Plane
-from warprrf.geometry.render import Blending, Rasterizer
+from warprrf.geometry.rasterizer import Blending, Rasterizer
 from warprrf.kernels import optimize
 from warprrf.kernels import ssim as ssim_kernels
 from warprrf.kernels.sh import COEFFICIENTS

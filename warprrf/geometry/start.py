@@ -17,7 +17,7 @@ from warprrf.geometry.planes import Plane, aligned, occupancy
 
 if TYPE_CHECKING:
     from warprrf.geometry.config import ReconstructionConfig
-    from warprrf.geometry.sfm import SparseModel
+    from warprrf.geometry.sparse import SparseModel
 
 
 def start_of(

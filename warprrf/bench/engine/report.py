@@ -18,7 +18,7 @@ from warprrf.bench.engine.form_kernels import STRIP
 from warprrf.bench.engine.forms import RASTERISER
 from warprrf.bench.markdown import table
 from warprrf.bench.stages import write_atomically
-from warprrf.geometry.render import RADIO
+from warprrf.geometry.rasterizer import RADIO
 from warprrf.rf.harmonic.single_bounce import FieldOptions
 from warprrf.rf.harmonic.transport import ALPHA_MIN, TOP_K
 

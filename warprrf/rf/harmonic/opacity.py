@@ -17,7 +17,8 @@ import warp as wp
 from warprrf.device import Progress
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.geometry.render import Blending, blend_weights
+from warprrf.geometry.rasterizer import Blending
+from warprrf.geometry.render import blend_weights
 from warprrf.kernels import opacity as _kernels
 from warprrf.rf.harmonic.transport import Transport, cutoffs
 

@@ -25,7 +25,8 @@ import numpy as np
 from warprrf.device import Progress, check_array
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import rotations_of
-from warprrf.geometry.render import Blending, blend_weights
+from warprrf.geometry.rasterizer import Blending
+from warprrf.geometry.render import blend_weights
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.spectrum import check_shape, pixel_directions
 
