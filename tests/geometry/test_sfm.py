@@ -264,6 +264,12 @@ def test_photos_that_are_not_there_are_named(tmp_path):
         find_photos([tmp_path / "a.jpg", tmp_path / "b.jpg"])
 
 
+def test_hidden_files_are_no_photos(tmp_path):
+    for name in ("a.jpg", "b.png", "c.JPG", ".d.123.partial.jpg", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert list(find_photos(tmp_path)) == ["a.jpg", "b.png", "c.JPG"]
+
+
 def test_unreadable_and_odd_photos_are_named(tmp_path, lobby):
     good = [shutil.copy(p, tmp_path) for p in lobby[0][:3]]
     broken = tmp_path / "broken.jpg"

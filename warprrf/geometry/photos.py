@@ -18,7 +18,8 @@ MIN_PHOTOS = 3
 def find_photos(photos: Any) -> dict[str, Path]:
     """Photo name to file, sorted by name, for a folder or a sequence of image files.
 
-    A name is the path below the folder (or below the files' common folder), with forward slashes.
+    A name is the path below the folder (or below the files' common folder), with forward slashes. Hidden files of a
+    folder are left out: half-written ones, or another system's notes.
 
     Raises:
         ValueError: if the folder or files do not exist, or too few photos are there.
@@ -29,7 +30,8 @@ def find_photos(photos: Any) -> dict[str, Path]:
             raise ValueError(
                 f"photos: {root} is not a folder; expected a folder of photos or a list of image files"
             )
-        files = sorted(p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
+        found = (p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
+        files = sorted(p for p in found if not p.name.startswith("."))
     else:
         files = [Path(p) for p in photos]
         missing = [str(p) for p in files if not p.is_file()]

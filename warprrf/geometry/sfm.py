@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, require
+from warprrf.files import write_text
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.photos import MIN_PHOTOS, check_photos, find_photos, some
 from warprrf.geometry.sparse import SparseModel
@@ -160,9 +161,7 @@ def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, 
             link.symlink_to(path)
         except OSError:  # a file system without links
             shutil.copyfile(path, link)
-    temporary = stamp.with_suffix(".tmp")
-    temporary.write_text(json.dumps(state))
-    os.replace(temporary, stamp)
+    write_text(stamp, json.dumps(state))
 
 
 def _fresh_copy(source: Path | None, target: Path) -> None:

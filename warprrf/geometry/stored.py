@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import check_array
-from warprrf.geometry.gaussians import Gaussians, replacing
+from warprrf.files import write_atomically
+from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.patches import PlanarPatch
 from warprrf.geometry.planes import Plane
@@ -55,12 +56,8 @@ def write(
         arrays |= {f"patch_{k}": p.faces.astype(np.int64) for k, p in enumerate(patches)}
     if mesh is not None:
         arrays |= {"vertices": mesh.vertices, "faces": mesh.faces}
-    with replacing(path) as temporary:
-        save_file(
-            {name: np.ascontiguousarray(values) for name, values in arrays.items()},
-            temporary,
-            metadata={"header": json.dumps(head)},
-        )
+    whole = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    write_atomically(path, lambda file: save_file(whole, file, metadata={"header": json.dumps(head)}))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ holds the same variables with mantissas rounded to what matters, so that zlib fi
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
+from warprrf.files import write_atomically
 from warprrf.rf.absorption import Air
 from warprrf.rf.antenna import deembed_dataset
 from warprrf.rf.spectrum import Spectrum, check_shape, default_floor, pixel_angles, to_db
@@ -334,7 +334,7 @@ class SpectrumDataset:
             one = data[name][0].nbytes if len(self) else 1
             chunk = (max(1, min(len(self), _CHUNK_BYTES // one)), *data[name].shape[1:])
             encoding[name] = {**packing, "_FillValue": None, "chunksizes": chunk}
-        write_whole(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=encoding))
+        write_atomically(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=encoding))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SpectrumDataset:
@@ -415,7 +415,7 @@ class SpectrumDataset:
             {f"warprrf_{name}": " ".join(repr(float(v)) for v in row) for name, row in numbers.items()}
         )
         header.update({"warprrf_engine": self.engine, "warprrf_polarisation": self.polarisation})
-        write_whole(path, lambda part: exr.File(header, dict(channels)).write(str(part)), suffix=".exr")
+        write_atomically(path, lambda part: exr.File(header, dict(channels)).write(str(part)))
 
 
 def import_exr(path: str | os.PathLike[str]) -> Spectrum:
@@ -468,20 +468,6 @@ def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.nd
     role = np.full(count, "train", dtype="<U5")
     role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
     return role
-
-
-def write_whole(path: str | os.PathLike[str], write: Any, suffix: str = "") -> None:
-    """Call ``write(temporary path)`` in the target's folder, then move the file into place."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=suffix)
-    os.close(handle)
-    try:
-        write(Path(name))
-        os.chmod(name, 0o644)
-        os.replace(name, target)
-    finally:
-        Path(name).unlink(missing_ok=True)
 
 
 def _round_mantissa(values: np.ndarray, bits: int, step: float) -> np.ndarray:

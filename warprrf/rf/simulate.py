@@ -13,8 +13,9 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
+from warprrf.files import write_atomically
 from warprrf.rf.absorption import air_of
-from warprrf.rf.dataset import SpectrumDataset, write_whole
+from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.fresnel import as_mesh, surface_table
 from warprrf.rf.sionna_engine import SionnaEngine
@@ -299,4 +300,4 @@ class _Cache:
             "kinds": np.array(list(found.totals)),
             "totals": np.array(list(found.totals.values())),
         }
-        write_whole(self._path(point), lambda part: np.savez(part, **arrays), suffix=".npz")
+        write_atomically(self._path(point), lambda file: np.savez(file, **arrays))

@@ -22,8 +22,8 @@ from warprrf.bench.methods import (
     untaught,
 )
 from warprrf.bench.setting import Geometry, Truth
-from warprrf.bench.stages import write_atomically
 from warprrf.device import Progress
+from warprrf.files import write_atomically
 from warprrf.rf import metrics
 
 __all__ = ["HARMONIC", "UNTAUGHT", "VARIANTS", "point_at_transmitter", "score", "sight_of", "source_of"]

@@ -24,7 +24,7 @@ from warprrf.bench.bistatic.plots import (
 )
 from warprrf.bench.markdown import cell, table
 from warprrf.bench.pictures import METHODS, spectrum_rows
-from warprrf.bench.stages import write_atomically
+from warprrf.files import write_atomically, write_text
 from warprrf.rf.bistatic.uncertainty import OUTLIERS
 
 ASKED_MARGIN_DB: dict[str, dict[str, dict[int, float]]] = {
@@ -103,7 +103,7 @@ def write(folder: str | os.PathLike[str]) -> Path:
     parts = [summary_text(found)]
     parts += [f"![{captions[name]}]({name})\n\n{captions[name]}" for name in pictures]
     path = folder / "bistatic.md"
-    write_atomically(path, lambda file: Path(file).write_text("\n\n".join(parts) + "\n", encoding="utf-8"))
+    write_text(path, "\n\n".join(parts) + "\n")
     return path
 
 

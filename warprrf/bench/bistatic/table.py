@@ -21,8 +21,9 @@ from warprrf.bench.bistatic.methods import HARMONIC, UNTAUGHT, VARIANTS, score, 
 from warprrf.bench.bistatic.plots import WHOLE
 from warprrf.bench.machine import machine
 from warprrf.bench.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
-from warprrf.bench.stages import StagedRun, fingerprint, plain, write_atomically, write_json
+from warprrf.bench.stages import StagedRun, fingerprint, plain, write_json
 from warprrf.device import Progress
+from warprrf.files import write_arrays, write_atomically
 from warprrf.marks import code_mark
 from warprrf.rf import lookups
 from warprrf.rf.dataset import SpectrumDataset
@@ -393,7 +394,7 @@ class _Bench:
                     ask = lookups.nearest(truth.train(truth.few)) if nearest else self._field(row).spectrum
                     arrays[row["method"]] = _images(test, [ask(test.receivers[i]) for i in indices])
                     progress("spectra", done + 1, len(picked))
-                write_atomically(self.rows.folder / file, partial(_save_arrays, arrays))
+                write_arrays(self.rows.folder / file, arrays)
                 return {
                     "receivers": test.receivers[indices],
                     "blocked": ~test.line_of_sight[indices],
@@ -429,10 +430,6 @@ def _middle(psnr: np.ndarray, blocked: np.ndarray) -> np.ndarray:
         if len(index):
             chosen.append(index[np.argsort(psnr[index])][(len(index) - 1) // 2])
     return np.array(chosen, dtype=int)
-
-
-def _save_arrays(arrays: dict[str, Any], path: str) -> None:
-    np.savez_compressed(path, **arrays)
 
 
 def _find(table: list[Row], truth: str, count: int, method: str) -> Row:

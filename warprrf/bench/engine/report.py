@@ -17,7 +17,7 @@ from warprrf.bench.engine import blend, plots, transport
 from warprrf.bench.engine.form_kernels import STRIP
 from warprrf.bench.engine.forms import RASTERISER
 from warprrf.bench.markdown import table
-from warprrf.bench.stages import write_atomically
+from warprrf.files import write_atomically, write_text
 from warprrf.geometry.rasterizer import RADIO
 from warprrf.rf.harmonic.single_bounce import FieldOptions
 from warprrf.rf.harmonic.transport import ALPHA_MIN, TOP_K
@@ -81,7 +81,7 @@ def write(folder: str | os.PathLike[str]) -> Path:
     parts = [summary_text(found)]
     parts += [f"![{captions[name]}]({name})\n\n{captions[name]}" for name in pictures]
     path = folder / "engine.md"
-    write_atomically(path, lambda file: Path(file).write_text("\n\n".join(parts) + "\n", encoding="utf-8"))
+    write_text(path, "\n\n".join(parts) + "\n")
     return path
 
 

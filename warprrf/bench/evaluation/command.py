@@ -18,8 +18,9 @@ from warprrf.bench.evaluation.protocol import SCALES, SPLITS, TRUTHS, Scale, Set
 from warprrf.bench.evaluation.runs import Store, sweep
 from warprrf.bench.machine import machine
 from warprrf.bench.setting import DATA, Geometry, files, scene_of
-from warprrf.bench.stages import StagedRun, fingerprint, plain, write_atomically, write_json
+from warprrf.bench.stages import StagedRun, fingerprint, plain, write_json
 from warprrf.device import Progress
+from warprrf.files import write_atomically
 from warprrf.marks import code_mark
 from warprrf.rf.dataset import SpectrumDataset
 

@@ -22,7 +22,7 @@ from warprrf.bench.evaluation.protocol import TRUTHS, Run, Scale
 from warprrf.bench.evaluation.runs import Row, Store
 from warprrf.bench.markdown import cell, table
 from warprrf.bench.pictures import METHODS
-from warprrf.bench.stages import write_atomically
+from warprrf.files import write_atomically, write_text
 
 PUBLISHED: tuple[Row, ...] = tuple(
     {
@@ -339,20 +339,12 @@ def write(
             "RF-3DGS+ less RF-3DGS, by the law that the truth's scattering obeys.",
         )
     for name, (figure, _) in pictures.items():
-        write_atomically(folder / name, partial(_savefig, figure))
+        write_atomically(folder / name, partial(figure.savefig, dpi=110))
     parts = [markdown(kind, found), *(f"![{text}]({name})\n\n{text}" for name, (_, text) in pictures.items())]
     content = {f"{kind}.md": "\n\n".join(parts) + "\n", f"{kind}.csv": csv_text(rows)}
     for name, text in content.items():
-        write_atomically(folder / name, partial(_write_text, text))
+        write_text(folder / name, text)
     return folder / f"{kind}.md"
-
-
-def _savefig(figure: Any, path: str) -> None:
-    figure.savefig(path, dpi=110)
-
-
-def _write_text(text: str, path: str) -> None:
-    Path(path).write_text(text, encoding="utf-8")
 
 
 def _grid(rows: Sequence[Row], runs: dict[str, Run], store: Store, scale: Scale) -> tuple[Any, str] | None:

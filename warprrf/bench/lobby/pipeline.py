@@ -25,8 +25,9 @@ from warprrf.bench.lobby import score as truth_scores
 from warprrf.bench.lobby.photos import noise_psnr_db
 from warprrf.bench.lobby.spectra import FILES as TRUTHS
 from warprrf.bench.machine import machine
-from warprrf.bench.stages import StagedRun, fingerprint, plain, write_atomically, write_json
+from warprrf.bench.stages import StagedRun, fingerprint, plain, write_json
 from warprrf.device import Progress
+from warprrf.files import write_arrays, write_atomically
 from warprrf.geometry.config import ReconstructionConfig
 from warprrf.geometry.meshio import write_mesh
 from warprrf.geometry.photos import read_photo
@@ -311,7 +312,7 @@ def _geometry_error(
         "mesh_points": scored.points[some].astype(np.float32),
         "mesh_error_m": scored.distance_m[some].astype(np.float32),
     }
-    write_atomically(out / "geometry_error.npz", partial(_save_arrays, arrays))
+    write_arrays(out / "geometry_error.npz", arrays)
     return figures
 
 
@@ -418,12 +419,8 @@ def _pictures(
         progress("pictures", done + 1, len(predictors))
     with np.load(out / "geometry_error.npz", allow_pickle=False) as stored:
         arrays |= {name: stored[name] for name in stored.files}
-    write_atomically(out / "pictures.npz", partial(_save_arrays, arrays))
+    write_arrays(out / "pictures.npz", arrays)
     return {}
-
-
-def _save_arrays(arrays: dict[str, Any], path: str) -> None:
-    np.savez_compressed(path, **arrays)
 
 
 def _spread_by_score(score: np.ndarray, blocked: np.ndarray) -> np.ndarray:

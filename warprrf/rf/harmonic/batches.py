@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.geometry.gaussians import replacing
+from warprrf.files import write_atomically
 from warprrf.kernels import field as _kernels
 from warprrf.kernels import ssim as _ssim
 from warprrf.rf.harmonic.store import StoredTransport
@@ -172,8 +172,7 @@ class MappedBatches(Sequence[Batch]):
         files = {name: self._folder / f"{index:05d}_{name}.npy" for name in _BATCH_ARRAYS}
         if not all(file.exists() for file in files.values()):
             for name, values in self._problem.sorted_pairs(self._parts[index]).items():
-                with replacing(files[name]) as temporary:
-                    np.save(temporary, values)
+                write_atomically(files[name], lambda file, values=values: np.save(file, values))  # type: ignore[misc]
         arrays = {name: np.load(file, mmap_mode="r") for name, file in files.items()}
         on_cpu = self._problem.device.is_cpu
         return self._problem.uploaded(self._parts[index], arrays, copy=not on_cpu)
