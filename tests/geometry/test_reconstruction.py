@@ -3,11 +3,15 @@
 import json
 import re
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from views import look  # noqa: E402
 
 import warprrf as wr
 from warprrf.geometry import from_photos, sparse
@@ -32,17 +36,6 @@ SMALL = ReconstructionConfig(
     depth_downscale=4,
     voxel_m=0.1,
 )
-
-
-def look(position, target, width=64, height=48, f=40.0):
-    ahead = np.asarray(target, float) - position
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = [right, np.cross(ahead, right), ahead]
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return wr.Camera.pinhole(width, height, fx=f, fy=f, cx=width / 2, cy=height / 2, world_to_camera=pose)
 
 
 def wall_plane(size=2.0):
