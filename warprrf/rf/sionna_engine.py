@@ -19,6 +19,7 @@ from warprrf.rf.channel.sionna_paths import repeated
 from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.llvm import select_llvm
+from warprrf.rf.materials import VACUUM_PERMITTIVITY
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
 from warprrf.rf.waves import check_frequency
@@ -28,7 +29,6 @@ _PATHS_PER_SAMPLE_AND_BOUNCE = 1
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
 _DIFFUSE = 2  # sionna.rt.InteractionType.DIFFUSE
-_VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
 
 
 def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
@@ -88,7 +88,7 @@ def _radio_material(loaded: Any, rt: Any, material: Any, frequency: float) -> An
         loaded.add(radio)
     eta = complex(material.permittivity(frequency))
     radio.relative_permittivity = eta.real
-    radio.conductivity = -eta.imag * 2.0 * np.pi * frequency * _VACUUM_PERMITTIVITY
+    radio.conductivity = -eta.imag * 2.0 * np.pi * frequency * VACUUM_PERMITTIVITY
     radio.thickness = float(material.thickness_m)
     radio.scattering_coefficient = float(material.scattering_coefficient(frequency))
     radio.xpd_coefficient = 0.0
