@@ -9,8 +9,7 @@ import numpy as np
 from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
-from warprrf.rf.exact import sub_pixel_directions
-from warprrf.rf.spectrum import spread
+from warprrf.rf.spectrum import spread, sub_pixel_directions
 
 EVEN_SUB_PIXELS = 4  # square root of the directions that stand for a whole pixel's even power
 

@@ -29,11 +29,11 @@ from pathlib import Path
 import numpy as np
 
 from warprrf.geometry.meshio import write_mesh
-from warprrf.rf.bistatic.bounces import fresnel_curves
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.fit import NEPER
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import LAMBERTIAN, lobe, slab_reflection
+from warprrf.rf.half_spaces import fresnel_curves
 from warprrf.rf.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
 
 ABOUT = "Digital twin written by warprrf.write_twin."

@@ -14,19 +14,20 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from warprrf.geometry import o3d
 from warprrf.rf.beam import BeamOperator
 from warprrf.rf.bistatic import fit as fitting
-from warprrf.rf.bistatic.bounces import BounceTracer, fresnel_curves
+from warprrf.rf.bistatic.bounces import BounceTracer
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.specular import specular_paths
 from warprrf.rf.bistatic.surface import Surface
 from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.bistatic.training import trace
 from warprrf.rf.dataset import SpectrumDataset
-from warprrf.rf.exact import ExactEngine, sub_pixel_directions
+from warprrf.rf.exact import ExactEngine
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.half_spaces import fresnel_curves
 from warprrf.rf.lookups import nearest
 from warprrf.rf.metrics import evaluate
-from warprrf.rf.spectrum import spread, to_db
+from warprrf.rf.spectrum import spread, sub_pixel_directions, to_db
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F

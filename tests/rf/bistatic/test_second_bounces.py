@@ -11,7 +11,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.rf.beam import BeamOperator
-from warprrf.rf.bistatic.bounces import fresnel_curves
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.fit import Layout, Parameters, View, fit_groups, jacobian, predict
 from warprrf.rf.bistatic.grouping import regroup
@@ -22,6 +21,7 @@ from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.bistatic.training import trace
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.half_spaces import fresnel_curves
 from warprrf.rf.spectrum import to_db
 
 F = 300e9

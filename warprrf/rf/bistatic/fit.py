@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 
-from warprrf.rf.bistatic.bounces import fresnel_curves
+from warprrf.rf.half_spaces import fresnel_curves
 
 NEPER = 10.0 / np.log(10.0)
 HUBER_DB = 3.0  # larger residuals count linearly: shadows that the geometry puts in the wrong place

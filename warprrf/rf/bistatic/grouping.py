@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warprrf.rf.bistatic.bounces import fresnel_curves
 from warprrf.rf.bistatic.fit import NEPER, Parameters, View, huber, predict, scattered_share, specular_power
+from warprrf.rf.half_spaces import fresnel_curves
 
 LOOK_COST = 3.0  # what one unit of difference in look, squared, counts as in the objective
 MOST_LOOK = 9.0

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warprrf.rf.bistatic.bounces import NEAREST_M, BounceTracer, Lit, Met, fresnel_curves
+from warprrf.rf.bistatic.bounces import NEAREST_M, BounceTracer, Lit, Met
 from warprrf.rf.bistatic.fit import Parameters
 from warprrf.rf.bistatic.mirror_tree import MirrorTree
 from warprrf.rf.bistatic.specular import unobstructed
+from warprrf.rf.half_spaces import fresnel_curves
 
 
 @dataclass(frozen=True)

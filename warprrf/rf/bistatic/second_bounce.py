@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.rf.bistatic.bounces import BounceTracer, Met, fresnel_curves
+from warprrf.rf.bistatic.bounces import BounceTracer, Met
 from warprrf.rf.bistatic.fit import Parameters, scattered_share
 from warprrf.rf.bistatic.mirror_light import MirrorLight
 from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.half_spaces import fresnel_curves
 
 RAYS = 128  # from each element, over its hemisphere
 LEAST_MIRROR = 1e-4  # reflected share of power below which a patch is no mirror
