@@ -159,7 +159,15 @@ def _line_of_sight(
     share = free.reshape(count, -1).mean(axis=1)
     nothing = np.zeros((count, 0))
     return _rows(
-        np.arange(count), 0, nothing.astype(int), nothing, nothing, np.zeros((count, 0, 3)), length, toward, share
+        np.arange(count),
+        0,
+        nothing.astype(int),
+        nothing,
+        nothing,
+        np.zeros((count, 0, 3)),
+        length,
+        toward,
+        share,
     )
 
 
@@ -245,7 +253,9 @@ def _mirror_chains(
     along = legs / np.maximum(lengths, 1e-12)[..., None]
     cosine = np.abs((along[:, :-1] * surface.plane_normal[patch]).sum(axis=2))
     turn = turns(stops, surface.plane_normal[patch])
-    return _rows(row, order, patch, cosine, turn, point, lengths.sum(axis=1), -along[:, -1], np.ones(len(row)))
+    return _rows(
+        row, order, patch, cosine, turn, point, lengths.sum(axis=1), -along[:, -1], np.ones(len(row))
+    )
 
 
 def unobstructed(
