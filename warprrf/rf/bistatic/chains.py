@@ -1,9 +1,8 @@
 """Power that chains of mirrors reflect of unpolarised light.
 
 One mirror reflects the mean of |TE|^2 and |TM|^2. After it light is polarised, so that the next one reflects more or
-less than its own mean, by as much as 8 dB where the floor near Brewster's angle follows a wall: what is across the plane
-of incidence of the one lies in that of the other. Between the two, amplitudes (TE, TM) turn by the angle between the
-planes:
+less than its own mean, 7 dB less where a wall follows a floor met at Brewster's angle: what lies across the plane of
+incidence of the one lies in that of the other. Between two mirrors (TE, TM) turn by the angle between their planes:
 
     power = 1/2 ||D_n R_n ... D_2 R_2 D_1||^2 (Frobenius), D = diag(TE, TM), R the rotation by that angle,
 
