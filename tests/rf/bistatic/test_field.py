@@ -392,7 +392,7 @@ def test_a_fit_goes_on_after_steps_that_were_cut_short() -> None:
     basis[:lit, 0, 0] = 200.0 * fresnel_curves().at(fresnel_curves().coordinates, true.log_excess)[0][0]
     view = fitting.View(
         groups=np.array([0]), basis=basis, seen=np.zeros(0, int), dark=none, gain=np.zeros(0),
-        path_group=np.zeros((0, 3), int), cosine=np.zeros((0, 3)), beam=none.T,
+        path_group=np.zeros((0, 3), int), cosine=np.zeros((0, 3)), turn=np.zeros((0, 3)), beam=none.T,
         extra=np.zeros(lit + hopeless, np.float32), again_group=np.zeros(0, int), again=none,
         target_db=np.full(lit + hopeless, 40.0),
     )  # fmt: skip

@@ -210,7 +210,12 @@ def test_derivatives_follow_light_that_is_sent_on(views: list[View]) -> None:
     view = with_light(views[0], rng)
     # beams of single paths would drown the rest in single precision
     view = replace(
-        view, gain=view.gain[:0], beam=view.beam[:0], path_group=view.path_group[:0], cosine=view.cosine[:0]
+        view,
+        gain=view.gain[:0],
+        beam=view.beam[:0],
+        path_group=view.path_group[:0],
+        cosine=view.cosine[:0],
+        turn=view.turn[:0],
     )
     layout = Layout(3, 5, indirect=True, gain=True)
     p = Parameters(

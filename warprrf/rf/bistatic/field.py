@@ -340,6 +340,7 @@ class BistaticField(RadioField):
             gain=gain,
             path_group=self._met_groups(sight.paths),
             cosine=sight.paths.cosine,
+            turn=sight.paths.turn,
             beam=sight.beams.reshape(len(gain), count)[:, pixels],
             extra=np.zeros(len(pixels), np.float32),
             again_group=np.zeros(0, int),
@@ -440,9 +441,9 @@ class BistaticField(RadioField):
         """Power of each line-of-sight and mirror path, shape ``(L,)``."""
         base = (self.wavelength_m / (4.0 * np.pi * paths.length_m)) ** 2 * paths.share**2
         base = base * self.tracer.through_air(paths.length_m)
-        power = specular_power(base, self._met_groups(paths), paths.cosine, self.parameters)[0] * np.exp(
-            self.parameters.log_gain
-        )
+        groups = self._met_groups(paths)
+        power = specular_power(base, groups, paths.cosine, paths.turn, self.parameters)[0]
+        power = power * np.exp(self.parameters.log_gain)
         kept = (paths.order <= self.terms.mirror_order) & ((paths.order > 0) | self.terms.line_of_sight)
         return np.where(kept, power, 0.0)
 

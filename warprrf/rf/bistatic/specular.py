@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.bistatic.chains import turns
 from warprrf.rf.bistatic.mirror_tree import SLACK_M, MirrorTree
 from warprrf.rf.bistatic.surface import Surface
 
@@ -33,6 +34,7 @@ class SpecularPaths:
         order: reflections, 0 for line of sight, shape ``(L,)``.
         patch: patches met, from the transmitter on, -1 where fewer, shape ``(L, 3)``.
         cosine: cosine of incidence at each, shape ``(L, 3)``.
+        turn: angle of its plane of incidence to the one before [rad], shape ``(L, 3)``; see :mod:`chains`.
         point: mirror points [m], shape ``(L, 3, 3)``; NaN where fewer.
         length_m: total length, shape ``(L,)``.
         arrival: unit direction of arrival, shape ``(L, 3)``.
@@ -43,6 +45,7 @@ class SpecularPaths:
     order: np.ndarray
     patch: np.ndarray
     cosine: np.ndarray
+    turn: np.ndarray
     point: np.ndarray
     length_m: np.ndarray
     arrival: np.ndarray
@@ -119,15 +122,15 @@ def _zone_radius(wavelength: float, near: np.ndarray, far: np.ndarray, skin: flo
 
 
 def _rows(
-    receiver: np.ndarray, order: int, patch: np.ndarray, cosine: np.ndarray, point: np.ndarray, length: np.ndarray,
-    arrival: np.ndarray, share: np.ndarray,
+    receiver: np.ndarray, order: int, patch: np.ndarray, cosine: np.ndarray, turn: np.ndarray, point: np.ndarray,
+    length: np.ndarray, arrival: np.ndarray, share: np.ndarray,
 ) -> SpecularPaths:  # fmt: skip
     """Rows of paths with ``order`` reflections, what they lack of ``MOST_MIRRORS`` filled up."""
     kept = np.flatnonzero(share >= LEAST_SHARE)
     empty = MOST_MIRRORS - order
     return SpecularPaths(
         receiver, np.full(len(receiver), order), np.pad(patch, ((0, 0), (0, empty)), constant_values=-1),
-        np.pad(cosine, ((0, 0), (0, empty))), np.pad(point, ((0, 0), (0, empty), (0, 0)), constant_values=np.nan),
+        np.pad(cosine, ((0, 0), (0, empty))), np.pad(turn, ((0, 0), (0, empty))), np.pad(point, ((0, 0), (0, empty), (0, 0)), constant_values=np.nan),
         length, arrival, share,
     ).subset(kept)  # fmt: skip
 
@@ -156,7 +159,15 @@ def _line_of_sight(
     share = free.reshape(count, -1).mean(axis=1)
     nothing = np.zeros((count, 0))
     return _rows(
-        np.arange(count), 0, nothing.astype(int), nothing, np.zeros((count, 0, 3)), length, toward, share
+        np.arange(count),
+        0,
+        nothing.astype(int),
+        nothing,
+        nothing,
+        np.zeros((count, 0, 3)),
+        length,
+        toward,
+        share,
     )
 
 
@@ -199,7 +210,8 @@ def _mirror_once(
     tx = np.broadcast_to(transmitter, (len(idx), 3))
     met[idx] = _clear(surface.mesh, flat[idx], tx, surface.skin_m, device)
     share = met.reshape(shape[:2]).mean(axis=1)
-    return _rows(r, 1, p[:, None], cosine[:, None], point[:, None], length, toward, share)
+    only = np.zeros((len(r), 1))
+    return _rows(r, 1, p[:, None], cosine[:, None], only, point[:, None], length, toward, share)
 
 
 def _near_patch(surface: Surface, point: np.ndarray, patch: np.ndarray) -> np.ndarray:
@@ -240,7 +252,10 @@ def _mirror_chains(
     lengths = np.linalg.norm(legs, axis=2)
     along = legs / np.maximum(lengths, 1e-12)[..., None]
     cosine = np.abs((along[:, :-1] * surface.plane_normal[patch]).sum(axis=2))
-    return _rows(row, order, patch, cosine, point, lengths.sum(axis=1), -along[:, -1], np.ones(len(row)))
+    turn = turns(stops, surface.plane_normal[patch])
+    return _rows(
+        row, order, patch, cosine, turn, point, lengths.sum(axis=1), -along[:, -1], np.ones(len(row))
+    )
 
 
 def unobstructed(

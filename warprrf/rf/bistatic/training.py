@@ -449,7 +449,8 @@ class _Training:
         order = (view.path_group >= 0).sum(axis=1)
         keep = (order <= terms.mirror_order) & ((order > 0) | terms.line_of_sight)
         view = replace(
-            view, gain=view.gain[keep], path_group=view.path_group[keep], cosine=view.cosine[keep], beam=view.beam[keep]
+            view, gain=view.gain[keep], path_group=view.path_group[keep], cosine=view.cosine[keep],
+            turn=view.turn[keep], beam=view.beam[keep],
         )  # fmt: skip
         if not terms.diffuse:
             view = replace(view, groups=view.groups[:0], basis=view.basis[:, :0])
