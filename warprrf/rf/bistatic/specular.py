@@ -130,7 +130,8 @@ def _rows(
     empty = MOST_MIRRORS - order
     return SpecularPaths(
         receiver, np.full(len(receiver), order), np.pad(patch, ((0, 0), (0, empty)), constant_values=-1),
-        np.pad(cosine, ((0, 0), (0, empty))), np.pad(turn, ((0, 0), (0, empty))), np.pad(point, ((0, 0), (0, empty), (0, 0)), constant_values=np.nan),
+        np.pad(cosine, ((0, 0), (0, empty))), np.pad(turn, ((0, 0), (0, empty))),
+        np.pad(point, ((0, 0), (0, empty), (0, 0)), constant_values=np.nan),
         length, arrival, share,
     ).subset(kept)  # fmt: skip
 
