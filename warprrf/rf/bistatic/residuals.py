@@ -75,12 +75,12 @@ def fit_residual(
     target = np.stack([s.target_db for s in shares], axis=1)
     rows, columns = beam.shape
 
-    def spread(values: np.ndarray) -> np.ndarray:
+    def spread(values: np.ndarray, quick: bool = True) -> np.ndarray:
         image = (power @ values.astype(np.float32)).reshape(count, pixels).T
-        return beam(image.reshape(rows, columns, count)).reshape(pixels, count)
+        return beam(image.reshape(rows, columns, count), quick=quick).reshape(pixels, count)
 
     def gather(image: np.ndarray) -> np.ndarray:
-        back = beam.adjoint(image.astype(np.float32).reshape(rows, columns, count))
+        back = beam.adjoint(image.astype(np.float32).reshape(rows, columns, count), quick=True)
         found: np.ndarray = power.T @ back.reshape(pixels, count).T.ravel()
         return found
 
@@ -97,7 +97,7 @@ def fit_residual(
     unknown = np.zeros(gains.shape[1])
     for _ in range(ROUNDS):
         gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
-        total = np.maximum(spread(gain), 0.0) + rest
+        total = np.maximum(spread(gain, quick=False), 0.0) + rest
         residual = NEPER * np.log1p(total) - target
         robust = np.minimum(HUBER_DB / np.maximum(np.abs(residual), 1e-9), 1.0) / noise_db**2
         slope = NEPER / (1.0 + total)

@@ -52,9 +52,9 @@ MORE: tuple[tuple[str, Any], ...] = (
 """Bounces that may be added to single ones, in the order in which they are tried."""
 QUICK: dict[str, Any] = {
     "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": True,
-    "residual": False, "sub_pixels": 1,
+    "residual": True, "sub_pixels": 1,
 }  # fmt: skip
-"""What a quick fit takes for given: light of more than one bounce is even, and one ray a pixel."""
+"""What a quick fit takes for given: light of more than one bounce is even but for the residual, one ray a pixel."""
 FEW_MATERIALS = 30
 REGROUPED = 3  # rounds of deciding what is of one material, and fitting
 OUTER = 2  # rounds of further bounces and groups in turn
