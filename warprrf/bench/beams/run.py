@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import warprrf as wr
 from warprrf.bench.beams.links import BANDWIDTH_HZ, Ends, Links, ends, gains
@@ -101,13 +102,15 @@ def run_beams(
                     fields[model, count] = _fit(run, truth, place, model, count)
             code = source("rf", "kernels", "geometry", "bench/beams")
             settings = [truth.mark, place.mark, place.scene_mark, list(truth.counts), list(sides), list(both)]
-            report["truths"][truth.name] = run.stage(
-                f"beams {truth.name}",
-                lambda done, truth=truth, fields=fields: judge(  # type: ignore[misc]
-                    truth, place, fields, tuple(sides), both, seed, done
-                ),
-                inputs=[*settings, every, seed, code],
-            )
+            # A receiver's matrices are small: on busy cores threads of BLAS wait for each other most of the time.
+            with threadpool_limits(1, user_api="blas"):
+                report["truths"][truth.name] = run.stage(
+                    f"beams {truth.name}",
+                    lambda done, truth=truth, fields=fields: judge(  # type: ignore[misc]
+                        truth, place, fields, tuple(sides), both, seed, done
+                    ),
+                    inputs=[*settings, every, seed, code],
+                )
             place.forget()
     write_json(Path(out) / "beams.json", report)
     write(out)
