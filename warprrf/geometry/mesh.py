@@ -158,7 +158,7 @@ class Mesh:
         t, face = self._rays.nearest(
             o, d, reach=np.full(1, np.inf), clearance=0.0, device=device, backend=backend
         )
-        if (face < 0).any() and self.is_closed:
+        if face.min(initial=0) < 0 and self.is_closed:
             self._rays.recast(o, d, t, face, device=device, backend=backend)
         # Points may be asked for after the caller has changed its arrays.
         own = [

@@ -14,6 +14,8 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.geometry import embree, o3d
+from warprrf.kernels.lanes import LANES
+from warprrf.kernels.packed_rays import judge_segments, pack_rays, pack_segments, place_hits
 from warprrf.kernels.rays import (
     AGAIN,
     BAD,
@@ -21,11 +23,7 @@ from warprrf.kernels.rays import (
     FREE,
     GRAZING,
     cast_rays,
-    judge_segments,
     look,
-    pack_rays,
-    pack_segments,
-    place_hits,
 )
 
 BACKENDS = ("auto", "warp", "embree")
@@ -38,11 +36,15 @@ EMBREE_RAYS_TO_LOAD = 200_000
 """From this many rays on it is loaded for them: that takes one to three seconds, once a process."""
 
 # Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
-_EMBREE_CHUNK = 262_144
+_EMBREE_CHUNK = 524_288
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
 _FREE_SHARE = 0.5
-_PROBE = 8_192
+_PROBE = 2_048
+# Faces that block most, asked before the hierarchy: at most so many, each the first to block this share of segments at
+# least. Asking costs a segment 1 ns a face, and searching it 100 to 500.
+_BLOCKERS = 16
+_BLOCKER_SHARE = 0.01
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4
@@ -118,6 +120,7 @@ class RaySearch:
         self._radius = 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
         offset = np.einsum("ni,ni->n", face_normals, triangles[:, 0] - self._center)
         self._planes = np.column_stack([face_normals, offset])
+        self._triangles = triangles
         self._vertices = (vertices - self._center).astype(np.float32)
         self._faces = faces
         self._on_device: dict[str, tuple[wp.Mesh, wp.array]] = {}
@@ -166,7 +169,7 @@ class RaySearch:
             ]  # fmt: skip
             _device.launch(cast_rays, count, inputs, device=where)
             t, face = distance.numpy(), found.numpy()
-        if (face == BAD).any():
+        if face.min(initial=0) == BAD:
             _refuse(o, d)
         return t, face
 
@@ -187,14 +190,15 @@ class RaySearch:
         pieces = _device.threads()
         for first in range(0, count, chunk):
             size = min(chunk, count - first)
-            inputs = [first, center, self._radius, *given, rays]
-            _device.launch(pack_rays, size, inputs, device=cpu, pieces=pieces)
+            blocks = -(-size // LANES)
+            inputs = [first, size, center, self._radius, *given, rays]
+            _device.launch(pack_rays, blocks, inputs, device=cpu, pieces=pieces)
             met_at, met = scene.cast(rays.numpy().reshape(-1, 6)[:size])
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
-            inputs = [first, center, self._radius, planes, faces, *given, *hits, *out]
-            _device.launch(place_hits, size, inputs, device=cpu, pieces=pieces)
-        again = np.flatnonzero(face == AGAIN)
-        if len(again):
+            inputs = [first, size, center, self._radius, planes, faces, *given, *hits, *out]
+            _device.launch(place_hits, blocks, inputs, device=cpu, pieces=pieces)
+        if face.min() == AGAIN:
+            again = np.flatnonzero(face == AGAIN)
             t[again], face[again] = self._nearest_embree(
                 rows(o, again), rows(d, again), clearance, cpu, t[again]
             )
@@ -222,7 +226,7 @@ class RaySearch:
             inputs = [mesh.id, wp.vec3d(*self._center), self._radius, planes, clearance, *ends, found]
             _device.launch(look, count, inputs, device=where)
             sight = found.numpy()
-        if (sight == BAD).any():
+        if sight.min(initial=0) == BAD:
             _refuse(a, b, names=("a", "b"))
         return sight == FREE
 
@@ -231,8 +235,9 @@ class RaySearch:
     ) -> None:
         """Fill ``sight`` with FREE, BLOCKED and BAD.
 
-        The first hit names a face, whose plane judges in float64. Where enough segments of the chunk before were
-        free, they are sorted out by a search for any hit at all, which is cheaper; what it finds is still judged.
+        The first hit names a face, whose plane judges in float64. A probe says what the others will be like: mostly
+        free segments are sorted out by a search for any hit at all, which is cheaper; mostly blocked ones by the few
+        faces that block most, if there are such, before the hierarchy is asked. What a search finds is still judged.
         """
         scene, names = self._embree
         count, pieces = len(sight), _device.threads()
@@ -241,43 +246,56 @@ class RaySearch:
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [clearance, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu)]
         out = _given(sight, wp.int32, cpu)
-        # A short first chunk says how the others will be, where there are enough of them.
         starts = [0, *range(min(_PROBE, chunk), count, chunk)] if count > 4 * _PROBE else [0]
-        mostly_free = False
+        mostly_free, none = False, np.empty(0)
+        frequent = none
         for first, end in zip(starts, [*starts[1:], count], strict=True):
             size = end - first
-            inputs = [first, center, self._radius, *given, rays]
-            _device.launch(pack_segments, size, inputs, device=cpu, pieces=pieces)
-            packed, which = rays.numpy().reshape(-1, 6)[:size], np.empty(0, dtype=np.int32)
+            known = _given(none if mostly_free else frequent, wp.float64, cpu)
+            inputs = [first, size, center, self._radius, *given, known, rays, out]
+            _device.launch(pack_segments, -(-size // LANES), inputs, device=cpu, pieces=pieces)
+            packed, part = rays.numpy().reshape(-1, 6)[:size], sight[first:end]
             if mostly_free:
-                blocked = scene.blocked(packed)
-                # A segment that is not finite meets nothing: leave it to the kernel.
-                blocked |= ~np.isfinite(packed[:, 3])
-                sight[first:end] = FREE
-                which = np.flatnonzero(blocked).astype(np.int32)
-                packed = packed[which]
-            if len(packed):
-                met = _given(scene.cast(packed)[1], wp.int32, cpu)
+                which = np.flatnonzero(scene.blocked(packed))
+            else:
+                which = np.flatnonzero(part == FREE)
+            which = which.astype(np.int32)
+            if len(which):
+                met = scene.cast(packed if len(which) == size else packed[which])[1]
                 inputs = [
-                    first,
-                    _given(which, wp.int32, cpu),
-                    center,
-                    self._radius,
-                    planes,
-                    faces,
-                    *given,
-                    met,
-                    out,
-                ]
-                _device.launch(judge_segments, len(packed), inputs, device=cpu, pieces=pieces)
-            mostly_free = int(np.count_nonzero(sight[first:end] == FREE)) > _FREE_SHARE * size
-        again = np.flatnonzero(sight == AGAIN)
-        if len(again):
+                    first, len(which), _given(which, wp.int32, cpu), center, self._radius, planes, faces, *given,
+                    _given(met, wp.int32, cpu), out,
+                ]  # fmt: skip
+                _device.launch(judge_segments, -(-len(which) // LANES), inputs, device=cpu, pieces=pieces)
+            if first == 0 and end < count and len(which):
+                frequent = self._frequent_blockers(met[part[which] == BLOCKED], size)
+            mostly_free = int(np.count_nonzero(part == FREE)) > _FREE_SHARE * size
+        if sight.min() == AGAIN:
+            again = np.flatnonzero(sight == AGAIN)
             start = rows(a, again)
             way = rows(b, again) - start
             inner = np.linalg.norm(way, axis=1) - clearance
             t, face = self._nearest_embree(start, way, clearance, cpu)
             sight[again] = np.where((face < 0) | (t >= inner), FREE, BLOCKED)
+
+    def _frequent_blockers(self, met: np.ndarray, size: int) -> np.ndarray:
+        """The faces, as `pack_segments` knows them, that come first often among ``met``, found by ``size`` segments."""
+        names = self._embree[1]
+        often = np.bincount(met[met >= 0], minlength=1)
+        chosen = np.argsort(-often, kind="stable")[:_BLOCKERS]
+        chosen = chosen[often[chosen] > _BLOCKER_SHARE * size]
+        if len(names):
+            chosen = names[chosen]
+        normal = self._planes[chosen, :3]
+        corners = self._triangles[chosen] - self._center
+        rows = [self._planes[chosen]]
+        for k in (1, 2):
+            # A barycentric coordinate grows from 0 at the edge between the others to 1 at corner k.
+            edge = corners[:, 3 - k] - corners[:, 0]
+            inward = np.cross(normal, edge)
+            inward /= (inward * (corners[:, k] - corners[:, 0])).sum(axis=1, keepdims=True)
+            rows.append(np.column_stack([inward, -(inward * corners[:, 0]).sum(axis=1)]))
+        return np.concatenate(rows, axis=1).reshape(-1)
 
     def recast(
         self, o: np.ndarray, d: np.ndarray, t: np.ndarray, face: np.ndarray, *, device: Any, backend: str

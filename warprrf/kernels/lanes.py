@@ -57,11 +57,7 @@ def build(real: Any) -> SimpleNamespace:
         """Whether a lane is above zero."""
         ...
 
-    @wp.func_native(f"""
-    int bits = 0;
-    for (int i = 0; i < {LANES}; ++i) bits |= x[i] > wp::{name}(0) ? 1 << i : 0;
-    return bits;
-    """)
+    @wp.func_native(_positive_bits(name))
     def positive_bits(x: lanes) -> int:  # type: ignore[valid-type, empty-body]
         """Bit i is set where lane i is above zero."""
         ...
@@ -196,6 +192,21 @@ def _vector(name: str) -> str:
     typedef wp::vec_t<{LANES}, wp::{name}> lanes;
 #endif
 """
+
+
+def _positive_bits(name: str) -> str:
+    """C++ that makes a bit of each comparison: one instruction where a CPU compiler has vectors of truths."""
+    return f"""
+#if defined(__clang__)
+    typedef wp::{name} lanes __attribute__((vector_size({LANES} * sizeof(wp::{name})), aligned(4)));
+    typedef bool truths __attribute__((ext_vector_type({LANES})));
+    return __builtin_bit_cast(unsigned short, __builtin_convertvector(*(const lanes*)&x > 0, truths));
+#else
+    int bits = 0;
+    for (int i = 0; i < {LANES}; ++i) bits |= x[i] > wp::{name}(0) ? 1 << i : 0;
+    return bits;
+#endif
+    """
 
 
 def _numbers(count: int, first: int = 0) -> str:

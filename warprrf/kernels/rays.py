@@ -19,8 +19,8 @@ FREE = wp.constant(0)
 BLOCKED = wp.constant(1)
 """Segment that a surface blocks."""
 
-# What float32 may displace a surface along a ray, over the largest coordinate: six roundings of 2^-24.
-_ROUNDING = wp.constant(wp.float64(3.6e-7))
+ROUNDING = wp.constant(wp.float64(3.6e-7))
+"""What float32 may displace a surface along a ray, over the largest coordinate: six roundings of 2^-24."""
 # A ray's start is on a plane if no further from it than this, over the largest coordinate: float64 rounding.
 _ON_PLANE = wp.constant(wp.float64(1e-12))
 GRAZING = 1e-7
@@ -28,77 +28,13 @@ GRAZING = 1e-7
 
 _GRAZING = wp.constant(wp.float64(GRAZING))
 _FAR = wp.constant(wp.float64(1e30))
-# Beyond these a hit is neither grazing nor at the ray's start, without a closer look.
-_STEEP_SQUARE = wp.constant(wp.float64(1e-12))
-_CLEAR = wp.constant(wp.float64(1e-9))
-# Squares between these neither overflow nor lose digits in float32.
-_LEAST_SQUARE = wp.constant(wp.float32(1e-30))
-_MOST_SQUARE = wp.constant(wp.float32(1e30))
 _STEPS = 8
-
-
-# Warp's own indexing allows for negative indices and strides, some six instructions an access.
-@wp.func_native("return source.data[i < source.shape[0] ? i : source.shape[0] - 1];")
-def ray_row(source: wp.array(dtype=wp.vec3d), i: int) -> wp.vec3d:  # type: ignore[empty-body]
-    """Row ``i >= 0`` of a contiguous array, or its last row."""
-    ...
-
-
-@wp.func_native("return source.data[i];")
-def plane_row(source: wp.array(dtype=wp.vec4d), i: int) -> wp.vec4d:  # type: ignore[empty-body]
-    """Row ``i >= 0`` of a contiguous array."""
-    ...
-
-
-@wp.func_native("""
-#if !defined(__CUDA_ARCH__)
-    const int ahead = k + 16 < met.shape[0] ? met.data[k + 16] : -1;
-    if (ahead >= 0) __builtin_prefetch(planes.data + ahead);
-#endif
-""")
-def fetch_ahead(planes: wp.array(dtype=wp.vec4d), met: wp.array(dtype=wp.int32), k: int) -> None:
-    """Ask for the plane that will be wanted 16 rays later: incoherent rays find it in no cache."""
-    ...
-
-
-@wp.func_native("return source.data[i];")
-def name_at(source: wp.array(dtype=wp.int32), i: int) -> wp.int32:  # type: ignore[empty-body]
-    """Element ``i >= 0`` of a contiguous array."""
-    ...
-
-
-@wp.func_native("distance.data[i] = t; face.data[i] = name;")
-def keep(
-    distance: wp.array(dtype=wp.float64),
-    face: wp.array(dtype=wp.int32),
-    i: int,
-    t: wp.float64,
-    name: wp.int32,
-) -> None:
-    """Write a hit to contiguous arrays, ``i >= 0``."""
-    ...
-
-
-@wp.func_native("rays.data[2 * k] = start; rays.data[2 * k + 1] = way;")
-def put(rays: wp.array(dtype=wp.vec3), k: int, start: wp.vec3, way: wp.vec3) -> None:
-    """Write ray ``k >= 0`` to a contiguous array."""
-    ...
 
 
 @wp.func
 def narrow(p: wp.vec3d):
     """A position or direction in float32."""
     return wp.vec3(wp.float32(p[0]), wp.float32(p[1]), wp.float32(p[2]))
-
-
-@wp.func
-def unit_narrow(direction: wp.vec3d):
-    """A direction in float32, of length one to rounding; NaN if it has none. Normalised in float32, which is faster."""
-    d = narrow(direction)
-    square = wp.dot(d, d)
-    if square > _LEAST_SQUARE and square < _MOST_SQUARE:
-        return d * (wp.float32(1.0) / wp.sqrt(square))
-    return narrow(direction * (wp.float64(1.0) / wp.length(direction)))
 
 
 @wp.func
@@ -153,7 +89,7 @@ def search(
 ):
     """Distance [m] and face of what a ray meets beyond ``clearance`` and within ``reach``; inf and MISS if nothing."""
     unit = direction / length
-    step = _ROUNDING * scale
+    step = ROUNDING * scale
     start = clearance - step
     most = wp.min(reach, _FAR)
     found = wp.float64(wp.inf)
@@ -232,164 +168,6 @@ def look(
         return
     t, name = search(mesh, planes, origin, way, length, scale, clearance, length - clearance)
     sight[i] = wp.where(name >= 0 and t < length - clearance, BLOCKED, FREE)
-
-
-@wp.kernel(enable_backward=False)
-def pack_segments(
-    offset: int,
-    first: int,
-    center: wp.vec3d,
-    radius: wp.float64,
-    clearance: wp.float64,
-    starts: wp.array(dtype=wp.vec3d),
-    ends: wp.array(dtype=wp.vec3d),
-    rays: wp.array(dtype=wp.vec3),
-):
-    """Segments from number ``first`` on as pairs (start, way) in float32, from ``clearance`` to ``clearance`` before
-    the end, longer by the rounding; a bad one or one that short meets nothing."""
-    k = offset + wp.tid()
-    i = first + k
-    origin = ray_row(starts, i) - center
-    way = (ray_row(ends, i) - center) - origin
-    length = wp.length(way)
-    unit = way * (wp.float64(1.0) / length)
-    step = _ROUNDING * rounding_scale(origin, radius)
-    inner = length - wp.float64(2.0) * clearance
-    reach = wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan))
-    put(rays, k, narrow(origin + (clearance - step) * unit), narrow(reach * unit))
-
-
-@wp.kernel(enable_backward=False)
-def judge_segments(
-    offset: int,
-    first: int,
-    which: wp.array(dtype=wp.int32),
-    center: wp.vec3d,
-    radius: wp.float64,
-    planes: wp.array(dtype=wp.vec4d),
-    names: wp.array(dtype=wp.int32),
-    clearance: wp.float64,
-    starts: wp.array(dtype=wp.vec3d),
-    ends: wp.array(dtype=wp.vec3d),
-    met: wp.array(dtype=wp.int32),
-    sight: wp.array(dtype=wp.int32),
-):
-    """What the first hits of :func:`pack_segments` say in float64: FREE, BLOCKED, or AGAIN if it takes a closer look.
-
-    ``which`` names the segments, empty if all; ``names`` the faces of the hierarchy's, empty if it holds all.
-    """
-    k = offset + wp.tid()
-    i = first + k
-    if which.shape[0] > 0:
-        i = first + name_at(which, k)
-    origin = ray_row(starts, i) - center
-    way = (ray_row(ends, i) - center) - origin
-    length = wp.length(way)
-    scale = rounding_scale(origin, radius)
-    fetch_ahead(planes, met, k)
-    name = name_at(met, k)
-    if name < 0:
-        sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
-        return
-    if names.shape[0] > 0:
-        name = name_at(names, name)
-    plane = plane_row(planes, name)
-    normal = wp.vec3d(plane[0], plane[1], plane[2])
-    slope = wp.dot(normal, way)
-    height = plane[3] - wp.dot(normal, origin)
-    sight[i] = AGAIN
-    if slope * slope > _STEEP_SQUARE * length * length:
-        t = height * length / slope
-        if t > clearance and wp.abs(height) > _CLEAR * scale:
-            sight[i] = wp.where(t < length - clearance, BLOCKED, FREE)
-
-
-@wp.kernel(enable_backward=False)
-def pack_rays(
-    offset: int,
-    first: int,
-    center: wp.vec3d,
-    radius: wp.float64,
-    clearance: wp.float64,
-    start: wp.array(dtype=wp.float64),
-    origins: wp.array(dtype=wp.vec3d),
-    directions: wp.array(dtype=wp.vec3d),
-    rays: wp.array(dtype=wp.vec3),
-):
-    """Rays from number ``first`` on as pairs (start, unit direction) in float32; a bad one meets nothing.
-
-    ``start`` holds the distance [m] at which each begins; if empty, all begin at ``clearance``, less the rounding.
-    """
-    k = offset + wp.tid()
-    i = first + k
-    origin = ray_row(origins, i) - center
-    direction = ray_row(directions, i)
-    near = narrow(origin)
-    begin = wp.float32(clearance) - wp.float32(_ROUNDING) * (
-        wp.float32(radius) + wp.abs(near[0]) + wp.abs(near[1]) + wp.abs(near[2])
-    )
-    if start.shape[0] > 0:
-        begin = wp.float32(start[i])
-    unit = unit_narrow(direction)
-    put(rays, k, near + begin * unit, unit)
-
-
-@wp.kernel(enable_backward=False)
-def place_hits(
-    offset: int,
-    first: int,
-    center: wp.vec3d,
-    radius: wp.float64,
-    planes: wp.array(dtype=wp.vec4d),
-    names: wp.array(dtype=wp.int32),
-    clearance: wp.float64,
-    start: wp.array(dtype=wp.float64),
-    origins: wp.array(dtype=wp.vec3d),
-    directions: wp.array(dtype=wp.vec3d),
-    met_at: wp.array(dtype=wp.float32),
-    met: wp.array(dtype=wp.int32),
-    distance: wp.array(dtype=wp.float64),
-    face: wp.array(dtype=wp.int32),
-):
-    """Distances in float64 of what the rays of :func:`pack_rays` met; ``names`` are the faces of a hierarchy's, empty
-    if it holds all."""
-    k = offset + wp.tid()
-    i = first + k
-    origin = ray_row(origins, i) - center
-    direction = ray_row(directions, i)
-    fetch_ahead(planes, met, k)
-    name = name_at(met, k)
-    if name >= 0:
-        if names.shape[0] > 0:
-            name = name_at(names, name)
-        plane = plane_row(planes, name)
-        normal = wp.vec3d(plane[0], plane[1], plane[2])
-        square = wp.dot(direction, direction)
-        slope = wp.dot(normal, direction)
-        height = plane[3] - wp.dot(normal, origin)
-        if slope * slope > _STEEP_SQUARE * square and wp.abs(height) > _CLEAR * rounding_scale(
-            origin, radius
-        ):
-            t = height * wp.sqrt(square) / slope
-            if t > clearance:  # nearly every ray: nothing is left to decide
-                keep(distance, face, i, t, name)
-                return
-    length = wp.length(direction)
-    scale = rounding_scale(origin, radius)
-    if name < 0:
-        distance[i] = wp.float64(wp.inf)
-        face[i] = wp.where(is_bad(scale, length), BAD, MISS)
-        return
-    begin = clearance - _ROUNDING * scale
-    if start.shape[0] > 0:
-        begin = start[i]
-    near = begin + wp.float64(met_at[k])
-    t = plane_distance(origin, direction, length, scale, planes[name], near, clearance)
-    if wp.isnan(t):
-        t = near + _ROUNDING * scale
-        name = AGAIN
-    distance[i] = t
-    face[i] = name
 
 
 @wp.kernel
