@@ -7,6 +7,7 @@ Both answer in float32 which face a ray meets; distances [m] are then taken in f
 from __future__ import annotations
 
 from functools import cached_property
+from threading import local
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.geometry import embree, o3d
 from warprrf.kernels.lanes import LANES
-from warprrf.kernels.packed_rays import judge_segments, pack_rays, pack_segments, place_hits
+from warprrf.kernels.packed_rays import judge_segments, pack_rays, pack_segments, pick_rays, place_hits
 from warprrf.kernels.rays import (
     AGAIN,
     BAD,
@@ -45,6 +46,9 @@ _PROBE = 2_048
 # least. Asking costs a segment 1 ns a face, and searching it 100 to 500.
 _BLOCKERS = 16
 _BLOCKER_SHARE = 0.01
+# From this many faces on, rays without order are put in order of start and direction before they are cast: the parts of
+# the hierarchy that they meet are then still in the cache.
+_FACES_TO_SORT = 20_000
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4
@@ -180,7 +184,8 @@ class RaySearch:
         count = max(len(o), len(d))
         chunk = min(count, _EMBREE_CHUNK)
         t, face = np.empty(count), np.empty(count, dtype=np.int32)
-        rays = wp.empty(2 * chunk, dtype=wp.vec3, device=cpu)
+        rays = _packed_rays(chunk)
+        keys = np.empty(chunk if len(self._faces) >= _FACES_TO_SORT else 0, dtype=np.uint16)
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [
             clearance, _given(np.empty(0) if start is None else start, wp.float64, cpu),
@@ -191,9 +196,9 @@ class RaySearch:
         for first in range(0, count, chunk):
             size = min(chunk, count - first)
             blocks = -(-size // LANES)
-            inputs = [first, size, center, self._radius, *given, rays]
+            inputs = [first, size, center, self._radius, *given, rays, _given(keys, wp.uint16, cpu)]
             _device.launch(pack_rays, blocks, inputs, device=cpu, pieces=pieces)
-            met_at, met = scene.cast(rays.numpy().reshape(-1, 6)[:size])
+            met_at, met = _cast(scene, rays, size, keys[:size])
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
             inputs = [first, size, center, self._radius, planes, faces, *given, *hits, *out]
             _device.launch(place_hits, blocks, inputs, device=cpu, pieces=pieces)
@@ -216,12 +221,12 @@ class RaySearch:
         """
         where = _device.resolve(device)
         count = max(len(a), len(b)) if min(len(a), len(b)) else 0
-        sight = np.empty(count, dtype=np.int32)
+        sight = np.empty(count, dtype=np.int8)
         if choose_backend(backend, where, count) == "embree" and count:
             self._free_embree(a, b, sight, clearance, where)
         else:
             mesh, planes = self._built(where)
-            found = _given(sight, wp.int32, where)
+            found = _given(sight, wp.int8, where)
             ends = [_given(a, wp.vec3d, where), _given(b, wp.vec3d, where)]
             inputs = [mesh.id, wp.vec3d(*self._center), self._radius, planes, clearance, *ends, found]
             _device.launch(look, count, inputs, device=where)
@@ -242,28 +247,32 @@ class RaySearch:
         scene, names = self._embree
         count, pieces = len(sight), _device.threads()
         chunk = min(count, _EMBREE_CHUNK)
-        rays = wp.empty(2 * chunk, dtype=wp.vec3, device=cpu)
+        rays = _packed_rays(chunk)
+        keys = np.empty(chunk if len(self._faces) >= _FACES_TO_SORT else 0, dtype=np.uint16)
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [clearance, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu)]
-        out = _given(sight, wp.int32, cpu)
+        out = _given(sight, wp.int8, cpu)
         starts = [0, *range(min(_PROBE, chunk), count, chunk)] if count > 4 * _PROBE else [0]
         mostly_free, none = False, np.empty(0)
         frequent = none
         for first, end in zip(starts, [*starts[1:], count], strict=True):
             size = end - first
-            known = _given(none if mostly_free else frequent, wp.float64, cpu)
-            inputs = [first, size, center, self._radius, *given, known, rays, out]
+            known, kept = (none, keys[:0]) if mostly_free else (frequent, keys)
+            inputs = [
+                first, size, center, self._radius, *given, _given(known, wp.float64, cpu), rays,
+                _given(kept, wp.uint16, cpu), out,
+            ]  # fmt: skip
             _device.launch(pack_segments, -(-size // LANES), inputs, device=cpu, pieces=pieces)
-            packed, part = rays.numpy().reshape(-1, 6)[:size], sight[first:end]
+            part = sight[first:end]
             if mostly_free:
-                which = np.flatnonzero(scene.blocked(packed))
+                which = np.flatnonzero(scene.blocked(_rows_of(rays, size)))
             else:
                 which = np.flatnonzero(part == FREE)
-            which = which.astype(np.int32)
             if len(which):
-                met = scene.cast(packed if len(which) == size else packed[which])[1]
+                met = _cast(scene, rays, size, kept, which)[1]
+                chosen = _given(which.astype(np.int32), wp.int32, cpu)
                 inputs = [
-                    first, len(which), _given(which, wp.int32, cpu), center, self._radius, planes, faces, *given,
+                    first, len(which), chosen, center, self._radius, planes, faces, *given,
                     _given(met, wp.int32, cpu), out,
                 ]  # fmt: skip
                 _device.launch(judge_segments, -(-len(which) // LANES), inputs, device=cpu, pieces=pieces)
@@ -340,6 +349,49 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
         return backend
     least = EMBREE_RAYS if o3d.loaded() else EMBREE_RAYS_TO_LOAD
     return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
+
+
+def _packed_rays(size: int) -> wp.array:
+    """Room for ``size`` packed rays, the same at each call in a thread: pages that are new cost more than packing."""
+    if getattr(_scratch, "rays", None) is None or len(_scratch.rays) < 2 * size:
+        _scratch.rays = wp.empty(2 * size, dtype=wp.vec3, device="cpu")
+    return _scratch.rays
+
+
+def _rows_of(rays: wp.array, size: int) -> np.ndarray:
+    """The first ``size`` packed rays, as Embree takes them."""
+    packed: np.ndarray = rays.numpy().reshape(-1, 6)[:size]
+    return packed
+
+
+def _cast(
+    scene: embree.EmbreeScene, rays: wp.array, size: int, keys: np.ndarray, which: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """First hits of the first ``size`` packed rays, or of those that ``which`` names.
+
+    Where neighbours among them have other ``keys``, they are sorted by key for the search.
+    """
+    if which is not None and len(keys):
+        keys = keys[which]
+    if 2 * np.count_nonzero(keys[1:] != keys[:-1]) <= len(keys):
+        if which is None or len(which) == size:
+            return scene.cast(_rows_of(rays, size))
+        return scene.cast(_picked(rays, which))
+    order = np.argsort(keys, kind="stable")
+    met_at, met = np.empty(len(order), dtype=np.float32), np.empty(len(order), dtype=np.int32)
+    met_at[order], met[order] = scene.cast(_picked(rays, order if which is None else which[order]))
+    return met_at, met
+
+
+def _picked(rays: wp.array, which: np.ndarray) -> np.ndarray:
+    """Packed rays that ``which`` names, in this order."""
+    picked = wp.empty(2 * len(which), dtype=wp.vec3, device="cpu")
+    inputs = [len(which), rays, _given(which, wp.int64, picked.device), picked]
+    _device.launch(pick_rays, -(-len(which) // LANES), inputs, device="cpu", pieces=_device.threads())
+    return _rows_of(picked, len(which))
+
+
+_scratch = local()
 
 
 def rows(array: np.ndarray, index: np.ndarray) -> np.ndarray:

@@ -52,6 +52,7 @@ roots_of_singles = _of_singles.roots
 
 _HALF = LANES // 2  # numbers of float64 that a register of 512 bits holds
 _AHEAD = 16  # blocks of 16 rows, 3 KiB
+_CELLS = 4  # that a key tells apart along each axis
 _EVERY = (1 << LANES) - 1
 _TYPES = f"""
     typedef wp::float64 half_lanes __attribute__((vector_size({_HALF} * sizeof(wp::float64)), aligned(8)));
@@ -210,6 +211,33 @@ def put_rays(
 
 
 @wp.func_native(f"""
+    const wp::float32 each = {_CELLS // 2} / radius, most = {_CELLS - 1};
+    for (int j = 0; j < {LANES}; ++j) {{
+        int key = (dx[j] > 0) | (dy[j] > 0) << 1 | (dz[j] > 0) << 2;
+        const wp::float32 start[3] = {{sx[j], sy[j], sz[j]}};
+        for (int c = 0; c < 3; ++c) {{
+            const wp::float32 cell = start[c] * each + {_CELLS // 2};
+            key = {_CELLS} * key + wp::int32(cell > 0 ? (cell < most ? cell : most) : 0);
+        }}
+        keys.data[k + j] = key;
+    }}
+""")
+def put_keys(
+    keys: wp.array(dtype=wp.uint16),
+    k: int,
+    radius: wp.float32,
+    sx: singles,  # type: ignore[valid-type]
+    sy: singles,  # type: ignore[valid-type]
+    sz: singles,  # type: ignore[valid-type]
+    dx: singles,  # type: ignore[valid-type]
+    dy: singles,  # type: ignore[valid-type]
+    dz: singles,  # type: ignore[valid-type]
+) -> None:
+    """Write keys ``k`` to ``k + 16``: rays of one key go into one octant and start in one cell of the bounds."""
+    ...
+
+
+@wp.func_native(f"""
     wp::vec_t<{LANES}, wp::float64> out;
     for (int j = 0; j < {LANES}; ++j) out[j] = source.data[i + j];
     return out;
@@ -331,7 +359,7 @@ def along(
     for (int j = 0; j < {LANES}; ++j)
         sight.data[i + j] = (bad >> j) & 1 ? {BAD} : (blocked >> j) & 1 ? {BLOCKED} : {FREE};
 """)
-def tell(sight: wp.array(dtype=wp.int32), i: int, blocked: int, bad: int) -> None:
+def tell(sight: wp.array(dtype=wp.int8), i: int, blocked: int, bad: int) -> None:
     """Write FREE, BLOCKED and BAD for segments ``i`` to ``i + 16``."""
     ...
 
@@ -339,7 +367,7 @@ def tell(sight: wp.array(dtype=wp.int32), i: int, blocked: int, bad: int) -> Non
 @wp.func_native(f"""
     for (int j = 0; j < {LANES}; ++j) sight.data[first + which.data[k + j]] = {BLOCKED};
 """)
-def block(sight: wp.array(dtype=wp.int32), first: int, which: wp.array(dtype=wp.int32), k: int) -> None:
+def block(sight: wp.array(dtype=wp.int8), first: int, which: wp.array(dtype=wp.int32), k: int) -> None:
     """Write BLOCKED for segments ``first`` plus elements ``k`` to ``k + 16`` of ``which``."""
     ...
 
@@ -396,10 +424,12 @@ def pack_rays(
     origins: wp.array(dtype=wp.vec3d),
     directions: wp.array(dtype=wp.vec3d),
     rays: wp.array(dtype=wp.vec3),
+    keys: wp.array(dtype=wp.uint16),
 ):
     """``size`` rays from number ``first`` on as pairs (start, unit direction) in float32; a bad one meets nothing.
 
     ``start`` holds the distance [m] at which each begins; if empty, all begin at ``clearance``, less the rounding.
+    ``keys``, if not empty, become numbers that rays near each other share.
     """
     k = wp.static(LANES) * (offset + wp.tid())
     i = first + k
@@ -420,6 +450,8 @@ def pack_rays(
         if start.shape[0] > 0:
             begin = rounded(numbers(start, i))
         square = wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz)
+        if keys.shape[0] > 0:
+            put_keys(keys, k, wp.float32(radius), x, y, z, dx, dy, dz)
         inverse = wp.cw_div(singles(wp.float32(1.0)), roots_of_singles(square))
         dx = wp.cw_mul(dx, inverse)
         dy = wp.cw_mul(dy, inverse)
@@ -430,10 +462,45 @@ def pack_rays(
         low = positive_bits_of_singles(square - singles(_LEAST_SQUARE))
         high = positive_bits_of_singles(singles(_MOST_SQUARE) - square)
         rare = wp.static(_EVERY) - (low & high)
+    elif keys.shape[0] > 0:
+        for j in range(count):
+            keys[k + j] = wp.uint16(0)
     while rare != 0:
         j = lowest_bit(rare)
         rare = rare & (rare - 1)
         pack_ray(i + j, k + j, center, radius, clearance, start, origins, directions, rays)
+
+
+@wp.func_native(f"""
+    const int end = k + {LANES} < size ? k + {LANES} : size;
+    for (int j = k; j < end; ++j) {{
+        if (j + 2 * {LANES} < size) __builtin_prefetch(rays.data + 2 * which.data[j + 2 * {LANES}]);
+        const wp::vec3* from = rays.data + 2 * which.data[j];
+        picked.data[2 * j] = from[0];
+        picked.data[2 * j + 1] = from[1];
+    }}
+""")
+def pick(
+    rays: wp.array(dtype=wp.vec3),
+    which: wp.array(dtype=wp.int64),
+    k: int,
+    size: int,
+    picked: wp.array(dtype=wp.vec3),
+) -> None:
+    """Copy rays ``which[k]`` to ``which[k + 16]``, those below ``size``."""
+    ...
+
+
+@wp.kernel(module="unique", module_options=_OPTIONS, enable_backward=False)
+def pick_rays(
+    offset: int,
+    size: int,
+    rays: wp.array(dtype=wp.vec3),
+    which: wp.array(dtype=wp.int64),
+    picked: wp.array(dtype=wp.vec3),
+):
+    """The rays of :func:`pack_rays` that ``which`` names, ``size`` of them, one after the other."""
+    pick(rays, which, wp.static(LANES) * (offset + wp.tid()), size, picked)
 
 
 @wp.func
@@ -543,7 +610,7 @@ def pack_segment(
     starts: wp.array(dtype=wp.vec3d),
     ends: wp.array(dtype=wp.vec3d),
     rays: wp.array(dtype=wp.vec3),
-    sight: wp.array(dtype=wp.int32),
+    sight: wp.array(dtype=wp.int8),
 ):
     """Pack segment ``i`` at place ``k``."""
     origin = row(starts, i) - center
@@ -556,7 +623,7 @@ def pack_segment(
     reach = wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan))
     rays[2 * k] = narrow(origin + (clearance - step) * unit)
     rays[2 * k + 1] = narrow(reach * unit)
-    sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
+    sight[i] = wp.int8(wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD))
 
 
 @wp.func
@@ -611,13 +678,14 @@ def pack_segments(
     ends: wp.array(dtype=wp.vec3d),
     blockers: wp.array(dtype=wp.float64),
     rays: wp.array(dtype=wp.vec3),
-    sight: wp.array(dtype=wp.int32),
+    keys: wp.array(dtype=wp.uint16),
+    sight: wp.array(dtype=wp.int8),
 ):
     """Segments from number ``first`` on as pairs (start, way) in float32, from ``clearance`` to ``clearance`` before
     the end, longer by the rounding; a bad one or one that short meets nothing.
 
     ``sight`` becomes BAD where a segment is not finite, BLOCKED where one of ``blockers``, rows of plane and
-    barycentric coordinates, surely lies between, else FREE until something is met.
+    barycentric coordinates, surely lies between, else FREE until something is met. ``keys`` as in :func:`pack_rays`.
     """
     k = wp.static(LANES) * (offset + wp.tid())
     i = first + k
@@ -625,6 +693,8 @@ def pack_segments(
     if count < wp.static(LANES):
         for j in range(count):
             pack_segment(i + j, k + j, center, radius, clearance, starts, ends, rays, sight)
+            if keys.shape[0] > 0:
+                keys[k + j] = wp.uint16(0)
         return
     fetch_rows(starts, i)
     fetch_rows(ends, i)
@@ -642,6 +712,8 @@ def pack_segments(
     wx = rounded(dx)
     wy = rounded(dy)
     wz = rounded(dz)
+    if keys.shape[0] > 0:
+        put_keys(keys, k, wp.float32(radius), sx, sy, sz, wx, wy, wz)
     one = singles(wp.float32(1.0))
     length = roots_of_singles(wp.cw_mul(wx, wx) + wp.cw_mul(wy, wy) + wp.cw_mul(wz, wz))
     # Over the length: where the segment begins, and how much of it is left.
@@ -678,7 +750,7 @@ def judge_segment(
     starts: wp.array(dtype=wp.vec3d),
     ends: wp.array(dtype=wp.vec3d),
     met: int,
-    sight: wp.array(dtype=wp.int32),
+    sight: wp.array(dtype=wp.int8),
 ):
     """Judge what segment ``i`` met."""
     origin = row(starts, i) - center
@@ -686,7 +758,7 @@ def judge_segment(
     length = wp.length(way)
     scale = rounding_scale(origin, radius)
     if met < 0:
-        sight[i] = wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD)
+        sight[i] = wp.int8(wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD))
         return
     name = met
     if names.shape[0] > 0:
@@ -695,11 +767,11 @@ def judge_segment(
     normal = wp.vec3d(plane[0], plane[1], plane[2])
     slope = wp.dot(normal, way)
     height = plane[3] - wp.dot(normal, origin)
-    sight[i] = AGAIN
+    sight[i] = wp.int8(AGAIN)
     if slope * slope > _STEEP_SQUARE * length * length:
         t = height * length / slope
         if t > clearance and wp.abs(height) > _CLEAR * scale:
-            sight[i] = wp.where(t < length - clearance, BLOCKED, FREE)
+            sight[i] = wp.int8(wp.where(t < length - clearance, BLOCKED, FREE))
 
 
 @wp.kernel(module="unique", module_options=_OPTIONS, enable_backward=False)
@@ -716,7 +788,7 @@ def judge_segments(
     starts: wp.array(dtype=wp.vec3d),
     ends: wp.array(dtype=wp.vec3d),
     met: wp.array(dtype=wp.int32),
-    sight: wp.array(dtype=wp.int32),
+    sight: wp.array(dtype=wp.int8),
 ):
     """What the first hits of :func:`pack_segments` say in float64: FREE, BLOCKED, or AGAIN if it takes a closer look.
 

@@ -152,7 +152,7 @@ def look(
     clearance: wp.float64,
     starts: wp.array(dtype=wp.vec3d),
     ends: wp.array(dtype=wp.vec3d),
-    sight: wp.array(dtype=wp.int32),
+    sight: wp.array(dtype=wp.int8),
 ):
     """Whether each segment is FREE but for ``clearance`` at its ends, or BLOCKED."""
     i = offset + wp.tid()
@@ -161,13 +161,13 @@ def look(
     length = wp.length(way)
     scale = rounding_scale(origin, radius)
     if not (wp.isfinite(scale) and wp.isfinite(length)):
-        sight[i] = BAD
+        sight[i] = wp.int8(BAD)
         return
     if length <= wp.float64(2.0) * clearance:
-        sight[i] = FREE
+        sight[i] = wp.int8(FREE)
         return
     t, name = search(mesh, planes, origin, way, length, scale, clearance, length - clearance)
-    sight[i] = wp.where(name >= 0 and t < length - clearance, BLOCKED, FREE)
+    sight[i] = wp.int8(wp.where(name >= 0 and t < length - clearance, BLOCKED, FREE))
 
 
 @wp.kernel
