@@ -71,17 +71,6 @@ def fingerprint(parts: Iterable[Any]) -> str:
     return digest.hexdigest()
 
 
-def source(*modules: str) -> str:  # of beams' bench alone: all others have `warprrf.marks.code_mark`
-    """Fingerprint of the source below `warprrf/` of the named packages or files ("geometry", "device.py")."""
-    root = Path(__file__).resolve().parent.parent
-    digest = hashlib.sha256()
-    for module in modules:
-        place = root / module
-        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
-
-
 class StagedRun:
     """A folder with resumable stages; a context manager, since one folder takes one run at a time.
 
