@@ -10,11 +10,13 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
-from warprrf.rf.bistatic.bounces import fresnel_curves
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.bistatic.chains import chain_reflection, turns
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.specular import specular_paths
+from warprrf.rf.bistatic.surface import SKIN_M, Surface
 from warprrf.rf.bistatic.terms import Terms
+from warprrf.rf.half_spaces import fresnel_curves
 from warprrf.rf.paths import MirrorTracer
 
 F = 300e9
@@ -120,3 +122,40 @@ def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
         np.log([[3.0, 3.0]]), np.ones((1, 2)), turns(stops, normal), np.ones((1, 2), bool)
     )
     np.testing.assert_allclose(share[0], (1.0 / 3.0) ** 4, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("edge_m", "least", "most"), [(-0.2, 1.0, 1.0), (-0.012, 0.4, 0.75), (0.01, 0.0, 0.0)]
+)
+def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: float, most: float) -> None:
+    """Floor, then a wall: a screen across the leg between them leaves all, about half, or nothing of the path.
+
+    The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a skin above a mirror, which
+    moves them by a centimetre.
+    """
+    mesh, _ = joined(box_mesh([0, 0, 0], [5, 4, 3], inward=True))
+    alone = specular_paths(_surface(mesh), TX, RX[None], 1e-3, order=2)
+    order = np.flatnonzero(alone.order == 2)
+    over = alone.point[order]
+    pick = order[np.flatnonzero((np.abs(over[:, 0, 2]) < 1e-9) & (np.abs(over[:, 1, 0] - 5.0) < 1e-9))[0]]
+    floor, wall = alone.point[pick, 0], alone.point[pick, 1]
+    middle, toward = 0.5 * (floor + wall), wall - floor
+    across = np.cross(toward, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    up = np.cross(across, toward / np.linalg.norm(toward))
+    corner = middle + edge_m * across
+    plate = np.array(
+        [corner - 0.3 * up, corner + 0.3 * up, corner - across + 0.3 * up, corner - across - 0.3 * up]
+    )
+    both, _ = joined((mesh.vertices, mesh.faces), (plate, np.array([[0, 1, 2], [0, 2, 3]])))
+    found = specular_paths(_surface(both), TX, RX[None], 1e-3, order=2)
+    same = (found.order == 2) & (np.abs(found.length_m - alone.length_m[pick]) < 1e-9)
+    same &= found.arrival @ alone.arrival[pick] > 1 - 1e-12
+    assert alone.share[pick] == 1.0
+    assert same.sum() == (most > 0)
+    assert all(least <= share <= most for share in found.share[same])
+
+
+def _surface(mesh: Mesh) -> Surface:
+    """A surface that is as wrong as one from photos: its skin widens the zones."""
+    return replace(Surface.of(mesh), skin_m=SKIN_M)
