@@ -130,8 +130,8 @@ def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
 def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: float, most: float) -> None:
     """Floor, then a wall: a screen across the leg between them leaves all, about half, or nothing of the path.
 
-    The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a skin above a mirror, which
-    moves them by a centimetre.
+    The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a skin above a mirror,
+    which moves them by a centimetre.
     """
     mesh, _ = joined(box_mesh([0, 0, 0], [5, 4, 3], inward=True))
     alone = specular_paths(_surface(mesh), TX, RX[None], 1e-3, order=2)
