@@ -84,7 +84,8 @@ plt.show()
 # errors well below a pixel mean a stiff model.
 
 # %%
-from warprrf.geometry.sfm import align_to_known, structure_from_motion
+from warprrf.geometry.sfm import structure_from_motion
+from warprrf.geometry.sparse import align_to_known
 
 start = time.perf_counter()
 sparse = structure_from_motion(

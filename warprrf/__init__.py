@@ -21,7 +21,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Air": "rf.absorption",
     "BeamChoice": "rf.channel.beams",
-    "Blending": "geometry.render",
+    "Blending": "geometry.rasterizer",
     "BlendWeights": "geometry.render",
     "Camera": "geometry.camera",
     "Codebook": "rf.channel.beams",
@@ -33,7 +33,7 @@ _HOMES = {
     "PlanarArray": "rf.channel.arrays",
     "RadioField": "rf.field",
     "RadioMap": "rf.coverage.radio_map",
-    "Rasterizer": "geometry.render",
+    "Rasterizer": "geometry.rasterizer",
     "Relevance": "rf.relevance",
     "Reconstruction": "geometry.reconstruction",
     "Scene": "rf.scene",
@@ -74,10 +74,10 @@ if TYPE_CHECKING:
     from warprrf.geometry.gaussian_rays import GaussianRays as GaussianRays
     from warprrf.geometry.gaussians import Gaussians as Gaussians
     from warprrf.geometry.mesh import Mesh as Mesh
+    from warprrf.geometry.rasterizer import Blending as Blending
+    from warprrf.geometry.rasterizer import Rasterizer as Rasterizer
     from warprrf.geometry.reconstruction import Reconstruction as Reconstruction
-    from warprrf.geometry.render import Blending as Blending
     from warprrf.geometry.render import BlendWeights as BlendWeights
-    from warprrf.geometry.render import Rasterizer as Rasterizer
     from warprrf.geometry.render import blend_weights as blend_weights
     from warprrf.geometry.render import render as render
     from warprrf.rf.absorption import Air as Air

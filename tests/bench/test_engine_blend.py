@@ -15,7 +15,7 @@ from warprrf.bench.engine.torch_renderer import render_with_torch  # noqa: E402
 from warprrf.device import threads  # noqa: E402
 from warprrf.geometry import interop  # noqa: E402
 from warprrf.geometry.camera import Camera  # noqa: E402
-from warprrf.geometry.render import Blending  # noqa: E402
+from warprrf.geometry.rasterizer import Blending  # noqa: E402
 
 POSE = np.eye(4)
 POSE[:3, 3] = (0.1, -0.2, 0.3)

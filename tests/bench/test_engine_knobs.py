@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib")
 from warprrf.bench import engine
 from warprrf.bench.engine import knobs, report, table
 from warprrf.bench.engine.forms import FORMS, RASTERISER, exponential_forms, response_forms
-from warprrf.geometry.render import RADIO
+from warprrf.geometry.rasterizer import RADIO
 
 TINY = engine.Sizes(
     gaussians=600,

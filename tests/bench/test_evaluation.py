@@ -23,10 +23,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from small_room import SHAPE, small_room  # noqa: E402
 
 import warprrf as wr  # noqa: E402
-from warprrf import cli  # noqa: E402
+from warprrf import cli, marks  # noqa: E402
 from warprrf.bench import evaluation  # noqa: E402
 from warprrf.bench.evaluation import comparison, protocol, report, runs  # noqa: E402
-from warprrf.bench.evaluation.methods import METHODS, UNTAUGHT, Effort  # noqa: E402
+from warprrf.bench.evaluation.methods import METHODS, UNTAUGHT, Effort, code_of  # noqa: E402
 from warprrf.bench.evaluation.paper_law import law_reach, paper_law_spectra  # noqa: E402
 from warprrf.bench.evaluation.protocol import Run, Setting  # noqa: E402
 from warprrf.bench.evaluation.runs import Store, sweep  # noqa: E402
@@ -173,6 +173,23 @@ def test_finished_runs_are_kept_and_changed_options_are_not_mistaken(
 
 
 # --------------------------------------------------------------------------------------------------- the sets
+
+
+def test_a_method_is_marked_by_the_code_that_it_runs() -> None:
+    behind = {name: set(marks._sources(method.code)) for name, method in METHODS.items()}
+    own = {
+        "bistatic": "warprrf.rf.bistatic.fit",
+        "rf3dgs+": "warprrf.rf.harmonic.fitting",
+        "nerf2": "warprrf.rf.baselines.training",
+        "sionna": "warprrf.rf.channel.sionna_paths",
+        "nearest": "warprrf.rf.lookups",
+    }
+    for name, module in own.items():
+        assert module in behind[name]
+        # A change in one method's code leaves the others' runs as they are.
+        assert not [other for other in own if other != name and module in behind[other]]
+    assert all("warprrf.rf.metrics" in modules for modules in behind.values())
+    assert len({code_of(name) for name in own}) == len(own)
 
 
 def test_plan_has_nested_counts_one_run_for_what_is_untaught_and_networks_where_asked() -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from warprrf.bench.lobby import spectra
-from warprrf.rf.dataset import COMPACT_DELAY_STEP_S, SpectrumDataset
+from warprrf.rf.dataset import SpectrumDataset
+from warprrf.rf.dataset_files import COMPACT_DELAY_STEP_S
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectrum import to_db

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warprrf.bench.stages import STATE_FILE, StagedRun, fingerprint, plain, write_atomically
+from warprrf.bench.stages import STATE_FILE, StagedRun, fingerprint, plain
+from warprrf.files import write_text
 
 
 def _once(folder: Path, calls: list[str], value: int, *, stage_input: object = 0, fresh: bool = False) -> int:
@@ -20,7 +21,7 @@ def _once(folder: Path, calls: list[str], value: int, *, stage_input: object = 0
 
         def work(progress: object) -> dict[str, int]:
             calls.append("work")
-            write_atomically(folder / "out.txt", lambda name: Path(name).write_text(str(value)))
+            write_text(folder / "out.txt", str(value))
             return {"value": value}
 
         return int(run.stage("one", work, inputs=[stage_input], outputs=["out.txt"])["value"])
@@ -90,20 +91,6 @@ def test_killed_attempt_is_continued_and_its_time_counted(tmp_path: Path) -> Non
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
     with StagedRun(tmp_path), pytest.raises(ValueError, match="another run is at work"), StagedRun(tmp_path):
         pass
-
-
-def test_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "kept.txt"
-    path.write_text("old")
-
-    def broken(name: str) -> None:
-        Path(name).write_text("half")
-        raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        write_atomically(path, broken)
-    assert path.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["kept.txt"]
 
 
 def test_corrupt_state_says_how_to_go_on(tmp_path: Path) -> None:

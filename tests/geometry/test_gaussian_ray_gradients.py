@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 
 from warprrf.geometry.gaussian_rays import GaussianRays
-from warprrf.geometry.render import Blending
+from warprrf.geometry.rasterizer import Blending
 
 SCENES = 60
 COUNT, RAYS, PLACES = 7, 40, 3

@@ -6,7 +6,7 @@ import warp as wp
 
 import warprrf as wr
 from warprrf.geometry.gaussian_rays import GaussianRays
-from warprrf.geometry.render import RADIO, Blending, Rasterizer
+from warprrf.geometry.rasterizer import RADIO, Blending, Rasterizer
 
 RULES = ["product", "exp"]
 

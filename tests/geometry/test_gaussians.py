@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warprrf.geometry.gaussians import Gaussians, quaternions_of, replacing, rotations_of
+from warprrf.geometry.gaussians import Gaussians, quaternions_of, rotations_of
 
 
 def some(n=5, coefficients=16, seed=0):
@@ -114,12 +114,3 @@ def test_quaternions_are_normalised_and_turn_back_from_rotations():
     assert np.allclose(r @ r.transpose(0, 2, 1), np.eye(3), atol=1e-12)
     back = quaternions_of(r)
     assert np.allclose(np.abs(np.sum(back * g.quaternions, axis=1)), 1, atol=1e-6)
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "kept.txt"
-    path.write_text("old")
-    with pytest.raises(RuntimeError), replacing(path) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
-    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]

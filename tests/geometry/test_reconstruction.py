@@ -1,14 +1,20 @@
 """From photos to geometry: initial Gaussians, resumed runs, files."""
 
 import json
+import re
+import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parent))
+from views import look  # noqa: E402
+
 import warprrf as wr
-from warprrf.geometry import from_photos, sfm
+from warprrf.geometry import from_photos, sparse
 from warprrf.geometry.config import ReconstructionConfig
 from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.from_photos import reconstruct
@@ -30,17 +36,6 @@ SMALL = ReconstructionConfig(
     depth_downscale=4,
     voxel_m=0.1,
 )
-
-
-def look(position, target, width=64, height=48, f=40.0):
-    ahead = np.asarray(target, float) - position
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = [right, np.cross(ahead, right), ahead]
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return wr.Camera.pinhole(width, height, fx=f, fy=f, cx=width / 2, cy=height / 2, world_to_camera=pose)
 
 
 def wall_plane(size=2.0):
@@ -125,12 +120,12 @@ def test_without_a_survey_z_is_up_and_the_size_is_plausible():
     cameras = {f"{k}": look([0.1 * k, 0.02 * k**2, 0.0], [1 + k, 2.0, 0.1]) for k in range(4)}
     rng = np.random.default_rng(0)
     points = rng.uniform(5, 6, (30, 3))
-    sparse = sfm.SparseModel(
+    model = sparse.SparseModel(
         cameras, points, points, np.ones(30), np.full(30, 2), np.arange(0, 61, 2), np.tile([0, 3], 30)
     )
     turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     turn *= np.linalg.det(turn)
-    out = from_photos._assumed_scale(sfm.transformed(sparse, 0.2, turn, np.ones(3)))
+    out = sparse.assume_scale(sparse.transformed(model, 0.2, turn, np.ones(3)))
     for camera in out.cameras.values():
         assert camera.rotation[1] @ [0, 0, 1] < -0.9  # the photo's down
     gap = [np.linalg.norm(p - c.position) for c in list(out.cameras.values())[::3] for p in out.points]
@@ -202,6 +197,32 @@ def test_a_killed_run_continues_to_the_same_result(whole):
     assert stages == {"depth", "surface"}
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
+
+
+@pytest.mark.parametrize(
+    "changed, again",
+    [
+        ("start", {"planes", "refine", "depth", "surface"}),
+        ("refined", {"refine", "depth", "surface"}),
+        ("surface", {"depth", "surface"}),
+    ],
+)
+def test_a_step_of_other_code_is_done_again_and_those_after_it(
+    whole, changed, again, tmp_path, monkeypatch, caplog
+):
+    workspace, photos, known, rec = whole
+    shutil.copytree(workspace, tmp_path / "w", symlinks=True)
+    options = {"workspace": tmp_path / "w", "known_positions": known, "held_out": VIEWS[4:5], "device": "cpu"}
+    code_of = from_photos.code_of
+    monkeypatch.setattr(from_photos, "code_of", lambda step: "new code" if step == changed else code_of(step))
+    stages = set()
+    other = reconstruct(photos, config=SMALL, progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == again
+    assert len(caplog.messages) == 1 and re.search(rf"{changed}\..*other code", caplog.messages[0])
+    np.testing.assert_array_equal(other.mesh.vertices, rec.mesh.vertices)
+    stages.clear()
+    reconstruct(photos, config=SMALL, progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == set()
 
 
 def test_a_changed_setting_is_not_served_from_the_old_run(whole):

@@ -6,7 +6,8 @@ import warp as wp
 
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.geometry.render import RADIO, Blending, Rasterizer, blend_weights, render
+from warprrf.geometry.rasterizer import RADIO, Blending, Rasterizer
+from warprrf.geometry.render import blend_weights, render
 
 
 def pinhole(width=64, height=48, position=(0.0, 0.0, -4.0)):

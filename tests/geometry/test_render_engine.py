@@ -8,10 +8,11 @@ import warp as wp
 
 from warprrf import device
 from warprrf.bench.engine.scenes import gaussians, panorama, photo, room
-from warprrf.geometry import render as render_module
+from warprrf.geometry import rasterizer
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.geometry.render import RADIO, Blending, Rasterizer, render
+from warprrf.geometry.rasterizer import RADIO, Blending, Rasterizer
+from warprrf.geometry.render import render
 from warprrf.kernels import binning, blend, project, rays
 from warprrf.kernels.lanes import BLOCK, LANES
 from warprrf.kernels.lanes import build as lane_functions
@@ -114,7 +115,7 @@ def test_the_number_of_threads_changes_no_bit(camera, monkeypatch):
     results = []
     for count in (1, 2, 5):
         with ThreadPoolExecutor(5) as pool:
-            for module in (device, render_module):
+            for module in (device, rasterizer):
                 monkeypatch.setattr(module, "threads", lambda count=count: count)
             monkeypatch.setattr(device, "_pool", lambda pool=pool: pool)
             results.append(image_and_gradients(g, CAMERAS[camera], channels=5))

@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from warprrf.geometry.camera import Camera
-from warprrf.geometry.render import Blending, Rasterizer
+from warprrf.geometry.rasterizer import Blending, Rasterizer
 
 SCENES = 60
 COUNT, CHANNELS = 6, 2

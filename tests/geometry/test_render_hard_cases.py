@@ -10,7 +10,8 @@ from scipy.special import spence
 
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.geometry.render import Blending, Rasterizer, render
+from warprrf.geometry.rasterizer import Blending, Rasterizer
+from warprrf.geometry.render import render
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 SMOOTH = Blending(alpha_min=1e-6, alpha_max=1.0, transmittance_min=-0.5)

@@ -10,6 +10,8 @@ import pytest
 
 from warprrf.geometry import sfm
 from warprrf.geometry.camera import Camera
+from warprrf.geometry.photos import find_photos, match_names
+from warprrf.geometry.sparse import SparseModel, align_to_known, fit_similarity
 
 pytest.importorskip("pycolmap")
 Image = pytest.importorskip("PIL.Image")
@@ -33,7 +35,7 @@ def model(rng, names="abcdefgh"):
             640, 480, fx=400, fy=410, cx=320, cy=240, world_to_camera=pose
         )
     points = rng.standard_normal((50, 3))
-    return sfm.SparseModel(
+    return SparseModel(
         cameras, points, np.full((50, 3), 0.5), np.full(50, 0.3), np.full(50, 2), np.arange(0, 101, 2),
         np.tile([0, 1], 50),
     )  # fmt: skip
@@ -66,7 +68,7 @@ def test_similarity_is_recovered(seed):
     rng = np.random.default_rng(seed)
     scale, turn, shift = np.exp(rng.uniform(-3, 3)), rotation(rng), 10 * rng.standard_normal(3)
     source = rng.standard_normal((4 + seed, 3))
-    got = sfm.fit_similarity(source, scale * source @ turn.T + shift)
+    got = fit_similarity(source, scale * source @ turn.T + shift)
     assert got[0] == pytest.approx(scale, rel=1e-9)
     np.testing.assert_allclose(got[1], turn, atol=1e-9)
     np.testing.assert_allclose(got[2], shift, atol=1e-9 * (1 + scale))
@@ -74,7 +76,7 @@ def test_similarity_is_recovered(seed):
 
 def test_similarity_is_proper_even_where_a_mirror_image_would_fit_better():
     source = np.random.default_rng(0).standard_normal((6, 3))
-    _, turn, _ = sfm.fit_similarity(source, source * [1, 1, -1])
+    _, turn, _ = fit_similarity(source, source * [1, 1, -1])
     assert np.linalg.det(turn) == pytest.approx(1)
 
 
@@ -86,7 +88,7 @@ def test_no_similarity_nearby_fits_noisy_points_better():
     def cost(s, r, t):
         return ((s * source @ r.T + t - target) ** 2).sum()
 
-    s, r, t = sfm.fit_similarity(source, target)
+    s, r, t = fit_similarity(source, target)
     least = cost(s, r, t)
     for _ in range(200):
         spin = np.cross(np.eye(3), 1e-2 * rng.standard_normal(3))
@@ -100,7 +102,7 @@ def test_no_similarity_nearby_fits_noisy_points_better():
 def test_points_on_a_line_fix_no_rotation():
     line = np.outer(np.arange(5.0), [1, 2, 3])
     with pytest.raises(ValueError, match="one line"):
-        sfm.fit_similarity(line, line)
+        fit_similarity(line, line)
 
 
 def test_alignment_moves_world_and_cameras_together():
@@ -108,7 +110,7 @@ def test_alignment_moves_world_and_cameras_together():
     sparse = model(rng)
     scale, turn, shift = 3.7, rotation(rng), np.array([5.0, -2.0, 1.0])
     known = {n: scale * turn @ c.position + shift for n, c in list(sparse.cameras.items())[:4]}
-    aligned = sfm.align_to_known(sparse, known)
+    aligned = align_to_known(sparse, known)
     assert aligned.metric and aligned.scale_rms_m < 1e-12
     np.testing.assert_allclose(aligned.points, scale * sparse.points @ turn.T + shift, atol=1e-12)
     for name, camera in sparse.cameras.items():
@@ -122,7 +124,7 @@ def test_alignment_reports_the_rms_that_is_left():
     sparse = model(np.random.default_rng(2))
     off = 0.02 * np.random.default_rng(5).standard_normal((8, 3))
     known = {n: c.position + e for (n, c), e in zip(sparse.cameras.items(), off, strict=True)}
-    aligned = sfm.align_to_known(sparse, known)
+    aligned = align_to_known(sparse, known)
     left = [np.linalg.norm(aligned.cameras[n].position - p) for n, p in known.items()]
     assert aligned.scale_rms_m == pytest.approx(np.sqrt(np.mean(np.square(left))))
     assert 0.005 < aligned.scale_rms_m < np.sqrt((off**2).sum(axis=1).mean())
@@ -132,16 +134,16 @@ def test_bad_surveyed_positions_are_refused():
     sparse = model(np.random.default_rng(4))
     known = {n: c.position for n, c in sparse.cameras.items()}
     with pytest.raises(ValueError, match="at least 3"):
-        sfm.align_to_known(sparse, dict(list(known.items())[:2]))
+        align_to_known(sparse, dict(list(known.items())[:2]))
     with pytest.raises(ValueError, match=r"no such photo: z\.jpg"):
-        sfm.align_to_known(sparse, known | {"z.jpg": [0, 0, 0]})
+        align_to_known(sparse, known | {"z.jpg": [0, 0, 0]})
     with pytest.raises(ValueError, match="NaN"):
-        sfm.align_to_known(sparse, known | {"a.jpg": [0, np.nan, 0]})
+        align_to_known(sparse, known | {"a.jpg": [0, np.nan, 0]})
     with pytest.raises(ValueError, match="one line"):
-        sfm.align_to_known(sparse, {"a.jpg": [0, 0, 0], "b.jpg": [1, 1, 1], "c.jpg": [2, 2, 2]})
+        align_to_known(sparse, {"a.jpg": [0, 0, 0], "b.jpg": [1, 1, 1], "c.jpg": [2, 2, 2]})
     lost = replace(sparse, cameras=dict(list(sparse.cameras.items())[:2]), unposed=tuple(known)[2:])
     with pytest.raises(ValueError, match=r"only 2 of the surveyed photos were posed.*c\.jpg"):
-        sfm.align_to_known(lost, known)
+        align_to_known(lost, known)
 
 
 # ------------------------------------------------------------------------------------------- real photos
@@ -150,7 +152,7 @@ def test_bad_surveyed_positions_are_refused():
 def test_poses_of_rendered_photos_agree_with_the_truth(posed, lobby):
     sparse, truth = posed[1], lobby[1]
     assert set(sparse.cameras) == set(VIEWS) and sparse.unposed == ()
-    aligned = sfm.align_to_known(sparse, truth)
+    aligned = align_to_known(sparse, truth)
     assert aligned.scale_rms_m < 0.03  # ten neighbouring views; the whole walk does better
     assert sparse.cameras[VIEWS[0]].fx == pytest.approx(395, rel=0.03)  # estimated from the images alone
 
@@ -198,6 +200,35 @@ def test_other_photos_do_not_reuse_old_work(posed, lobby, tmp_path):
     assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:9])
 
 
+def test_work_of_other_code_is_done_again_and_says_so(posed, lobby, tmp_path, monkeypatch, caplog):
+    shutil.copytree(posed[0], tmp_path / "w", symlinks=True)
+    options = {"workspace": tmp_path / "w", "max_features": 1500}
+    stages = set()
+    monkeypatch.setattr(sfm, "code_mark", lambda *modules, packages: f"new code, {packages}")
+    sparse = sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == {"features", "matching", "mapping"}
+    assert len(caplog.messages) == 1 and "other code" in caplog.messages[0]
+    np.testing.assert_array_equal(sparse.points, posed[1].points)
+    # The same mark again: resumed. A workspace from before there were marks: done again.
+    stages.clear()
+    sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == set() and len(caplog.messages) == 1
+    stamp = tmp_path / "w" / "sfm" / "photos.json"
+    old = json.loads(stamp.read_text())
+    assert "pycolmap" in old.pop("code")
+    stamp.write_text(json.dumps(old))
+
+    class Begun(Exception):
+        pass
+
+    def begin(stage, done, total):
+        raise Begun(stage)
+
+    with pytest.raises(Begun, match="features"):
+        sfm.structure_from_motion(lobby[0], progress=begin, **options)
+    assert len(caplog.messages) == 2
+
+
 def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
     import pycolmap
 
@@ -226,11 +257,17 @@ def save(path, pixels):
 
 def test_photos_that_are_not_there_are_named(tmp_path):
     with pytest.raises(ValueError, match="not a folder"):
-        sfm.find_photos(tmp_path / "nowhere")
+        find_photos(tmp_path / "nowhere")
     with pytest.raises(ValueError, match="got 0 photos"):
-        sfm.find_photos(tmp_path)
+        find_photos(tmp_path)
     with pytest.raises(ValueError, match=r"2 of 2 files do not exist.*b\.jpg"):
-        sfm.find_photos([tmp_path / "a.jpg", tmp_path / "b.jpg"])
+        find_photos([tmp_path / "a.jpg", tmp_path / "b.jpg"])
+
+
+def test_hidden_files_are_no_photos(tmp_path):
+    for name in ("a.jpg", "b.png", "c.JPG", ".d.123.partial.jpg", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert list(find_photos(tmp_path)) == ["a.jpg", "b.png", "c.JPG"]
 
 
 def test_unreadable_and_odd_photos_are_named(tmp_path, lobby):
@@ -265,9 +302,9 @@ def test_distorted_camera_models_are_refused(tmp_path, lobby):
 
 def test_short_names_serve_where_they_are_unique():
     names = ["left/a.jpg", "left/b.jpg", "right/b.jpg"]
-    assert sfm.match_names("held_out", ["a.jpg", "right/b.jpg"], names) == ["left/a.jpg", "right/b.jpg"]
+    assert match_names("held_out", ["a.jpg", "right/b.jpg"], names) == ["left/a.jpg", "right/b.jpg"]
     with pytest.raises(ValueError, match=r"held_out: several photos have the file name of b\.jpg"):
-        sfm.match_names("held_out", ["b.jpg"], names)
+        match_names("held_out", ["b.jpg"], names)
 
 
 def test_promising_pairs_hold_the_true_neighbours(posed, monkeypatch):

@@ -1,7 +1,14 @@
 """Points, planes, fused depth and planar patches against shapes known in closed form."""
 
+import sys
+from functools import partial
+from pathlib import Path
+
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+import views  # noqa: E402
 
 from warprrf.geometry import surface
 from warprrf.geometry.camera import Camera
@@ -9,21 +16,9 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planes import Plane, dilate, plane_axes
 
 pytest.importorskip("open3d")
+look = partial(views.look, width=160, height=120, f=100.0, off=(1.5, -2.0))
 
 LOW, HIGH = np.array([-2.0, -1.5, 0.0]), np.array([2.013, 1.517, 2.511])  # not whole voxels
-
-
-def look(position, target, width=160, height=120, f=100.0):
-    ahead = np.asarray(target, float) - position
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = [right, np.cross(ahead, right), ahead]
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return Camera.pinhole(
-        width, height, fx=f, fy=f, cx=width / 2 + 1.5, cy=height / 2 - 2, world_to_camera=pose
-    )
 
 
 def room_range(camera):

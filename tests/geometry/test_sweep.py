@@ -1,16 +1,22 @@
 """Planes proven by comparing photos, on photos of a painted room that is known in closed form."""
 
+import sys
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parent))
+import views  # noqa: E402
+
 from warprrf.geometry import sweep
-from warprrf.geometry.camera import Camera
 from warprrf.geometry.edges import meeting
 from warprrf.geometry.planes import Plane, aligned, occupancy, plane_axes
 
 pytest.importorskip("open3d")
+look = partial(views.look, width=240, height=180, f=170.0)
 
 TABLE = (np.array([-0.5, -0.4]), np.array([0.5, 0.4]), 0.7)  # corners and height of its top
 LOW, HIGH = np.array([-2.0, -2.0]), np.array([2.0, 2.0])  # of the floor that is looked at
@@ -27,17 +33,6 @@ def paint(x, y):
     return (1 - a) * ((1 - b) * at(i, j) + b * at(i, j + 1)) + a * (
         (1 - b) * at(i + 1, j) + b * at(i + 1, j + 1)
     )
-
-
-def look(position, target, width=240, height=180, f=170.0):
-    ahead = np.asarray(target, float) - position
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = [right, np.cross(ahead, right), ahead]
-    pose[:3, 3] = -pose[:3, :3] @ position
-    return Camera.pinhole(width, height, fx=f, fy=f, cx=width / 2, cy=height / 2, world_to_camera=pose)
 
 
 def photo(camera):

@@ -5,13 +5,10 @@ import os
 import numpy as np
 import pytest
 
-from warprrf.rf.dataset import (
-    COMPACT_AOD_STEP_RAD,
-    COMPACT_DELAY_STEP_S,
-    SpectrumDataset,
-    assign_roles,
-    import_exr,
-)
+from warprrf.rf.dataset import SpectrumDataset, assign_roles
+from warprrf.rf.dataset_files import COMPACT_AOD_STEP_RAD, COMPACT_DELAY_STEP_S
+from warprrf.rf.exr import export_exr, import_exr
+from warprrf.rf.spectrum import Spectrum
 
 
 def dataset(count=40, shape=(12, 24), seed=0):
@@ -108,7 +105,14 @@ def test_exr_keeps_the_spectrum_and_its_numbers(tmp_path):
     np.testing.assert_array_equal(s.aod, ds.aod[5])
     assert (s.floor, s.range_db) == (ds.floor, ds.range_db)
     assert s.attributes["frequency_hz"] == 300e9
+    assert (s.attributes["engine"], s.attributes["polarisation"]) == (ds.engine, ds.polarisation)
     np.testing.assert_array_equal(s.attributes["receiver"], ds.receivers[5])
+
+
+def test_a_spectrum_without_delays_is_no_exr(tmp_path):
+    pytest.importorskip("OpenEXR")
+    with pytest.raises(ValueError, match="spectrum: got one without delay"):
+        export_exr(tmp_path / "one.exr", Spectrum(np.ones((2, 4))))
 
 
 def test_missing_and_damaged_files_are_named(tmp_path):

@@ -259,7 +259,7 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     field = BistaticField(
         surface=surface, transmitter=np.array([0.02, 0.0, 0.0]), frequency_hz=F, shape=SHAPE, floor=1e-20,
         range_db=(-200.0, -80.0), beam_sigma_rad=np.radians(5.0), parameters=parameters, material=np.zeros(groups, int),
-        residual=np.zeros(len(surface.element_area)),
+        residual=np.zeros((2, surface.texels)),
         terms=Terms(line_of_sight=False, mirror_order=0, lobes=(0,), diffuse_order=2),
     )  # fmt: skip
     thrice = replace(field, terms=replace(field.terms, diffuse_order=3))

@@ -151,8 +151,7 @@ def test_beams_made_at_once_are_those_made_one_by_one(sigma: float) -> None:
 def test_strongest_ray_of_a_pixel_is_that_of_the_spread_paths() -> None:
     import warp as wp
 
-    from warprrf.rf.exact import sub_pixel_directions
-    from warprrf.rf.spectrum import strongest_rays
+    from warprrf.rf.spectrum import strongest_rays, sub_pixel_directions
 
     shape, sigma = (36, 72), 0.1
     directions = sub_pixel_directions(shape, 3)[0]

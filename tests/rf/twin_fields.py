@@ -45,6 +45,6 @@ def known_field(**changes) -> BistaticField:
             weight, np.log([2.0, 5.0, 1.0]), np.log([0.75, 0.36, 0.99]), np.full(3, -np.inf)
         ),
         "material": surface.material,
-        "residual": np.zeros(len(surface.element_area)),
+        "residual": np.zeros((2, surface.texels)),
     }
     return BistaticField(**(given | changes))

@@ -18,8 +18,9 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.bench.machine import machine
-from warprrf.bench.stages import write_atomically, write_json
+from warprrf.bench.stages import write_json
 from warprrf.device import Progress
+from warprrf.files import write_atomically, write_text
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.arrays import PlanarArray, plane_wave_error
 from warprrf.rf.channel.band_plan import thz_channel
@@ -86,7 +87,7 @@ def run_channel(
         progress("channel", len(stages), len(stages))
     write_json(folder / "channel.json", report)
     text = table(report)
-    write_atomically(folder / "channel.md", lambda name: Path(name).write_text(text, encoding="utf-8"))
+    write_text(folder / "channel.md", text)
     _plot(report["plane_wave"], folder / "plane_wave.png")
     return report
 

@@ -14,7 +14,8 @@ import numpy as np
 from warprrf.device import Progress, check_array
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.harmonic import transport as _transport
+from warprrf.rf.harmonic.interaction import INTERACTION_POINTS, interaction_points, path_lengths
+from warprrf.rf.harmonic.transport import transport
 from warprrf.rf.spectrum import pixel_directions
 
 REPEATS = 3  # the fastest of so many runs is quoted
@@ -47,10 +48,9 @@ def interaction_point_rows(
     """
     positions = check_array("receivers", receivers, (None, 3))
     source = check_array("transmitter", transmitter, (3,))
-    weights = _transport.transport
-    weights(geometry.gaussians, positions[:1], shape, device=device)  # compile outside the clock
+    transport(geometry.gaussians, positions[:1], shape, device=device)  # compile outside the clock
     start = time.perf_counter()
-    seen = weights(geometry.gaussians, positions, shape, device=device, progress=progress)
+    seen = transport(geometry.gaussians, positions, shape, device=device, progress=progress)
     blending = (time.perf_counter() - start) / len(positions)
     size = (len(positions), *seen.shape, 3)
     truth = true_mesh.cast(
@@ -58,18 +58,16 @@ def interaction_point_rows(
         np.broadcast_to(pixel_directions(seen.shape), size).reshape(-1, 3),
         device=device,
     )
-    exact = _transport.path_lengths(truth.point.reshape(size), source, positions).total
+    exact = path_lengths(truth.point.reshape(size), source, positions).total
     rows = []
-    for kind in _transport.INTERACTION_POINTS:
+    for kind in INTERACTION_POINTS:
         if kind == "mesh" and geometry.mesh is None:
             continue
         fastest = np.inf
         for _ in range(REPEATS):
             start = time.perf_counter()
-            points = _transport.interaction_points(
-                seen, geometry.gaussians, kind, mesh=geometry.mesh, device=device
-            )
-            lengths = _transport.path_lengths(points, source, positions).total
+            points = interaction_points(seen, geometry.gaussians, kind, mesh=geometry.mesh, device=device)
+            lengths = path_lengths(points, source, positions).total
             fastest = min(fastest, time.perf_counter() - start)
         error = np.abs(lengths - exact)
         error = error[np.isfinite(error)]

@@ -6,7 +6,7 @@ is counted to every one of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,11 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
+from warprrf.bench import setting
 from warprrf.bench.setting import Geometry
+from warprrf.bench.stages import fingerprint
 from warprrf.device import Progress
+from warprrf.marks import code_mark
 from warprrf.rf import lookups
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.sight import Sight
@@ -25,19 +28,19 @@ from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.harmonic.field import HarmonicField
 from warprrf.rf.spectrum import Spectrum, angles_from_directions, spread
 
-# Files of no field: changing them leaves our rows as they are.
-_NEITHER = (
-    "absorption", "antenna", "blockage", "llvm", "mirror_chains", "mitsuba_photos", "newrf", "reflections",
-    "relevance", "relevance_choice", "relevance_model", "sionna_calibration", "sionna_engine", "twin",
-)  # fmt: skip
+METRICS_CODE = ("warprrf.rf.metrics", "warprrf.rf.dataset")
+LOOKUPS_CODE = ("warprrf.rf.lookups", *METRICS_CODE)
+HARMONIC_CODE = ("warprrf.rf.harmonic", "warprrf.geometry.stored", *METRICS_CODE)
+BISTATIC_CODE = ("warprrf.rf.bistatic", "warprrf.geometry.stored", *METRICS_CODE)
+"""Modules that the figures of a method depend on, for :func:`warprrf.marks.code_mark`."""
 
 
-def field_code(*, bistatic: bool, harmonic: bool) -> tuple[str, ...]:
-    """Files and packages below ``warprrf/`` that the figures of our own fields, or of neither, depend on."""
-    folder = Path(wr.__file__).parent / "rf"
-    files = [f"rf/{file.name}" for file in sorted(folder.glob("*.py")) if file.stem not in _NEITHER]
-    models = [f"rf/{name}" for name, asked in (("bistatic", bistatic), ("harmonic", harmonic)) if asked]
-    return ("device.py", "kernels", "geometry", *files, "rf/channel", "rf/coverage", *models)
+def method_mark(modules: Sequence[str], *files: str) -> str:
+    """Fingerprint of the code of a method's figures: ``modules``, and of the benches what is shared and ``files``.
+
+    What the benches import belongs to other methods too: their files count alone.
+    """
+    return fingerprint([code_mark(*modules), *(Path(file) for file in (__file__, setting.__file__, *files))])
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.bench.stages import write_atomically, write_json
+from warprrf.bench.stages import write_json
 from warprrf.device import Progress
+from warprrf.files import write_text
 from warprrf.rf.mirror_chains import MirrorChains, mirror_chains
 from warprrf.rf.newrf import NewrfRays, load_newrf, match_rays
 from warprrf.rf.paths import MirrorTracer
@@ -105,7 +106,7 @@ def run(
     }
     folder = Path(out)
     write_json(folder / "newrf.json", report)
-    write_atomically(folder / "newrf.md", lambda name: Path(name).write_text(summary_text(report) + "\n"))
+    write_text(folder / "newrf.md", summary_text(report) + "\n")
     return report
 
 

@@ -19,8 +19,9 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.bench.machine import machine
-from warprrf.bench.stages import fingerprint, write_atomically, write_json
+from warprrf.bench.stages import fingerprint, write_json
 from warprrf.device import Progress
+from warprrf.files import write_atomically, write_text
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.coverage.radio_map import RadioMap
@@ -179,7 +180,7 @@ def run_map(
     write_json(folder / "map.json", report)
     finest.save(folder / "map.nc")
     text = table(report)
-    write_atomically(folder / "map.md", lambda name: Path(name).write_text(text + "\n", encoding="utf-8"))
+    write_text(folder / "map.md", text + "\n")
     _plots(folder, report, finest, truth, counted)
     return report
 

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.bench.stages import write_atomically, write_json
+from warprrf.bench.stages import write_json
 from warprrf.device import Progress, require
+from warprrf.files import write_atomically, write_text
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.field import RadioField
@@ -113,7 +114,7 @@ def run(
     folder = Path(out)
     write_json(folder / "relevance.json", report)
     text = summary_text(report) + "\n"
-    write_atomically(folder / "relevance.md", lambda name: Path(name).write_text(text))
+    write_text(folder / "relevance.md", text)
     write_atomically(folder / "relevance.png", lambda name: _picture(report).savefig(name, dpi=130))
     return report
 

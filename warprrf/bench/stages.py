@@ -23,30 +23,16 @@ from typing import IO, Any
 import numpy as np
 
 from warprrf.device import Progress
+from warprrf.files import write_atomically
 
 HEARTBEAT_S = 5.0  # how much time of a killed stage may go unrecorded
 STATE_FILE = "stages.json"
 
 
-def write_atomically(path: str | os.PathLike[str], write: Callable[[str], Any]) -> None:
-    """Call `write` with a temporary name of the same suffix and folder, then put the file in its place.
-
-    A kill leaves the old file or the new one, never half of one.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
-    try:
-        write(str(partial))
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
 def write_json(path: str | os.PathLike[str], value: Any) -> None:
     """Write `value` as strict JSON: arrays become lists, NaN and infinities null."""
     text = json.dumps(plain(value), indent=1, allow_nan=False)
-    write_atomically(path, lambda name: Path(name).write_text(text + "\n"))
+    write_atomically(path, lambda file: file.write_text(text + "\n", encoding="utf-8"))
 
 
 def plain(value: Any) -> Any:
@@ -82,17 +68,6 @@ def fingerprint(parts: Iterable[Any]) -> str:
                     digest.update(hashlib.file_digest(content, "sha256").digest())
         else:
             digest.update(b"\0value " + json.dumps(plain(part), sort_keys=True).encode())
-    return digest.hexdigest()
-
-
-def source(*modules: str) -> str:
-    """Fingerprint of the source below `warprrf/` of the named packages or files ("geometry", "device.py")."""
-    root = Path(__file__).resolve().parent.parent
-    digest = hashlib.sha256()
-    for module in modules:
-        place = root / module
-        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
 

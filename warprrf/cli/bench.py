@@ -89,20 +89,11 @@ def add_benches(add: Add) -> None:
     worth.add_argument("--out", help="folder of the results (default runs/relevance)")
     worth.add_argument("--data", help="folder of the scene (default data/lobby)")
     ours = add("bistatic", _bench, "the bistatic field beside other systems", HELP_BENCH_BISTATIC, tables)
-    ours.add_argument("--out", help="folder of the results (default runs/bistatic)")
-    ours.add_argument(
-        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
-    )
-    ours.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
-    ours.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    _compares_fields(ours, "runs/bistatic", counts="10 50 400")
     ours.add_argument("--second", metavar="FILE", help="spectra under another transmitter (default: made)")
-    ours.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (10 50 400)")
-    ours.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
-    ours.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
     ours.add_argument(
         "--repeat", type=int, default=10, metavar="N", help="receivers of Sionna's second solve (10; 0: none)"
     )
-    ours.add_argument("--fresh", action="store_true", help="start over instead of continuing")
     engine = add("engine", _bench, "the engine's speed against error", HELP_BENCH_ENGINE, tables)
     engine.add_argument("--out", help="folder of the results (default runs/engine)")
     engine.add_argument("--scene", default="data/lobby/scene.xml", help="scene that rays are cast at (XML)")
@@ -110,7 +101,7 @@ def add_benches(add: Add) -> None:
         "--opensplat", metavar="FOLDER", help="checkout of OpenSplat: its CPU rasteriser is a peer too"
     )
     engine.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, in a minute")
-    engine.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+    _continues(engine)
     radio = add(
         "channel",
         _bench,
@@ -140,19 +131,33 @@ def add_benches(add: Add) -> None:
     ):
         _add_evaluation(add(name, _bench, line, HELP_BENCH_EVALUATION, tables))
     beams = add("beams", _bench, "beams chosen from the field, beside pilots", HELP_BENCH_BEAMS, tables)
-    beams.add_argument("--out", help="folder of the results (default runs/beams)")
-    beams.add_argument(
-        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
-    )
-    beams.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
-    beams.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
-    beams.add_argument("--counts", nargs="+", type=int, metavar="N", help="training receivers (5 10 50)")
-    beams.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
+    _compares_fields(beams, "runs/beams", counts="5 10 50")
     beams.add_argument(
         "--sides", nargs="+", type=int, metavar="N", help="elements a side of an array (4 8 16 32 64)"
     )
-    beams.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
-    beams.add_argument("--fresh", action="store_true", help="start over instead of continuing")
+
+
+def _compares_on_data(one: argparse.ArgumentParser, out: str) -> None:
+    """Options of what compares methods on data sets."""
+    one.add_argument("--out", help=f"folder of the results (default {out})")
+    one.add_argument(
+        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
+    )
+    one.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
+    one.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    _continues(one)
+
+
+def _compares_fields(one: argparse.ArgumentParser, out: str, *, counts: str) -> None:
+    """Options of what compares fields on both truths."""
+    _compares_on_data(one, out)
+    one.add_argument("--counts", nargs="+", type=int, metavar="N", help=f"training receivers ({counts})")
+    one.add_argument("--truths", nargs="+", choices=("exact", "sionna"), help="default: both")
+    one.add_argument("--every", type=int, default=1, metavar="K", help="each K-th test receiver (1)")
+
+
+def _continues(one: argparse.ArgumentParser) -> None:
+    one.add_argument("--fresh", action="store_true", help="start over instead of continuing")
 
 
 def _add_evaluation(one: argparse.ArgumentParser) -> None:
@@ -160,12 +165,7 @@ def _add_evaluation(one: argparse.ArgumentParser) -> None:
         "--scale", choices=("small", "paper"), default="small",
         help="small: within an hour on two cores; paper: full schedules, all subsets and seeds (default small)",
     )  # fmt: skip
-    one.add_argument("--out", help="folder of the results of both commands (default runs/evaluation)")
-    one.add_argument(
-        "--data", nargs="+", help="folder of spectra and scene, or NetCDF files (default data/lobby)"
-    )
-    one.add_argument("--geometry", help="a reconstruction's folder (default runs/lobby/reconstruction)")
-    one.add_argument("--scene", metavar="XML", help="true scene (default: the one beside the data)")
+    _compares_on_data(one, "runs/evaluation, for both commands")
     one.add_argument("--methods", nargs="+", metavar="METHOD", help="only these")
     one.add_argument("--truths", nargs="+", metavar="TRUTH", help="exact, sionna, paper-law (the scale's)")
     one.add_argument("--splits", nargs="+", metavar="SPLIT", help="random, region (the scale's)")
@@ -177,7 +177,6 @@ def _add_evaluation(one: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=1, metavar="N",
         help="processes of a local cluster without --scheduler (default 1; 0: in this process)",
     )  # fmt: skip
-    one.add_argument("--fresh", action="store_true", help="start over instead of continuing")
 
 
 def _bench_newrf(args: argparse.Namespace, bars: Bars) -> None:

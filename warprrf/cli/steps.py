@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from warprrf.bench.stages import write_atomically, write_json
+from warprrf.bench.stages import write_json
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add, existing, load_geometry, read_positions, read_receivers
 from warprrf.cli.tables import table
+from warprrf.files import write_text
 
 HELP_RECONSTRUCT = """\
 The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
@@ -283,4 +284,4 @@ def _relevance(args: argparse.Namespace, bars: Bars) -> None:
     if args.out:
         found.save(args.out)
         text = found.table() + "\n"
-        write_atomically(Path(args.out).with_suffix(".md"), lambda name: Path(name).write_text(text))
+        write_text(Path(args.out).with_suffix(".md"), text)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from warprrf.bench.stages import write_atomically
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add, existing
 from warprrf.cli.tables import aligned
 from warprrf.device import require
+from warprrf.files import write_arrays, write_atomically
 
 HELP_RENDER = """\
 examples:
@@ -88,7 +88,7 @@ def _render(args: argparse.Namespace, bars: Bars) -> None:
 def _write_spectrum(spectrum: Any, path: Path) -> None:
     if path.suffix == ".npz":
         arrays = {"path_gain": spectrum.path_gain, "delay_s": spectrum.delay_s, "aod": spectrum.aod}
-        write_atomically(path, lambda name: np.savez_compressed(name, **arrays))
+        write_arrays(path, arrays)
     elif path.suffix == ".png":
         figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
         spectrum.plot(ax=figure.add_subplot())

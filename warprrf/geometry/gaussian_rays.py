@@ -21,14 +21,8 @@ import warp as wp
 
 from warprrf.device import check_array, launch, resolve
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.geometry.render import (
-    RADIO,
-    RULES,
-    Blending,
-    _active_tape,
-    _gradient,
-    _with_gradients,
-)
+from warprrf.geometry.rasterizer import RADIO, RULES, Blending
+from warprrf.geometry.tape import active_tape, gradient, with_gradients
 from warprrf.kernels import gaussian_rays as kernels
 
 CPU_PIECES = 4  # gradient sums on a CPU, one writer each: the result does not depend on the thread count
@@ -178,7 +172,7 @@ class GaussianRays:
 
     def trace(self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak") -> Traced:
         """:meth:`hits` as Warp arrays, differentiable on an active tape in the parameters (not in the rays)."""
-        tape = _active_tape()
+        tape = active_tape()
         found, adjoint = self._trace(origins, directions, k, order, requires_grad=tape is not None)
         if tape is not None:
             self._record(tape, adjoint, found.outputs)
@@ -186,7 +180,7 @@ class GaussianRays:
 
     def transmit(self, a: Any, b: Any) -> wp.array:
         """:meth:`transmittance` as a Warp array, differentiable on an active tape in the parameters."""
-        tape = _active_tape()
+        tape = active_tape()
         values, adjoint = self._transmit(a, b, requires_grad=tape is not None)
         if tape is not None:
             self._record(tape, adjoint, (values,))
@@ -209,7 +203,7 @@ class GaussianRays:
                 if not array.retain_grad:
                     array.grad.zero_()
 
-        tape.record_func(backward, _with_gradients(*self.inputs, *outputs))
+        tape.record_func(backward, with_gradients(*self.inputs, *outputs))
 
     def _trace(
         self, origins: Any, directions: Any, k: int, order: str, *, requires_grad: bool
@@ -270,7 +264,7 @@ class GaussianRays:
         sums = wp.zeros((pieces, len(self), kernels.SUMS), dtype=wp.float64, device=self.device)
         launch(kernel, count, [count, pieces, *inputs, sums], device=self.device, pieces=pieces)
         _, quaternions, scales, _ = self.inputs
-        gradients = [_gradient(array) for array in self.inputs]
+        gradients = [gradient(array) for array in self.inputs]
         launch(
             self._kernels.chain, len(self), [quaternions, scales, self._scene.whitening, sums, *gradients],
             device=self.device,

@@ -6,8 +6,6 @@ Scales in metres, opacities in [0, 1], quaternions wxyz (normalised on entry), c
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import check_array
+from warprrf.files import write_atomically
 from warprrf.kernels.sh import COEFFICIENTS
 
 # The file holds the logit; beyond this an opacity is as good as 0 or 1 and its logit stays finite in float32.
@@ -129,8 +128,8 @@ class Gaussians:
         ).astype("<f4")  # fmt: skip
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
         header += [f"property float {name}" for name in names] + ["end_header", ""]
-        with replacing(path) as temporary:
-            temporary.write_bytes("\n".join(header).encode("ascii") + columns.tobytes())
+        data = "\n".join(header).encode("ascii") + columns.tobytes()
+        write_atomically(path, lambda file: file.write_bytes(data))
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Gaussians:
@@ -205,19 +204,6 @@ def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     )
     best = candidates[np.arange(len(r)), np.argmax(four, axis=1)]
     return best / np.linalg.norm(best, axis=1, keepdims=True)
-
-
-@contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its place when the block ends well, and vanishes when it does not."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:

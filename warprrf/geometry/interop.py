@@ -17,7 +17,7 @@ import warp as wp
 from warprrf.device import require, resolve
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussian_rays import GaussianRays
-from warprrf.geometry.render import Blending, Rasterizer
+from warprrf.geometry.rasterizer import Blending, Rasterizer
 from warprrf.kernels.sh import COEFFICIENTS
 
 if TYPE_CHECKING:

@@ -242,6 +242,20 @@ class Mesh:
         return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)
 
 
+def as_mesh(mesh_or_scene: Any) -> Mesh:
+    """The mesh of a scene, or the mesh itself.
+
+    Raises:
+        TypeError: if it is neither.
+    """
+    if isinstance(mesh_or_scene, Mesh):
+        return mesh_or_scene
+    mesh = getattr(mesh_or_scene, "mesh", None)
+    if isinstance(mesh, Mesh):
+        return mesh
+    raise TypeError(f"mesh_or_scene: got {type(mesh_or_scene).__name__}, expected a Mesh or a Scene")
+
+
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Nearest point of triangle k to point k: the foot on the plane if inside, else the nearest on its edges."""
     corners = [triangles[:, k] for k in range(3)]

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import check_array, require
+from warprrf.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -91,11 +92,8 @@ def write_mesh(
         coordinates = check_array("uv", uv, (len(vertices), 2)).astype(np.float32)
         mesh.vertex_attributes["s"] = coordinates[:, 0]
         mesh.vertex_attributes["t"] = coordinates[:, 1]
-    path.parent.mkdir(parents=True, exist_ok=True)
     data = mesh.export(file_type=path.suffix.lstrip("."))
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_bytes(data.encode() if isinstance(data, str) else data)
-    os.replace(temporary, path)
+    write_atomically(path, lambda file: file.write_bytes(data.encode() if isinstance(data, str) else data))
 
 
 def merge_vertices(vertices: np.ndarray, faces: np.ndarray, digits: int = 5) -> tuple[np.ndarray, np.ndarray]:

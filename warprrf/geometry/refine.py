@@ -19,10 +19,11 @@ import numpy as np
 import warp as wp
 
 from warprrf.device import Progress, check_array, launch, resolve
+from warprrf.files import write_atomically
 from warprrf.geometry.camera import Camera
-from warprrf.geometry.gaussians import Gaussians, quaternions_of, replacing, rotations_of
+from warprrf.geometry.gaussians import Gaussians, quaternions_of, rotations_of
 from warprrf.geometry.planes import Plane
-from warprrf.geometry.render import Blending, Rasterizer
+from warprrf.geometry.rasterizer import Blending, Rasterizer
 from warprrf.kernels import optimize
 from warprrf.kernels import ssim as ssim_kernels
 from warprrf.kernels.sh import COEFFICIENTS
@@ -441,8 +442,7 @@ class _Refinement:
         from safetensors.numpy import save_file
 
         metadata = {"iteration": str(self.iteration), "settings": self.fingerprint()}
-        with replacing(path) as temporary:
-            save_file(self.arrays(), temporary, metadata)
+        write_atomically(path, lambda file: save_file(self.arrays(), file, metadata))
 
     def restore(self, path: Path) -> None:
         """Continue from a checkpoint."""

@@ -1,9 +1,9 @@
-"""Structure from motion: camera poses and a sparse point cloud from photo files, and their scale in metres.
+"""Structure from motion: camera poses and a sparse point cloud from photo files.
 
 Wraps pycolmap (COLMAP: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT on the image
 files, matching, incremental mapping with one shared pinhole camera whose focal length is estimated. Photos must be
-free of lens distortion. The model comes out in units and axes of its own; :func:`align_to_known` brings it to metres
-with a similarity fitted to surveyed camera positions. Everything runs on the CPU and repeats itself for a given seed.
+free of lens distortion. The model comes out in units and axes of its own; :mod:`warprrf.geometry.sparse` brings it to
+metres. Everything runs on the CPU and repeats itself for a given seed.
 """
 
 from __future__ import annotations
@@ -16,113 +16,29 @@ import shutil
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_array, require
+from warprrf.device import Progress, require
+from warprrf.files import write_text
 from warprrf.geometry.camera import Camera
+from warprrf.geometry.photos import MIN_PHOTOS, check_photos, find_photos, some
+from warprrf.geometry.sparse import SparseModel
+from warprrf.marks import code_mark, log_other_code
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-MIN_PHOTOS = 3
+
 # Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
 MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
-COARSE_NEIGHBOURS = (
-    16  # pairs kept for each photo; on the lobby 24 gives the same errors and takes half as long again
-)
+COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
-
-
-@dataclass(frozen=True)
-class SparseModel:
-    """Posed cameras and a sparse point cloud.
-
-    Attributes:
-        cameras: photo name to :class:`Camera`, for the photos that were posed.
-        points: 3D points, shape ``(P, 3)`` float64; metres once aligned, arbitrary units before.
-        colors: colour of each point in [0, 1], shape ``(P, 3)``.
-        reprojection_error: mean reprojection error of each point [pixels], shape ``(P,)``.
-        track_length: number of photos that see each point, shape ``(P,)`` int64.
-        track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
-        track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
-        unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
-        other_models: number of photos in each smaller model that was left out.
-        metric: True once :func:`align_to_known` has brought the model to metres.
-        scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
-    """
-
-    cameras: dict[str, Camera]
-    points: np.ndarray
-    colors: np.ndarray
-    reprojection_error: np.ndarray
-    track_length: np.ndarray
-    track_start: np.ndarray
-    track_camera: np.ndarray
-    unposed: tuple[str, ...] = ()
-    other_models: tuple[int, ...] = ()
-    metric: bool = False
-    scale_rms_m: float = float("nan")
-
-    def viewpoints(self) -> np.ndarray:
-        """Mean position of the cameras that see each point, shape ``(P, 3)``: normals are turned towards it."""
-        positions = np.array([camera.position for camera in self.cameras.values()])
-        total = np.add.reduceat(positions[self.track_camera], self.track_start[:-1], axis=0)
-        return total / self.track_length[:, None]
-
-    def subset(self, keep: np.ndarray) -> SparseModel:
-        """The model with only the points where ``keep`` (boolean, shape ``(P,)``) is True."""
-        seen = np.repeat(keep, self.track_length)
-        length = self.track_length[keep]
-        return replace(
-            self,
-            points=self.points[keep],
-            colors=self.colors[keep],
-            reprojection_error=self.reprojection_error[keep],
-            track_length=length,
-            track_start=np.concatenate([[0], np.cumsum(length)]),
-            track_camera=self.track_camera[seen],
-        )
-
-
-def find_photos(photos: Any) -> dict[str, Path]:
-    """Photo name to file, sorted by name, for a folder or a sequence of image files.
-
-    A name is the path below the folder (or below the files' common folder), with forward slashes.
-
-    Raises:
-        ImportError: if pycolmap is not installed.
-        ValueError: if the folder or files do not exist, or too few photos are there.
-    """
-    require("pycolmap", extra="photos")
-    if isinstance(photos, str | os.PathLike):
-        root = Path(photos)
-        if not root.is_dir():
-            raise ValueError(
-                f"photos: {root} is not a folder; expected a folder of photos or a list of image files"
-            )
-        files = sorted(p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
-    else:
-        files = [Path(p) for p in photos]
-        missing = [str(p) for p in files if not p.is_file()]
-        if missing:
-            raise ValueError(f"photos: {len(missing)} of {len(files)} files do not exist: {_some(missing)}")
-        parents = {str(p.resolve().parent) for p in files}
-        root = Path(os.path.commonpath(parents)) if parents else Path()
-        files = [p.resolve() for p in files]
-    named = {p.relative_to(root).as_posix(): p.resolve() for p in files}
-    if len(named) < MIN_PHOTOS:
-        raise ValueError(
-            f"photos: got {len(named)} photos in {root}, expected at least {MIN_PHOTOS} "
-            f"({', '.join(PHOTO_SUFFIXES)}); a room wants 60 or more that overlap"
-        )
-    return dict(sorted(named.items()))
 
 
 def structure_from_motion(
@@ -135,10 +51,10 @@ def structure_from_motion(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SparseModel:
-    """Camera poses and sparse points of ``photos``, in the model's own units (see :func:`align_to_known`).
+    """Camera poses and sparse points of ``photos``, in the model's own units (see :mod:`~warprrf.geometry.sparse`).
 
-    Finished steps are kept in ``workspace`` and reused as long as photos and options stay the same, so that a stopped
-    run goes on where it was.
+    Finished steps are kept in ``workspace`` and reused as long as photos, options, pycolmap and this code stay the
+    same, so that a stopped run goes on where it was.
 
     Args:
         photos: a folder, or a sequence of image files, all of one size and from one undistorted camera.
@@ -164,12 +80,12 @@ def structure_from_motion(
         raise ValueError(f'pairs: got {pairs!r}, expected "auto" or "exhaustive"')
     if max_features < 100:
         raise ValueError(f"max_features: got {max_features}, expected at least 100")
-    named = find_photos(photos)
-    _check_photos(named)
     colmap = require("pycolmap", extra="photos")
+    named = find_photos(photos)
+    check_photos(named)
     folder = Path(workspace) / "sfm"
     options = {"max_features": max_features, "camera_model": camera_model, "pairs": pairs, "seed": seed}
-    _open_workspace(folder, named, options)
+    _open_workspace(folder, named, options, code_mark(__name__, packages=("pycolmap",)))
     report = progress or (lambda stage, done, total: None)
     with _quiet(colmap):
         colmap.set_random_seed(seed)
@@ -207,136 +123,6 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
         return replace(_sparse_model(model, sorted(i.name for i in model.images.values())), metric=True)
 
 
-def fit_similarity(source: Any, target: Any) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale ``s``, rotation ``R`` (3, 3) and shift ``t`` (3,) that minimise ``sum |s R source + t - target|^2``.
-
-    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
-    1991, eqs. (40) to (43). Float64 throughout.
-
-    Raises:
-        ValueError: for fewer than three points, or points on one line.
-    """
-    source = check_array("source", source, (None, 3))
-    target = check_array("target", target, (len(source), 3))
-    if len(source) < 3:
-        raise ValueError(f"source: got {len(source)} points, expected at least 3")
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    for name, centred in (("source", a), ("target", b)):
-        spread = np.linalg.svd(centred, compute_uv=False)
-        if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:
-            raise ValueError(
-                f"{name}: the points lie on one line (or coincide), so that the rotation is not fixed"
-            )
-    u, d, vt = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = (u * sign) @ vt
-    scale = float((d * sign).sum() / (a**2).sum())
-    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
-
-
-def align_to_known(sparse: SparseModel, known_positions: Mapping[str, Any]) -> SparseModel:
-    """``sparse`` in metres and world axes, by the similarity that best meets surveyed camera positions.
-
-    Args:
-        known_positions: photo name (or its file name, where that is unique) to camera position (3,) [m].
-
-    Returns:
-        The transformed model; its ``scale_rms_m`` is the rms distance left at the surveyed cameras [m].
-
-    Raises:
-        ValueError: for fewer than three positions, positions on one line, a name that is no photo, or a surveyed
-            photo that could not be posed.
-    """
-    if len(known_positions) < 3:
-        raise ValueError(
-            f"known_positions: got {len(known_positions)}, expected at least 3 camera positions that are not on a line"
-        )
-    names = match_names("known_positions", known_positions, (*sparse.cameras, *sparse.unposed))
-    lost = [n for n in names if n not in sparse.cameras]
-    usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in sparse.cameras}
-    if len(usable) < 3:
-        raise ValueError(
-            f"known_positions: only {len(usable)} of the surveyed photos were posed, expected at least 3; "
-            f"without pose: {_some(lost)}"
-        )
-    source = np.array([sparse.cameras[n].position for n in usable])
-    target = np.array([check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in usable.items()])
-    try:
-        scale, rotation, shift = fit_similarity(source, target)
-    except ValueError as error:
-        raise ValueError(f"known_positions: {error}") from error
-    rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
-    return replace(transformed(sparse, scale, rotation, shift), metric=True, scale_rms_m=rms)
-
-
-def match_names(argument: str, wanted: Any, names: Sequence[str]) -> list[str]:
-    """Full photo names of ``wanted``: each is a name, or a file name that only one of ``names`` has.
-
-    Raises:
-        ValueError: naming the entries that are no photo, or that several photos share.
-    """
-    by_file: dict[str, list[str]] = {}
-    for name in names:
-        by_file.setdefault(name.rsplit("/", 1)[-1], []).append(name)
-    found: list[str] = []
-    unknown: list[str] = []
-    shared: list[str] = []
-    for key in wanted:
-        key = str(key)
-        if key in names:
-            found.append(key)
-        elif len(by_file.get(Path(key).name, ())) == 1:
-            found.append(by_file[Path(key).name][0])
-        else:
-            (shared if Path(key).name in by_file else unknown).append(key)
-    if unknown:
-        raise ValueError(
-            f"{argument}: no such photo: {_some(unknown)}; photos are named like {_some(list(names), 2)}"
-        )
-    if shared:
-        raise ValueError(
-            f"{argument}: several photos have the file name of {_some(shared)}; give the longer name"
-        )
-    return found
-
-
-def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
-    """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
-    cameras = {}
-    for name, camera in sparse.cameras.items():
-        pose = np.eye(4)
-        pose[:3, :3] = camera.rotation @ rotation.T
-        pose[:3, 3] = -pose[:3, :3] @ (scale * rotation @ camera.position + shift)
-        cameras[name] = replace(camera, world_to_camera=pose)
-    return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)
-
-
-def _some(items: Sequence[str], limit: int = 5) -> str:
-    more = f" and {len(items) - limit} more" if len(items) > limit else ""
-    return ", ".join(str(i) for i in items[:limit]) + more
-
-
-def _check_photos(named: Mapping[str, Path]) -> None:
-    image = require("PIL.Image", extra="photos")
-    bad, sizes = [], {}
-    for name, path in named.items():
-        try:
-            with image.open(path) as photo:
-                photo.load()
-                sizes[name] = photo.size
-        except (OSError, SyntaxError, ValueError) as error:
-            bad.append(f"{name} ({error})")
-    if bad:
-        raise ValueError(f"photos: {len(bad)} of {len(named)} files do not read as images: {_some(bad)}")
-    common = max(set(sizes.values()), key=list(sizes.values()).count)
-    odd = [f"{n} ({s[0]} x {s[1]})" for n, s in sizes.items() if s != common]
-    if odd:
-        raise ValueError(
-            f"photos: {len(odd)} photos are not {common[0]} x {common[1]} as the others are; one camera with one "
-            f"image size is expected: {_some(odd)}"
-        )
-
-
 @contextmanager
 def _quiet(colmap: ModuleType) -> Iterator[None]:
     """COLMAP logs to stderr; keep only its fatal messages, and put the level back afterwards."""
@@ -348,15 +134,20 @@ def _quiet(colmap: ModuleType) -> Iterator[None]:
         colmap.logging.minloglevel = before
 
 
-def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any]) -> None:
-    """Make ``folder`` hold the work for these photos and options: what other photos or options left there goes."""
+def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any], code: str) -> None:
+    """Make ``folder`` hold the work of this code on these photos, with these options: what others left there goes."""
     state = {
         "options": options,
         "photos": {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in named.items()},
+        "code": code,
     }
     stamp = folder / "photos.json"
-    if stamp.is_file() and json.loads(stamp.read_text()) == state:
-        return
+    if stamp.is_file():
+        before = json.loads(stamp.read_text())
+        if before == state:
+            return
+        if before | {"code": code} == state:
+            log_other_code(folder)
     if folder.is_dir():
         for part in ("photos.json", "features.db", "matches.db", "working.db", "pairs.txt"):
             (folder / part).unlink(missing_ok=True)
@@ -370,9 +161,7 @@ def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, 
             link.symlink_to(path)
         except OSError:  # a file system without links
             shutil.copyfile(path, link)
-    temporary = stamp.with_suffix(".tmp")
-    temporary.write_text(json.dumps(state))
-    os.replace(temporary, stamp)
+    write_text(stamp, json.dumps(state))
 
 
 def _fresh_copy(source: Path | None, target: Path) -> None:
@@ -433,7 +222,7 @@ def _match(
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
                 f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), "
-                f"too few remain to work with: {_some(blank)}"
+                f"too few remain to work with: {some(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
         if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
@@ -538,7 +327,7 @@ def _map(colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int,
             )
         raise ValueError(
             f"photos: too few matches between the {len(named)} photos to pose any ({linked} pairs of photos match); "
-            f"expected photos of one textured place that overlap by half or more: {_some(list(named))}"
+            f"expected photos of one textured place that overlap by half or more: {some(list(named))}"
         )
     largest, *others = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     partial = folder / "model.partial"

@@ -1,9 +1,13 @@
-"""Geometry on disk: Gaussians, planes, patches and a mesh with a header, in one safetensors file, replaced at once."""
+"""Geometry on disk: Gaussians, planes, patches and a mesh with a header, in one safetensors file, replaced at once.
+
+:class:`Steps` keeps the steps of a run so, each for what it was made from.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,10 +15,12 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import check_array
-from warprrf.geometry.gaussians import Gaussians, replacing
+from warprrf.files import write_atomically
+from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.patches import PlanarPatch
 from warprrf.geometry.planes import Plane
+from warprrf.marks import log_other_code
 
 _GAUSSIANS = ("means", "quaternions", "scales", "opacities", "sh")
 
@@ -50,12 +56,8 @@ def write(
         arrays |= {f"patch_{k}": p.faces.astype(np.int64) for k, p in enumerate(patches)}
     if mesh is not None:
         arrays |= {"vertices": mesh.vertices, "faces": mesh.faces}
-    with replacing(path) as temporary:
-        save_file(
-            {name: np.ascontiguousarray(values) for name, values in arrays.items()},
-            temporary,
-            metadata={"header": json.dumps(head)},
-        )
+    whole = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
+    write_atomically(path, lambda file: save_file(whole, file, metadata={"header": json.dumps(head)}))
 
 
 @dataclass(frozen=True)
@@ -128,27 +130,44 @@ def read(path: Path) -> Stored:
 
 
 class Steps:
-    """Finished steps of a run: one file each, valid for one fingerprint."""
+    """Finished steps of a run, in their order: one file each, valid for what went in, the code, and the steps before.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        folder: where the files lie; made if missing.
+        inputs: what the first step starts from, as plain values.
+    """
+
+    def __init__(self, folder: Path, inputs: Any) -> None:
         self.folder = folder
+        self._key = _digest(inputs)
         folder.mkdir(parents=True, exist_ok=True)
 
-    def save(self, name: str, key: str, **parts: Any) -> None:
-        """Keep what step ``name`` made, the parts of :func:`write`, under fingerprint ``key``."""
-        write(self.folder / f"{name}.safetensors", {"key": key}, **parts)
+    def step(self, name: str, code: str, make: Callable[[str], dict[str, Any]]) -> Stored:
+        """What step ``name`` leaves: its file if the same code made it from the same, else what ``make`` makes.
 
-    def load(self, name: str, key: str) -> Stored | None:
-        """What step ``name`` made under fingerprint ``key``, or None."""
+        Args:
+            code: mark of the step's code; see :func:`warprrf.marks.code_mark`.
+            make: called with a key of the step; returns the parts that :func:`write` takes.
+        """
+        header = {"key": self._key, "code": code}
+        self._key = _digest(header)
         path = self.folder / f"{name}.safetensors"
-        if not path.is_file():
-            return None
-        found = read(path)
-        return found if found.header.get("key") == key else None
+        if path.is_file():
+            found = read(path)
+            if header.items() <= found.header.items():
+                return found
+            if found.header.get("key") == header["key"]:
+                log_other_code(path)
+        write(path, header, **make(self._key))
+        return read(path)
 
     def only(self, name: str, pattern: str) -> Path:
-        """The path of ``name``; files of the same pattern that belong to other fingerprints are removed."""
+        """The path of ``name``; files of the same pattern that belong to other keys are removed."""
         for path in self.folder.glob(pattern):
             if path.name != name:
                 path.unlink()
         return self.folder / name
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()

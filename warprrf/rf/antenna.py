@@ -11,24 +11,18 @@ does not turn and directions were told apart by other means; its pattern over ab
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.spectrum import (
     check_shape,
-    default_floor,
     pixel_angles,
     pixel_directions,
     pixel_solid_angles,
     spread_paths,
-    to_db,
 )
-
-if TYPE_CHECKING:
-    from warprrf.rf.dataset import SpectrumDataset
 
 ITERATIONS = 2000
 """Most Richardson-Lucy steps."""
@@ -47,6 +41,9 @@ LIMIT_DB = 20.0
 DYNAMIC_RANGE_DB = 60.0
 """What an estimate holds that far below its strongest direction is dropped [dB]."""
 
+SCANNED = "scanned antenna: Richardson-Lucy on the sphere, then spread by the stated beam"
+FIXED = "fixed antenna: divided by its gain in each direction"
+
 _TOGETHER = 32  # receivers whose estimates are refined at once
 _FLAT_DB = 0.1  # a pattern that varies less cannot tell directions apart
 
@@ -61,6 +58,7 @@ class Deembedded(NamedTuple):
         steps: Steps taken, shape ``(R,)``, int; 0 for a fixed antenna.
         misfit: Relative misfit of the measurement, weighted by solid angle, shape ``(R,)``; 0 for a fixed antenna.
         covered: Share of the sphere of which something can be told.
+        method: What was done, :data:`SCANNED` or :data:`FIXED`.
     """
 
     path_gain: np.ndarray
@@ -68,18 +66,28 @@ class Deembedded(NamedTuple):
     steps: np.ndarray
     misfit: np.ndarray
     covered: float
+    method: str
 
 
-def deembed_dataset(
-    dataset: SpectrumDataset,
+def deembed(
+    path_gain: np.ndarray,
     pattern: Any,
+    beam_sigma_rad: float,
     *,
     boresight_gain_dbi: float | None = None,
     noise: float = 0.0,
     progress: _device.Progress | None = None,
     **options: Any,
-) -> SpectrumDataset:
-    """What :meth:`SpectrumDataset.deembed` does; ``options`` go to :func:`deembed_scanned` or :func:`deembed_fixed`."""
+) -> Deembedded:
+    """``path_gain`` (R, H, W) without the antenna; see :meth:`warprrf.SpectrumDataset.deembed`.
+
+    A pattern ``(H, W)`` is a fixed antenna's, any other a scanned one's; ``options`` go to :func:`deembed_scanned` or
+    :func:`deembed_fixed`.
+
+    Raises:
+        TypeError: for an option of the other kind of antenna.
+        ValueError: for noise with a fixed antenna, or as these two raise it.
+    """
     fixed = not callable(pattern) and np.ndim(pattern) == 2
     allowed = {"limit_db"} if fixed else {"snapshots", "iterations", "tolerance", "device"}
     if wrong := sorted(set(options) - allowed):
@@ -92,48 +100,15 @@ def deembed_dataset(
             raise ValueError(
                 "noise: a fixed antenna's spectra are divided as they are; take the noise off first"
             )
-        done = deembed_fixed(dataset.path_gain, pattern, boresight_gain_dbi=boresight_gain_dbi, **options)
-    else:
-        done = deembed_scanned(
-            dataset.path_gain,
-            pattern,
-            dataset.beam_sigma_rad,
-            boresight_gain_dbi=boresight_gain_dbi,
-            noise=noise,
-            progress=progress,
-            **options,
-        )
-    count, rows, columns = done.path_gain.shape
-    there = done.source.reshape(count, -1)
-    chosen = np.maximum(there, 0)
-    each = np.arange(count)[:, None]
-    delay = np.where(there >= 0, dataset.delay_s.reshape(count, -1)[each, chosen], np.nan)
-    aod = np.where(there[..., None] >= 0, dataset.aod.reshape(count, -1, 2)[each, chosen], np.nan)
-    gain = done.path_gain.astype(np.float32)
-    lit = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
-    floor = default_floor(gain) if lit else dataset.floor
-    return replace(
-        dataset,
-        path_gain=gain,
-        delay_s=delay.reshape(count, rows, columns),
-        aod=aod.reshape(count, rows, columns, 2),
-        floor=floor,
-        range_db=(10.0 * float(np.log10(floor)), float(to_db(gain.max(initial=0.0), floor))),
-        attributes={
-            **dataset.attributes,
-            "deembedded": (
-                "fixed antenna: divided by its gain in each direction"
-                if fixed
-                else "scanned antenna: Richardson-Lucy on the sphere, then spread by the stated beam"
-            ),
-            "deembedded_boresight_gain_dbi": (
-                "as the pattern states" if boresight_gain_dbi is None else float(boresight_gain_dbi)
-            ),
-            "deembedded_noise": float(noise),
-            "deembedded_share_of_sphere": done.covered,
-            "deembedded_steps_median": float(np.median(done.steps)) if count else 0.0,
-            "deembedded_misfit_median": float(np.median(done.misfit)) if count else 0.0,
-        },
+        return deembed_fixed(path_gain, pattern, boresight_gain_dbi=boresight_gain_dbi, **options)
+    return deembed_scanned(
+        path_gain,
+        pattern,
+        beam_sigma_rad,
+        boresight_gain_dbi=boresight_gain_dbi,
+        noise=noise,
+        progress=progress,
+        **options,
     )
 
 
@@ -244,7 +219,7 @@ def deembed_scanned(
                 )
             if progress is not None:
                 progress("deembed", k + 1, count)
-    return Deembedded(path_gain, source, steps, misfit, 1.0)
+    return Deembedded(path_gain, source, steps, misfit, 1.0, SCANNED)
 
 
 def _richardson_lucy(
@@ -308,7 +283,8 @@ def deembed_fixed(
     source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)
     weight = pixel_solid_angles(gain.shape)[:, None]
     covered = float((weight * told).sum() / (weight * np.ones_like(gain)).sum())
-    return Deembedded(path_gain, source, np.zeros(len(power), dtype=int), np.zeros(len(power)), covered)
+    none = np.zeros(len(power))
+    return Deembedded(path_gain, source, none.astype(int), none, covered, FIXED)
 
 
 def _spectra(name: str, value: Any) -> np.ndarray:

@@ -1,35 +1,22 @@
-"""A set of spectra of one transmitter: in memory, as NetCDF, split for training, one spectrum to and from OpenEXR.
-
-Files are NetCDF-4 (xarray over h5netcdf) in SI units with everything needed to read them as attributes. A compact file
-holds the same variables with mantissas rounded to what matters, so that zlib finds something to compress.
-"""
+"""A set of spectra of one transmitter: what it holds, how it is split for training, what is measured out of it."""
 
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warprrf import device as _device
+from warprrf.rf import dataset_files, exr
 from warprrf.rf.absorption import Air
-from warprrf.rf.antenna import deembed_dataset
-from warprrf.rf.spectrum import Spectrum, check_shape, default_floor, pixel_angles, to_db
+from warprrf.rf.antenna import deembed
+from warprrf.rf.spectrum import Spectrum, check_shape, default_floor, to_db
 from warprrf.rf.waves import check_frequency
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
-
-# What a compact file keeps. A relative step of 2^-7 errs by at most 0.017 dB, half of N0 / 64 moves the dB image by at
-# most 0.034 dB; a pixel that becomes zero is empty, so its delay and AoD go too.
-COMPACT_GAIN_BITS = 7  # explicit mantissa bits
-COMPACT_GAIN_OF_FLOOR = 2.0**-6  # absolute step, times N0
-COMPACT_DELAY_STEP_S = 2.0**-39  # 1.8 ps between values: errors below 0.91 ps, 0.27 mm
-COMPACT_AOD_STEP_RAD = 2.0**-10  # 9.8e-4 rad between values: errors below 4.9e-4 rad
-_CHUNK_BYTES = 2_000_000  # spectra are packed several to a chunk
 
 _ROLES = ("train", "test")
 
@@ -256,8 +243,42 @@ class SpectrumDataset:
             TypeError: on a pattern that does not read as numbers, or an option of the other kind of antenna.
             ValueError: on negative, NaN or infinite gains, a scanned antenna without directivity, another shape.
         """
-        return deembed_dataset(
-            self, pattern, boresight_gain_dbi=boresight_gain_dbi, noise=noise, progress=progress, **options
+        done = deembed(
+            self.path_gain,
+            pattern,
+            self.beam_sigma_rad,
+            boresight_gain_dbi=boresight_gain_dbi,
+            noise=noise,
+            progress=progress,
+            **options,
+        )
+        count, rows, columns = done.path_gain.shape
+        there = done.source.reshape(count, -1)
+        chosen = np.maximum(there, 0)
+        each = np.arange(count)[:, None]
+        delay = np.where(there >= 0, self.delay_s.reshape(count, -1)[each, chosen], np.nan)
+        aod = np.where(there[..., None] >= 0, self.aod.reshape(count, -1, 2)[each, chosen], np.nan)
+        gain = done.path_gain.astype(np.float32)
+        lit = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
+        floor = default_floor(gain) if lit else self.floor
+        return replace(
+            self,
+            path_gain=gain,
+            delay_s=delay.reshape(count, rows, columns),
+            aod=aod.reshape(count, rows, columns, 2),
+            floor=floor,
+            range_db=(10.0 * float(np.log10(floor)), float(to_db(gain.max(initial=0.0), floor))),
+            attributes={
+                **self.attributes,
+                "deembedded": done.method,
+                "deembedded_boresight_gain_dbi": (
+                    "as the pattern states" if boresight_gain_dbi is None else float(boresight_gain_dbi)
+                ),
+                "deembedded_noise": float(noise),
+                "deembedded_share_of_sphere": done.covered,
+                "deembedded_steps_median": float(np.median(done.steps)) if count else 0.0,
+                "deembedded_misfit_median": float(np.median(done.misfit)) if count else 0.0,
+            },
         )
 
     def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
@@ -268,73 +289,7 @@ class SpectrumDataset:
             compact: Round mantissas first: path gain to 0.4 % or N0 / 128, the larger, delay to 0.91 ps, AoD to
                 4.9e-4 rad. The dB image moves by at most 0.04 dB, and the file says so.
         """
-        xarray = _device.require("xarray", extra="all")
-        _device.require("h5netcdf", extra="all")
-        gain, delay, aod = self.path_gain, self.delay_s, self.aod
-        attributes: dict[str, Any] = {
-            "title": "Spatial radio spectra",
-            "frequency_hz": self.frequency_hz,
-            "beam": "von Mises-Fisher, kappa = 1 / beam_sigma_rad^2, sums to one over the pixels for each path",
-            "beam_sigma_rad": self.beam_sigma_rad,
-            "floor": self.floor,
-            "floor_meaning": "N0 [linear]: dB images are 10 log10(path_gain + N0)",
-            "range_low_db": self.range_db[0],
-            "range_high_db": self.range_db[1],
-            "engine": self.engine,
-            "polarisation": self.polarisation,
-            "seed": self.seed,
-            "axes": "metres, z up; zenith 0 to pi, azimuth -pi to pi; arrival points from the receiver",
-            "compact": int(compact),
-            **self.attributes,
-        }
-        if compact:
-            gain = _round_mantissa(gain, COMPACT_GAIN_BITS, COMPACT_GAIN_OF_FLOOR * self.floor)
-            empty = gain == 0
-            delay = np.where(empty, np.nan, np.round(delay / COMPACT_DELAY_STEP_S) * COMPACT_DELAY_STEP_S)
-            aod = (np.round(aod / COMPACT_AOD_STEP_RAD) * COMPACT_AOD_STEP_RAD).astype(np.float32)
-            aod[empty] = np.nan
-            attributes["compact_rounding"] = (
-                f"path_gain: {COMPACT_GAIN_BITS} mantissa bits and steps of floor * {COMPACT_GAIN_OF_FLOOR:g}; "
-                f"delay: {COMPACT_DELAY_STEP_S:g} s; aod: {COMPACT_AOD_STEP_RAD:g} rad"
-            )
-        zenith, azimuth = pixel_angles(self.shape)
-        pixel = ("receiver", "zenith", "azimuth")
-        data = xarray.Dataset(
-            {
-                "receiver_position": (("receiver", "xyz"), self.receivers, {"units": "m"}),
-                "transmitter_position": (("xyz",), self.transmitter, {"units": "m"}),
-                "path_gain": (pixel, gain, {"units": "1", "long_name": "path gain per pixel, linear"}),
-                "delay": (pixel, delay, {"units": "s", "long_name": "delay of the pixel's strongest path"}),
-                "aod": (
-                    (*pixel, "angle"),
-                    aod,
-                    {
-                        "units": "rad",
-                        "long_name": "zenith and azimuth of departure of the pixel's strongest path",
-                    },
-                ),
-                "role": (
-                    ("receiver",),
-                    (self.role == "test").astype(np.int8),
-                    {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "train test"},
-                ),
-                "line_of_sight": (("receiver",), self.line_of_sight.astype(np.int8), {"units": "1"}),
-            },
-            coords={
-                "zenith": (("zenith",), zenith, {"units": "rad"}),
-                "azimuth": (("azimuth",), azimuth, {"units": "rad"}),
-                "xyz": ["x", "y", "z"],
-                "angle": ["zenith", "azimuth"],
-            },
-            attrs=attributes,
-        )
-        packing: dict[str, Any] = {"zlib": True, "shuffle": True, "complevel": 9 if compact else 4}
-        encoding = {}
-        for name in ("path_gain", "delay", "aod"):
-            one = data[name][0].nbytes if len(self) else 1
-            chunk = (max(1, min(len(self), _CHUNK_BYTES // one)), *data[name].shape[1:])
-            encoding[name] = {**packing, "_FillValue": None, "chunksizes": chunk}
-        write_whole(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=encoding))
+        dataset_files.write(path, vars(self), compact=compact)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SpectrumDataset:
@@ -344,120 +299,19 @@ class SpectrumDataset:
             FileNotFoundError: if there is no such file.
             ValueError: if it is not a readable NetCDF file of spectra.
         """
-        file = Path(path)
-        if not file.is_file():
-            raise FileNotFoundError(f"path: there is no data set {file}; warprrf simulate makes one")
-        xarray = _device.require("xarray", extra="all")
-        _device.require("h5netcdf", extra="all")
-        try:
-            with xarray.open_dataset(file, engine="h5netcdf", decode_cf=False) as opened:
-                data = opened.load()
-        except (OSError, ValueError, RuntimeError, KeyError) as error:
-            raise ValueError(f"path: {file} does not read as NetCDF-4 ({error}); is it whole?") from error
-        known = {"frequency_hz", "beam_sigma_rad", "floor", "range_low_db", "range_high_db"}
-        known |= {"engine", "polarisation", "seed"}
-        variables = {
-            "receiver_position",
-            "transmitter_position",
-            "path_gain",
-            "delay",
-            "aod",
-            "role",
-            "line_of_sight",
-        }
-        missing = sorted((known - set(data.attrs)) | (variables - set(data.variables)))
-        if missing:
-            raise ValueError(f"path: {file} lacks {', '.join(missing)}, expected a data set saved by warprrf")
-        a = {name: _plain(value) for name, value in data.attrs.items()}
-        spare = {"title", "beam", "floor_meaning", "axes", "compact", "compact_rounding"}
-        return cls(
-            receivers=data["receiver_position"].values,
-            transmitter=data["transmitter_position"].values,
-            frequency_hz=a["frequency_hz"],
-            path_gain=data["path_gain"].values,
-            delay_s=data["delay"].values,
-            aod=data["aod"].values,
-            floor=a["floor"],
-            range_db=(a["range_low_db"], a["range_high_db"]),
-            beam_sigma_rad=a["beam_sigma_rad"],
-            engine=str(a["engine"]),
-            polarisation=str(a["polarisation"]),
-            seed=int(a["seed"]),
-            role=np.where(data["role"].values == 1, "test", "train"),
-            line_of_sight=data["line_of_sight"].values.astype(bool),
-            attributes={name: value for name, value in a.items() if name not in known | spare},
-        )
+        return cls(**dataset_files.read(path))
 
     def export_exr(self, path: str | os.PathLike[str], index: int) -> None:
         """Write one spectrum as OpenEXR: channels path_gain, delay, aod_zenith, aod_azimuth, 32-bit.
 
         Numbers in the header are text, because EXR headers hold 32-bit floats only.
         """
-        exr = _device.require("OpenEXR", extra="exr")
         if not -len(self) <= index < len(self):
             raise ValueError(f"index: got {index}, expected a receiver from 0 to {len(self) - 1}")
-        channels = {
-            "path_gain": self.path_gain[index].astype(np.float32),
-            "delay": self.delay_s[index].astype(np.float32),
-            "aod_zenith": np.ascontiguousarray(self.aod[index, ..., 0]),
-            "aod_azimuth": np.ascontiguousarray(self.aod[index, ..., 1]),
-        }
-        header: dict[str, Any] = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-        numbers = {
-            "frequency_hz": [self.frequency_hz],
-            "beam_sigma_rad": [self.beam_sigma_rad],
-            "floor": [self.floor],
-            "range_db": self.range_db,
-            "receiver": self.receivers[index],
-            "transmitter": self.transmitter,
-        }
-        header.update(
-            {f"warprrf_{name}": " ".join(repr(float(v)) for v in row) for name, row in numbers.items()}
+        spectrum = self[index]
+        exr.export_exr(
+            path, replace(spectrum, attributes={**spectrum.attributes, "polarisation": self.polarisation})
         )
-        header.update({"warprrf_engine": self.engine, "warprrf_polarisation": self.polarisation})
-        write_whole(path, lambda part: exr.File(header, dict(channels)).write(str(part)), suffix=".exr")
-
-
-def import_exr(path: str | os.PathLike[str]) -> Spectrum:
-    """Read one spectrum from OpenEXR; position, frequency, beam and engine are in its ``attributes``.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it does not read as one of ours.
-    """
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"path: there is no file {file}")
-    exr = _device.require("OpenEXR", extra="exr")
-    try:
-        with exr.File(str(file), separate_channels=True) as opened:
-            header = dict(opened.header())
-            channels = {name: np.array(channel.pixels) for name, channel in opened.channels().items()}
-    except (OSError, RuntimeError, ValueError) as error:
-        raise ValueError(f"path: {file} does not read as OpenEXR ({error})") from error
-    names = ("path_gain", "delay", "aod_zenith", "aod_azimuth")
-    lacking = [n for n in names if n not in channels] + [
-        n for n in ("floor", "range_db") if f"warprrf_{n}" not in header
-    ]
-    if lacking:
-        raise ValueError(f"path: {file} lacks {', '.join(lacking)}, expected a spectrum exported by warprrf")
-    numbers = {}
-    for name in ("frequency_hz", "beam_sigma_rad", "floor", "range_db", "receiver", "transmitter"):
-        row = np.array([float(v) for v in str(header.get(f"warprrf_{name}", "nan")).split()])
-        numbers[name] = row if len(row) > 1 else float(row[0])
-    low, high = np.reshape(numbers.pop("range_db"), 2)
-    return Spectrum(
-        path_gain=channels["path_gain"],
-        delay_s=channels["delay"].astype(np.float64),
-        aod=np.stack([channels["aod_zenith"], channels["aod_azimuth"]], axis=-1),
-        floor=float(numbers.pop("floor")),
-        range_db=(float(low), float(high)),
-        attributes={
-            **numbers,
-            "engine": str(header.get("warprrf_engine", "")),
-            "polarisation": str(header.get("warprrf_polarisation", "")),
-        },
-    )
 
 
 def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.ndarray:
@@ -468,37 +322,3 @@ def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.nd
     role = np.full(count, "train", dtype="<U5")
     role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
     return role
-
-
-def write_whole(path: str | os.PathLike[str], write: Any, suffix: str = "") -> None:
-    """Call ``write(temporary path)`` in the target's folder, then move the file into place."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=suffix)
-    os.close(handle)
-    try:
-        write(Path(name))
-        os.chmod(name, 0o644)
-        os.replace(name, target)
-    finally:
-        Path(name).unlink(missing_ok=True)
-
-
-def _round_mantissa(values: np.ndarray, bits: int, step: float) -> np.ndarray:
-    """float32 values with ``bits`` explicit mantissa bits, and no finer than a power of two of at most ``step``."""
-    step = 2.0 ** np.floor(np.log2(step))
-    coarse = np.round(values / np.float32(step)) * np.float32(step)
-    rounded = np.where(values < step * 2.0**bits, coarse, values).astype(np.float32)
-    drop = 23 - bits
-    whole = rounded.view(np.uint32)
-    half = np.uint32((1 << (drop - 1)) - 1) + ((whole >> np.uint32(drop)) & np.uint32(1))  # ties to even
-    return ((whole + half) & np.uint32(0xFFFFFFFF ^ ((1 << drop) - 1))).view(np.float32)
-
-
-def _plain(value: Any) -> Any:
-    """A NetCDF attribute as a Python value."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.reshape(-1)[0]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value.decode() if isinstance(value, bytes) else value

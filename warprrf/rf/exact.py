@@ -29,9 +29,8 @@ from warprrf.rf.spectrum import (
     BEAM_SIGMA_RAD,
     angles_from_directions,
     check_shape,
-    directions_from_angles,
-    pixel_solid_angles,
     spread_paths,
+    sub_pixel_directions,
 )
 
 SUB_PIXELS = 8
@@ -42,7 +41,6 @@ Error of the total diffuse power at 60 x 120 over 17 places in a furnished room,
 """
 REVISION = 2
 """Raised whenever the engine's numbers change: finished receivers of another revision are not used."""
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True)
@@ -232,23 +230,3 @@ class _SubPixels:
 def _sub_pixel_grid(shape: tuple[int, int], sub_pixels: int, device: str) -> _SubPixels:
     directions, solid_angles = sub_pixel_directions(shape, sub_pixels)
     return _SubPixels(directions, solid_angles, wp.array(directions, dtype=wp.vec3d, device=device))
-
-
-def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """``sub_pixels``^2 directions per pixel, pixel by pixel, of equal solid angle within one.
-
-    Returns:
-        Unit directions, shape ``(H W sub_pixels^2, 3)``, and their solid angles [sr].
-    """
-    rows, columns = shape
-    count = sub_pixels**2
-    step = min(
-        (a for a in range(1, count + 1) if np.gcd(a, count) == 1), key=lambda a: abs(a - count * _GOLDEN)
-    )
-    k, i, j = np.arange(count), np.arange(rows)[:, None, None], np.arange(columns)[None, :, None]
-    across = (k + np.mod(i * _GOLDEN, 1.0)) / count  # one value a row and direction: no two alike in a column
-    down = (k * step % count + np.mod(j * _GOLDEN, 1.0)) / count
-    top, bottom = np.cos(i * np.pi / rows), np.cos((i + 1) * np.pi / rows)
-    azimuth = -np.pi + (j + across) * 2.0 * np.pi / columns
-    directions = directions_from_angles(np.arccos(top + (bottom - top) * down), azimuth).reshape(-1, 3)
-    return directions, np.repeat(pixel_solid_angles(shape) / count, columns * count)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.geometry.gaussians import replacing
+from warprrf.files import write_atomically
 
 FORMAT = "warprrf field 1"
 
@@ -21,12 +21,9 @@ def write(
     """Write ``tensors`` and ``header`` (plain values) to ``path``."""
     from safetensors.numpy import save_file
 
-    with replacing(path) as temporary:
-        save_file(
-            {name: np.ascontiguousarray(value) for name, value in tensors.items()},
-            temporary,
-            metadata={"format": kind, "header": json.dumps(header)},
-        )
+    whole = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    about = {"format": kind, "header": json.dumps(header)}
+    write_atomically(path, lambda file: save_file(whole, file, metadata=about))
 
 
 def read(path: str | os.PathLike[str], kind: str = FORMAT) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

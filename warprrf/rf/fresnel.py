@@ -12,8 +12,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from warprrf.geometry.mesh import Mesh
-
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
 LAMBERTIAN = 0
 """Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""
@@ -146,17 +144,3 @@ def lobe_norm(alpha_r: int, cos_incidence: Any) -> np.ndarray:
             total = total + binomial * 2.0 * np.pi / (j + 1) * cos * series
         binomial = binomial * (alpha_r - j) / (j + 1)
     return total / 2.0**alpha_r
-
-
-def as_mesh(mesh_or_scene: Any) -> Mesh:
-    """The mesh of a scene, or the mesh itself.
-
-    Raises:
-        TypeError: if it is neither.
-    """
-    if isinstance(mesh_or_scene, Mesh):
-        return mesh_or_scene
-    mesh = getattr(mesh_or_scene, "mesh", None)
-    if isinstance(mesh, Mesh):
-        return mesh
-    raise TypeError(f"mesh_or_scene: got {type(mesh_or_scene).__name__}, expected a Mesh or a Scene")

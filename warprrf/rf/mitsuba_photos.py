@@ -10,12 +10,14 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warprrf.device import Progress, require
+from warprrf.files import write_atomically
 from warprrf.geometry.camera import Camera
 from warprrf.rf.llvm import select_llvm
 
@@ -199,11 +201,9 @@ def render_photos(
         for k, (path, camera) in enumerate(zip(paths, cameras.values(), strict=True)):
             if not path.is_file():
                 pixels = tone_map(_radiance(mi, scene, camera, spp, seed + k, max_depth), exposure)
-                temporary = path.with_name(path.name + ".partial")
-                images.fromarray(np.round(255 * pixels).astype(np.uint8)).save(
-                    temporary, format="JPEG", quality=quality, optimize=True
-                )
-                os.replace(temporary, path)
+                photo = images.fromarray(np.round(255 * pixels).astype(np.uint8))
+                save = partial(photo.save, format="JPEG", quality=quality, optimize=True)
+                write_atomically(path, save)
             if progress is not None:
                 progress("photos", k + 1, len(paths))
     return paths

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh import Mesh, as_mesh
 from warprrf.rf.channel.path_set import Paths
-from warprrf.rf.fresnel import SPEED_OF_LIGHT, SurfaceTable, as_mesh, slab_reflection, surface_table
+from warprrf.rf.fresnel import SPEED_OF_LIGHT, SurfaceTable, slab_reflection, surface_table
 from warprrf.rf.spectrum import transverse_basis
 from warprrf.rf.waves import check_frequency
 

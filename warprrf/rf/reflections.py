@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fresnel import SPEED_OF_LIGHT, as_mesh
+from warprrf.geometry.mesh import Mesh, as_mesh
+from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.mirror_chains import MirrorChains, mirror_chains
 from warprrf.rf.paths import MirrorTracer, PlanarPatches, _connected
 

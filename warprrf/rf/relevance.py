@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, check_array
+from warprrf.files import write_text
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.terms import Terms
-from warprrf.rf.dataset import write_whole
 from warprrf.rf.field import RadioField
 from warprrf.rf.receivers import check_receiver
 from warprrf.rf.relevance_choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
@@ -182,7 +182,7 @@ class Relevance:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON, in one go."""
         text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
-        write_whole(path, lambda name: name.write_text(text))
+        write_text(path, text)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Relevance:

@@ -17,7 +17,7 @@ import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.absorption import gas_attenuation_db_per_m
-from warprrf.rf.bistatic.bounces import LOBES, fresnel_curves
+from warprrf.rf.bistatic.bounces import LOBES
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.fit import Parameters
 from warprrf.rf.bistatic.sight import Sight
@@ -26,6 +26,7 @@ from warprrf.rf.bistatic.surface import Surface
 from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.blockage import LIFT_M, SidePaths, diffracted, transmitted
 from warprrf.rf.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection, surface_table
+from warprrf.rf.half_spaces import fresnel_curves
 from warprrf.rf.spectrum import default_floor, pixel_solid_angles, spread, to_db
 
 ASSUMED_PERMITTIVITY = 4.0 * (1.0 - 0.06j)

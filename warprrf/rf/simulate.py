@@ -13,10 +13,12 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
+from warprrf.files import write_atomically
+from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.absorption import air_of
-from warprrf.rf.dataset import SpectrumDataset, write_whole
+from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
-from warprrf.rf.fresnel import as_mesh, surface_table
+from warprrf.rf.fresnel import surface_table
 from warprrf.rf.sionna_engine import SionnaEngine
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
 from warprrf.rf.waves import check_frequency
@@ -299,4 +301,4 @@ class _Cache:
             "kinds": np.array(list(found.totals)),
             "totals": np.array(list(found.totals.values())),
         }
-        write_whole(self._path(point), lambda part: np.savez(part, **arrays), suffix=".npz")
+        write_atomically(self._path(point), lambda file: np.savez(file, **arrays))

@@ -225,7 +225,7 @@ class SionnaEngine:
             "diffuse": (kinds == _DIFFUSE).any(axis=0)[valid],
             "bounces": (kinds != 0).sum(axis=0)[valid],
         }
-        # Sionna stores paths in the order in which its threads end; in this order one seed's numbers are always the same
+        # Sionna stores paths in the order in which its threads end; sorted, one seed's numbers are always the same
         order = np.lexsort([*found["aod"].T, *found["arrival"].T, found["power"], found["tau"]])
         found = {name: values[order] for name, values in found.items()}
         if self.air is not None:

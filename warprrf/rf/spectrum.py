@@ -31,6 +31,8 @@ BEAM_CUTOFF = 7.0
 FLOOR_BELOW_MEDIAN_DB = 60.0
 """The default N0 lies this far below the median over views of the view's maximum."""
 
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
 
 def check_shape(shape: Any) -> tuple[int, int]:
     """``shape`` as (rows, columns), each at least 2.
@@ -72,6 +74,26 @@ def pixel_solid_angles(shape: tuple[int, int]) -> np.ndarray:
     rows, columns = check_shape(shape)
     zenith = np.arange(rows + 1) * np.pi / rows
     return (np.cos(zenith[:-1]) - np.cos(zenith[1:])) * 2.0 * np.pi / columns
+
+
+def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    """``sub_pixels``^2 directions per pixel, pixel by pixel, of equal solid angle within one.
+
+    Returns:
+        Unit directions, shape ``(H W sub_pixels^2, 3)``, and their solid angles [sr].
+    """
+    rows, columns = shape
+    count = sub_pixels**2
+    step = min(
+        (a for a in range(1, count + 1) if np.gcd(a, count) == 1), key=lambda a: abs(a - count * _GOLDEN)
+    )
+    k, i, j = np.arange(count), np.arange(rows)[:, None, None], np.arange(columns)[None, :, None]
+    across = (k + np.mod(i * _GOLDEN, 1.0)) / count  # one value a row and direction: no two alike in a column
+    down = (k * step % count + np.mod(j * _GOLDEN, 1.0)) / count
+    top, bottom = np.cos(i * np.pi / rows), np.cos((i + 1) * np.pi / rows)
+    azimuth = -np.pi + (j + across) * 2.0 * np.pi / columns
+    directions = directions_from_angles(np.arccos(top + (bottom - top) * down), azimuth).reshape(-1, 3)
+    return directions, np.repeat(pixel_solid_angles(shape) / count, columns * count)
 
 
 def directions_from_angles(zenith: Any, azimuth: Any) -> np.ndarray:

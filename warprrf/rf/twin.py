@@ -29,11 +29,11 @@ from pathlib import Path
 import numpy as np
 
 from warprrf.geometry.meshio import write_mesh
-from warprrf.rf.bistatic.bounces import fresnel_curves
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.fit import NEPER
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import LAMBERTIAN, lobe, slab_reflection
+from warprrf.rf.half_spaces import fresnel_curves
 from warprrf.rf.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
 
 ABOUT = "Digital twin written by warprrf.write_twin."
@@ -323,8 +323,8 @@ def _left_out(field: BistaticField) -> tuple[str, ...]:
     if p.log_gain != 0.0:
         found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
     if field.terms.residual:
-        squares = np.average(field.residual**2, weights=s.element_area)
-        found.append(f"residuals of surface elements, {NEPER * np.sqrt(squares):.2f} dB rms over area")
+        squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.texel, s.mesh.areas))
+        found.append(f"residuals within groups, {NEPER * np.sqrt(squares):.2f} dB rms over area")
     if field.terms.indirect:
         found.append("indirect radiance of each group: further bounces are the ray tracer's")
     return tuple(found)

@@ -11,7 +11,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined  # noqa: E402
 
 from warprrf.rf.beam import BeamOperator
-from warprrf.rf.bistatic.bounces import fresnel_curves
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.bistatic.fit import Layout, Parameters, View, fit_groups, jacobian, predict
 from warprrf.rf.bistatic.grouping import regroup
@@ -22,6 +21,7 @@ from warprrf.rf.bistatic.terms import Terms
 from warprrf.rf.bistatic.training import trace
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.half_spaces import fresnel_curves
 from warprrf.rf.spectrum import to_db
 
 F = 300e9
@@ -101,7 +101,7 @@ def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
             parameters=Parameters(
                 weight, np.array([np.log(4.0), np.log(199.0)]), np.array([nothing, 0.0]), np.full(2, -np.inf)
             ),
-            material=np.arange(2), residual=np.zeros(len(surface.element_area)),
+            material=np.arange(2), residual=np.zeros((2, surface.texels)),
         )  # fmt: skip
 
     lit = field(both, transmitter, mirror_scatter=True)
@@ -210,7 +210,12 @@ def test_derivatives_follow_light_that_is_sent_on(views: list[View]) -> None:
     view = with_light(views[0], rng)
     # beams of single paths would drown the rest in single precision
     view = replace(
-        view, gain=view.gain[:0], beam=view.beam[:0], path_group=view.path_group[:0], cosine=view.cosine[:0]
+        view,
+        gain=view.gain[:0],
+        beam=view.beam[:0],
+        path_group=view.path_group[:0],
+        cosine=view.cosine[:0],
+        turn=view.turn[:0],
     )
     layout = Layout(3, 5, indirect=True, gain=True)
     p = Parameters(
@@ -249,15 +254,15 @@ def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
 
     from warprrf.geometry.mesh import Mesh
     from warprrf.rf.bistatic.bounces import BounceTracer
-    from warprrf.rf.bistatic.second_bounce import SeenElements
+    from warprrf.rf.bistatic.second_bounce import SeenSurface
     from warprrf.rf.bistatic.surface import Surface
 
     box = trimesh.creation.box((6.0, 4.0, 3.0))
     surface = Surface.of(Mesh(box.vertices, box.faces[:, ::-1]))
     tracer = BounceTracer(surface, (12, 24))
-    seen = SeenElements.of(tracer, tracer.meet(np.array([0.5, -0.3, 0.2])))
+    seen = SeenSurface.of(tracer, tracer.meet(np.array([0.5, -0.3, 0.2])))
     assert seen.solid_angle.sum() == pytest.approx(4.0 * np.pi, rel=1e-6)
     radiance, wavelength = 0.7, 1e-3
-    power = seen.power(np.full(len(surface.element_area), radiance), wavelength)
+    power = seen.power(np.full(len(seen.face), radiance), wavelength)
     assert power.sum() == pytest.approx((wavelength / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6)
     assert np.array_equal(np.unique(seen.pixel), np.arange(12 * 24))

@@ -10,9 +10,10 @@ from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.harmonic.field import HarmonicField
+from warprrf.rf.harmonic.interaction import interaction_points
 from warprrf.rf.harmonic.paths import BEAM_REACH
 from warprrf.rf.harmonic.single_bounce import FieldOptions
-from warprrf.rf.harmonic.transport import interaction_points, transport
+from warprrf.rf.harmonic.transport import transport
 from warprrf.rf.metrics import psnr, unit_image
 from warprrf.rf.spectrum import angles_from_directions, pixel_directions, pixel_solid_angles
 

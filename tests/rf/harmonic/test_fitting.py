@@ -5,7 +5,9 @@ import pytest
 import warp as wp
 
 from warprrf.kernels.ssim import RADIUS, WINDOW
-from warprrf.rf.harmonic.fitting import Layer, Problem, Rates, Target, fit_layer, weighted_means
+from warprrf.rf.harmonic.batches import Problem
+from warprrf.rf.harmonic.fitting import Layer, Rates, Target, fit_layer
+from warprrf.rf.harmonic.targets import weighted_means
 from warprrf.rf.harmonic.transport import Transport
 from warprrf.rf.spectrum import pixel_directions
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from warprrf.geometry.gaussians import Gaussians
+from warprrf.rf.harmonic.batches import Problem
 from warprrf.rf.harmonic.field import HarmonicField
-from warprrf.rf.harmonic.fitting import Layer, Problem, Target
+from warprrf.rf.harmonic.fitting import Layer, Target
 from warprrf.rf.harmonic.opacity import Listed, OpacityTraining, list_responses
 from warprrf.rf.harmonic.transport import Transport, transport
 

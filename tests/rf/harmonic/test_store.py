@@ -8,9 +8,12 @@ from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.render import blend_weights
 from warprrf.rf import field_files
 from warprrf.rf.harmonic import store
-from warprrf.rf.harmonic.fitting import Problem, Target, fit_layer, weighted_means
+from warprrf.rf.harmonic.batches import Problem
+from warprrf.rf.harmonic.fitting import Target, fit_layer
+from warprrf.rf.harmonic.interaction import interaction_points
 from warprrf.rf.harmonic.store import StoredTransport, store_transport
-from warprrf.rf.harmonic.transport import cutoffs, interaction_points, transport
+from warprrf.rf.harmonic.targets import weighted_means
+from warprrf.rf.harmonic.transport import cutoffs, transport
 
 SHAPE = (12, 24)
 RECEIVERS = np.random.default_rng(0).uniform(-0.5, 0.5, (23, 3))

@@ -20,10 +20,10 @@ from warprrf.rf.channel.arrays import PlanarArray, orientation_towards
 from warprrf.rf.channel.beams import Codebook, dft_codebook
 from warprrf.rf.channel.path_set import Paths
 from warprrf.rf.dataset import SpectrumDataset
-from warprrf.rf.exact import ExactEngine, sub_pixel_directions
+from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.paths import MirrorTracer
-from warprrf.rf.spectrum import angles_from_directions, directions_from_angles, spread
+from warprrf.rf.spectrum import angles_from_directions, directions_from_angles, spread, sub_pixel_directions
 from warprrf.rf.waves import carrier_phase
 
 SUB_PIXELS = (

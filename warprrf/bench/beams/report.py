@@ -10,7 +10,7 @@ from typing import Any
 from warprrf import device as _device
 from warprrf.bench.beams.users import KNOWN
 from warprrf.bench.beams.users import table as users_table
-from warprrf.bench.stages import write_atomically
+from warprrf.files import write_atomically, write_text
 
 Row = dict[str, Any]
 ASKED_WITHIN, ASKED_WITHIN_BLOCKED, ASKED_N_TRAIN = 0.90, 0.75, 10
@@ -52,7 +52,7 @@ def write(folder: str | os.PathLike[str]) -> Path:
         raise ValueError(f"out: {folder} has no beams.json, expected the result of run_beams")
     report = json.loads((folder / "beams.json").read_text())
     text = "\n".join(_document(report)) + "\n"
-    write_atomically(folder / "beams.md", lambda name: Path(name).write_text(text, encoding="utf-8"))
+    write_text(folder / "beams.md", text)
     try:
         figure_module = _device.require("matplotlib.figure", extra="plots")
     except ImportError:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import warprrf as wr
 from warprrf.bench.beams.links import BANDWIDTH_HZ, Ends, Links, ends, gains
@@ -17,8 +18,10 @@ from warprrf.bench.beams.users import several_users
 from warprrf.bench.bistatic.methods import source_of
 from warprrf.bench.machine import machine
 from warprrf.bench.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
-from warprrf.bench.stages import StagedRun, source, write_atomically, write_json
+from warprrf.bench.stages import StagedRun, write_json
 from warprrf.device import Progress
+from warprrf.files import write_atomically
+from warprrf.marks import code_mark
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.channel.beams import select_beams
 from warprrf.rf.channel.path_set import Paths
@@ -99,15 +102,17 @@ def run_beams(
             for model in MODELS:
                 for count in truth.counts:
                     fields[model, count] = _fit(run, truth, place, model, count)
-            code = source("rf", "kernels", "geometry", "bench/beams")
+            code = code_mark("warprrf.rf", "warprrf.kernels", "warprrf.geometry", "warprrf.bench.beams")
             settings = [truth.mark, place.mark, place.scene_mark, list(truth.counts), list(sides), list(both)]
-            report["truths"][truth.name] = run.stage(
-                f"beams {truth.name}",
-                lambda done, truth=truth, fields=fields: judge(  # type: ignore[misc]
-                    truth, place, fields, tuple(sides), both, seed, done
-                ),
-                inputs=[*settings, every, seed, code],
-            )
+            # A receiver's matrices are small: on busy cores threads of BLAS wait for each other most of the time.
+            with threadpool_limits(1, user_api="blas"):
+                report["truths"][truth.name] = run.stage(
+                    f"beams {truth.name}",
+                    lambda done, truth=truth, fields=fields: judge(  # type: ignore[misc]
+                        truth, place, fields, tuple(sides), both, seed, done
+                    ),
+                    inputs=[*settings, every, seed, code],
+                )
             place.forget()
     write_json(Path(out) / "beams.json", report)
     write(out)

@@ -10,17 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from warprrf.bench.methods import (
-    field_code,
+    BISTATIC_CODE,
+    HARMONIC_CODE,
+    LOOKUPS_CODE,
     fit_bistatic,
     fit_harmonic,
     fit_lookup,
+    method_mark,
     point_at_transmitter,
     sight_of,
     untaught,
 )
 from warprrf.bench.setting import Geometry, Truth
-from warprrf.bench.stages import source, write_atomically
 from warprrf.device import Progress
+from warprrf.files import write_atomically
 from warprrf.rf import metrics
 
 __all__ = ["HARMONIC", "UNTAUGHT", "VARIANTS", "point_at_transmitter", "score", "sight_of", "source_of"]
@@ -48,8 +51,9 @@ RAY_METHODS = ("bistatic", "zero")
 
 def source_of(method: str) -> str:
     """Fingerprint of the code that a method's rows depend on."""
-    code = field_code(bistatic=method in RAY_METHODS, harmonic=method in HARMONIC)
-    return source(*code, "bench/bistatic/methods.py", "bench/setting.py", "bench/methods.py")
+    if method in RAY_METHODS:
+        return method_mark(BISTATIC_CODE, __file__)
+    return method_mark(HARMONIC_CODE if method in HARMONIC else LOOKUPS_CODE, __file__)
 
 
 def score(

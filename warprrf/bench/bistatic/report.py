@@ -23,8 +23,7 @@ from warprrf.bench.bistatic.plots import (
     reliability,
 )
 from warprrf.bench.markdown import cell, table
-from warprrf.bench.pictures import METHODS, spectrum_rows
-from warprrf.bench.stages import write_atomically
+from warprrf.bench.pictures import METHODS, spectrum_rows, write_page
 from warprrf.rf.bistatic.uncertainty import OUTLIERS
 
 ASKED_MARGIN_DB: dict[str, dict[str, dict[int, float]]] = {
@@ -98,13 +97,8 @@ def write(folder: str | os.PathLike[str]) -> Path:
                 f"Receiver at ({at}) m, {state}: {TRUTH_NAMES[shown['truth']]} truth, predictions from "
                 f"{shown['n_train']} spectra, and their differences from the truth."
             )
-    for name, figure in pictures.items():
-        write_atomically(folder / name, lambda file, figure=figure: figure.savefig(file, dpi=100))  # type: ignore[misc]
-    parts = [summary_text(found)]
-    parts += [f"![{captions[name]}]({name})\n\n{captions[name]}" for name in pictures]
-    path = folder / "bistatic.md"
-    write_atomically(path, lambda file: Path(file).write_text("\n\n".join(parts) + "\n", encoding="utf-8"))
-    return path
+    shown = {name: (figure, captions[name]) for name, figure in pictures.items()}
+    return write_page(folder / "bistatic.md", summary_text(found), shown)
 
 
 # ----------------------------------------------------------------------------------------------------- tables

@@ -21,8 +21,10 @@ from warprrf.bench.bistatic.methods import HARMONIC, UNTAUGHT, VARIANTS, score, 
 from warprrf.bench.bistatic.plots import WHOLE
 from warprrf.bench.machine import machine
 from warprrf.bench.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
-from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
+from warprrf.bench.stages import StagedRun, fingerprint, plain, write_json
 from warprrf.device import Progress
+from warprrf.files import write_arrays, write_atomically
+from warprrf.marks import code_mark
 from warprrf.rf import lookups
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.spectrum import to_db
@@ -147,7 +149,7 @@ class _Bench:
     def __init__(self, rows: _Rows, geometry: Geometry, truths: list[Truth], seed: int) -> None:
         self.rows, self.geometry, self.truths, self.seed = rows, geometry, truths, seed
         self.code = {method: source_of(method) for method in VARIANTS}
-        self.checks = source("bench/bistatic/checks.py")
+        self.checks = Path(checks.__file__)
 
     def report(self, second: Path | None, second_at: tuple[float, ...], repeat: int) -> dict[str, Any]:
         table = self._table()
@@ -314,9 +316,7 @@ class _Bench:
                     count,
                     self.geometry.scene_mark,
                     self.checks,
-                    source(
-                        "rf/sionna_engine.py", "rf/channel/sionna_paths.py", "rf/simulate.py", "rf/metrics.py"
-                    ),
+                    code_mark("warprrf.rf.simulate", "warprrf.rf.metrics"),
                 ],
             )
             rows.append({"truth": truth.name, **row})
@@ -340,7 +340,7 @@ class _Bench:
                 truth.mark,
                 self.geometry.scene_mark,
                 transmitter,
-                source("rf/exact.py", "rf/simulate.py"),
+                code_mark("warprrf.rf.simulate"),
                 self.checks,
             ]
             self.rows.row("second-spectra", make, inputs, (file.name,))
@@ -394,7 +394,7 @@ class _Bench:
                     ask = lookups.nearest(truth.train(truth.few)) if nearest else self._field(row).spectrum
                     arrays[row["method"]] = _images(test, [ask(test.receivers[i]) for i in indices])
                     progress("spectra", done + 1, len(picked))
-                write_atomically(self.rows.folder / file, partial(_save_arrays, arrays))
+                write_arrays(self.rows.folder / file, arrays)
                 return {
                     "receivers": test.receivers[indices],
                     "blocked": ~test.line_of_sight[indices],
@@ -409,7 +409,7 @@ class _Bench:
                     *(x for m in ("bistatic", *HARMONIC) for x in self._inputs(truth, m)),
                     truth.few,
                     [row["variant"] for row in others],
-                    source("bench/bistatic/table.py"),
+                    Path(__file__),
                 ],
                 (file,),
             )
@@ -430,10 +430,6 @@ def _middle(psnr: np.ndarray, blocked: np.ndarray) -> np.ndarray:
         if len(index):
             chosen.append(index[np.argsort(psnr[index])][(len(index) - 1) // 2])
     return np.array(chosen, dtype=int)
-
-
-def _save_arrays(arrays: dict[str, Any], path: str) -> None:
-    np.savez_compressed(path, **arrays)
 
 
 def _find(table: list[Row], truth: str, count: int, method: str) -> Row:

@@ -27,7 +27,7 @@ from warprrf.geometry.camera import Camera
 from warprrf.geometry.discs import discs_on_mesh
 from warprrf.geometry.gaussian_rays import GaussianRays
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.render import RADIO, Blending, Rasterizer
+from warprrf.geometry.rasterizer import RADIO, Blending, Rasterizer
 from warprrf.rf.harmonic.transport import transport
 from warprrf.rf.spectrum import pixel_directions, to_db
 

@@ -19,7 +19,8 @@ import warp as wp
 
 from warprrf.bench.engine.scenes import gaussians, panorama, photo, room
 from warprrf.device import launch, threads
-from warprrf.geometry.render import RADIO, TILE_GRAIN, Prepared, Rasterizer, blend_weights, render
+from warprrf.geometry.rasterizer import RADIO, TILE_GRAIN, Prepared, Rasterizer
+from warprrf.geometry.render import blend_weights, render
 from warprrf.kernels import weights
 from warprrf.kernels.lanes import LANES
 from warprrf.kernels.project import PRODUCT

@@ -17,8 +17,8 @@ from warprrf.bench.engine import blend, plots, transport
 from warprrf.bench.engine.form_kernels import STRIP
 from warprrf.bench.engine.forms import RASTERISER
 from warprrf.bench.markdown import table
-from warprrf.bench.stages import write_atomically
-from warprrf.geometry.render import RADIO
+from warprrf.bench.pictures import write_page
+from warprrf.geometry.rasterizer import RADIO
 from warprrf.rf.harmonic.single_bounce import FieldOptions
 from warprrf.rf.harmonic.transport import ALPHA_MIN, TOP_K
 
@@ -69,8 +69,6 @@ def write(folder: str | os.PathLike[str]) -> Path:
     }
     if any("embree bare" in row for row in found["rays"]):
         pictures["rays.png"] = plots.rays(found["rays"], ASKED_RAYS)
-    for name, figure in pictures.items():
-        write_atomically(folder / name, lambda file, figure=figure: figure.savefig(file, dpi=100))  # type: ignore[misc]
     captions = {
         "knobs.png": "Error and time of each setting; red: the cheapest that will do.",
         "counts.png": "Discs on the room's mesh against rays cast at it.",
@@ -78,11 +76,8 @@ def write(folder: str | os.PathLike[str]) -> Path:
         "forms.png": "Forms of the exact response in three regimes and of exp; red: the cheapest that will do.",
         "rays.png": "Mesh rays and lines of sight over Embree called bare.",
     }
-    parts = [summary_text(found)]
-    parts += [f"![{captions[name]}]({name})\n\n{captions[name]}" for name in pictures]
-    path = folder / "engine.md"
-    write_atomically(path, lambda file: Path(file).write_text("\n\n".join(parts) + "\n", encoding="utf-8"))
-    return path
+    shown = {name: (figure, captions[name]) for name, figure in pictures.items()}
+    return write_page(folder / "engine.md", summary_text(found), shown)
 
 
 def _knob_panels(found: Row, picks: Row) -> list[plots.Panel]:

@@ -19,8 +19,9 @@ from warprrf.bench.engine.forms import exponential_forms, response_forms
 from warprrf.bench.engine.rays import run_rays
 from warprrf.bench.engine.transport import run_transport
 from warprrf.bench.machine import machine
-from warprrf.bench.stages import StagedRun, plain, source, write_json
+from warprrf.bench.stages import StagedRun, plain, write_json
 from warprrf.device import Progress, threads
+from warprrf.marks import code_mark
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ QUICK = Sizes(
 )
 """Shows that everything runs, in a minute; its figures mean little."""
 
-_CODE = ("kernels", "device.py", "geometry")
+_CODE = ("warprrf.kernels", "warprrf.geometry")
 
 
 def run_engine(
@@ -120,7 +121,7 @@ def run_engine(
             "rays",
             lambda tell: run_rays(**options, seed=seed, device=device, progress=tell),  # type: ignore[arg-type]
             {**options, "scene": str(scene)},
-            "bench/engine/rays.py",
+            "warprrf.bench.engine.rays",
         )
         found["blend"] = None
         if importlib.util.find_spec("torch") is not None:
@@ -137,10 +138,7 @@ def run_engine(
                     progress=tell,
                 ),
                 {"blend": size.blend, "repeats": size.repeats, "opensplat": opensplat and str(opensplat)},
-                "bench/engine/blend.py",
-                "bench/engine/opensplat.py",
-                "bench/engine/peers.py",
-                "bench/engine/torch_renderer.py",
+                "warprrf.bench.engine.blend",
             )
         n, measured, receivers = size.stored
         found["transport"] = stages.figures(
@@ -155,11 +153,9 @@ def run_engine(
                 progress=tell,
             ),
             {"stored": size.stored, "shape": size.shape},
-            "bench/engine/transport.py",
-            "rf/harmonic/transport.py",
-            "rf/harmonic/store.py",
-            "rf/harmonic/fitting.py",
-            "rf/receivers.py",
+            "warprrf.bench.engine.transport",
+            "warprrf.rf.harmonic.fitting",
+            "warprrf.rf.harmonic.store",
         )
         found["seconds"] = run.seconds()
     write_json(Path(out) / "engine.json", found)
@@ -171,13 +167,13 @@ class _Stages:
     """Measurements as stages whose inputs are their sizes, the seed, the device and the code that they time."""
 
     def __init__(self, run: StagedRun, device: str, seed: int) -> None:
-        self._run, self._common = run, [device, seed, threads(), source(*_CODE)]
+        self._run, self._common = run, [device, seed, threads(), code_mark(*_CODE)]
 
     def figures(
         self, name: str, work: Callable[[Progress], dict[str, Any]], sizes: dict[str, Any], *code: str
     ) -> dict[str, Any]:
         """The figures of measurement ``name``."""
-        inputs = [*self._common, sizes, source(*code) if code else ""]
+        inputs = [*self._common, sizes, code_mark(*code) if code else ""]
         return self._run.stage(name, work, inputs=inputs)
 
     def rows(
@@ -199,7 +195,7 @@ def _knobs(stages: _Stages, size: Sizes, seed: int, device: Any, found: dict[str
         return known["room"]
 
     about = {"gaussians": size.gaussians, "shape": size.shape, "repeats": size.repeats}
-    code = ("bench/engine/knobs.py", "bench/engine/transport.py", "rf/harmonic/transport.py")
+    code = ("warprrf.bench.engine.knobs",)
 
     def rows(name: str, work: Callable[[], list[dict[str, Any]]], **sizes: Any) -> None:
         def measure(tell: Progress) -> list[dict[str, Any]]:
@@ -241,13 +237,12 @@ def _knobs(stages: _Stages, size: Sizes, seed: int, device: Any, found: dict[str
             name,
             lambda tell, work=work, count=count: work(**count, repeats=n, seed=seed, device=device),  # type: ignore[misc]
             {**count, "repeats": n},
-            "bench/engine/forms.py",
-            "bench/engine/form_kernels.py",
+            "warprrf.bench.engine.forms",
         )
 
 
 def _growth(stages: _Stages, size: Sizes, seed: int, device: Any, found: dict[str, Any]) -> None:
-    code = ("bench/engine/knobs.py", "bench/engine/blend.py", "rf/harmonic/transport.py")
+    code = ("warprrf.bench.engine.knobs",)
     options: dict[str, Any] = {"repeats": min(3, size.repeats), "seed": seed, "device": device}
     for name, work in (("counts", knobs.count_row), ("growth", knobs.growth_row)):
         found[name] = [

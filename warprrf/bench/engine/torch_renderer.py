@@ -1,6 +1,6 @@
 """The rasteriser's definition in plain tensor operations: the peer that our kernels are measured against.
 
-Same images as :class:`warprrf.geometry.render.Rasterizer` (exact response on every ray, both cameras, both
+Same images as :class:`warprrf.geometry.rasterizer.Rasterizer` (exact response on every ray, both cameras, both
 transmittance rules, order by range, same cutoffs and early exit),
 differentiated by torch's autograd. Nothing loops over
 Gaussians or pixels: tiles of 8 x 8 pixels are padded to lists of similar length and processed in bulk.
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from warprrf.geometry.camera import Camera
-from warprrf.geometry.render import Blending
+from warprrf.geometry.rasterizer import Blending
 
 if TYPE_CHECKING:
     import torch

@@ -18,8 +18,10 @@ from warprrf.bench.evaluation.protocol import SCALES, SPLITS, TRUTHS, Scale, Set
 from warprrf.bench.evaluation.runs import Store, sweep
 from warprrf.bench.machine import machine
 from warprrf.bench.setting import DATA, Geometry, files, scene_of
-from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
+from warprrf.bench.stages import StagedRun, fingerprint, plain, write_json
 from warprrf.device import Progress
+from warprrf.files import write_atomically
+from warprrf.marks import code_mark
 from warprrf.rf.dataset import SpectrumDataset
 
 KINDS = ("table1", "sparsity")
@@ -192,9 +194,10 @@ def _paper_law(stages: StagedRun, xml: Path, exact: Path, device: Any) -> Path:
 
     place = Geometry(stages.folder, xml, device)
     inputs = [
-        exact, place.scene_mark,
-        source("rf/exact.py", "rf/paths.py", "rf/waves.py", "kernels/scatter.py", "bench/evaluation/paper_law.py"),
-    ]  # fmt: skip
+        exact,
+        place.scene_mark,
+        code_mark("warprrf.bench.evaluation.paper_law"),
+    ]
     stages.stage("paper-law", make, inputs=inputs, outputs=(file.name,))
     return file
 

@@ -15,9 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.bench.methods import Fitted, field_code, fit_bistatic, fit_harmonic, fit_lookup, untaught
+from warprrf.bench.methods import (
+    BISTATIC_CODE,
+    HARMONIC_CODE,
+    LOOKUPS_CODE,
+    METRICS_CODE,
+    Fitted,
+    fit_bistatic,
+    fit_harmonic,
+    fit_lookup,
+    method_mark,
+    untaught,
+)
 from warprrf.bench.setting import Geometry
-from warprrf.bench.stages import source
 from warprrf.device import Progress
 from warprrf.rf.bistatic.field import BistaticField
 from warprrf.rf.dataset import SpectrumDataset
@@ -91,7 +101,7 @@ class Method:
     Attributes:
         fit: learns from a task.
         variants: of which the better one counts.
-        code: files and packages below ``warprrf/`` that its figures depend on.
+        code: modules and packages that its figures depend on, with what these import.
         traces: what it asks of the geometry's kept rays: "rays", "weights" or nothing.
         network: whether it is a network, trained on fewer sets in a small evaluation.
         random: whether it differs by seed though it sees no spectrum.
@@ -233,36 +243,32 @@ def _sionna(scene: Scene, task: Task) -> Fitted:
     return Fitted(predict, size_bytes=size, details={"depth": task.depth})
 
 
-_METRICS = ("rf/metrics.py", "rf/spectrum.py", "rf/dataset.py", "kernels/beam.py")
-_NETWORKS = ("rf/baselines", *_METRICS)
-_LOOKUPS = ("rf/lookups.py", *_METRICS)
-_SIONNA = ("rf/sionna_engine.py", "rf/channel/sionna_paths.py", "rf/scene.py", "rf/materials.py", *_METRICS)
-_HARMONIC = field_code(bistatic=False, harmonic=True)
-_BISTATIC = field_code(bistatic=True, harmonic=False)
+_NETWORKS = ("warprrf.rf.baselines", *METRICS_CODE)
+_SIONNA = ("warprrf.rf.sionna_engine", *METRICS_CODE)
 _MISJUDGED = f"permittivity off by a factor {PERMITTIVITY_OFF}, roughness by {ROUGHNESS_OFF}, up or down"
 
 METHODS: dict[str, Method] = {
-    "bistatic": Method(_bistatic(), code=_BISTATIC, traces="rays"),
+    "bistatic": Method(_bistatic(), code=BISTATIC_CODE, traces="rays"),
     "bistatic-quick": Method(
         _bistatic(quick=True),
-        code=_BISTATIC,
+        code=BISTATIC_CODE,
         note="no term is tried: single bounces and even light, one ray a pixel",
     ),
-    "rf3dgs+": Method(_harmonic("rf3dgs+"), GAINS, _HARMONIC, "weights", note="opacity frozen"),
+    "rf3dgs+": Method(_harmonic("rf3dgs+"), GAINS, HARMONIC_CODE, "weights", note="opacity frozen"),
     "rf3dgs": Method(
         _harmonic("rf3dgs"),
         GAINS,
-        _HARMONIC,
+        HARMONIC_CODE,
         "weights",
         note="opacity frozen, delay and AoD channels trained",
     ),
     "rf3dgs+alpha": Method(
-        _harmonic("rf3dgs+", True), ("exp",), _HARMONIC, "weights", note="opacity trained with the gain"
+        _harmonic("rf3dgs+", True), ("exp",), HARMONIC_CODE, "weights", note="opacity trained with the gain"
     ),
     "rf3dgs-alpha": Method(
         _harmonic("rf3dgs", True),
         ("exp",),
-        _HARMONIC,
+        HARMONIC_CODE,
         "weights",
         note="opacity trained with the gain, as published; delay and AoD channels trained",
     ),
@@ -270,16 +276,16 @@ METHODS: dict[str, Method] = {
     "cgan": Method(_cgan, code=_NETWORKS, network=True, note="ours: none is public; no geometry"),
     "sionna-calibrated": Method(
         _calibrated,
-        code=("rf/sionna_calibration.py", "rf/twin.py", *_SIONNA, *_BISTATIC),
+        code=("warprrf.rf.sionna_calibration", "warprrf.rf.twin", *_SIONNA, *BISTATIC_CODE),
         note="Sionna RT's gradients on our reconstructed mesh, as many seconds as bistatic took",
     ),
-    "nearest": Method(_lookup("nearest"), code=_LOOKUPS),
-    "idw": Method(_lookup("idw"), ("db", "linear"), _LOOKUPS),
-    "constant": Method(_lookup("constant"), code=_LOOKUPS),
-    "mean": Method(_lookup("mean"), code=_LOOKUPS),
+    "nearest": Method(_lookup("nearest"), code=LOOKUPS_CODE),
+    "idw": Method(_lookup("idw"), ("db", "linear"), LOOKUPS_CODE),
+    "constant": Method(_lookup("constant"), code=LOOKUPS_CODE),
+    "mean": Method(_lookup("mean"), code=LOOKUPS_CODE),
     "sionna": Method(_assumed, code=_SIONNA, random=True, note=f"Sionna RT on the true mesh, {_MISJUDGED}"),
-    "transmitter": Method(_untaught("transmitter"), code=_METRICS),
-    "zero": Method(_untaught("zero"), code=_BISTATIC, note="our mesh, every surface taken for the prior"),
+    "transmitter": Method(_untaught("transmitter"), code=METRICS_CODE),
+    "zero": Method(_untaught("zero"), code=BISTATIC_CODE, note="our mesh, every surface taken for the prior"),
 }
 UNTAUGHT = ("sionna", "transmitter", "zero")
 """Methods that see no spectrum: one run for all numbers of training receivers."""
@@ -290,11 +296,6 @@ AFTER = {"sionna-calibrated": "bistatic"}
 
 
 @cache
-def code_mark(method: str) -> str:
+def code_of(method: str) -> str:
     """Fingerprint of the code that a method's figures depend on."""
-    return source(
-        *dict.fromkeys(METHODS[method].code),
-        "bench/methods.py",
-        "bench/setting.py",
-        "bench/evaluation/methods.py",
-    )
+    return method_mark(METHODS[method].code, __file__)

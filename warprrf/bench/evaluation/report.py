@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,8 @@ from warprrf.bench.evaluation.plots import law_bars, sparsity_curves, spectra_gr
 from warprrf.bench.evaluation.protocol import TRUTHS, Run, Scale
 from warprrf.bench.evaluation.runs import Row, Store
 from warprrf.bench.markdown import cell, table
-from warprrf.bench.pictures import METHODS
-from warprrf.bench.stages import write_atomically
+from warprrf.bench.pictures import METHODS, write_page
+from warprrf.files import write_text
 
 PUBLISHED: tuple[Row, ...] = tuple(
     {
@@ -338,21 +337,8 @@ def write(
             law_bars(lines),
             "RF-3DGS+ less RF-3DGS, by the law that the truth's scattering obeys.",
         )
-    for name, (figure, _) in pictures.items():
-        write_atomically(folder / name, partial(_savefig, figure))
-    parts = [markdown(kind, found), *(f"![{text}]({name})\n\n{text}" for name, (_, text) in pictures.items())]
-    content = {f"{kind}.md": "\n\n".join(parts) + "\n", f"{kind}.csv": csv_text(rows)}
-    for name, text in content.items():
-        write_atomically(folder / name, partial(_write_text, text))
-    return folder / f"{kind}.md"
-
-
-def _savefig(figure: Any, path: str) -> None:
-    figure.savefig(path, dpi=110)
-
-
-def _write_text(text: str, path: str) -> None:
-    Path(path).write_text(text, encoding="utf-8")
+    write_text(folder / f"{kind}.csv", csv_text(rows))
+    return write_page(folder / f"{kind}.md", markdown(kind, found), pictures, dpi=110)
 
 
 def _grid(rows: Sequence[Row], runs: dict[str, Run], store: Store, scale: Scale) -> tuple[Any, str] | None:

@@ -24,13 +24,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.bench.evaluation.methods import AFTER, METHODS, UNTAUGHT, Task, code_mark
+from warprrf.bench.evaluation.methods import AFTER, METHODS, UNTAUGHT, Task, code_of
 from warprrf.bench.evaluation.protocol import Run, Setting, shown_receivers, truth_of
 from warprrf.bench.machine import processor_name
 from warprrf.bench.methods import Fitted
 from warprrf.bench.setting import Geometry, Truth
-from warprrf.bench.stages import fingerprint, plain, write_atomically, write_json
+from warprrf.bench.stages import fingerprint, plain, write_json
 from warprrf.device import Progress, require, resolve, threads
+from warprrf.files import write_arrays
 from warprrf.rf import metrics
 from warprrf.rf.dataset import SpectrumDataset
 from warprrf.rf.spectrum import to_db
@@ -209,7 +210,7 @@ class Store:
 
     def save(self, run: Run, mark: str, row: Row, arrays: dict[str, np.ndarray]) -> Row:
         """Keep a finished run; the figures last, so that they never stand without their pictures."""
-        write_atomically(self.pictures(run), partial(_savez, arrays))
+        write_arrays(self.pictures(run), arrays)
         kept: Row = {**plain(row), "mark": mark}
         write_json(self.folder / f"{run.key}.json", kept)
         return kept
@@ -219,15 +220,11 @@ class Store:
         return self.folder / f"{run.key}.npz"
 
 
-def _savez(arrays: dict[str, np.ndarray], path: str) -> None:
-    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
-
-
 def mark_of(run: Run, setting: Setting) -> str:
     """Fingerprint of what a run's figures depend on."""
     return fingerprint(
         [run.key, setting.mark(run.truth), setting.geometry_mark, setting.every if run.split == "random" else 1,
-         _effort(run, setting), code_mark(run.method)]
+         _effort(run, setting), code_of(run.method)]
     )  # fmt: skip
 
 

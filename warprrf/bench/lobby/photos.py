@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.bench.stages import write_json
 from warprrf.device import Progress, require
 from warprrf.geometry.camera import Camera
 from warprrf.rf.mitsuba_photos import render_photos
@@ -213,12 +214,6 @@ def _spread_out(cameras: dict[str, Camera]) -> list[str]:
     return sorted(names[k] for k in taken)
 
 
-def _write_json(path: Path, value: Any) -> None:
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
-
-
 def write_plan(
     directory: str | os.PathLike[str], photo_plan: PhotoPlan, *, rendering: dict[str, Any]
 ) -> None:
@@ -228,7 +223,7 @@ def write_plan(
         "width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2
     }  # fmt: skip
     cameras = photo_plan.cameras
-    _write_json(
+    write_json(
         directory / "photos.json",
         {
             "photos": list(cameras),
@@ -238,11 +233,11 @@ def write_plan(
             "rendering": rendering,
         },
     )
-    _write_json(
+    write_json(
         directory / "surveyed.json",
         {name: [round(float(v), 4) for v in cameras[name].position] for name in photo_plan.surveyed},
     )
-    _write_json(
+    write_json(
         directory / "poses_true.json",
         {
             "about": "True poses, for evaluation only. OpenCV axes (x right, y down, z forward), metres.",

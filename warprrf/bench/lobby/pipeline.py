@@ -25,11 +25,13 @@ from warprrf.bench.lobby import score as truth_scores
 from warprrf.bench.lobby.photos import noise_psnr_db
 from warprrf.bench.lobby.spectra import FILES as TRUTHS
 from warprrf.bench.machine import machine
-from warprrf.bench.stages import StagedRun, fingerprint, plain, source, write_atomically, write_json
+from warprrf.bench.stages import StagedRun, fingerprint, plain, write_json
 from warprrf.device import Progress
+from warprrf.files import write_arrays, write_atomically
 from warprrf.geometry.config import ReconstructionConfig
-from warprrf.geometry.from_photos import read_photo
 from warprrf.geometry.meshio import write_mesh
+from warprrf.geometry.photos import read_photo
+from warprrf.marks import code_mark
 from warprrf.rf import lookups, metrics
 from warprrf.rf.harmonic.transport import Transport, transport
 from warprrf.rf.spectrum import to_db
@@ -39,8 +41,8 @@ LOOKUPS = {"nearest": lookups.nearest, "idw": lookups.idw, "constant": lookups.c
 TRAIN_RECEIVERS = 50  # the training subset that the asked fit time is stated for
 MAP_POINTS = 40_000  # of the mesh, drawn in the report
 SECTION_HEIGHT_M = 1.2
-SOURCE_OF_GEOMETRY = ("device.py", "kernels", "geometry")
-SOURCE_OF_RADIO = (*SOURCE_OF_GEOMETRY, "rf")
+GEOMETRY_CODE = ("warprrf.geometry", "warprrf.kernels")
+RADIO_CODE = (*GEOMETRY_CODE, "warprrf.rf")
 
 
 @dataclass(frozen=True)
@@ -104,14 +106,13 @@ def run(
     sizes = REDUCED if reduced else FULL
     _check_data(data)
     with StagedRun(out, fresh=fresh, progress=progress) as stages:
-        geometry_source = source(*SOURCE_OF_GEOMETRY)
         inputs = [
             data / "photos",
             data / "photos.json",
             data / "surveyed.json",
             seed,
             asdict(sizes),
-            geometry_source,
+            code_mark(*GEOMETRY_CODE),
         ]
         geometry = stages.stage(
             "geometry",
@@ -122,13 +123,13 @@ def run(
         errors = stages.stage(
             "geometry error",
             partial(_geometry_error, out, data, sizes, seed, device),
-            inputs=[*inputs, data / "poses_true.json", data / "scene.xml", source("bench")],
+            inputs=[*inputs, data / "poses_true.json", data / "scene.xml", code_mark("warprrf.bench")],
             outputs=("geometry_error.npz",),
         )
         view = _View(out / "reconstruction", sizes, device)
         figures: dict[str, dict[str, Any]] = {}
         for truth, name in TRUTHS.items():
-            radio = [*inputs, data / name, source(*SOURCE_OF_RADIO)]
+            radio = [*inputs, data / name, code_mark(*RADIO_CODE)]
             fits = {
                 model: stages.stage(
                     f"fit {model}, {truth}",
@@ -141,14 +142,14 @@ def run(
             figures[truth] = stages.stage(
                 f"evaluation, {truth}",
                 partial(_evaluation, out, data / name, view, truth, seed),
-                inputs=[*radio, MODELS, source("bench/lobby/pipeline.py")],
+                inputs=[*radio, MODELS, Path(__file__)],
             )
             for model in MODELS:
                 figures[truth]["methods"][model] |= fits[model]
         stages.stage(
             "pictures",
             partial(_pictures, out, data, view, figures["exact"]["methods"], seed),
-            inputs=[*radio, *(data / name for name in TRUTHS.values()), source("bench/lobby/pipeline.py")],
+            inputs=[*radio, *(data / name for name in TRUTHS.values()), Path(__file__)],
             outputs=("pictures.npz",),
         )
         report: dict[str, Any] = {
@@ -230,7 +231,7 @@ def _geometry(
 ) -> dict[str, Any]:
     files, held_out, surveyed = photos(data, sizes)
     # Unfinished steps of other code are not continued: neither figures nor times would be this code's.
-    workspace = out / "workspace" / source(*SOURCE_OF_GEOMETRY)[:12]
+    workspace = out / "workspace" / code_mark(*GEOMETRY_CODE)[:12]
     for other in workspace.parent.glob("*"):
         if other != workspace:
             shutil.rmtree(other) if other.is_dir() else other.unlink()
@@ -311,7 +312,7 @@ def _geometry_error(
         "mesh_points": scored.points[some].astype(np.float32),
         "mesh_error_m": scored.distance_m[some].astype(np.float32),
     }
-    write_atomically(out / "geometry_error.npz", partial(_save_arrays, arrays))
+    write_arrays(out / "geometry_error.npz", arrays)
     return figures
 
 
@@ -418,12 +419,8 @@ def _pictures(
         progress("pictures", done + 1, len(predictors))
     with np.load(out / "geometry_error.npz", allow_pickle=False) as stored:
         arrays |= {name: stored[name] for name in stored.files}
-    write_atomically(out / "pictures.npz", partial(_save_arrays, arrays))
+    write_arrays(out / "pictures.npz", arrays)
     return {}
-
-
-def _save_arrays(arrays: dict[str, Any], path: str) -> None:
-    np.savez_compressed(path, **arrays)
 
 
 def _spread_by_score(score: np.ndarray, blocked: np.ndarray) -> np.ndarray:

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from warprrf.bench.pictures import METHODS, figure_of, spectrum_rows
-from warprrf.bench.stages import write_atomically
 from warprrf.device import require
+from warprrf.files import write_text
 from warprrf.geometry.section import section as section
 
 # Key of report.json, its name, unit, what is asked (None: measured only), and whether more is better.
@@ -82,7 +82,7 @@ def write(folder: str | os.PathLike[str]) -> Path:
         pictures = {name: stored[name] for name in stored.files}
     page = _page(figures, pictures)
     path = folder / "report.html"
-    write_atomically(path, lambda name: Path(name).write_text(page, encoding="utf-8"))
+    write_text(path, page)
     return path
 
 

@@ -15,6 +15,7 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ import numpy as np
 from warprrf.bench.lobby.radio import material_table
 from warprrf.bench.lobby.textures import paint
 from warprrf.device import Progress, require
+from warprrf.files import write_atomically, write_text
 from warprrf.geometry.meshio import write_mesh
 
 ROOM = np.array([[0.0, 0.0, 0.0], [15.0, 12.0, 4.0]])
@@ -289,10 +291,8 @@ def build(directory: str | os.PathLike[str], *, seed: int = 0, progress: Progres
         faces = [f for _, f in members]
         atlas = _Atlas(faces, np.random.default_rng([seed, *material.encode()]))
         target = directory / "textures" / f"{material}.jpg"
-        temporary = target.with_name(target.name + ".partial")
         picture = image_module.fromarray(np.round(255 * atlas.image).astype(np.uint8))
-        picture.save(temporary, format="JPEG", quality=JPEG_QUALITY, optimize=True)
-        os.replace(temporary, target)
+        write_atomically(target, partial(picture.save, format="JPEG", quality=JPEG_QUALITY, optimize=True))
         for solid in (s for s in solids if s.material == material):
             vertices, triangles, uv, count = [], [], [], 0
             for k, (owner, face) in enumerate(members):
@@ -307,12 +307,6 @@ def build(directory: str | os.PathLike[str], *, seed: int = 0, progress: Progres
             write_mesh(path, np.concatenate(vertices), np.array(triangles), uv=np.concatenate(uv))
         if progress is not None:
             progress("scene", done + 1, len(materials))
-    _write_text(directory / "materials.json", json.dumps(material_table(), indent=1) + "\n")
-    _write_text(directory / "scene.xml", scene_xml(solids))
+    write_text(directory / "materials.json", json.dumps(material_table(), indent=1) + "\n")
+    write_text(directory / "scene.xml", scene_xml(solids))
     return directory / "scene.xml"
-
-
-def _write_text(path: Path, text: str) -> None:
-    temporary = path.with_name(path.name + ".partial")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)

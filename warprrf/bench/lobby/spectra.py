@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.rf.dataset import assign_roles, write_whole
+from warprrf.files import write_text
+from warprrf.rf.dataset import assign_roles
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import sample_receivers, simulate
@@ -119,7 +120,7 @@ def _write_receivers(path: Path, scene: Scene, who: Plan) -> None:
         "line_of_sight": seen.tolist(),
     }
     lines = ",\n".join(f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in text.items())
-    write_whole(path, lambda part: part.write_text("{\n" + lines + "\n}\n"))
+    write_text(path, "{\n" + lines + "\n}\n")
 
 
 def compare_engines(

@@ -17,16 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.rf import field_files
 from warprrf.rf.baselines.images import SpectrumImages
 from warprrf.rf.baselines.training import (
     ImageModel,
     draws,
     seeded,
-    summary,
     torch_device,
     torch_module,
-    train,
     whole_number,
 )
 
@@ -77,6 +74,8 @@ class CGANOptions:
 
 class CGAN(ImageModel):
     """A trained conditional GAN; build it with :meth:`fit` or :meth:`load`. Its ``network`` is the generator."""
+
+    Options = CGANOptions
 
     @classmethod
     def fit(
@@ -143,21 +142,10 @@ class CGAN(ImageModel):
             adams["generator"].step()
             return float(distance.detach())
 
-        identity = field_files.fingerprint("CGAN", chosen, iterations, batch, seed, known)
-        losses = train(
-            {"generator": generator, "critic": critic}, adams, step, iterations=iterations, identity=identity,
-            checkpoint=checkpoint, progress=progress,
+        return cls._trained(
+            known, chosen, {"generator": generator, "critic": critic}, adams, step, start=start, iterations=iterations,
+            seed=seed, about={"batch": batch, "loss": "L1 of the generator"}, checkpoint=checkpoint, progress=progress,
         )  # fmt: skip
-        report = summary(known, time.perf_counter() - start, losses, seed)
-        return cls(
-            options=chosen,
-            network=generator.eval(),
-            directions=known.directions,
-            transmitter=known.transmitters[0],
-            floor=known.floor,
-            range_db=known.range_db,
-            report={**report, "iterations": iterations, "batch": batch, "loss": "L1 of the generator"},
-        )
 
     def image(self, rx: Any, transmitter: Any = None) -> np.ndarray:
         """The picture at ``rx`` (3,) [m], shape ``(H, W)`` float32 in [0, 1]; it holds for the training transmitter."""
@@ -171,10 +159,6 @@ class CGAN(ImageModel):
         noise = told.new_zeros((1, self.options.noise))
         with torch.inference_mode():
             return np.asarray(_draw(self.network, told, noise, self.shape)[0, 0].cpu().numpy())
-
-    @classmethod
-    def _options(cls, values: dict[str, Any]) -> CGANOptions:
-        return CGANOptions(**values)
 
     @classmethod
     def _build(cls, options: CGANOptions, shape: tuple[int, int], seed: int) -> Any:

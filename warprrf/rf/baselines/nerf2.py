@@ -22,16 +22,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.rf import field_files
 from warprrf.rf.baselines.images import SpectrumImages
 from warprrf.rf.baselines.training import (
     ImageModel,
     draws,
     seeded,
-    summary,
     torch_device,
     torch_module,
-    train,
     whole_number,
 )
 
@@ -82,6 +79,8 @@ class NeRF2Options:
 
 class NeRF2(ImageModel):
     """A trained NeRF2; build it with :meth:`fit` or :meth:`load`."""
+
+    Options = NeRF2Options
 
     @classmethod
     def fit(
@@ -139,21 +138,10 @@ class NeRF2(ImageModel):
             optimiser.step()
             return float(loss.detach())
 
-        identity = field_files.fingerprint("NeRF2", options, iterations, rays, seed, known)
-        losses = train(
-            {"network": network}, {"adam": optimiser}, step, iterations=iterations, identity=identity,
-            checkpoint=checkpoint, progress=progress,
+        return cls._trained(
+            known, options, {"network": network}, {"adam": optimiser}, step, start=start, iterations=iterations,
+            seed=seed, about={"rays": rays}, checkpoint=checkpoint, progress=progress,
         )  # fmt: skip
-        report = summary(known, time.perf_counter() - start, losses, seed)
-        return cls(
-            options=options,
-            network=network.eval(),
-            directions=known.directions,
-            transmitter=known.transmitters[0],
-            floor=known.floor,
-            range_db=known.range_db,
-            report={**report, "iterations": iterations, "rays": rays},
-        )
 
     def image(self, rx: Any, transmitter: Any = None) -> np.ndarray:
         """The picture at ``rx`` (3,) [m], shape ``(H, W)`` float32, not below zero.
@@ -173,10 +161,6 @@ class NeRF2(ImageModel):
                 for d in torch.split(toward, RAYS_AT_ONCE)
             ]
             return np.asarray(torch.cat(parts).cpu().numpy()).reshape(self.shape)
-
-    @classmethod
-    def _options(cls, values: dict[str, Any]) -> NeRF2Options:
-        return NeRF2Options(**values)
 
     @classmethod
     def _build(cls, options: NeRF2Options, shape: tuple[int, int], seed: int) -> Any:

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -181,8 +181,10 @@ class ImageModel(ABC):
         transmitter: position of the first training picture [m], shape ``(3,)``.
         floor, range_db: by which [0, 1] is a dB image; None if it was trained on other pictures.
         report: how training went: receivers, seconds, losses, bytes of the weights.
+        Options: class of ``options``.
     """
 
+    Options: ClassVar[type[Any]]
     options: Any
     network: Any = field(repr=False)
     directions: np.ndarray = field(repr=False)
@@ -246,7 +248,7 @@ class ImageModel(ABC):
                 f"{os.fspath(path)}: holds a {header.get('model')!r}, expected a {cls.__name__!r}"
             )
         try:
-            options = cls._options(header["options"])
+            options = cls.Options(**header["options"])
             directions, transmitter = tensors["directions"], tensors["transmitter"]
             network = cls._build(options, (directions.shape[0], directions.shape[1]), 0)
             head = "weights/"
@@ -266,13 +268,55 @@ class ImageModel(ABC):
 
     @classmethod
     @abstractmethod
-    def _options(cls, values: dict[str, Any]) -> Any:
-        """The options of a file's header."""
-
-    @classmethod
-    @abstractmethod
     def _build(cls, options: Any, shape: tuple[int, int], seed: int) -> Any:
         """A fresh network on the CPU."""
+
+    @classmethod
+    def _trained(
+        cls,
+        known: SpectrumImages,
+        options: Any,
+        networks: dict[str, Any],
+        optimisers: dict[str, Any],
+        step: Callable[[int], float],
+        *,
+        start: float,
+        iterations: int,
+        seed: int,
+        about: dict[str, Any],
+        checkpoint: str | os.PathLike[str] | None,
+        progress: Progress | None,
+    ) -> Self:
+        """The model whose network is the first of ``networks``, trained by :func:`train`.
+
+        ``start`` is when the fit began, by ``time.perf_counter``; ``about`` is what the result depends on besides, and
+        part of the report.
+        """
+        losses = train(
+            networks,
+            optimisers,
+            step,
+            iterations=iterations,
+            identity=field_files.fingerprint(cls.__name__, options, iterations, *about.values(), seed, known),
+            checkpoint=checkpoint,
+            progress=progress,
+        )
+        return cls(
+            options=options,
+            network=next(iter(networks.values())).eval(),
+            directions=known.directions,
+            transmitter=known.transmitters[0],
+            floor=known.floor,
+            range_db=known.range_db,
+            report={
+                "receivers": len(known),
+                "fit_time_s": time.perf_counter() - start,
+                "losses": losses,
+                "seed": int(seed),
+                "iterations": iterations,
+                **about,
+            },
+        )
 
     @property
     def _torch_device(self) -> Any:
@@ -281,8 +325,3 @@ class ImageModel(ABC):
     def _positions(self, rx: Any, transmitter: Any) -> tuple[np.ndarray, np.ndarray]:
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         return check_array("rx", rx, (3,)), source
-
-
-def summary(data: SpectrumImages, seconds: float, losses: list[float], seed: int) -> dict[str, Any]:
-    """The report of a training."""
-    return {"receivers": len(data), "fit_time_s": seconds, "losses": losses, "seed": int(seed)}

@@ -3,5 +3,6 @@
 ``field`` is the field: it asks ``sight`` what a receiver sees, composes spectra of its ``terms``, and has ``paths`` and
 ``files``. A ``surface`` is met by rays (``bounces``), reached by way of mirrors (``specular``, ``mirror_tree``,
 ``mirror_light``) and lit by other surfaces (``second_bounce``). ``training`` fits it: groups of surfaces (``fit``),
-which of them are of one material (``grouping``), single elements (``residuals``), and its error (``uncertainty``).
+which of them are of one material (``grouping``), what differs within a group (``residuals``), and its error
+(``uncertainty``).
 """

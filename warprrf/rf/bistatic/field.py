@@ -66,7 +66,8 @@ class BistaticField(RadioField):
         terms: what it models.
         parameters: of the groups; those of one material are alike.
         material: of each group, shape ``(G,)``.
-        residual: ln gain of each element over its group, shape ``(E,)``.
+        residual: ln gain of each texel over its group, for single bounces and for light that it sends on, shape
+            ``(2, X)``; see :mod:`warprrf.rf.bistatic.residuals`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         air: absorption of every path: that of the data set it was fitted to; None for none.
         report: how the fit went.
@@ -129,7 +130,7 @@ class BistaticField(RadioField):
             terms=modelled,
             parameters=Parameters.prior(surface.groups, len(modelled.lobes)),
             material=surface.material,
-            residual=np.zeros(len(surface.element_area)),
+            residual=np.zeros((2, surface.texels)),
             air=getattr(ds, "air", None),
             device=device,
         )
@@ -239,8 +240,7 @@ class BistaticField(RadioField):
         if self.terms.diffuse:
             rays = gain * self.tracer.scatter(sight.met, sight.lit, p.weight, p.log_excess, self.wavelength_m)
             if self.terms.residual:
-                face = sight.met.face.numpy()
-                rays = rays * np.exp(self.residual[self.surface.element[np.maximum(face, 0)]])
+                rays = rays * self.texture(np.maximum(sight.met.face.numpy(), 0))
         further = gain * self.further(sight)
         image += self.beam(rays.reshape(*self.shape, -1).sum(axis=-1) + further)
         return Composed(rays, strength, further, np.maximum(image, 0.0))
@@ -248,7 +248,9 @@ class BistaticField(RadioField):
     def further(self, sight: Sight) -> np.ndarray:
         """Path gain per pixel (H, W), before the beam, of everything after a first bounce."""
         out = np.zeros(self.shape[0] * self.shape[1])
-        for pixel, _, power in self._sent_on(sight):
+        for pixel, face, power in self.sent_on(sight):
+            if self.terms.residual:
+                power = power * self.texture(face, sight.transmitter)
             out += np.bincount(pixel, power, minlength=len(out))
         return out.reshape(self.shape) + self._mirrored_scene(sight)
 
@@ -259,29 +261,45 @@ class BistaticField(RadioField):
             The groups that send it (B,), their images (N, B), and what mirrors show besides (N,).
         """
         count = self.shape[0] * self.shape[1]
-        parts = self._sent_on(sight)
-        found = np.unique(np.concatenate([np.zeros(0, int), *(group for _, group, _ in parts)]))
+        parts = [(pixel, self.surface.group[face], power) for pixel, face, power in self.sent_on(sight)]
+        found = np.unique(np.concatenate([np.zeros(0, int), *(np.unique(group) for _, group, _ in parts)]))
+        column = np.zeros(self.surface.groups, int)
+        column[found] = np.arange(len(found))
         images = np.zeros((count, len(found)))
         for pixel, group, power in parts:
-            cell = pixel * len(found) + np.searchsorted(found, group)
+            cell = pixel * len(found) + column[group]
             images += np.bincount(cell, power, minlength=images.size).reshape(images.shape)
         shown = self._mirrored_scene(sight).reshape(-1, 1)
         return found, self.beam.at(pixels, images), self.beam.at(pixels, shown)[:, 0]
 
-    def _sent_on(self, sight: Sight) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Pixel, group and path gain of what groups send on of light that other surfaces gave them."""
+    def texture(self, face: np.ndarray, sent_on_from: np.ndarray | None = None) -> np.ndarray:
+        """Gain of each face (K,) over its group: for single bounces, or for light that it sends on.
+
+        Args:
+            face: faces of :attr:`surface`.
+            sent_on_from: the transmitter (3,) whose light is sent on. Light of another than the fitted one falls
+                elsewhere: of that nothing was learned, so its gains are 1.
+        """
+        if sent_on_from is None:
+            return np.asarray(np.exp(self.residual[0]))[self.surface.texel[face]]
+        if not np.array_equal(sent_on_from, self.transmitter):
+            return np.ones(len(face))
+        return np.asarray(np.exp(self.residual[1]))[self.surface.texel[face]]
+
+    def sent_on(self, sight: Sight) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Pixel, face and path gain of light that faces got from other surfaces and send on, without the residual."""
         parts = []
         sent = self.sent(sight.transmitter)
         if sent is not None:
-            seen = sight.elements
-            power = seen.power(sent, self.wavelength_m)
+            seen = sight.surface
+            power = seen.power(sent[self.surface.element[seen.face]], self.wavelength_m)
             lit = power > 0
-            parts.append((seen.pixel[lit], self.surface.element_group[seen.element[lit]], power[lit]))
+            parts.append((seen.pixel[lit], seen.face[lit], power[lit]))
         if self.terms.diffuse and self.terms.mirror_scatter:
             light = self.element_light(sight.transmitter).mirrors
             mirrored = sight.mirrored(light)
             power = light.power(mirrored, self.parameters, self.wavelength_m)
-            parts.append((mirrored.pixel, self.surface.group[mirrored.face.numpy()], power))
+            parts.append((mirrored.pixel, mirrored.face.numpy(), power))
         return parts
 
     def _mirrored_scene(self, sight: Sight) -> np.ndarray:
@@ -322,6 +340,7 @@ class BistaticField(RadioField):
             gain=gain,
             path_group=self._met_groups(sight.paths),
             cosine=sight.paths.cosine,
+            turn=sight.paths.turn,
             beam=sight.beams.reshape(len(gain), count)[:, pixels],
             extra=np.zeros(len(pixels), np.float32),
             again_group=np.zeros(0, int),
@@ -422,9 +441,9 @@ class BistaticField(RadioField):
         """Power of each line-of-sight and mirror path, shape ``(L,)``."""
         base = (self.wavelength_m / (4.0 * np.pi * paths.length_m)) ** 2 * paths.share**2
         base = base * self.tracer.through_air(paths.length_m)
-        power = specular_power(base, self._met_groups(paths), paths.cosine, self.parameters)[0] * np.exp(
-            self.parameters.log_gain
-        )
+        groups = self._met_groups(paths)
+        power = specular_power(base, groups, paths.cosine, paths.turn, self.parameters)[0]
+        power = power * np.exp(self.parameters.log_gain)
         kept = (paths.order <= self.terms.mirror_order) & ((paths.order > 0) | self.terms.line_of_sight)
         return np.where(kept, power, 0.0)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 _SURFACE = (
     "normal", "patch", "plane_normal", "plane_offset", "group", "material", "look", "patch_group", "element",
-    "element_centre", "element_area", "element_group",
+    "texel", "texel_element", "element_centre", "element_area", "element_group",
 )  # fmt: skip
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")
 
@@ -59,6 +59,8 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
         )
         if len(surface.patch) != len(surface.mesh.faces) or len(parameters.log_excess) != surface.groups:
             raise ValueError("its parameters do not fit its surface")
+        if tensors["residual"].shape != (2, surface.texels):
+            raise ValueError("its residual does not fit its surface")
         errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
         plain = {name: header[name] for name in _PLAIN}
         return {

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 
-from warprrf.rf.bistatic.bounces import fresnel_curves
+from warprrf.rf.bistatic.chains import chain_reflection
+from warprrf.rf.half_spaces import fresnel_curves
 
 NEPER = 10.0 / np.log(10.0)
 HUBER_DB = 3.0  # larger residuals count linearly: shadows that the geometry puts in the wrong place
@@ -87,7 +88,8 @@ class View:
         seen: groups that it sees at all, shape ``(B,)``.
         dark: indirect power at unit radiance, shape ``(N, B)`` float32.
         gain: power of each specular path without its reflections, shape ``(K,)``.
-        path_group, cosine: groups it meets (-1: none) and cosines of incidence, shapes ``(K, 3)``.
+        path_group, cosine, turn: groups it meets (-1: none), cosines of incidence and angles between planes of
+            incidence, shapes ``(K, 3)``.
         beam: power of each path's beam per pixel, shape ``(K, N)`` float32.
         extra: power that is not fitted, shape ``(N,)``.
         again_group, again: groups that send on light of other surfaces, shape ``(C,)``, and what they send, shape
@@ -102,6 +104,7 @@ class View:
     gain: np.ndarray
     path_group: np.ndarray
     cosine: np.ndarray
+    turn: np.ndarray
     beam: np.ndarray
     extra: np.ndarray
     again_group: np.ndarray
@@ -188,20 +191,15 @@ class Layout:
 
 
 def specular_power(
-    gain: np.ndarray, path_group: np.ndarray, cosine: np.ndarray, p: Parameters
+    gain: np.ndarray, path_group: np.ndarray, cosine: np.ndarray, turn: np.ndarray, p: Parameters
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Power of specular paths ``(K,)``, and its logarithmic derivatives to the mirror strength and the excess of each
     met group, ``(K, 3)`` (zero where none)."""
-    power = np.asarray(gain, float).copy()
-    slope = np.zeros(path_group.shape)
-    for b in range(path_group.shape[1]):
-        met = path_group[:, b] >= 0
-        g = path_group[met, b]
-        if len(g):
-            value, rise = fresnel_curves().value(p.log_excess[g], cosine[met, b])
-            power[met] *= np.exp(p.log_mirror[g]) * value
-            slope[met, b] = rise / np.maximum(value, 1e-12)
-    return power, (path_group >= 0).astype(float), slope
+    met = path_group >= 0
+    own = np.maximum(path_group, 0)
+    share, slope = chain_reflection(p.log_excess[own], cosine, turn, met)
+    strength = np.where(met, p.log_mirror[own], 0.0).sum(axis=1)
+    return np.asarray(gain, float) * np.exp(strength) * share, met.astype(float), slope
 
 
 def scattered_share(p: Parameters) -> np.ndarray:
@@ -219,7 +217,7 @@ def predict(view: View, p: Parameters) -> np.ndarray:
     if len(view.again_group):
         power = power + view.again @ scattered_share(p.take(view.again_group)).astype(np.float32)
     power = power + view.dark @ np.exp(p.log_indirect[view.seen]).astype(np.float32)
-    strength = specular_power(view.gain, view.path_group, view.cosine, p)[0]
+    strength = specular_power(view.gain, view.path_group, view.cosine, view.turn, p)[0]
     return np.exp(p.log_gain) * (power + strength.astype(np.float32) @ view.beam)
 
 
@@ -257,7 +255,7 @@ def jacobian(view: View, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.
         dark = view.dark * np.exp(p.log_indirect[view.seen]).astype(np.float32)
         power = power + dark.sum(axis=1)
         blocks.append((layout.stride * view.seen + layout.lobes + 2, dark))
-    strength, to_mirror, rise = specular_power(view.gain, view.path_group, view.cosine, p)
+    strength, to_mirror, rise = specular_power(view.gain, view.path_group, view.cosine, view.turn, p)
     power = power + strength.astype(np.float32) @ view.beam
     met = np.unique(view.path_group[view.path_group >= 0])
     if len(met):

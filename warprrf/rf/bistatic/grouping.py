@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warprrf.rf.bistatic.bounces import fresnel_curves
 from warprrf.rf.bistatic.fit import NEPER, Parameters, View, huber, predict, scattered_share, specular_power
+from warprrf.rf.half_spaces import fresnel_curves
 
 LOOK_COST = 3.0  # what one unit of difference in look, squared, counts as in the objective
 MOST_LOOK = 9.0
@@ -104,7 +104,7 @@ def _costs(views: Sequence[View], p: Parameters, owner: np.ndarray, noise_db: fl
         loss = huber(NEPER * np.log1p(power) - view.target_db)[0].sum()
         met = view.path_group >= 0
         now = np.where(met, owner[np.where(met, view.path_group, 0)], -1)
-        strength = specular_power(view.gain, now, view.cosine, p)[0]
+        strength = specular_power(view.gain, now, view.cosine, view.turn, p)[0]
         units = np.unique(np.concatenate([view.groups, view.again_group, view.path_group[met]]))
         for unit in units:
             change = np.zeros((len(power), count), np.float32)
@@ -120,8 +120,9 @@ def _costs(views: Sequence[View], p: Parameters, owner: np.ndarray, noise_db: fl
                 trial = np.repeat(now[paths][None], count, axis=0)
                 own = np.broadcast_to(view.path_group[paths] == unit, trial.shape)
                 trial = np.where(own, np.arange(count)[:, None, None], trial).reshape(-1, trial.shape[2])
-                gain, cosine = np.tile(view.gain[paths], count), np.tile(view.cosine[paths], (count, 1))
-                new = specular_power(gain, trial, cosine, p)[0].reshape(count, -1)
+                gain = np.tile(view.gain[paths], count)
+                cosine, turn = (np.tile(a[paths], (count, 1)) for a in (view.cosine, view.turn))
+                new = specular_power(gain, trial, cosine, turn, p)[0].reshape(count, -1)
                 change += ((new - strength[paths]).astype(np.float32) @ view.beam[paths]).T
             trial_db = NEPER * np.log1p(np.maximum(power[:, None] + np.exp(p.log_gain) * change, 0.0))
             out[unit] += (huber(trial_db - view.target_db[:, None])[0].sum(axis=0) - loss) / noise_db**2

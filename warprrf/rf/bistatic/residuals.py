@@ -1,125 +1,126 @@
-"""What differs within a material group: a gain for each surface element, held close to one.
+"""What differs within a material group: a gain for each surface element and each texel of it, held close to one.
 
-Photos tell materials apart only so far, and a mesh misses what it misses. The residual is fitted by Gauss-Newton with
-conjugate gradients: the Jacobian is the receiver beam after a sparse matrix, neither of which is ever formed.
+Photos tell materials apart only so far, and a mesh misses what it misses: that is the gain of single bounces. Light
+that surfaces send on to each other has a gain of its own, because it is known less well: elements are half a metre
+wide, and of further bounces some are left out. (Sionna RT's rays scatter at the same points whatever the receiver, so
+its dark corners have a texture that can be learned.)
+
+Both are fitted by Gauss-Newton with conjugate gradients: the Jacobian is the receiver beam after a sparse matrix.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_matrix, hstack, identity, vstack
 
 from warprrf.rf.beam import BeamOperator
-from warprrf.rf.bistatic.fit import NEPER
+from warprrf.rf.bistatic.fit import HUBER_DB, NEPER
+from warprrf.rf.bistatic.surface import Surface
 
 ROUNDS = 4
 CONJUGATE_STEPS = 12
-DEVIATION = 0.5  # of an element's gain from its group's [nepers]
-HUBER_DB = 3.0
+DEVIATIONS = ((0.5, 0.5), (1.0, 2.0))
+"""Of the gains of elements and of texels from 1 [nepers]: for single bounces, and for light that is sent on."""
+LARGEST = 4.0  # gain [nepers]
+LONGEST_STEP = 3.0  # of a gain, in standard deviations
 
 
 @dataclass(frozen=True)
 class Shares:
-    """What each element gives the pixels of one receiver before the beam, in units of N0, as (pixel, element, power)
-    triples, the rest of its spectrum after the beam, and the target.
+    """What texels give the pixels of one receiver before the beam, the rest of its spectrum after the beam, and the
+    target, in units of N0.
 
     Attributes:
-        pixel, element, power: shapes ``(E,)``.
+        single: single bounces, sparse, shape ``(N, X)``.
+        further: light that is sent on, likewise.
         rest: shape ``(N,)``.
         target_db: 10 log10(P / N0 + 1), shape ``(N,)``.
     """
 
-    pixel: np.ndarray
-    element: np.ndarray
-    power: np.ndarray
+    single: csr_matrix
+    further: csr_matrix
     rest: np.ndarray
     target_db: np.ndarray
 
 
 def gather_shares(
-    face_element: np.ndarray, power: np.ndarray, per_pixel: int, elements: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays (K,) gathered by pixel and element: pixel, element, power."""
+    pixel: np.ndarray, face: np.ndarray, power: np.ndarray, pixels: int, surface: Surface
+) -> csr_matrix:
+    """Power of rays (K,) gathered by pixel and texel, shape ``(pixels, X)`` float32."""
     k = np.flatnonzero(power > 0)
-    key = (k // per_pixel) * elements + face_element[k]
-    unique, index = np.unique(key, return_inverse=True)
-    return unique // elements, unique % elements, np.bincount(index.reshape(-1), power[k])
+    triples = power[k].astype(np.float32), (pixel[k], surface.texel[face[k]])
+    return csr_matrix(triples, shape=(pixels, surface.texels))
 
 
 def fit_residual(
-    shares: Sequence[Shares],
-    beam: BeamOperator,
-    elements: int,
-    *,
-    deviation: float = DEVIATION,
-    noise_db: float = 3.0,
+    shares: Sequence[Shares], beam: BeamOperator, surface: Surface, *, noise_db: float = 3.0
 ) -> np.ndarray:
-    """ln of each element's gain over its group's, shape ``(elements,)``; zero where nothing is seen of it.
+    """ln of each texel's gains over its group's, shape ``(2, X)``; zero where nothing is seen of it.
+
+    A texel's gain is the product of its element's and its own, each log-normal about 1 with :data:`DEVIATIONS`: few
+    spectra move elements, many move texels.
 
     Args:
         shares: one for each training receiver.
         beam: the receiver beam.
-        elements: number of elements.
-        deviation: standard deviation of the prior [nepers].
-        noise_db: standard deviation of a pixel's error that it is weighed against; see :func:`fit_groups`.
+        surface: whose texels they are.
+        noise_db: standard deviation of a pixel's error that gains are weighed against; see :func:`fit_groups`.
     """
     pixels, count = len(shares[0].target_db), len(shares)
-    pixel = np.concatenate([s.pixel + r * pixels for r, s in enumerate(shares)])
-    element = np.concatenate([s.element for s in shares])
-    power = np.concatenate([s.power for s in shares])
+    power = vstack([hstack([s.single, s.further]) for s in shares], format="csr")
     rest = np.stack([s.rest for s in shares], axis=1)
     target = np.stack([s.target_db for s in shares], axis=1)
     rows, columns = beam.shape
 
-    def spread(values: np.ndarray) -> np.ndarray:
-        image = (
-            np.bincount(pixel, values, minlength=count * pixels).astype(np.float32).reshape(count, pixels).T
-        )
-        return beam(image.reshape(rows, columns, count)).reshape(pixels, count)
+    def spread(values: np.ndarray, quick: bool = True) -> np.ndarray:
+        image = (power @ values.astype(np.float32)).reshape(count, pixels).T
+        return beam(image.reshape(rows, columns, count), quick=quick).reshape(pixels, count)
 
     def gather(image: np.ndarray) -> np.ndarray:
-        back = (
-            beam.adjoint(image.astype(np.float32).reshape(rows, columns, count))
-            .reshape(pixels, count)
-            .T.ravel()
-        )
-        return back[pixel]
+        back = beam.adjoint(image.astype(np.float32).reshape(rows, columns, count), quick=True)
+        found: np.ndarray = power.T @ back.reshape(pixels, count).T.ravel()
+        return found
 
-    r = np.zeros(elements)
-    weight, ridge = 1.0 / noise_db**2, 1.0 / deviation**2
+    # Unknowns have unit variance a priori: elements and texels of single bounces, then of light that is sent on.
+    texel = np.arange(surface.texels)
+    member = csr_matrix((np.ones(len(texel)), (texel, surface.texel_element)))
+    either = [
+        hstack([of_element * member, of_texel * identity(len(texel))]) for of_element, of_texel in DEVIATIONS
+    ]
+    gains = vstack(
+        [hstack([either[0], csr_matrix(either[0].shape)]), hstack([csr_matrix(either[1].shape), either[1]])],
+        format="csr",
+    )
+    unknown = np.zeros(gains.shape[1])
     for _ in range(ROUNDS):
-        now = power * np.exp(r[element])
-        total = np.maximum(spread(now), 0.0) + rest
+        gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
+        total = np.maximum(spread(gain, quick=False), 0.0) + rest
         residual = NEPER * np.log1p(total) - target
-        robust = weight * np.where(
-            np.abs(residual) <= HUBER_DB, 1.0, HUBER_DB / np.maximum(np.abs(residual), 1e-9)
-        )
+        robust = np.minimum(HUBER_DB / np.maximum(np.abs(residual), 1e-9), 1.0) / noise_db**2
         slope = NEPER / (1.0 + total)
 
         def curvature(
-            v: np.ndarray, now: np.ndarray = now, slope: np.ndarray = slope, robust: np.ndarray = robust
+            v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = slope**2 * robust
         ) -> np.ndarray:
-            image = slope * spread(now * v[element])
-            return np.bincount(element, now * gather(slope * robust * image), minlength=elements) + ridge * v
+            found: np.ndarray = gains.T @ (gain * gather(weight * spread(gain * (gains @ v)))) + v
+            return found
 
-        gradient = (
-            np.bincount(element, now * gather(slope * robust * residual), minlength=elements) + ridge * r
-        )
-        step = _conjugate_gradients(curvature, -gradient)
-        r = np.clip(r + np.clip(step, -1.5, 1.5), -4.0, 4.0)
-    return r
+        gradient = gains.T @ (gain * gather(slope * robust * residual)) + unknown
+        unknown += np.clip(_conjugate_gradients(curvature, -gradient), -LONGEST_STEP, LONGEST_STEP)
+    return np.clip(gains @ unknown, -LARGEST, LARGEST).reshape(2, -1)
 
 
-def _conjugate_gradients(matrix: object, right: np.ndarray) -> np.ndarray:
+def _conjugate_gradients(matrix: Callable[[np.ndarray], np.ndarray], right: np.ndarray) -> np.ndarray:
     x = np.zeros_like(right)
     residual = right.copy()
     direction, size = residual.copy(), float(residual @ residual)
     for _ in range(CONJUGATE_STEPS):
         if size < 1e-12:
             break
-        image = matrix(direction)  # type: ignore[operator]
+        image = matrix(direction)
         step = size / float(direction @ image)
         x += step * direction
         residual -= step * image

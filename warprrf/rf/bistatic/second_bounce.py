@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.rf.bistatic.bounces import BounceTracer, Met, fresnel_curves
+from warprrf.rf.bistatic.bounces import BounceTracer, Met
 from warprrf.rf.bistatic.fit import Parameters, scattered_share
 from warprrf.rf.bistatic.mirror_light import MirrorLight
 from warprrf.rf.bistatic.surface import Surface
+from warprrf.rf.half_spaces import fresnel_curves
 
 RAYS = 128  # from each element, over its hemisphere
 LEAST_MIRROR = 1e-4  # reflected share of power below which a patch is no mirror
@@ -118,30 +119,25 @@ def mirrored_scene(
 
 
 @dataclass(frozen=True)
-class SeenElements:
-    """Elements that a grid's rays meet: of each pixel and element the solid angle [sr], less what the air between
-    absorbs, all shapes ``(K,)``."""
+class SeenSurface:
+    """Faces that a grid's rays meet: of each ray that meets one its pixel, the face, and the solid angle [sr], less
+    what the air between absorbs, all shapes ``(K,)``."""
 
     pixel: np.ndarray
-    element: np.ndarray
+    face: np.ndarray
     solid_angle: np.ndarray
 
     @classmethod
-    def of(cls, tracer: BounceTracer, met: Met) -> SeenElements:
+    def of(cls, tracer: BounceTracer, met: Met) -> SeenSurface:
         """Those of the rays that met ``met``."""
         face = met.face.numpy()
         ray = np.flatnonzero(face >= 0)
-        pixel = ray // tracer.sub_pixels**2
-        elements = len(tracer.surface.element_area)
-        key = pixel * elements + tracer.surface.element[face[ray]]
-        pairs, place = np.unique(key, return_inverse=True)
         seen = tracer.solid_angle[ray] * tracer.through_air(met.range_m.numpy()[ray])
-        solid_angle = np.bincount(place.ravel(), seen, minlength=len(pairs))
-        return cls(pairs // elements, pairs % elements, solid_angle)
+        return cls(ray // tracer.sub_pixels**2, face[ray], seen)
 
     def power(self, sent: np.ndarray, wavelength_m: float) -> np.ndarray:
-        """Path gain of each (K,) of the radiance (E,) that elements send on evenly."""
-        return (wavelength_m / (4.0 * np.pi)) ** 2 * self.solid_angle * sent[self.element]
+        """Path gain of each (K,) of the radiance that each ray's surface sends on evenly, shape ``(K,)``."""
+        return (wavelength_m / (4.0 * np.pi)) ** 2 * self.solid_angle * sent
 
 
 def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:

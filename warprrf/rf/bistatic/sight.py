@@ -9,7 +9,7 @@ import numpy as np
 
 from warprrf.rf.bistatic.bounces import BounceTracer, Lit, Met
 from warprrf.rf.bistatic.mirror_light import MirrorLight, MirrorSight
-from warprrf.rf.bistatic.second_bounce import SeenElements
+from warprrf.rf.bistatic.second_bounce import SeenSurface
 from warprrf.rf.bistatic.specular import SpecularPaths
 
 
@@ -36,9 +36,9 @@ class Sight:
     _mirrored: list[MirrorSight] = field(default_factory=list, repr=False)
 
     @cached_property
-    def elements(self) -> SeenElements:
-        """Surface elements that its rays meet."""
-        return SeenElements.of(self.tracer, self.met)
+    def surface(self) -> SeenSurface:
+        """Faces that its rays meet."""
+        return SeenSurface.of(self.tracer, self.met)
 
     def mirrored(self, light: MirrorLight) -> MirrorSight:
         """What its rays see of the light that mirrors throw on surfaces, traced once."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.bistatic.chains import turns
 from warprrf.rf.bistatic.mirror_tree import SLACK_M, MirrorTree
 from warprrf.rf.bistatic.surface import Surface
 
@@ -33,6 +34,7 @@ class SpecularPaths:
         order: reflections, 0 for line of sight, shape ``(L,)``.
         patch: patches met, from the transmitter on, -1 where fewer, shape ``(L, 3)``.
         cosine: cosine of incidence at each, shape ``(L, 3)``.
+        turn: angle of its plane of incidence to the one before [rad], shape ``(L, 3)``; see :mod:`chains`.
         point: mirror points [m], shape ``(L, 3, 3)``; NaN where fewer.
         length_m: total length, shape ``(L,)``.
         arrival: unit direction of arrival, shape ``(L, 3)``.
@@ -43,6 +45,7 @@ class SpecularPaths:
     order: np.ndarray
     patch: np.ndarray
     cosine: np.ndarray
+    turn: np.ndarray
     point: np.ndarray
     length_m: np.ndarray
     arrival: np.ndarray
@@ -76,7 +79,10 @@ def specular_paths(
         parts.append(_mirror_once(surface, transmitter, receivers, wavelength_m, samples, device))
     if order >= 2 and len(surface.plane_offset):
         tree = tree or MirrorTree(surface, transmitter, order)
-        parts += [_mirror_chains(surface, tree, receivers, k, device) for k in range(2, order + 1)]
+        parts += [
+            _mirror_chains(surface, tree, receivers, k, wavelength_m, samples, device)
+            for k in range(2, order + 1)
+        ]
     return SpecularPaths(
         **{
             name: np.concatenate([getattr(p, name) for p in parts])
@@ -119,15 +125,16 @@ def _zone_radius(wavelength: float, near: np.ndarray, far: np.ndarray, skin: flo
 
 
 def _rows(
-    receiver: np.ndarray, order: int, patch: np.ndarray, cosine: np.ndarray, point: np.ndarray, length: np.ndarray,
-    arrival: np.ndarray, share: np.ndarray,
+    receiver: np.ndarray, order: int, patch: np.ndarray, cosine: np.ndarray, turn: np.ndarray, point: np.ndarray,
+    length: np.ndarray, arrival: np.ndarray, share: np.ndarray,
 ) -> SpecularPaths:  # fmt: skip
     """Rows of paths with ``order`` reflections, what they lack of ``MOST_MIRRORS`` filled up."""
     kept = np.flatnonzero(share >= LEAST_SHARE)
     empty = MOST_MIRRORS - order
     return SpecularPaths(
         receiver, np.full(len(receiver), order), np.pad(patch, ((0, 0), (0, empty)), constant_values=-1),
-        np.pad(cosine, ((0, 0), (0, empty))), np.pad(point, ((0, 0), (0, empty), (0, 0)), constant_values=np.nan),
+        np.pad(cosine, ((0, 0), (0, empty))), np.pad(turn, ((0, 0), (0, empty))),
+        np.pad(point, ((0, 0), (0, empty), (0, 0)), constant_values=np.nan),
         length, arrival, share,
     ).subset(kept)  # fmt: skip
 
@@ -156,7 +163,15 @@ def _line_of_sight(
     share = free.reshape(count, -1).mean(axis=1)
     nothing = np.zeros((count, 0))
     return _rows(
-        np.arange(count), 0, nothing.astype(int), nothing, np.zeros((count, 0, 3)), length, toward, share
+        np.arange(count),
+        0,
+        nothing.astype(int),
+        nothing,
+        nothing,
+        np.zeros((count, 0, 3)),
+        length,
+        toward,
+        share,
     )
 
 
@@ -177,16 +192,8 @@ def _mirror_once(
     t = length * below[r, p] / (below[r, p] + height[p])
     point = receivers[r] + t[:, None] * toward
     cosine = np.abs((toward * surface.plane_normal[p]).sum(axis=1))
-    # The zone's cut by the plane is an ellipse, longer by 1 / cos along the plane of incidence.
     radius = _zone_radius(wavelength, t, length - t, surface.skin_m)
-    normal = surface.plane_normal[p]
-    across = np.cross(toward, normal)
-    size = np.linalg.norm(across, axis=1, keepdims=True)
-    across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), _across(normal)[0])
-    along = np.cross(normal, across) / np.maximum(cosine, 0.05)[:, None]
-    target = point[:, None] + radius[:, None, None] * (
-        samples[:, 0, None] * across[:, None] + samples[:, 1, None] * along[:, None]
-    )
+    target = point[:, None] + radius[:, None, None] * _cut(toward, surface.plane_normal[p], samples)
     shape = target.shape
     start = np.broadcast_to(receivers[r][:, None], shape).reshape(-1, 3)
     which = np.repeat(p, len(samples))
@@ -199,7 +206,21 @@ def _mirror_once(
     tx = np.broadcast_to(transmitter, (len(idx), 3))
     met[idx] = _clear(surface.mesh, flat[idx], tx, surface.skin_m, device)
     share = met.reshape(shape[:2]).mean(axis=1)
-    return _rows(r, 1, p[:, None], cosine[:, None], point[:, None], length, toward, share)
+    only = np.zeros((len(r), 1))
+    return _rows(r, 1, p[:, None], cosine[:, None], only, point[:, None], length, toward, share)
+
+
+def _cut(toward: np.ndarray, normal: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Offsets of ``samples`` of a zone of unit radius about ``toward`` (N, 3), on planes of ``normal`` (N, 3).
+
+    The cut is an ellipse, longer by 1 / cos along the plane of incidence; shape ``(N, S, 3)``.
+    """
+    cosine = np.abs((toward * normal).sum(axis=1))
+    across = np.cross(toward, normal)
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), _across(normal)[0])
+    along = np.cross(normal, across) / np.maximum(cosine, 0.05)[:, None]
+    return samples[:, 0, None] * across[:, None] + samples[:, 1, None] * along[:, None]
 
 
 def _near_patch(surface: Surface, point: np.ndarray, patch: np.ndarray) -> np.ndarray:
@@ -226,9 +247,15 @@ def _reaches(
 
 
 def _mirror_chains(
-    surface: Surface, tree: MirrorTree, receivers: np.ndarray, order: int, device: Any
+    surface: Surface,
+    tree: MirrorTree,
+    receivers: np.ndarray,
+    order: int,
+    wavelength: float,
+    samples: np.ndarray,
+    device: Any,
 ) -> SpecularPaths:
-    """Paths of ``order`` reflections, each leg tried along one ray."""
+    """Paths of ``order`` reflections whose middle ray is free; the others of their zone say what share is."""
     row, chain, point = tree.candidates(receivers, order, device=device)
     free = unobstructed(surface, tree, receivers[row], chain, point, device)
     row, chain, point = row[free], chain[free], point[free]
@@ -238,9 +265,19 @@ def _mirror_chains(
     )
     legs = np.diff(stops, axis=1)
     lengths = np.linalg.norm(legs, axis=2)
+    length = lengths.sum(axis=1)
     along = legs / np.maximum(lengths, 1e-12)[..., None]
-    cosine = np.abs((along[:, :-1] * surface.plane_normal[patch]).sum(axis=2))
-    return _rows(row, order, patch, cosine, point, lengths.sum(axis=1), -along[:, -1], np.ones(len(row)))
+    normal = surface.plane_normal[patch]
+    cosine = np.abs((along[:, :-1] * normal).sum(axis=2))
+    before = np.cumsum(lengths, axis=1)[:, :-1]
+    radius = _zone_radius(wavelength, before, length[:, None] - before, surface.skin_m)
+    around = np.repeat(point[:, None], len(samples), axis=1)
+    for k in range(order):
+        around[:, :, k] += radius[:, k, None, None] * _cut(along[:, k], normal[:, k], samples)
+    ends, which = (np.repeat(a, len(samples), axis=0) for a in (receivers[row], chain))
+    met = unobstructed(surface, tree, ends, which, around.reshape(-1, order, 3), device)
+    share = met.reshape(len(row), len(samples)).mean(axis=1)
+    return _rows(row, order, patch, cosine, turns(stops, normal), point, length, -along[:, -1], share)
 
 
 def unobstructed(

@@ -2,7 +2,8 @@
 
 A group holds faces that look alike and so share radio parameters: a Scene's materials where they are known, else
 patches of a reconstruction gathered by the colour that photos gave them. An element is a piece of one group, about half
-a metre wide: what differs within a group is told apart at that scale.
+a metre wide, at which scale surfaces light each other; a texel is a piece of an element: what differs within a group is
+told apart at both scales.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from warprrf.kernels import bounce
 from warprrf.rf.paths import planar_patches as exact_patches
 
 ELEMENT_M = 0.5  # width of an element
+TEXELS = 3  # along an element
 LARGEST_FACE_M = 0.6  # longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
 LARGE_PIECE_M2 = 1.5  # a piece of a patch this large is a group of its own
@@ -49,6 +51,8 @@ class Surface:
         look: colour of each group, scaled so that 1 tells materials apart, shape ``(G, 4)``; NaN where unknown.
         patch_group: group of each patch, shape ``(P,)`` int32.
         element: surface element of each face, shape ``(F,)`` int32.
+        texel: texel of each face, shape ``(F,)`` int32.
+        texel_element: element of each texel, shape ``(X,)`` int32.
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
@@ -64,6 +68,8 @@ class Surface:
     look: np.ndarray
     patch_group: np.ndarray
     element: np.ndarray
+    texel: np.ndarray
+    texel_element: np.ndarray
     element_centre: np.ndarray
     element_area: np.ndarray
     element_group: np.ndarray
@@ -74,6 +80,11 @@ class Surface:
     def groups(self) -> int:
         """Number of groups."""
         return len(self.group_names)
+
+    @property
+    def texels(self) -> int:
+        """Number of texels."""
+        return len(self.texel_element)
 
     @classmethod
     def of(cls, geometry: Any, *, element_m: float = ELEMENT_M) -> Surface:
@@ -127,9 +138,10 @@ class Surface:
         element_m: float,
     ) -> Surface:
         centre, area = mesh.triangles.mean(axis=1), mesh.areas
-        cells = np.floor((centre - mesh.bounds[0]) / element_m).astype(np.int64)
-        key = np.column_stack([group, patch, cells])
+        cells = np.floor(TEXELS * (centre - mesh.bounds[0]) / element_m).astype(np.int64)
+        key = np.column_stack([group, patch, cells // TEXELS])
         element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
+        pieces, texel = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
         total = np.maximum(np.bincount(element, area), 1e-12)
         middle = (
             np.stack([np.bincount(element, area * centre[:, k]) for k in range(3)], axis=1) / total[:, None]
@@ -143,7 +155,8 @@ class Surface:
                 patch_group[p] = np.bincount(group[own], area[own]).argmax()
         return cls(
             mesh, np.asarray(normal), np.asarray(patch, np.int32), planes[0], planes[1], np.asarray(group, np.int32),
-            kinds[0], kinds[1], patch_group, element, middle, total, owner, tuple(names), skin,
+            kinds[0], kinds[1], patch_group, element, texel.reshape(-1).astype(np.int32),
+            pieces[:, 0].astype(np.int32), middle, total, owner, tuple(names), skin,
         )  # fmt: skip
 
     def on_device(self, device: Any) -> Any:

@@ -19,7 +19,7 @@ class Terms:
         scatter_mirror: whether mirrors show the lit scene.
         diffuse_order: diffuse bounces on a path, 1 to 3.
         indirect: whether groups have an indirect radiance.
-        residual: whether elements differ from their group.
+        residual: whether surfaces differ within their group.
         sub_pixels: square root of the rays per pixel, 1 to 16.
     """
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress, check_array
@@ -51,9 +52,9 @@ MORE: tuple[tuple[str, Any], ...] = (
 """Bounces that may be added to single ones, in the order in which they are tried."""
 QUICK: dict[str, Any] = {
     "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": True,
-    "residual": False, "sub_pixels": 1,
+    "residual": True, "sub_pixels": 1,
 }  # fmt: skip
-"""What a quick fit takes for given: light of more than one bounce is even, and one ray a pixel."""
+"""What a quick fit takes for given: light of more than one bounce is even but for the residual, one ray a pixel."""
 FEW_MATERIALS = 30
 REGROUPED = 3  # rounds of deciding what is of one material, and fitting
 OUTER = 2  # rounds of further bounces and groups in turn
@@ -165,7 +166,7 @@ def train(
         scatter_mirror: the lit scene seen in mirrors.
         diffuse_order: diffuse bounces on a path: 1, 2 or 3.
         indirect: a non-negative radiance of each group, constant in direction.
-        residual: a gain for each surface element.
+        residual: gains of what differs within a group.
         sub_pixels: square root of the rays per pixel (None: 3, which no error in the lobby tells from 4; 2 costs 0.2
             dB of PSNR there and halves the time).
         quick: try no term: what is not given here is taken from :data:`QUICK`.
@@ -448,28 +449,34 @@ class _Training:
         order = (view.path_group >= 0).sum(axis=1)
         keep = (order <= terms.mirror_order) & ((order > 0) | terms.line_of_sight)
         view = replace(
-            view, gain=view.gain[keep], path_group=view.path_group[keep], cosine=view.cosine[keep], beam=view.beam[keep]
+            view, gain=view.gain[keep], path_group=view.path_group[keep], cosine=view.cosine[keep],
+            turn=view.turn[keep], beam=view.beam[keep],
         )  # fmt: skip
         if not terms.diffuse:
             view = replace(view, groups=view.groups[:0], basis=view.basis[:, :0])
         return view
 
     def _residual(self, field: BistaticField, chosen: np.ndarray) -> np.ndarray:
-        shares = []
-        elements = len(self.surface.element_area)
+        shares, surface, floor = [], self.surface, self.ds.floor
+        pixels, per_pixel = self.target[0].size, field.tracer.sub_pixels**2
         for r in chosen:
             sight = self.seen.sights[r]
             parts = field.compose(sight)
-            face = sight.met.face.numpy()
-            own = self.surface.element[np.maximum(face, 0)]
-            triples = gather_shares(own, parts.rays / self.ds.floor, field.tracer.sub_pixels**2, elements)
-            diffuse = field.beam(parts.rays.reshape(*field.shape, -1).sum(axis=-1))
-            rest = np.maximum(parts.image - diffuse, 0.0) / self.ds.floor
-            shares.append(Shares(*triples, rest.ravel(), self.target[r].ravel()))
-        return fit_residual(shares, field.beam, elements)
+            rays = np.arange(len(parts.rays))
+            single = gather_shares(
+                rays // per_pixel, sight.met.face.numpy(), parts.rays / floor, pixels, surface
+            )
+            gain = np.exp(field.parameters.log_gain) / floor
+            further = csr_matrix((pixels, surface.texels), dtype=np.float32)
+            for pixel, face, power in field.sent_on(sight):
+                further += gather_shares(pixel, face, gain * power, pixels, surface)
+            known = np.asarray((single + further).sum(axis=1)).reshape(field.shape)
+            rest = np.maximum(parts.image / floor - field.beam(known), 0.0)
+            shares.append(Shares(single, further, rest.ravel(), self.target[r].ravel()))
+        return fit_residual(shares, field.beam, surface)
 
     def _field(self, terms: Terms, fit: Fit, residual: np.ndarray | None) -> BistaticField:
-        zero = np.zeros(len(self.surface.element_area))
+        zero = np.zeros((2, self.surface.texels))
         field = replace(
             self.blank,
             terms=terms if residual is not None else replace(terms, residual=False),

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.files import write_arrays, write_text
 from warprrf.rf.channel.path_set import Paths
-from warprrf.rf.dataset import write_whole
 from warprrf.rf.scene import Scene
 
 REFLECTION, SCATTERING = 1, 3
@@ -72,7 +72,7 @@ def write_deepmimo(
     coefficient = coefficient.reshape(several.gain.shape)
     matrices = _matrices(several, coefficient, max_paths)
     for key, values in matrices.items():
-        _write_arrays(folder / f"{key}_t000_tx000_r001.npz", {key: values})
+        write_arrays(folder / f"{key}_t000_tx000_r001.npz", {key: values})
     described = _write_scene(folder, scene, carrier)
     bounces = np.isfinite(several.vertices[..., 0]).sum(axis=-1)
     mirrors = np.where(several.kind == "mirror", bounces, 0).max(initial=0)
@@ -110,7 +110,9 @@ def write_deepmimo(
         "materials": described.pop("materials"),
         "scene": described,
     }
-    _write_text(folder / "params.json", parameters)  # last: a folder without it does not load
+    write_text(
+        folder / "params.json", json.dumps(parameters, indent=2)
+    )  # last: a folder without it does not load
     return folder
 
 
@@ -190,10 +192,10 @@ def _write_scene(folder: Path, scene: Scene | None, carrier: float) -> dict[str,
             kinds[str(k)] = scene.face_material[chosen].astype(np.int64)
             objects.append({"name": name, "label": "objects", "id": k, "mesh_key": str(k)})
         materials = {f"material_{k}": _material(k, m, carrier) for k, m in enumerate(scene.materials)}
-    _write_arrays(folder / "vertices.npz", {"vertices": vertices})
-    _write_arrays(folder / "faces.npz", faces)
-    _write_arrays(folder / "materials.npz", kinds)
-    _write_text(folder / "objects.json", objects)
+    write_arrays(folder / "vertices.npz", {"vertices": vertices})
+    write_arrays(folder / "faces.npz", faces)
+    write_arrays(folder / "materials.npz", kinds)
+    write_text(folder / "objects.json", json.dumps(objects, indent=2))
     count = sum(len(f) for f in faces.values())
     return {
         "num_scenes": 1,
@@ -220,18 +222,6 @@ def _material(k: int, material: Any, carrier: float) -> dict[str, Any]:
         "roughness": float(material.roughness_m),
         "thickness": float(material.thickness_m),
     }
-
-
-def _write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-
-    write_whole(path, write)
-
-
-def _write_text(path: Path, value: Any) -> None:
-    write_whole(path, lambda temporary: temporary.write_text(json.dumps(value, indent=2), encoding="utf-8"))
 
 
 def _warprrf_version() -> str:

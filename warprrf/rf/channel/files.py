@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
+from warprrf.files import write_atomically
 from warprrf.rf.absorption import Air
 from warprrf.rf.channel.path_set import Paths
-from warprrf.rf.dataset import write_whole
 
 KINDS = ("", "los", "mirror", "diffuse")
 """What the values 0, 1, ... of the variable ``kind`` mean."""
@@ -72,7 +72,7 @@ def save_paths(paths: Paths, path: str | os.PathLike[str]) -> None:
     if several.air is not None:
         attributes |= several.air.attributes
     data = xarray.Dataset(variables, attrs=attributes)
-    write_whole(path, lambda temporary: data.to_netcdf(temporary, engine="h5netcdf"), suffix=".nc")
+    write_atomically(path, lambda file: data.to_netcdf(file, engine="h5netcdf"))
 
 
 def load_paths(path: str | os.PathLike[str]) -> Paths:

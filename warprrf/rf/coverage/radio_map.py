@@ -17,9 +17,9 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
+from warprrf.files import write_atomically
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.section import section
-from warprrf.rf.dataset import write_whole
 from warprrf.rf.receivers import ON_A_WALL_M
 from warprrf.rf.spectrum import BEAM_SIGMA_RAD
 
@@ -167,7 +167,7 @@ class RadioMap:
             f"{np.rad2deg(self.beam_sigma_rad):.3g} degrees, {budget}",
             fontsize=11,
         )
-        write_whole(path, lambda name: figure.savefig(name, dpi=110, format="png"), suffix=".png")
+        write_atomically(path, lambda file: figure.savefig(file, dpi=110, format="png"))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a NetCDF-4 file, whole or not at all: the four quantities over ``y`` and ``x``, and the outline."""
@@ -184,7 +184,7 @@ class RadioMap:
         }
         attributes = {name: float(getattr(self, name)) for name in _PLAIN} | {"format": _FORMAT}
         data = xarray.Dataset(variables, coords=coordinates, attrs=attributes)
-        write_whole(path, lambda temporary: data.to_netcdf(temporary, engine="h5netcdf"), suffix=".nc")
+        write_atomically(path, lambda file: data.to_netcdf(file, engine="h5netcdf"))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> RadioMap:

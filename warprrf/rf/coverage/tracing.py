@@ -150,13 +150,15 @@ class LinkTracer:
         lit = tracer.light(met, self.transmitter)
         face = met.face.numpy()
         meets = face >= 0
-        element = field.surface.element[np.maximum(face, 0)]
+        face = np.maximum(face, 0)
         power = tracer.scatter(met, lit, p.weight, p.log_excess, field.wavelength_m).astype(float)
         if field.terms.residual:
-            power *= np.exp(field.residual[element])
+            power *= field.texture(face)
         solid_angle = np.tile(tracer.solid_angle, count)
         if self._sent is not None:
-            radiance = np.where(meets, self._sent[element], 0.0)
+            radiance = np.where(meets, self._sent[field.surface.element[face]], 0.0)
+            if field.terms.residual:
+                radiance = radiance * field.texture(face, self.transmitter)
             radiance = radiance * tracer.through_air(np.where(meets, met.range_m.numpy(), 0.0))
             power += (field.wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * radiance
         # What is known by pixels alone goes to the pixel's rays in equal shares.
@@ -177,6 +179,8 @@ class LinkTracer:
         if self._mirrors is not None:
             seen = self._mirrors.sight(receivers, met, self._tracer)
             power = self._mirrors.power(seen, field.parameters, field.wavelength_m)
+            if field.terms.residual:
+                power = power * field.texture(seen.face.numpy(), self.transmitter)
             out += np.bincount(seen.pixel, power, minlength=len(out))
         if field.terms.scatter_mirror:
             shown = mirrored_scene(

@@ -34,8 +34,9 @@ from warprrf.rf.absorption import Air, air_of
 from warprrf.rf.field import RadioField
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.harmonic import transport as _transport
+from warprrf.rf.harmonic.batches import Problem, harmonics
 from warprrf.rf.harmonic.checkpoint import Checkpoint
-from warprrf.rf.harmonic.fitting import KINDS, Problem, Rates, fit_layer, harmonics
+from warprrf.rf.harmonic.fitting import KINDS, Rates, fit_layer
 from warprrf.rf.harmonic.opacity import OpacityTraining, list_responses
 from warprrf.rf.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.harmonic.single_bounce import FieldOptions, SingleBounce

@@ -9,7 +9,7 @@ is 1e-4.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,12 +17,11 @@ import warp as wp
 from warprrf.device import Progress
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
-from warprrf.geometry.render import Blending, blend_weights
+from warprrf.geometry.rasterizer import Blending
+from warprrf.geometry.render import blend_weights
 from warprrf.kernels import opacity as _kernels
+from warprrf.rf.harmonic.batches import Problem
 from warprrf.rf.harmonic.transport import Transport, cutoffs
-
-if TYPE_CHECKING:
-    from warprrf.rf.harmonic.fitting import Problem
 
 THINNED = 0.5  # of each opacity, while lists are made
 LISTED = 32  # Gaussians kept per pixel

@@ -17,8 +17,10 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.kernels.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.absorption import Air
 from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.harmonic import interaction as _interaction
 from warprrf.rf.harmonic import transport as _transport
-from warprrf.rf.harmonic.transport import Lengths, Transport
+from warprrf.rf.harmonic.interaction import Lengths
+from warprrf.rf.harmonic.transport import Transport
 from warprrf.rf.spectrum import pixel_solid_angles, spread
 
 if TYPE_CHECKING:
@@ -45,7 +47,7 @@ class FieldOptions:
             raise ValueError(f"model: got {self.model!r}, expected one of {', '.join(MODELS)}")
         for name, known in (
             ("transmittance", _transport.TRANSMITTANCE),
-            ("interaction_point", _transport.INTERACTION_POINTS),
+            ("interaction_point", _interaction.INTERACTION_POINTS),
             ("gain", GAINS),
             ("sh_degree", tuple(DEGREE_TO_COUNT)),
             ("line_of_sight", (None, "explicit")),
@@ -95,10 +97,10 @@ class SingleBounce:
 
     def lengths(self, seen: Transport | StoredTransport, transmitter: np.ndarray) -> Lengths:
         """Path lengths of every pixel of ``seen`` by the interaction point that the options name."""
-        points = _transport.interaction_points(
+        points = _interaction.interaction_points(
             seen, self.gaussians, self.options.interaction_point, mesh=self.mesh, device=self.device
         )
-        return _transport.path_lengths(points, transmitter, seen.receivers)
+        return _interaction.path_lengths(points, transmitter, seen.receivers)
 
     def line_of_sight(self, receiver: np.ndarray, transmitter: np.ndarray) -> tuple[bool, float]:
         """Whether the mesh lets them see each other, and their Friis gain, less absorption."""

@@ -16,16 +16,14 @@ import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_array
+from warprrf.device import Progress
+from warprrf.geometry.gaussians import Gaussians
 from warprrf.rf import field_files
-from warprrf.rf.harmonic.transport import TOP_K, Transport, View, joined, viewing
-
-if TYPE_CHECKING:
-    from warprrf.geometry.gaussians import Gaussians
+from warprrf.rf.harmonic.transport import TOP_K, Transport, View, index_of, joined, viewing
 
 FORMAT = "warprrf transport 1"
 HEADER = "transport.safetensors"
@@ -45,7 +43,7 @@ def store_transport(
     device: Any = None,
     progress: Progress | None = None,
 ) -> StoredTransport:
-    """:func:`warprrf.rf.transport.transport` into ``folder``; receivers that it holds already are not done again.
+    """:func:`~warprrf.rf.harmonic.transport.transport` into ``folder``; receivers that it holds are not done again.
 
     Args:
         folder: where the files go; made if missing.
@@ -122,13 +120,7 @@ class StoredTransport:
         Raises:
             ValueError: if it is none of these receivers.
         """
-        position = check_array("receiver", receiver, (3,))
-        found = np.flatnonzero((self.receivers == position).all(axis=1))
-        if len(found) == 0:
-            raise ValueError(
-                f"receiver: got {position.tolist()}, which is none of the {len(self.receivers)} here"
-            )
-        return self.subset(found[:1])
+        return self.subset([index_of(self.receivers, receiver)])
 
     def parts(self) -> Iterator[tuple[np.ndarray, Transport]]:
         """The receivers in portions that fit into memory, with their indices."""

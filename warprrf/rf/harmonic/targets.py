@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warprrf.rf.harmonic.fitting import Target, weighted_means
+from warprrf.rf.harmonic.fitting import Target
 from warprrf.rf.harmonic.single_bounce import SingleBounce
 from warprrf.rf.harmonic.transport import Transport
 from warprrf.rf.spectrum import directions_from_angles, to_db
@@ -100,3 +100,23 @@ def targets(
                 )
                 unseen[name] = middle / Y00
     return Targets(layers, unseen, gain_unit, delay_unit)
+
+
+def weighted_means(
+    transport: Transport | StoredTransport, values: np.ndarray, where: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Per Gaussian seen by ``transport``: its index, and the mean of ``values`` over the pixels ``where`` that see it.
+
+    Both images have shape ``(R, H, W)``; the mean is weighted by blending weight, NaN if it is seen in none of them.
+    """
+    seen = transport.seen
+    total, summed = np.zeros(len(seen)), np.zeros(len(seen))
+    for chosen, part in transport.parts():
+        local = np.searchsorted(seen, part.gaussian)
+        pixel = np.repeat(np.arange(len(part.start) - 1), np.diff(part.start))
+        met = where[chosen].ravel()
+        weight = part.weight * met[pixel]
+        total += np.bincount(local, weights=weight, minlength=len(seen))
+        value = np.where(met, values[chosen].ravel(), 0.0)[pixel]
+        summed += np.bincount(local, weights=weight * value, minlength=len(seen))
+    return seen, np.divide(summed, total, out=np.full(len(seen), np.nan), where=total > 0)
