@@ -209,7 +209,7 @@ def test_features_need_not_be_contiguous():
 
 
 @pytest.mark.skipif(not wp.get_cuda_supported_archs(), reason="this build of Warp has no CUDA compiler")
-@pytest.mark.parametrize("name", ["blend", "blend_adjoint", "block_masks", "fill_blocks", "place_hits"])
+@pytest.mark.parametrize("name", ["blend", "blend_adjoint", "block_masks", "fill_blocks", "cast_rays"])
 def test_kernels_compile_for_cuda(name, tmp_path):
     """Their native snippets too; no GPU is needed for that."""
     kernels = {
@@ -217,7 +217,7 @@ def test_kernels_compile_for_cuda(name, tmp_path):
         "blend_adjoint": blend.build(wp.float32, PRODUCT, 3).blend_adjoint[0],
         "block_masks": project.build(wp.float32).block_masks,
         "fill_blocks": binning.fill_blocks,
-        "place_hits": rays.place_hits,
+        "cast_rays": rays.cast_rays,
     }
     wp.compile_aot_module(kernels[name].module, device=None, arch=80, module_dir=tmp_path, use_ptx=True)
     assert list(tmp_path.glob("*.ptx"))
