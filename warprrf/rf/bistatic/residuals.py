@@ -20,8 +20,8 @@ from warprrf.rf.beam import BeamOperator
 from warprrf.rf.bistatic.fit import HUBER_DB, NEPER
 from warprrf.rf.bistatic.surface import Surface
 
-ROUNDS = 4
-CONJUGATE_STEPS = 12
+ROUNDS, QUICK_ROUNDS = 4, 2
+CONJUGATE_STEPS, QUICK_STEPS = 12, 8
 DEVIATIONS = ((0.5, 0.5), (1.0, 2.0))
 """Of the gains of elements and of texels from 1 [nepers]: for single bounces, and for light that is sent on."""
 LARGEST = 4.0  # gain [nepers]
@@ -56,7 +56,12 @@ def gather_shares(
 
 
 def fit_residual(
-    shares: Sequence[Shares], beam: BeamOperator, surface: Surface, *, noise_db: float = 3.0
+    shares: Sequence[Shares],
+    beam: BeamOperator,
+    surface: Surface,
+    *,
+    noise_db: float = 3.0,
+    quick: bool = False,
 ) -> np.ndarray:
     """ln of each texel's gains over its group's, shape ``(2, X)``; zero where nothing is seen of it.
 
@@ -68,6 +73,7 @@ def fit_residual(
         beam: the receiver beam.
         surface: whose texels they are.
         noise_db: standard deviation of a pixel's error that gains are weighed against; see :func:`fit_groups`.
+        quick: a third of the steps, which find three quarters of what is to be found.
     """
     pixels, count = len(shares[0].target_db), len(shares)
     power = vstack([hstack([s.single, s.further]) for s in shares], format="csr")
@@ -95,7 +101,8 @@ def fit_residual(
         format="csr",
     )
     unknown = np.zeros(gains.shape[1])
-    for _ in range(ROUNDS):
+    rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, CONJUGATE_STEPS)
+    for _ in range(rounds):
         gain = np.exp(np.clip(gains @ unknown, -LARGEST, LARGEST))
         total = np.maximum(spread(gain, quick=False), 0.0) + rest
         residual = NEPER * np.log1p(total) - target
@@ -109,15 +116,17 @@ def fit_residual(
             return found
 
         gradient = gains.T @ (gain * gather(slope * robust * residual)) + unknown
-        unknown += np.clip(_conjugate_gradients(curvature, -gradient), -LONGEST_STEP, LONGEST_STEP)
+        unknown += np.clip(_conjugate_gradients(curvature, -gradient, steps), -LONGEST_STEP, LONGEST_STEP)
     return np.clip(gains @ unknown, -LARGEST, LARGEST).reshape(2, -1)
 
 
-def _conjugate_gradients(matrix: Callable[[np.ndarray], np.ndarray], right: np.ndarray) -> np.ndarray:
+def _conjugate_gradients(
+    matrix: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int
+) -> np.ndarray:
     x = np.zeros_like(right)
     residual = right.copy()
     direction, size = residual.copy(), float(residual @ residual)
-    for _ in range(CONJUGATE_STEPS):
+    for _ in range(steps):
         if size < 1e-12:
             break
         image = matrix(direction)

@@ -211,7 +211,9 @@ def train(
     _check_transport(seen, ds, lobes, sub_pixels)
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        return _Training(seen, ds, gain_offset, int(iterations), seed, device, progress).run(fixed, wanted)
+        return _Training(seen, ds, gain_offset, int(iterations), quick, seed, device, progress).run(
+            fixed, wanted
+        )
 
 
 class _Training:
@@ -223,11 +225,13 @@ class _Training:
         ds: SpectrumDataset,
         gain: bool,
         steps: int,
+        quick: bool,
         seed: int,
         device: Any,
         progress: Any,
     ) -> None:
         self.seen, self.ds, self.gain, self.steps, self.device = seen, ds, gain, steps, device
+        self.quick = quick
         self.started = time.perf_counter()
         self.surface, self.count = seen.surface, len(ds.receivers)
         self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
@@ -473,7 +477,7 @@ class _Training:
             known = np.asarray((single + further).sum(axis=1)).reshape(field.shape)
             rest = np.maximum(parts.image / floor - field.beam(known), 0.0)
             shares.append(Shares(single, further, rest.ravel(), self.target[r].ravel()))
-        return fit_residual(shares, field.beam, surface)
+        return fit_residual(shares, field.beam, surface, quick=self.quick)
 
     def _field(self, terms: Terms, fit: Fit, residual: np.ndarray | None) -> BistaticField:
         zero = np.zeros((2, self.surface.texels))
