@@ -159,3 +159,27 @@ def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: f
 def _surface(mesh: Mesh) -> Surface:
     """A surface that is as wrong as one from photos: its skin widens the zones."""
     return replace(Surface.of(mesh), skin_m=SKIN_M)
+
+
+@pytest.mark.parametrize("mirrors", [1, 2, 3])
+def test_any_chain_reflects_as_fields_in_space_do(mirrors: int) -> None:
+    """Two field vectors across the first leg, reflected one mirror after the other in room coordinates.
+
+    With three mirrors the sense of each turn counts: of two, only its size.
+    """
+    stops, normal, cosine = reflected_ways(200, mirrors, 11)
+    log_excess = np.log(np.random.default_rng(4).uniform(0.5, 12.0, (200, mirrors)))
+    share, _ = chain_reflection(log_excess, cosine, turns(stops, normal), np.ones(cosine.shape, bool))
+    leg = np.diff(stops, axis=1)
+    leg /= np.linalg.norm(leg, axis=2, keepdims=True)
+    for path in range(200):
+        u = np.linalg.svd(leg[path, :1])[2][1:]  # two unit vectors across the first leg
+        for k in range(mirrors):
+            s = np.cross(leg[path, k], normal[path, k])
+            s /= np.linalg.norm(s)
+            before, after = np.cross(s, leg[path, k]), np.cross(s, leg[path, k + 1])
+            c, permittivity = cosine[path, k], 1.0 + np.exp(log_excess[path, k])
+            root = np.sqrt(permittivity - 1.0 + c**2)
+            te, tm = (c - root) / (c + root), (permittivity * c - root) / (permittivity * c + root)
+            u = te * np.outer(u @ s, s) + tm * np.outer(u @ before, after)
+        assert share[path] == pytest.approx(0.5 * (u**2).sum(), rel=1e-9)
