@@ -246,6 +246,10 @@ def test_the_beam_at_some_pixels_is_that_of_the_whole_image() -> None:
     whole = beam(images.reshape(*SHAPE, 3)).reshape(-1, 3)
     assert np.allclose(beam.at(pixels, images), whole[pixels], rtol=1e-5)
     assert np.allclose(whole.sum(axis=0), images.sum(axis=0), rtol=1e-12)
+    quick = beam(images.reshape(*SHAPE, 3), quick=True).reshape(-1, 3)
+    assert 0 < np.abs(quick - whole).max() < 3e-6 * whole.max()
+    back = beam.adjoint(images.reshape(*SHAPE, 3), quick=True).reshape(-1, 3)
+    assert np.abs(back - beam.adjoint(images.reshape(*SHAPE, 3)).reshape(-1, 3)).max() < 3e-6 * back.max()
 
 
 def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
