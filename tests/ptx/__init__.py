@@ -43,7 +43,7 @@ FAULTS = {
     1: "trap executed",
     2: "access to address {address:#x}, which is no memory",
     3: "access to address {address:#x}, which is not aligned to the access",
-    4: "access to byte {address} of shared memory, beyond its {shared_bytes}",
+    4: "access to byte {address} of shared memory, beyond its {shared_bytes} or not aligned",
     5: "deadlock",
     6: "the thread is not in the mask of its own operation",
     7: "shuffle from lane {address}, which is not in the mask or has left the kernel",
@@ -76,7 +76,7 @@ class _Context(ctypes.Structure):
         ("warp_order", ctypes.c_void_p), ("block_order", ctypes.c_void_p), ("counts", ctypes.c_void_p),
         ("print", _Print), ("blocks", ctypes.c_uint64), ("block", ctypes.c_uint64), ("budget", ctypes.c_int64),
         ("address", ctypes.c_uint64), ("block_dim", ctypes.c_uint32), ("thread", ctypes.c_uint32),
-        ("fault", ctypes.c_uint32), ("site", ctypes.c_uint32), ("arrived", ctypes.c_uint32 * 16),
+        ("fault", ctypes.c_uint32), ("site", ctypes.c_uint32), ("arrived", ctypes.c_uint32 * 16), ("jump", ctypes.c_void_p),
     ]  # fmt: skip
 
 

@@ -26,6 +26,8 @@ extern "C" float cosf(float);
 extern "C" float tanhf(float);
 extern "C" void* memset(void*, int, unsigned long);
 extern "C" void* memcpy(void*, const void*, unsigned long);
+extern "C" int _setjmp(void*) __attribute__((returns_twice));
+extern "C" void longjmp(void*, int) __attribute__((noreturn));
 
 enum State : u32 { READY, WAITING, FINISHED };
 enum Wait : u32 { NOTHING, BARRIER, WARP_BARRIER, SHUFFLE, VOTE, MATCH, REDUCE, ACTIVE_MASK };
@@ -69,9 +71,38 @@ struct Context {
     u32 fault;
     u32 site;
     u32 arrived[16]; // threads at each barrier that did not wait there
+    void* jump; // where a fault leads: the C library's jmp_buf
 };
 
-#define FAULT(what, where) do { C->fault = what; C->site = where; return; } while (0)
+// A fault leaves the launch: no frame in between has anything to undo.
+static __attribute__((noinline, noreturn, cold)) void fault(Context* C, u32 what, u32 site)
+{
+    C->fault = what;
+    C->site = site;
+    longjmp(C->jump, 1);
+}
+
+// One comparison finds null pointers (and what is little beyond) and addresses that are not multiples of 2^k.
+INLINE bool bad_address(u64 a, u32 k)
+{
+    const u64 b = a - 65536;
+    return (k ? (b >> k) | (b << (64 - k)) : b) >> (48 - k) != 0;
+}
+INLINE bool bad_shared(const Context* C, u64 a, u32 size, u32 align)
+{
+    return (u32)a + (u64)size > C->shared_bytes || (a & (align - 1)) != 0;
+}
+
+static __attribute__((noinline, noreturn, cold)) void bad_memory_access(Context* C, u64 a, u32 site)
+{
+    C->address = a;
+    fault(C, a < 65536 || a >> 48 ? BAD_ADDRESS : MISALIGNED, site);
+}
+static __attribute__((noinline, noreturn, cold)) void bad_shared_access(Context* C, u64 a, u32 site)
+{
+    C->address = a;
+    fault(C, OUT_OF_SHARED, site);
+}
 
 template <class T, class S> INLINE T rd(S x)
 {
@@ -311,9 +342,7 @@ static bool complete_warp(Context* C, Thread* W, u32 lanes, u32 first)
     if (kind == ACTIVE_MASK) return false;
     if (!((mask >> first) & 1)) {
         C->thread = (u32)(&F - C->threads);
-        C->fault = NOT_IN_MASK;
-        C->site = F.site;
-        return false;
+        fault(C, NOT_IN_MASK, F.site);
     }
     u32 members = 0;
     for (u32 i = 0; i < lanes; ++i) {
@@ -372,10 +401,8 @@ static bool complete_warp(Context* C, Thread* W, u32 lanes, u32 first)
             if (!inside) from = lane;
             if (!((members >> from) & 1)) {
                 C->thread = (u32)(&T - C->threads);
-                C->fault = SHUFFLE_FROM_ABSENT;
-                C->site = T.site;
                 C->address = (u64)from;
-                return false;
+                fault(C, SHUFFLE_FROM_ABSENT, T.site);
             }
             finish(T, value[from], inside);
         }
@@ -387,10 +414,7 @@ static bool complete_warps(Context* C, Thread* W, u32 lanes)
 {
     bool any = false;
     for (u32 i = 0; i < lanes; ++i)
-        if (W[i].state == WAITING && W[i].wait != BARRIER) {
-            any |= complete_warp(C, W, lanes, i);
-            if (C->fault) return false;
-        }
+        if (W[i].state == WAITING && W[i].wait != BARRIER) any |= complete_warp(C, W, lanes, i);
     if (any) return true;
     for (u32 i = 0; i < lanes; ++i) {  // nothing else moves: the lanes at one such instruction are active together
         if (W[i].state != WAITING || W[i].wait != ACTIVE_MASK) continue;
@@ -426,10 +450,8 @@ static bool complete_barriers(Context* C)
                 Thread& O = C->threads[s];
                 if (O.state == WAITING && O.wait == BARRIER && O.mask == b && O.site != T.site) {
                     C->thread = t;
-                    C->fault = DIVERGED_BARRIER;
-                    C->site = T.site;
                     C->address = s;
-                    return false;
+                    fault(C, DIVERGED_BARRIER, T.site);
                 }
             }
         }
@@ -437,9 +459,8 @@ static bool complete_barriers(Context* C)
         const u32 expected = wanted ? wanted : live;
         if (waiting + C->arrived[b] < expected) continue;
         if (waiting + C->arrived[b] > expected) {
-            C->fault = TOO_MANY_ARRIVED;
             C->address = b;
-            return false;
+            fault(C, TOO_MANY_ARRIVED, 0);
         }
         C->arrived[b] = 0;
         for (u32 t = 0; t < n; ++t) {
@@ -467,18 +488,14 @@ static void run_block(Context* C)
                     if (lane >= lanes || W[lane].state != READY) continue;
                     C->thread = 32 * w + lane;
                     run_thread(C, C->thread);
-                    if (C->fault) return;
                 }
             } while (complete_warps(C, W, lanes));
-            if (C->fault) return;
         }
         if (complete_barriers(C)) continue;
-        if (C->fault) return;
         for (u32 t = 0; t < n; ++t)
             if (C->threads[t].state != FINISHED) {
                 C->thread = t;
-                C->fault = DEADLOCK;
-                return;
+                fault(C, DEADLOCK, C->threads[t].site);
             }
         return;
     }

@@ -79,11 +79,13 @@ def translate(module: Module, entry: str, count: bool = False) -> Program:
 extern "C" u64 ptx_registers() {{ return sizeof(Registers); }}
 extern "C" void ptx_run(Context* C)
 {{
+    alignas(16) char jump[1024];
+    C->jump = jump;
+    if (_setjmp(jump)) return;
     for (u64 k = 0; k < C->blocks; ++k) {{
         C->block = C->block_order[k];
         __builtin_memset(C->shared, 0xff, C->shared_bytes);
         {run}
-        if (C->fault) return;
     }}
 }}
 """
@@ -104,7 +106,6 @@ _EACH_THREAD = """for (u32 w = 0, warps = (C->block_dim + 31) / 32; w < warps; +
                 if (t >= C->block_dim) continue;
                 C->thread = t;
                 run_thread(C, t);
-                if (C->fault) return;
             }"""
 
 
@@ -347,14 +348,14 @@ class _Translator:
             head = f"static {self.whole.signature(f.name)}\n{{\n{name} R = {{}};\n{name}_local L;\n"
             return f"{struct}\n{local}\n{head}{body}\n}}"
         if not self.waits:
-            head = f"static void run_thread(Context* C, u32 t)\n{{\nThread& T = C->threads[t];\n{name} R = {{}};\n"
+            head = f"static __attribute__((noinline)) void run_thread(Context* C, u32 t)\n{{\nThread& T = C->threads[t];\n{name} R = {{}};\n"
             return f"{struct}\n{local}\n{head}{name}_local L;\n{body}\n}}"
         cases = "".join(f"case {k}: goto resume_{k}; " for k in range(1, self.resumes + 1))
         struct = f"struct {name}_local {{{depot} }};\n" + struct.replace(" }", f" {name}_local local; }}", 1)
         restart = "__builtin_memset(&R, 0, sizeof(R)); __builtin_memset(&R.local, 0xff, sizeof(R.local));"
         # A finished thread of the block before left its registers: the scheduler resets the place to resume from.
         return (
-            f"{struct}\nstatic void run_thread(Context* C, u32 t)\n{{\nThread& T = C->threads[t];\n"
+            f"{struct}\nstatic __attribute__((noinline)) void run_thread(Context* C, u32 t)\n{{\nThread& T = C->threads[t];\n"
             f"{name}* __restrict registers = ({name}*)C->registers + t;\n{name}& R = *registers;\n"
             f"{name}_local& L = R.local;\nswitch (R.resume) {{ case 0: {restart} break; {cases}}}\n{body}\n}}"
         )
@@ -445,7 +446,7 @@ class _Translator:
         return types[0]
 
     def fault(self, what: str, s: Statement) -> str:
-        return f"FAULT({what}, {self.whole.site(s)}u)"
+        return f"fault(C, {what}, {self.whole.site(s)}u)"
 
     # Moves and memory
 
@@ -475,18 +476,14 @@ class _Translator:
         out = [f"{{ u64 at_ = {address};"]
         if space == "param":
             return out
-        site = self.whole.site(s)
+        kind = "shared" if space == "shared" else "memory"
         if space == "shared":
-            out.append(
-                f"if (UNLIKELY((u32)at_ + {size}ull > C->shared_bytes)) {{ C->address = at_; FAULT(OUT_OF_SHARED, {site}u); }}"
-            )
-            out.append("at_ = (u64)C->shared + (u32)at_;")
+            bad = f"bad_shared(C, at_, {size}u, {align}u)"
         else:
-            out.append(f"if (UNLIKELY(at_ < 65536)) {{ C->address = at_; FAULT(BAD_ADDRESS, {site}u); }}")
-        if align > 1:
-            out.append(
-                f"if (UNLIKELY(at_ & {align - 1}u)) {{ C->address = at_; FAULT(MISALIGNED, {site}u); }}"
-            )
+            bad = f"bad_address(at_, {align.bit_length() - 1}u)"
+        out.append(f"if (UNLIKELY({bad})) bad_{kind}_access(C, at_, {self.whole.site(s)}u);")
+        if space == "shared":
+            out.append("at_ = (u64)C->shared + (u32)at_;")
         return out
 
     def access(self, s: Statement, mods: list[str]) -> tuple[str, str, int]:
@@ -1003,7 +1000,7 @@ class _Translator:
             return [f"C->address = ldm<u64>((u64){places[0]}); {self.fault('ASSERTION', s)};"]
         self.whole.require(name)
         passed = "".join(f", (u64){p}" for p in places)
-        return [f"{_c_name(name)}(C, t{passed}); if (UNLIKELY(C->fault)) return;"]
+        return [f"{_c_name(name)}(C, t{passed});"]
 
     # What waits for other threads
 
