@@ -359,7 +359,7 @@ class Rasterizer:
         slopes = [gradient(array) for array in (out.features, out.alpha, out.depth)]
         flat = [a.flatten() for a in (out.features, out.alpha, out.depth, left, *slopes)]
         add_sums = self._sums_of_pixels if self.on_gpu else self._sums_of_tiles
-        with_range = int(out.depth.requires_grad and out.depth.grad.numpy().any())
+        with_range = int(out.depth.requires_grad and self._any(slopes[2]))
         for first in range(0, channels, kernels.CHANNELS):
             blend = self.kernels_for(channels - first)
             kernel = blend.blend_adjoint[with_range if first == 0 else 0]
@@ -372,6 +372,14 @@ class Rasterizer:
                 device=device,
             )  # fmt: skip
         return seen
+
+    def _any(self, values: wp.array) -> bool:
+        """Whether a value is not zero; from a GPU comes one number, not all."""
+        if not self.on_gpu:
+            return bool(values.numpy().any())
+        found = wp.zeros(1, dtype=int, device=self.device)
+        launch(self.kernels_for(1).any_gradient, values.size, [values.flatten(), found], device=self.device)
+        return bool(found.numpy()[0])
 
     def _sums_of_tiles(
         self,

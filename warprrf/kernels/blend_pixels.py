@@ -551,7 +551,14 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
 
         return blend_adjoint
 
+    @wp.kernel(module="unique", enable_backward=False)
+    def any_gradient(offset: int, values: wp.array(dtype=real), found: wp.array(dtype=int)):
+        """Set ``found`` where a value is not zero."""
+        if values[offset + wp.tid()] != real(0.0):
+            found[0] = 1
+
     return SimpleNamespace(
+        any_gradient=any_gradient,
         blend=blend,
         blend_adjoint=(adjoint_kernel(False), adjoint_kernel(True)),  # with or without gradients of ranges
     )
