@@ -59,7 +59,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         of.higher,
     )
     sums_of, read, write, number = of.sums, of.read, of.write, of.number
-    collect, spread, spread_numbers = of.collect, of.spread, of.spread_numbers
+    collect, inside, spread, spread_numbers = of.collect, of.inside, of.spread, of.spread_numbers
     shared = response_functions(real, rule)
     behind, forms, place_of, response = shared.behind, shared.forms, shared.place_of, shared.response
     ray_lengths, thinned, tiny = shared.ray_lengths, shared.thinned, shared.tiny
@@ -290,7 +290,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                     if wp.static(c == 3):
                         w3 += wp.cw_mul(v, here)
                 write(seeds, at + wp.static(BEHIND), goal)
-                write(seeds, at + wp.static(LEFT), one)
+                write(seeds, at + wp.static(LEFT), inside(columns, lines))
             zero = lanes()
             write(
                 background_sums,
