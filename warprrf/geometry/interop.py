@@ -210,18 +210,19 @@ def _functions() -> SimpleNamespace:
             wp.to_torch(array.grad, requires_grad=False) if array.requires_grad else None for array in arrays
         ]
 
-    def stream_of(tensor: torch.Tensor) -> Any:
+    def stream_of(tensor: torch.Tensor | None) -> Any:
         """On a GPU, what is launched inside goes to torch's current stream, behind what made the tensor."""
-        if not tensor.is_cuda:
+        if tensor is None or not tensor.is_cuda:
             return nullcontext()
         return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
 
     def in_stream(static: Function) -> Function:
-        """A forward or backward in the stream of the first tensor among its arguments."""
+        """A forward or backward in the stream of the first tensor among its arguments, if there is one: gradients of
+        outputs that nobody used are None."""
 
         @wraps(static)
         def run(*arguments: Any) -> Any:
-            first = next(a for a in arguments if isinstance(a, torch.Tensor))
+            first = next((a for a in arguments if isinstance(a, torch.Tensor)), None)
             with stream_of(first):
                 return static(*arguments)
 
