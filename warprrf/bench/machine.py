@@ -19,6 +19,7 @@ PACKAGES = (
     "h5netcdf",
     "safetensors",
     "torch",
+    "gsplat",
     "sionna-rt",
     "distributed",
 )
@@ -37,7 +38,7 @@ def processor_name() -> str:
 
 def machine(device: Any = None) -> dict[str, Any]:
     """What the figures were measured on: processor, cores, system, versions."""
-    processor = processor_name()
+    processor, on = processor_name(), resolve(device)
     versions = {}
     for package in PACKAGES:
         try:
@@ -47,7 +48,7 @@ def machine(device: Any = None) -> dict[str, Any]:
     return {
         "processor": processor,
         "cores": threads(),
-        "device": str(resolve(device)),
+        "device": f"{on} ({on.name})" if on.is_cuda else str(on),
         "system": platform.platform(),
         "python": platform.python_version(),
         "versions": versions,

@@ -8,9 +8,11 @@ Derivatives are of first order; asking for a second one raises torch's error ins
 from __future__ import annotations
 
 import math
-from functools import cache
+from collections.abc import Callable
+from contextlib import nullcontext
+from functools import cache, wraps
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import warp as wp
 
@@ -22,6 +24,8 @@ from warprrf.kernels.sh import COEFFICIENTS
 
 if TYPE_CHECKING:
     import torch
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def rasterize(
@@ -206,8 +210,27 @@ def _functions() -> SimpleNamespace:
             wp.to_torch(array.grad, requires_grad=False) if array.requires_grad else None for array in arrays
         ]
 
+    def stream_of(tensor: torch.Tensor | None) -> Any:
+        """On a GPU, what is launched inside goes to torch's current stream, behind what made the tensor."""
+        if tensor is None or not tensor.is_cuda:
+            return nullcontext()
+        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
+
+    def in_stream(static: Function) -> Function:
+        """A forward or backward in the stream of the first tensor among its arguments, if there is one: gradients of
+        outputs that nobody used are None."""
+
+        @wraps(static)
+        def run(*arguments: Any) -> Any:
+            first = next((a for a in arguments if isinstance(a, torch.Tensor)), None)
+            with stream_of(first):
+                return static(*arguments)
+
+        return cast("Function", run)
+
     class Rasterize(torch.autograd.Function):
         @staticmethod
+        @in_stream
         def forward(ctx: Any, cam: Camera, blending: Blending | None, *tensors: torch.Tensor) -> Any:
             r = raster(tensors[0], blending)
             types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
@@ -226,6 +249,7 @@ def _functions() -> SimpleNamespace:
 
         @staticmethod
         @once_differentiable
+        @in_stream
         def backward(ctx: Any, *incoming: torch.Tensor | None) -> Any:
             _ = ctx.saved_tensors  # raises if an input or an output was changed in place since forward
             seed(ctx.outputs, incoming)
@@ -233,6 +257,7 @@ def _functions() -> SimpleNamespace:
 
     class Colors(torch.autograd.Function):
         @staticmethod
+        @in_stream
         def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
             r = raster(means)
             inputs = (shared(means, r.vector(3)), shared(sh, r.real))
@@ -245,6 +270,7 @@ def _functions() -> SimpleNamespace:
 
         @staticmethod
         @once_differentiable
+        @in_stream
         def backward(ctx: Any, incoming: torch.Tensor) -> Any:
             _ = ctx.saved_tensors  # raises if an input was changed in place since forward
             seed((ctx.out,), (incoming.clone(),))  # Warp's own adjoint zeroes what it has read
@@ -252,6 +278,7 @@ def _functions() -> SimpleNamespace:
 
     class Rays(torch.autograd.Function):
         @staticmethod
+        @in_stream
         def forward(ctx: Any, query: tuple[str, tuple[Any, ...], Any, Any], *tensors: torch.Tensor) -> Any:
             method, arguments, options, blending = query
             r = raster(tensors[0])
@@ -271,6 +298,7 @@ def _functions() -> SimpleNamespace:
 
         @staticmethod
         @once_differentiable
+        @in_stream
         def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
             _ = ctx.saved_tensors  # raises if an input was changed in place since forward
             seed(ctx.outputs, tuple(g.double() for g in incoming[: len(ctx.outputs)]))

@@ -8,21 +8,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warprrf.device import PIECES_PER_THREAD, launch, resolve, threads
+from warprrf.device import MIN_SPLIT, PIECES_PER_THREAD, launch, resolve, threads
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.tape import active_tape, gradient, with_gradients
 from warprrf.kernels import binning
 from warprrf.kernels import blend as blend_kernels
+from warprrf.kernels import blend_pixels as pixel_kernels
 from warprrf.kernels import project as kernels
 from warprrf.kernels import sh as sh_kernels
 
+STRIPES = 4096  # partial sums
 TILE_GRAIN = 8  # a tile or a block is work enough for few of them to be worth a thread
 RULES = {"product": kernels.PRODUCT, "exp": kernels.EXPONENTIAL}
 
@@ -59,9 +61,18 @@ RADIO = Blending(alpha_min=1e-4, alpha_max=1 - 1e-6, transmittance_min=1e-6)
 
 
 @dataclass(frozen=True)
+class Blocks:
+    """What every block of pixels sees, near to far, and what each tile has to do, summed up."""
+
+    ids: wp.array
+    starts: wp.array
+    work: np.ndarray
+
+
+@dataclass(frozen=True)
 class Prepared:
-    """Gaussians projected for one camera: coefficients, and the lists of what tiles and blocks of pixels see, near to
-    far, on the device; ``work`` is what each tile has to do, summed up."""
+    """Gaussians projected for one camera: coefficients, and the lists of what tiles see, near to far, on the device;
+    a bit of ``masks`` for each block of its tile that an entry can reach."""
 
     camera: Camera
     view: Any
@@ -74,9 +85,27 @@ class Prepared:
     ids: wp.array
     masks: wp.array
     starts: wp.array
-    block_ids: wp.array
-    block_starts: wp.array
-    work: np.ndarray
+    counts: wp.array | None
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """The lists shared out to blocks of pixels; a GPU blends without."""
+        device, tiles = self.starts.device, len(self.starts) - 1
+        counts = self.counts
+        if counts is None:
+            counts = wp.empty(tiles, dtype=binning.integers, device=device)
+            launch(binning.block_counts, tiles, [self.masks, self.starts, counts], device=device)
+        sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])
+        starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
+        ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
+        launch(
+            binning.fill_blocks,
+            tiles,
+            [self.ids, self.masks, self.starts, starts, ids],
+            device=device,
+            grain=TILE_GRAIN,
+        )
+        return Blocks(ids, starts, sums[:: kernels.LANES] + np.arange(tiles + 1))
 
 
 @dataclass(frozen=True)
@@ -108,8 +137,7 @@ class Rasterizer:
         self.rules.alpha_min = self.blending.alpha_min
         self.rules.alpha_max = self.blending.alpha_max
         self.rules.transmittance_min = self.blending.transmittance_min
-        # Threads that share a tile in the adjoint: on a GPU each of its blocks has one.
-        self.parts = kernels.LANES if self.device.is_cuda else 1
+        self.on_gpu = self.device.is_cuda
 
     def vector(self, size: int) -> Any:
         """Warp's vector type of this precision."""
@@ -188,7 +216,7 @@ class Rasterizer:
             [*inputs, view, self.rules, span, count, distance, rows, centres],
             device=device,
         )
-        order, ends, entries = _sorted_visible(count, distance)
+        order, ends, entries = _sorted_visible(count, distance, *self._totals(count))
         tiles = view.tiles_x * view.tiles_y
         keys = wp.empty(2 * max(entries, 1), dtype=int, device=device)
         slots = wp.empty(2 * max(entries, 1), dtype=int, device=device)
@@ -204,25 +232,23 @@ class Rasterizer:
             )
             wp.utils.radix_sort_pairs(keys, slots, entries, 0, tiles.bit_length())
             launch(binning.tile_starts, tiles + 1, [keys, entries, starts], device=device)
-        counts = wp.empty(tiles, dtype=self.vector(kernels.LANES), device=device)
-        launch(
-            self.project_kernels.block_masks,
-            tiles,
-            [rows, centres, whose, slots, starts, rays, view.tiles_x, ids, masks, counts],
-            device=device,
-            grain=TILE_GRAIN,
-        )
-        sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])
-        block_starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
-        block_ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
-        launch(
-            binning.fill_blocks,
-            tiles,
-            [ids, masks, starts, block_starts, block_ids],
-            device=device,
-            grain=TILE_GRAIN,
-        )
-        work = sums[:: kernels.LANES] + np.arange(tiles + 1)
+        counts = None
+        if self.on_gpu:
+            launch(
+                pixel_kernels.build_masks(self.real),
+                entries,
+                [rows, centres, keys, slots, whose, rays, view.tiles_x, ids, masks],
+                device=device,
+            )
+        else:
+            counts = wp.empty(tiles, dtype=self.vector(kernels.LANES), device=device)
+            launch(
+                self.project_kernels.block_masks,
+                tiles,
+                [rows, centres, whose, slots, starts, rays, view.tiles_x, ids, masks, counts],
+                device=device,
+                grain=TILE_GRAIN,
+            )
         return Prepared(
             camera=cam,
             view=view,
@@ -235,10 +261,18 @@ class Rasterizer:
             ids=ids,
             masks=masks,
             starts=starts,
-            block_ids=block_ids,
-            block_starts=block_starts,
-            work=work,
+            counts=counts,
         )
+
+    def _totals(self, count: wp.array) -> tuple[int, int]:
+        """How many Gaussians are seen, and how many tiles they cover in all."""
+        if not self.on_gpu:
+            return int(np.count_nonzero(count.numpy())), int(count.numpy().sum(dtype=np.int64))
+        stripes = min(len(count), STRIPES)  # so that a few kilobytes come from the GPU, not all counts
+        found = wp.empty(stripes, dtype=binning.long_pair, device=self.device)
+        launch(binning.tally, stripes, [stripes, count, found], device=self.device)
+        visible, total = found.numpy().sum(axis=0)
+        return int(visible), int(total)
 
     def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
@@ -286,20 +320,27 @@ class Rasterizer:
         dominant = wp.empty(shape, dtype=int, device=device)
         flat = [a.flatten() for a in (image, alpha, depth, left, dominant, peak)]
         flat_features = _flat(features)
+        if self.on_gpu:
+            count, grain = (len(prepared.starts) - 1) * pixel_kernels.PIXELS, MIN_SPLIT
+            lists = [prepared.ids, prepared.masks, prepared.starts]
+        else:
+            count, grain = len(prepared.blocks.starts) - 1, TILE_GRAIN
+            lists = [prepared.blocks.ids, prepared.blocks.starts]
         for first in range(0, channels, kernels.CHANNELS):
             launch(
                 self.kernels_for(channels - first).blend,
-                len(prepared.block_starts) - 1,
-                [prepared.rows, flat_features, channels, first, background, prepared.block_ids,
-                 prepared.block_starts, prepared.rays, prepared.view, self.rules, *flat],
+                count,
+                [prepared.rows, flat_features, channels, first, background, *lists, prepared.rays, prepared.view,
+                 self.rules, *flat],
                 device=device,
-                grain=TILE_GRAIN,
+                grain=grain,
             )  # fmt: skip
         return Image(image, alpha, depth, dominant, peak), (left, background)
 
     def kernels_for(self, channels: int) -> Any:
         """Kernels that blend so many channels at once, four at most."""
-        return blend_kernels.build(self.real, RULES[self.blending.rule], min(channels, kernels.CHANNELS))
+        source = pixel_kernels if self.on_gpu else blend_kernels
+        return source.build(self.real, RULES[self.blending.rule], min(channels, kernels.CHANNELS))
 
     def blend_adjoint(
         self,
@@ -310,66 +351,110 @@ class Rasterizer:
         background: wp.array,
     ) -> wp.array:
         """Add the gradients of every input for those of ``out``; returns each Gaussian's summed blending weight."""
-        device, real, lanes = self.device, self.real, self.vector(kernels.LANES)
+        device, real = self.device, self.real
         channels, n = features.shape[1], len(features)
         means, quaternions, scales, opacities = prepared.inputs
         seen = wp.zeros(n, dtype=real, device=device)
         feature_grad = gradient(features)
-        parts, cuts, bounds = self.parts, None, []
-        if parts == 1:  # cut into pieces of equal work, each with its own seeds
-            pieces = 1 if threads() == 1 else PIECES_PER_THREAD * threads()
-            work = prepared.work
-            cuts = bounds = np.searchsorted(work, work[-1] * np.arange(pieces + 1) / pieces).tolist()
-        tiles = len(prepared.work) - 1
-        seeds = wp.empty(
-            (len(bounds) or tiles) * kernels.LANES * blend_kernels.PER_BLOCK, dtype=lanes, device=device
-        )
-        background_sums = wp.empty(tiles * parts, dtype=lanes, device=device)
         slopes = [gradient(array) for array in (out.features, out.alpha, out.depth)]
         flat = [a.flatten() for a in (out.features, out.alpha, out.depth, left, *slopes)]
-        flat_features = _flat(features)
-        with_range = int(out.depth.requires_grad and out.depth.grad.numpy().any())
+        add_sums = self._sums_of_pixels if self.on_gpu else self._sums_of_tiles
+        with_range = int(out.depth.requires_grad and self._any(slopes[2]))
         for first in range(0, channels, kernels.CHANNELS):
             blend = self.kernels_for(channels - first)
-            sums = (wp.empty if parts == 1 else wp.zeros)(len(prepared.ids), dtype=lanes, device=device)
-            launch(
-                blend.blend_adjoint[with_range if first == 0 else 0],
-                tiles * parts,
-                [parts, wp.array(bounds, dtype=int, device=device), prepared.rows, flat_features,
-                 channels, first, prepared.ids, prepared.slots, prepared.masks, prepared.starts, prepared.rays,
-                 prepared.view, self.rules, *flat, seeds, sums, background_sums],
-                device=device,
-                pieces=1,  # sums of shared tiles are atomic on a GPU alone
-                cuts=cuts,
-            )  # fmt: skip
+            kernel = blend.blend_adjoint[with_range if first == 0 else 0]
+            begins, sums = add_sums(blend, kernel, prepared, features, first, flat, background)
             launch(
                 self.project_kernels.chain,
                 n,
-                [means, quaternions, scales, opacities, prepared.view, first, prepared.begins, prepared.count, sums,
+                [means, quaternions, scales, opacities, prepared.view, first, begins, prepared.count, sums,
                  gradient(means), gradient(quaternions), gradient(scales), gradient(opacities), feature_grad, seen],
                 device=device,
             )  # fmt: skip
-            if background.requires_grad:
-                launch(
-                    blend.background_adjoint,
-                    min(channels - first, kernels.CHANNELS),
-                    [first, background_sums, background.grad],
-                    device=device,
-                )
         return seen
+
+    def _any(self, values: wp.array) -> bool:
+        """Whether a value is not zero; from a GPU comes one number, not all."""
+        if not self.on_gpu:
+            return bool(values.numpy().any())
+        found = wp.zeros(1, dtype=int, device=self.device)
+        launch(self.kernels_for(1).any_gradient, values.size, [values.flatten(), found], device=self.device)
+        return bool(found.numpy()[0])
+
+    def _sums_of_tiles(
+        self,
+        blend: Any,
+        kernel: Any,
+        prepared: Prepared,
+        features: wp.array,
+        first: int,
+        flat: list[wp.array],
+        background: wp.array,
+    ) -> tuple[wp.array, wp.array]:
+        """What `chain` adds up: a row of sums for every entry, and where each Gaussian's begin."""
+        device, lanes, channels = self.device, self.vector(kernels.LANES), features.shape[1]
+        # Cut into pieces of equal work, each with its own seeds.
+        pieces = 1 if threads() == 1 else PIECES_PER_THREAD * threads()
+        work = prepared.blocks.work
+        cuts = np.searchsorted(work, work[-1] * np.arange(pieces + 1) / pieces).tolist()
+        tiles = len(work) - 1
+        seeds = wp.empty(len(cuts) * kernels.LANES * blend_kernels.PER_BLOCK, dtype=lanes, device=device)
+        sums = wp.empty(len(prepared.ids), dtype=lanes, device=device)
+        background_sums = wp.empty(tiles, dtype=lanes, device=device)
+        launch(
+            kernel,
+            tiles,
+            [wp.array(cuts, dtype=int, device=device), prepared.rows, _flat(features), channels, first,
+             prepared.ids, prepared.slots, prepared.masks, prepared.starts, prepared.rays, prepared.view, self.rules,
+             *flat, seeds, sums, background_sums],
+            device=device,
+            cuts=cuts,
+        )  # fmt: skip
+        if background.requires_grad:
+            launch(
+                blend.background_adjoint,
+                min(channels - first, kernels.CHANNELS),
+                [first, background_sums, background.grad],
+                device=device,
+            )
+        return prepared.begins, sums
+
+    def _sums_of_pixels(
+        self,
+        blend: Any,
+        kernel: Any,
+        prepared: Prepared,
+        features: wp.array,
+        first: int,
+        flat: list[wp.array],
+        background: wp.array,
+    ) -> tuple[wp.array, wp.array]:
+        """The same on a GPU, where every Gaussian has one row."""
+        device = self.device
+        sums = wp.zeros(len(features), dtype=self.vector(kernels.LANES), device=device)
+        nothing = wp.empty(0, dtype=self.real, device=device)
+        launch(
+            kernel,
+            (len(prepared.starts) - 1) * pixel_kernels.PIXELS,
+            [prepared.rows, _flat(features), features.shape[1], first, prepared.ids, prepared.masks,
+             prepared.starts, prepared.rays, prepared.view, self.rules, *flat, sums,
+             background.grad if background.requires_grad else nothing],
+            device=device,
+        )  # fmt: skip
+        return wp.empty(0, dtype=int, device=device), sums
 
 
 def _flat(array: wp.array) -> wp.array:
     return (array if array.is_contiguous else array.contiguous()).flatten()
 
 
-def _sorted_visible(count: wp.array, distance: wp.array) -> tuple[wp.array, wp.array, int]:
+def _sorted_visible(
+    count: wp.array, distance: wp.array, visible: int, total: int
+) -> tuple[wp.array, wp.array, int]:
     """Visible Gaussians by range (as float32; ties by index), running ends of their tile entries, and the total."""
     device, n = count.device, len(count)
-    visible = int(np.count_nonzero(count.numpy()))
     if visible == 0:
         return wp.empty(0, dtype=int, device=device), wp.empty(0, dtype=int, device=device), 0
-    total = int(count.numpy().sum(dtype=np.int64))
     if total > 2**30:
         raise ValueError(
             f"gaussians: they cover {total} tiles in all, more than 2^30; prune large Gaussians or render smaller"

@@ -119,8 +119,8 @@ def blend_weights(
     total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
     launch(
         weight_kernels.build(wp.float32, RULES[blending.rule]).strongest,
-        len(view.block_starts) - 1,
-        [view.rows, view.block_ids, view.block_starts, view.rays, view.view, raster.rules, shape[2],
+        len(view.blocks.starts) - 1,
+        [view.rows, view.blocks.ids, view.blocks.starts, view.rays, view.view, raster.rules, shape[2],
          LANES, *(a.flatten() for a in (index, weight, range_, total))],
         device=raster.device,
         grain=TILE_GRAIN,

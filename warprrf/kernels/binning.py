@@ -8,6 +8,7 @@ import warp as wp
 from warprrf.kernels.lanes import LANES, lanes_of, lowest_bit
 
 integers = lanes_of(int)
+long_pair = wp.types.vector(2, wp.int64)
 
 
 @wp.kernel(enable_backward=False)
@@ -25,6 +26,17 @@ def sort_keys(
         key = wp.cast(distance[i], wp.int32)
     keys[i] = key
     values[i] = i
+
+
+@wp.kernel(enable_backward=False)
+def tally(offset: int, stripes: int, count: wp.array(dtype=int), found: wp.array(dtype=long_pair)):
+    """Of every stripe of Gaussians, how many are seen and how many tiles they cover."""
+    stripe = offset + wp.tid()
+    total = long_pair()
+    for i in range(stripe, count.shape[0], stripes):
+        if count[i] > 0:
+            total += long_pair(wp.int64(1), wp.int64(count[i]))
+    found[stripe] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -79,6 +91,22 @@ def tile_starts(offset: int, keys: wp.array(dtype=int), count: int, starts: wp.a
         else:
             hi = middle
     starts[tile] = lo
+
+
+@wp.kernel(enable_backward=False)
+def block_counts(
+    offset: int, masks: wp.array(dtype=int), starts: wp.array(dtype=int), counts: wp.array(dtype=integers)
+):
+    """How many of a tile's entries each of its blocks gets."""
+    tile = offset + wp.tid()
+    found = integers()
+    for j in range(starts[tile], starts[tile + 1]):
+        mask = masks[j]
+        while mask != 0:
+            b = lowest_bit(mask)
+            mask = mask & (mask - 1)
+            found[b] = found[b] + 1
+    counts[tile] = found
 
 
 @wp.kernel(enable_backward=False)

@@ -8,10 +8,8 @@ and scale. In the turned coordinates of the linear forms ``y = (-|M m| (g1^2 + g
 A thread of `blend` owns a block of 4 x 4 pixels and walks the block's list. A thread of `blend_adjoint` owns a tile:
 for each Gaussian it visits the blocks that the Gaussian reaches and reduces their sums over pixels once.
 
-Who adds where: a pair of Gaussian and tile has a slot of its own, `chain` adds up a Gaussian's slots, so no two tiles
-ever meet at an address. On a CPU one thread owns the slot and writes it. On a GPU sixteen threads share a tile, a block
-each, and add to the slot atomically: at most sixteen additions meet, those of one half warp that walks one list. A
-shuffle over the half warp would make them one; that has been run on no GPU yet, so it is not here.
+Who adds where: a pair of Gaussian and tile has a slot of its own, which the tile's thread writes; `chain` adds up a
+Gaussian's slots, so no two threads ever meet at an address. A GPU blends by :mod:`.blend_pixels`.
 """
 
 from functools import cache
@@ -61,7 +59,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         of.higher,
     )
     sums_of, read, write, number = of.sums, of.read, of.write, of.number
-    collect, spread, spread_numbers = of.collect, of.spread, of.spread_numbers
+    collect, inside, spread, spread_numbers = of.collect, of.inside, of.spread, of.spread_numbers
     shared = response_functions(real, rule)
     behind, forms, place_of, response = shared.behind, shared.forms, shared.place_of, shared.response
     ray_lengths, thinned, tiny = shared.ray_lengths, shared.thinned, shared.tiny
@@ -202,7 +200,6 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
         def blend_adjoint(
             offset: int,
-            parts: int,
             bounds: wp.array(dtype=int),
             rows: wp.array(dtype=coefficients),
             features: wp.array(dtype=real),
@@ -229,19 +226,14 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
             """Same walk as `blend`; leaves each Gaussian's gradient in a tile in ``sums[slot of the entry]``.
 
             dL/da_i = T_i x_i - (R - sum_{j<=i} w_j x_j) / (1 - a_i), x the gradient dotted with the pair's features, R
-            the same dotted with the finished pixel; without the division for the exponential rule. A tile is shared
-            among ``parts`` threads, 1 or 16. Threads ``bounds[p] .. bounds[p + 1]`` run one after the other and share
-            ``seeds``, tile after tile; with no bounds every tile has its own.
+            the same dotted with the finished pixel; without the division for the exponential rule. Tiles
+            ``bounds[p] .. bounds[p + 1]`` run one after the other and share ``seeds``.
             """
-            thread = offset + wp.tid()
-            tile = thread / parts
-            share = wp.static(LANES) / parts
-            open = ((1 << share) - 1) << (share * (thread % parts))
-            place = tile
-            if bounds.shape[0] > 0:
-                place = int(0)
-                while thread >= bounds[place + 1]:
-                    place += 1
+            tile = offset + wp.tid()
+            open = int(wp.static((1 << LANES) - 1))
+            place = int(0)
+            while tile >= bounds[place + 1]:
+                place += 1
             seed0 = place * wp.static(LANES * PER_BLOCK)
             column0 = (tile % view.tiles_x) * wp.static(TILE // BLOCK)
             line0 = (tile / view.tiles_x) * wp.static(TILE // BLOCK)
@@ -298,11 +290,11 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                     if wp.static(c == 3):
                         w3 += wp.cw_mul(v, here)
                 write(seeds, at + wp.static(BEHIND), goal)
-                write(seeds, at + wp.static(LEFT), one)
+                write(seeds, at + wp.static(LEFT), inside(columns, lines))
             zero = lanes()
             write(
                 background_sums,
-                thread,
+                tile,
                 sums_of(
                     w0, w1, w2, w3, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
                 ),
@@ -310,8 +302,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
             for j in range(starts[tile], starts[tile + 1]):
                 mask = masks[j] & open
                 if mask == 0:
-                    if parts == 1:
-                        write(sums, slots[j], lanes())
+                    write(sums, slots[j], lanes())
                     continue
                 k = ids[j]
                 s0 = lanes()
@@ -409,10 +400,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                     if not any_positive(left - tmin):
                         open = open & (-1 - (1 << b))
                 found = sums_of(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, s12, s13, s14, lanes())
-                if parts == 1:
-                    write(sums, slots[j], found)
-                else:
-                    wp.atomic_add(sums, slots[j], found)
+                write(sums, slots[j], found)
 
         return blend_adjoint
 

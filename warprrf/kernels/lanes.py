@@ -151,6 +151,16 @@ def build(real: Any) -> SimpleNamespace:
         ``line`` elements apart; zero beyond."""
         ...
 
+    @wp.func_native(f"""
+    wp::vec_t<{LANES}, wp::{name}> out;
+    for (int i = 0; i < {LANES}; ++i)
+        out[i] = wp::{name}(i % {BLOCK} < columns && i / {BLOCK} < rows ? 1 : 0);
+    return out;
+    """)
+    def inside(columns: int, rows: int) -> lanes:  # type: ignore[valid-type, empty-body]
+        """One in the first ``rows`` of the first ``columns`` pixels of a block, zero beyond."""
+        ...
+
     @wp.func_native(_spread(name))
     def spread(
         target: wp.array(dtype=real), at: int, line: int, step: int, columns: int, rows: int, values: lanes
@@ -171,6 +181,7 @@ def build(real: Any) -> SimpleNamespace:
         any_positive=any_positive,
         collect=collect,
         higher=higher,
+        inside=inside,
         lower=lower,
         number=number,
         positive_bits=positive_bits,

@@ -434,6 +434,7 @@ def build(real: Any) -> SimpleNamespace:
     ):
         """Sum over tiles and add the gradients of mean, quaternion, scale, opacity and features.
 
+        A Gaussian's sums follow one another from ``begins``; without ``begins`` it has one.
         With Y1 and Y2 turned back to the Gaussian's axes: dL/dmean = -2 M^T Y1, dL/ds_i = -2 Y2_ii / s_i,
         dL/dw_3 = 2 Y2_12 (s_2/s_1 - s_1/s_2) and cyclic for a local rotation w, and a quaternion turns by q (0, w/2).
         """
@@ -441,7 +442,12 @@ def build(real: Any) -> SimpleNamespace:
         if count[i] == 0:
             return
         y = total()
-        for entry in range(begins[i], begins[i] + count[i]):
+        begin = i
+        end = i + 1
+        if begins.shape[0] > 0:
+            begin = begins[i]
+            end = begin + count[i]
+        for entry in range(begin, end):
             row = sums[entry]
             for k in range(wp.static(GRADIENTS)):
                 y[k] += wp.float64(row[k])

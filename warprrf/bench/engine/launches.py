@@ -161,8 +161,8 @@ def passing_pairs(prepared: Prepared) -> int:
     count = wp.zeros(shape, dtype=int, device="cpu")
     launch(
         weights.build(wp.float32, PRODUCT).count_passing,
-        len(prepared.block_starts) - 1,
-        [prepared.rows, prepared.block_ids, prepared.block_starts, prepared.rays, prepared.view, raster.rules,
+        len(prepared.blocks.starts) - 1,
+        [prepared.rows, prepared.blocks.ids, prepared.blocks.starts, prepared.rays, prepared.view, raster.rules,
          count.flatten()],
         device="cpu",
         grain=TILE_GRAIN,
@@ -189,15 +189,15 @@ def _forward(n: int, width: int, height: int, seed: int) -> tuple[Callable[..., 
         wp.empty(pixels, dtype=wp.float32, device="cpu"),
     ]
     arguments = [
-        prepared.rows, features.flatten(), 3, 0, wp.zeros(3, dtype=wp.float32, device="cpu"), prepared.block_ids,
-        prepared.block_starts, prepared.rays, prepared.view, raster.rules, *out,
+        prepared.rows, features.flatten(), 3, 0, wp.zeros(3, dtype=wp.float32, device="cpu"), prepared.blocks.ids,
+        prepared.blocks.starts, prepared.rays, prepared.view, raster.rules, *out,
     ]  # fmt: skip
 
     def run(cuts: list[int] | None = None) -> None:
-        blocks = len(prepared.block_starts) - 1
+        blocks = len(prepared.blocks.starts) - 1
         launch(raster.kernels_for(3).blend, blocks, arguments, device="cpu", grain=TILE_GRAIN, cuts=cuts)
 
-    return run, prepared.work
+    return run, prepared.blocks.work
 
 
 def _share(

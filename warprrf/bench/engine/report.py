@@ -166,6 +166,8 @@ def summary_text(found: Row) -> str:
     parts += ["### Forms of the exact response, float32", _responses_table(found["responses"])]
     parts += [f"### Forms of exp(-h), strips of {STRIP}", _exponentials_table(found["exponentials"])]
     parts += ["### Forward and backward beside peers", _peers_text(found["blend"])]
+    if found.get("gpu") is not None:
+        parts += ["### Blending on a GPU", _gpu_text(found["gpu"])]
     parts += ["### Mesh rays", _rays_table(found["rays"])]
     parts += ["### Transport on disk", _transport_table(found["transport"])]
     return "\n\n".join(parts)
@@ -201,6 +203,19 @@ def asked(found: Row) -> list[list[str]]:
         add(
             "its images against torch's, 99.9 % of pixels", f"{blend.ASKED['image_difference']:g}",
             f"{difference:.1e}", difference <= blend.ASKED["image_difference"],
+        )  # fmt: skip
+    if found.get("gpu") is not None:
+        g = found["gpu"]
+        if "over_gsplat" in g:
+            limit = g["asked"]["over_gsplat"]
+            add(
+                f"forward + backward over gsplat, {g['gaussians']} Gaussians, on {g['machine']['device']}",
+                f"at most {limit:g}", f"{g['over_gsplat']:.2f}", g["over_gsplat"] <= limit,
+            )  # fmt: skip
+        limit = g["asked"]["spectrum_s"]
+        add(
+            f"spectrum of {g['gaussians']} Gaussians on {g['machine']['device']}", f"at most {1e3 * limit:g} ms",
+            f"{1e3 * g['spectrum_s']:.2f} ms", g["spectrum_s"] <= limit,
         )  # fmt: skip
     for row in found["growth"]:
         if row["gaussians"] == ASKED_SPECTRUM_S["gaussians"]:
@@ -443,6 +458,23 @@ def _peers_text(found: Row | None) -> str:
         if "opensplat_psnr_db" in found
         else "OpenSplat's CPU rasteriser was not measured: no checkout was given (`--opensplat FOLDER`).",
     ]
+    return "\n\n".join(lines)
+
+
+def _gpu_text(found: Row) -> str:
+    body = [
+        [name, *(f"{1e3 * found[key][part]:.2f}" for part in ("forward_s", "backward_s", "seconds"))]
+        for key, name in (("ours", "ours"), ("gsplat", "gsplat"))
+        if found[key] is not None
+    ]
+    lines = [table(("renderer", "forward [ms]", "backward [ms]", "both [ms]"), body)]
+    if found["gsplat"] is None:
+        lines.append("gsplat was not measured: it is not installed.")
+    lines.append(f"A spectrum of {found['spectrum_shape']} pixels takes {1e3 * found['spectrum_s']:.2f} ms.")
+    for name, times in found["kernels"].items():
+        longest = [[key, f"{value:.3f}"] for key, value in list(times.items())[:12]]
+        if longest:
+            lines.append(table((f"activity, {name}", "[ms]"), longest))
     return "\n\n".join(lines)
 
 

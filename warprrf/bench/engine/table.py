@@ -16,11 +16,12 @@ from typing import Any
 from warprrf.bench.engine import knobs, report
 from warprrf.bench.engine.blend import run_blend
 from warprrf.bench.engine.forms import exponential_forms, response_forms
+from warprrf.bench.engine.gpu import run_gpu
 from warprrf.bench.engine.rays import run_rays
 from warprrf.bench.engine.transport import run_transport
 from warprrf.bench.machine import machine
 from warprrf.bench.stages import StagedRun, plain, write_json
-from warprrf.device import Progress, threads
+from warprrf.device import Progress, resolve, threads
 from warprrf.marks import code_mark
 
 
@@ -103,7 +104,7 @@ def run_engine(
     Returns:
         What ``engine.json`` holds: rows by measurement (``alpha_min``, ``alpha_max``, ``top_k``, ``precision``,
         ``resolution``, ``points``, ``responses``, ``exponentials``, ``counts``, ``growth``, ``receivers``, ``rays``,
-        ``blend`` (None without torch), ``transport``), ``machine`` and ``sizes``.
+        ``blend`` (None without torch), ``gpu`` (None without a GPU too), ``transport``), ``machine`` and ``sizes``.
 
     Raises:
         ValueError: on a broken ``out``, or another run at work there, or if ``opensplat`` is no checkout.
@@ -123,7 +124,7 @@ def run_engine(
             {**options, "scene": str(scene)},
             "warprrf.bench.engine.rays",
         )
-        found["blend"] = None
+        found["blend"] = found["gpu"] = None
         if importlib.util.find_spec("torch") is not None:
             n, width, height = size.blend
             found["blend"] = stages.figures(
@@ -140,6 +141,13 @@ def run_engine(
                 {"blend": size.blend, "repeats": size.repeats, "opensplat": opensplat and str(opensplat)},
                 "warprrf.bench.engine.blend",
             )
+            if resolve(device).is_cuda:
+                found["gpu"] = stages.figures(
+                    "gpu",
+                    lambda tell: run_gpu(seed=seed, device=device, progress=tell),
+                    {},
+                    "warprrf.bench.engine.gpu",
+                )
         n, measured, receivers = size.stored
         found["transport"] = stages.figures(
             "transport",
