@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.device import check_array, launch, is_cuda, resolve
+from warprrf.device import check_array, is_cuda, launch, resolve
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.rasterizer import RADIO, RULES, Blending
 from warprrf.geometry.tape import active_tape, gradient, with_gradients
