@@ -31,10 +31,11 @@ import warp._src.codegen as warp_codegen
 import warp._src.context as warp_context
 from warp._src.build import build_cpu
 
+from ptx import cubin
 from ptx.parse import UnknownPtx, parse
 from ptx.translate import Program, translate
 
-__all__ = ["Fault", "UnknownPtx", "launch", "run"]
+__all__ = ["Fault", "UnknownPtx", "launch", "resources", "run"]
 
 ARCH = 80
 BUDGET = 1 << 33  # backward branches of a launch: minutes of work
@@ -128,7 +129,8 @@ def launch(
     if len(inputs) != len(arguments):
         raise ValueError(f"inputs: got {len(inputs)}, expected {len(arguments)} for kernel {kernel.key}")
     params = [warp_context._build_launch_bounds_from_tuple(dim, kernel.adj.kernel_dim)]
-    for values, slope in ((inputs, False), ([None] * len(inputs), True))[: 1 + adjoint]:
+    slopes = [a.type() if isinstance(a.type, warp_codegen.Struct) else None for a in arguments]
+    for values, slope in ((inputs, False), (slopes, True))[: 1 + adjoint]:
         params += [
             warp_context.pack_arg(kernel, a.type, a.label, value, "cpu", slope)
             for a, value in zip(arguments, values, strict=True)
@@ -282,21 +284,41 @@ _FORMAT = re.compile(r"(%(?:%|[-+ #0]*\d*(?:\.\d+)?(?:hh|h|ll|l)?[diuoxXcsfeEgGp
 
 def compile_kernel(kernel: wp.Kernel, block_dim: int) -> tuple[str, dict[str, int], tuple[str, str]]:
     """PTX of the kernel's module, its metadata, and the names of the kernel's forward and backward entries."""
+    path = _compiled(kernel, block_dim, ARCH, "ptx")
+    text, meta = _read(path, path.with_name(kernel.module._get_meta_name(block_dim=block_dim)))
+    return text, meta, _entries(kernel, block_dim)
+
+
+def resources(kernel: wp.Kernel, *, arch: int = 90, block_dim: int = 256) -> dict[str, cubin.Resources]:
+    """Registers, shared and local memory of a kernel's machine code for ``arch``: "forward" and, if any, "backward".
+
+    Shared memory includes what the system reserves (1024 bytes from sm_90 on), but no dynamic part.
+    """
+    found = cubin.read(_compiled(kernel, block_dim, arch, "cubin"))
+    names = zip(("forward", "backward"), _entries(kernel, block_dim), strict=True)
+    return {which: found[name] for which, name in names if name in found}
+
+
+def _compiled(kernel: wp.Kernel, block_dim: int, arch: int, kind: str) -> Path:
+    """PTX or cubin of the kernel's module, from the cache on disk or made now."""
     wp.init()
     module = kernel.module
-    options = module.resolve_options(wp.config, block_dim=block_dim)
     name = module.get_module_identifier(block_dim=block_dim)
-    folder = _cache() / f"{name}_sm{ARCH}"
-    output = f"{name}.ptx"
-    if not (folder / output).exists():
-        module._compile(None, folder, output, output_arch=ARCH, use_ptx=True, options=options)
-    text, meta = _read(folder / output, folder / module._get_meta_name(block_dim=block_dim))
-    mangled = kernel.get_mangled_name(kernel_hash=module.hashers[block_dim].kernel_hashes[kernel])
-    names = (
+    folder = _cache() / f"{name}_sm{arch}_{kind}"
+    path = folder / f"{name}.{kind}"
+    if not path.exists():
+        options = module.resolve_options(wp.config, block_dim=block_dim)
+        module._compile(None, folder, path.name, output_arch=arch, use_ptx=kind == "ptx", options=options)
+    return path
+
+
+def _entries(kernel: wp.Kernel, block_dim: int) -> tuple[str, str]:
+    """Names of the kernel's forward and backward entries."""
+    mangled = kernel.get_mangled_name(kernel_hash=kernel.module.hashers[block_dim].kernel_hashes[kernel])
+    return (
         warp_codegen.cuda_kernel_forward_name(kernel, name=mangled),
         warp_codegen.cuda_kernel_backward_name(kernel, name=mangled),
     )
-    return text, meta, names
 
 
 @cache
@@ -322,7 +344,9 @@ _loaded: dict[str, Executable] = {}
 
 def load(text: str, entry: str, count: bool = False) -> Executable:
     """Machine code of an entry, from the cache on disk or made now."""
-    key = hashlib.sha256(b"\0".join([_recipe(), text.encode(), entry.encode(), bytes([count])])).hexdigest()[:24]
+    key = hashlib.sha256(b"\0".join([_recipe(), text.encode(), entry.encode(), bytes([count])])).hexdigest()[
+        :24
+    ]
     if key in _loaded:
         return _loaded[key]
     wp.init()

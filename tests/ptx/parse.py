@@ -147,7 +147,9 @@ def parse(text: str) -> Module:
                 statement = text[label.end() : stop].strip()
                 directive, _, rest = statement.partition(" ")
                 if directive != ".branchtargets":
-                    raise UnknownPtx(f"PTX directive {directive} (line {line}) is not known: no indirect calls")
+                    raise UnknownPtx(
+                        f"PTX directive {directive} (line {line}) is not known: no indirect calls"
+                    )
                 function.body.append(Statement("targets", line, label[1], operands=tuple(split(rest))))
                 line += text.count("\n", position, stop + 1)
                 position = stop + 1
@@ -195,7 +197,9 @@ def _function(head: str) -> Function:
     found = _FUNCTION.match(head)
     if found is None:
         raise UnknownPtx(f"PTX function {head[:120]!r} is not understood")
-    rest = re.sub(r"\.(maxntid|reqntid|minnctapersm|maxnreg|maxnctapersm|pragma)\b[^.]*|\.noreturn", "", found["rest"])
+    rest = re.sub(
+        r"\.(maxntid|reqntid|minnctapersm|maxnreg|maxnctapersm|pragma)\b[^.]*|\.noreturn", "", found["rest"]
+    )
     if rest.strip():
         raise UnknownPtx(f"PTX function {found['name']}: {rest.strip()!r} is not known")
     return Function(
@@ -231,5 +235,11 @@ def _statement(text: str, line: int) -> Statement:
         negated = mark == "!"
     opcode, rest = re.match(r"([\w.:]+)\s*(.*)$", text, re.DOTALL).groups()
     return Statement(
-        "instruction", line, text=text, opcode=opcode, operands=tuple(split(rest)), guard=guard, guard_negated=negated
+        "instruction",
+        line,
+        text=text,
+        opcode=opcode,
+        operands=tuple(split(rest)),
+        guard=guard,
+        guard_negated=negated,
     )

@@ -234,7 +234,8 @@ class _Translator:
         self.tally: dict[str, int] | None = None
         body = function.body or []
         self.waits = any(
-            s.what == "instruction" and s.opcode.split(".")[0] in WAITING and s.opcode != "bar.arrive" for s in body
+            s.what == "instruction" and s.opcode.split(".")[0] in WAITING and s.opcode != "bar.arrive"
+            for s in body
         )
         if self.waits and not function.entry:
             raise UnknownPtx(f"PTX function {function.name} waits for other threads outside of an entry")
@@ -423,7 +424,9 @@ class _Translator:
         except UnknownPtx as error:
             raise UnknownPtx(f"line {s.line}, {s.text!r}: {error}") from error
         except (IndexError, ValueError, KeyError) as error:
-            raise UnknownPtx(f"PTX instruction {s.opcode} (line {s.line}: {s.text!r}) is not understood") from error
+            raise UnknownPtx(
+                f"PTX instruction {s.opcode} (line {s.line}: {s.text!r}) is not understood"
+            ) from error
         if s.guard:
             guard = self.read(s.guard, "pred")
             self.lines.append(f"if ({'!' if s.guard_negated else ''}{guard}) {{")
@@ -442,7 +445,9 @@ class _Translator:
         types = [m for m in mods if m in C_TYPES]
         unknown = [m for m in mods if m not in C_TYPES and m not in allowed]
         if unknown or len(types) != 1:
-            raise UnknownPtx(f"PTX instruction {s.opcode} (modifiers {', '.join(unknown) or 'of its types'}) is not known")
+            raise UnknownPtx(
+                f"PTX instruction {s.opcode} (modifiers {', '.join(unknown) or 'of its types'}) is not known"
+            )
         return types[0]
 
     def fault(self, what: str, s: Statement) -> str:
@@ -458,7 +463,9 @@ class _Translator:
             bits = 8 * SIZES[type_] // len(parts)
             value = self.read(source, f"b{8 * SIZES[type_]}")
             out = [f"{{ const u64 whole_ = {value};"]
-            out += [self.write(p, f"(u{bits})(whole_ >> {k * bits})") for k, p in enumerate(parts) if p != "_"]
+            out += [
+                self.write(p, f"(u{bits})(whole_ >> {k * bits})") for k, p in enumerate(parts) if p != "_"
+            ]
             return [*out, "}"]
         if source.startswith("{"):
             parts = split(source[1:-1])
@@ -712,7 +719,9 @@ class _Translator:
             raise UnknownPtx(f"PTX {s.opcode} is not known")
         return [self.write(ops[0], self.flush(mods, form, self.read(ops[1], "f32")))]
 
-    def extreme(self, s: Statement, mods: list[str], ops: tuple[str, ...], which: str, sign: str) -> list[str]:
+    def extreme(
+        self, s: Statement, mods: list[str], ops: tuple[str, ...], which: str, sign: str
+    ) -> list[str]:
         type_ = self.type_of(s, mods, {"ftz", "NaN"})
         values = [self.read(x, type_) for x in ops[1:]]
         if type_[0] != "f":
@@ -778,11 +787,21 @@ class _Translator:
 
     def op_shl(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
         type_ = self.type_of(s, mods)
-        return [self.write(ops[0], f"shift_left<{C_TYPES[type_]}>({self.read(ops[1], type_)}, {self.read(ops[2], 'u32')})")]
+        return [
+            self.write(
+                ops[0],
+                f"shift_left<{C_TYPES[type_]}>({self.read(ops[1], type_)}, {self.read(ops[2], 'u32')})",
+            )
+        ]
 
     def op_shr(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
         type_ = self.type_of(s, mods)
-        return [self.write(ops[0], f"shift_right<{C_TYPES[type_]}>({self.read(ops[1], type_)}, {self.read(ops[2], 'u32')})")]
+        return [
+            self.write(
+                ops[0],
+                f"shift_right<{C_TYPES[type_]}>({self.read(ops[1], type_)}, {self.read(ops[2], 'u32')})",
+            )
+        ]
 
     def op_shf(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
         self.type_of(s, mods, {"l", "r", "wrap", "clamp"})
@@ -938,8 +957,12 @@ class _Translator:
             a = [self.read(v[k], type_) for v in lists]
             fresh = {
                 "add": lambda a=a: f"old_ + {a[0]}",
-                "min": lambda a=a: f"least(old_, {a[0]})" if type_[0] == "f" else f"(old_ < {a[0]} ? old_ : {a[0]})",
-                "max": lambda a=a: f"most(old_, {a[0]})" if type_[0] == "f" else f"(old_ > {a[0]} ? old_ : {a[0]})",
+                "min": lambda a=a: (
+                    f"least(old_, {a[0]})" if type_[0] == "f" else f"(old_ < {a[0]} ? old_ : {a[0]})"
+                ),
+                "max": lambda a=a: (
+                    f"most(old_, {a[0]})" if type_[0] == "f" else f"(old_ > {a[0]} ? old_ : {a[0]})"
+                ),
                 "inc": lambda a=a: f"(old_ >= {a[0]} ? 0 : old_ + 1)",
                 "dec": lambda a=a: f"(old_ == 0 || old_ > {a[0]} ? {a[0]} : old_ - 1)",
                 "and": lambda a=a: f"old_ & {a[0]}",
@@ -948,7 +971,9 @@ class _Translator:
                 "exch": lambda a=a: a[0],
                 "cas": lambda a=a: f"(old_ == {a[0]} ? {a[1]} : old_)",
             }[kind]()
-            out.append(f"{{ const {c} old_ = ldm<{c}>(at_ + {k * size}); stm<{c}>(at_ + {k * size}, ({c})({fresh}));")
+            out.append(
+                f"{{ const {c} old_ = ldm<{c}>(at_ + {k * size}); stm<{c}>(at_ + {k * size}, ({c})({fresh}));"
+            )
             out.append("" if targets[k] == "_" else self.write(targets[k], "old_"))
             out.append("}")
         return [*out, "}"]
@@ -1069,7 +1094,9 @@ class _Translator:
         if len(mods) != 3 or mods[0] != "sync" or mods[2][0] == "f":
             raise UnknownPtx(f"PTX instruction {s.opcode} is not known")
         kind = kinds[mods[1]] + (2 if mods[2] == "s32" and mods[1] in ("min", "max") else 0)
-        out = self.wait(s, "REDUCE", kind=str(kind), mask=self.read(ops[2], "u32"), value=self.read(ops[1], "u32"))
+        out = self.wait(
+            s, "REDUCE", kind=str(kind), mask=self.read(ops[2], "u32"), value=self.read(ops[1], "u32")
+        )
         return [*out, self.write(ops[0], "(u32)T.value")]
 
     def op_activemask(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
