@@ -63,7 +63,7 @@ class Fault(RuntimeError):
 
 class _Thread(ctypes.Structure):
     _fields_ = [(name, ctypes.c_uint32) for name in ("state", "wait", "site", "kind", "mask", "count")] + [
-        ("value", ctypes.c_uint64), *((name, ctypes.c_uint32) for name in ("lane_from", "clamp", "flag", "arrives"))
+        ("value", ctypes.c_uint64), *((name, ctypes.c_uint32) for name in ("lane_from", "clamp", "flag", "unused"))
     ]  # fmt: skip
 
 
@@ -77,7 +77,8 @@ class _Context(ctypes.Structure):
         ("warp_order", ctypes.c_void_p), ("block_order", ctypes.c_void_p), ("counts", ctypes.c_void_p),
         ("print", _Print), ("blocks", ctypes.c_uint64), ("block", ctypes.c_uint64), ("budget", ctypes.c_int64),
         ("address", ctypes.c_uint64), ("block_dim", ctypes.c_uint32), ("thread", ctypes.c_uint32),
-        ("fault", ctypes.c_uint32), ("site", ctypes.c_uint32), ("arrived", ctypes.c_uint32 * 16), ("jump", ctypes.c_void_p),
+        ("fault", ctypes.c_uint32), ("site", ctypes.c_uint32), ("arrived", ctypes.c_uint32 * 16),
+        ("jump", ctypes.c_void_p),
     ]  # fmt: skip
 
 

@@ -47,7 +47,7 @@ struct Thread {
     u32 lane_from; // a shuffle's second and third operands
     u32 clamp;
     u32 flag;      // predicate brought, and got
-    u32 arrives;   // a barrier at which the thread does not wait
+    u32 unused;
 };
 
 // The same layout as ``Launch`` in Python.

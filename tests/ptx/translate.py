@@ -348,16 +348,14 @@ class _Translator:
         if not f.entry:
             head = f"static {self.whole.signature(f.name)}\n{{\n{name} R = {{}};\n{name}_local L;\n"
             return f"{struct}\n{local}\n{head}{body}\n}}"
+        run = "static __attribute__((noinline)) void run_thread(Context* C, u32 t)\n{\nThread& T = C->threads[t];\n"
         if not self.waits:
-            head = f"static __attribute__((noinline)) void run_thread(Context* C, u32 t)\n{{\nThread& T = C->threads[t];\n{name} R = {{}};\n"
-            return f"{struct}\n{local}\n{head}{name}_local L;\n{body}\n}}"
+            return f"{struct}\n{local}\n{run}{name} R = {{}};\n{name}_local L;\n{body}\n}}"
         cases = "".join(f"case {k}: goto resume_{k}; " for k in range(1, self.resumes + 1))
-        struct = f"struct {name}_local {{{depot} }};\n" + struct.replace(" }", f" {name}_local local; }}", 1)
+        struct = f"{local}\n" + struct.replace(" }", f" {name}_local local; }}", 1)
         restart = "__builtin_memset(&R, 0, sizeof(R)); __builtin_memset(&R.local, 0xff, sizeof(R.local));"
-        # A finished thread of the block before left its registers: the scheduler resets the place to resume from.
         return (
-            f"{struct}\nstatic __attribute__((noinline)) void run_thread(Context* C, u32 t)\n{{\nThread& T = C->threads[t];\n"
-            f"{name}* __restrict registers = ({name}*)C->registers + t;\n{name}& R = *registers;\n"
+            f"{struct}\n{run}{name}* __restrict registers = ({name}*)C->registers + t;\n{name}& R = *registers;\n"
             f"{name}_local& L = R.local;\nswitch (R.resume) {{ case 0: {restart} break; {cases}}}\n{body}\n}}"
         )
 
