@@ -336,7 +336,8 @@ def _cache() -> Path:
 @cache
 def _recipe() -> bytes:
     """What decides on the machine code besides the PTX."""
-    sources = [(HERE / name).read_bytes() for name in ("machine.h", "parse.py", "translate.py")]
+    names = ("machine.h", "parse.py", "operands.py", "arithmetic.py", "effects.py", "translate.py")
+    sources = [(HERE / name).read_bytes() for name in names]
     return b"".join([*sources, wp.config.version.encode()])
 
 

@@ -12,30 +12,10 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from ptx.arithmetic import Arithmetic
+from ptx.effects import Effects
+from ptx.operands import C_TYPES, SPACES, WAITING, c_name, immediate
 from ptx.parse import SIZES, Function, Module, Statement, UnknownPtx, Variable, split
-
-C_TYPES = {"pred": "bool", "f32": "f32", "f64": "f64"} | {
-    f"{kind}{bits}": f"{'s' if kind == 's' else 'u'}{bits}" for kind in "bus" for bits in (8, 16, 32, 64)
-}
-ROUNDINGS = {"rn": "NEAREST", "rz": "ZERO", "rm": "DOWN", "rp": "UP"}
-WHOLE = {"rni": "NEAREST", "rzi": "ZERO", "rmi": "DOWN", "rpi": "UP"}
-SCOPES = {"cta", "cluster", "gpu", "sys"}
-ORDERS = {"volatile", "relaxed", "acquire", "release", "acq_rel", "weak", "sc"}
-CACHES = {"ca", "cg", "cs", "cv", "lu", "wb", "wt", "nc"}
-SPACES = {"global", "shared", "local", "const", "param"}
-COMPARISONS = {
-    "eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">=", "lo": "<", "ls": "<=", "hi": ">", "hs": ">=",
-}  # fmt: skip
-SPECIAL = {
-    "%tid.x": "t", "%tid.y": "0u", "%tid.z": "0u", "%ntid.x": "C->block_dim", "%ntid.y": "1u", "%ntid.z": "1u",
-    "%ctaid.x": "(u32)C->block", "%ctaid.y": "0u", "%ctaid.z": "0u", "%nctaid.x": "(u32)C->blocks", "%nctaid.y": "1u",
-    "%nctaid.z": "1u", "%laneid": "(t & 31u)", "%warpid": "(t >> 5)", "WARP_SZ": "32u",
-    "%lanemask_eq": "(1u << (t & 31u))", "%lanemask_lt": "((1u << (t & 31u)) - 1u)",
-    "%lanemask_le": "((2u << (t & 31u)) - 1u)", "%lanemask_gt": "~((2u << (t & 31u)) - 1u)",
-    "%lanemask_ge": "~((1u << (t & 31u)) - 1u)",
-}  # fmt: skip
-WAITING = ("bar", "barrier", "shfl", "vote", "match", "redux", "activemask")
-HOST_FUNCTIONS = ("vprintf", "__assertfail")
 
 
 @dataclass
@@ -130,10 +110,6 @@ class _Shared:
         return f"{self.places[key]}u"
 
 
-def _c_name(name: str) -> str:
-    return "v_" + re.sub(r"\W", "_", name.replace("%", "").replace("$", "S_").replace(".", "_"))
-
-
 class _Whole:
     """What the functions of a program share."""
 
@@ -158,8 +134,8 @@ class _Whole:
 
     def signature(self, name: str) -> str:
         f = self.module.functions[name]
-        params = "".join(f", u64 {_c_name(p.name)}" for p in [*f.results, *f.params])
-        return f"void {_c_name(name)}(Context* C, const u32 t{params})"
+        params = "".join(f", u64 {c_name(p.name)}" for p in [*f.results, *f.params])
+        return f"void {c_name(name)}(Context* C, const u32 t{params})"
 
     def site(self, s: Statement) -> int:
         self.sites.append(f"PTX line {s.line}: {' '.join(s.text.split())}")
@@ -173,7 +149,7 @@ class _Whole:
         if v.space == "shared":
             return self.shared.place(v, "")
         if name not in self.defined:
-            c = _c_name(name)
+            c = c_name(name)
             self.defined[name] = f"(u64){c}"
             if v.external:
                 raise UnknownPtx(f"PTX variable {name} is external")
@@ -187,50 +163,16 @@ class _Whole:
 
     def _initial(self, text: str, type_: str) -> str:
         if re.match(r"^[-+]?\d|^0[fFdD]", text):
-            return _immediate(text, type_)
+            return immediate(text, type_)
         raise UnknownPtx(f"PTX initial value {text!r} is not known")
 
 
-def _immediate(text: str, type_: str) -> str:
-    """C++ of a constant operand read as ``type_``."""
-    low = text.lower()
-    c_type = C_TYPES[type_]
-    if low.startswith("0f"):
-        value = f"__builtin_bit_cast(f32, 0x{text[2:]}u)"
-        return value if c_type == "f32" else f"rd<{c_type}>({value})"
-    if low.startswith("0d"):
-        value = f"__builtin_bit_cast(f64, 0x{text[2:]}ull)"
-        return value if c_type == "f64" else f"rd<{c_type}>({value})"
-    found = re.match(r"^([-+~]?)(0x[0-9a-f]+|0b[01]+|0[0-7]*|[1-9]\d*)u?$", low)
-    if found is None:
-        raise UnknownPtx(f"PTX constant {text!r} is not understood")
-    digits = found[2]
-    number = int(digits, 8) if re.match(r"^0[0-7]+$", digits) else int(digits, 0)
-    number = -number if found[1] == "-" else ~number if found[1] == "~" else number
-    if type_ == "pred":
-        return "true" if number else "false"
-    if c_type in ("f32", "f64"):
-        raise UnknownPtx(f"PTX constant {text!r} is read as .{type_}")
-    bits = 8 * SIZES[type_]
-    return f"({c_type}){number % 2**bits}ull"
-
-
-class _Translator:
+class _Translator(Arithmetic, Effects):
     """One function."""
 
     def __init__(self, whole: _Whole, function: Function) -> None:
-        self.whole, self.function = whole, function
-        self.lines: list[str] = []
-        self.registers: dict[str, str] = {}  # C++ name -> C++ type
-        self.scopes: list[dict[str, tuple[str, int | None]]] = []
-        self.symbols: list[dict[str, str]] = []
-        self.scope_names: list[int] = []
+        super().__init__(whole, function)
         self.local_bytes = 0
-        self.resumes = 0
-        self.locals: list[str] = []
-        self.targets: dict[str, tuple[str, ...]] = {}
-        self.seen_labels: set[str] = set()
-        self.scopes_opened = 0
         self.tally: dict[str, int] | None = None
         body = function.body or []
         self.waits = any(
@@ -242,97 +184,15 @@ class _Translator:
         if function.entry:
             whole.cooperative = self.waits
 
-    # Scopes, names, operands
-
-    def push(self) -> None:
-        self.scopes.append({})
-        self.symbols.append({})
-        self.scope_names.append(self.scopes_opened)
-        self.scopes_opened += 1
-
-    def pop(self) -> None:
-        self.scopes.pop()
-        self.symbols.pop()
-        self.scope_names.pop()
-
-    def register(self, name: str) -> str | None:
-        """C++ name of a register, or None where the name is none."""
-        found = re.match(r"^(.*?)(\d+)$", name)
-        for scope, number in zip(reversed(self.scopes), reversed(self.scope_names), strict=True):
-            if name in scope and scope[name][1] is None:
-                type_ = scope[name][0]
-            elif found and found[1] in scope and scope[found[1]][1] and int(found[2]) < scope[found[1]][1]:
-                type_ = scope[found[1]][0]
-            else:
-                continue
-            c = _c_name(name) + (f"_{number}" if number else "")
-            self.registers.setdefault(c, C_TYPES[type_])
-            return f"R.{c}"
-        return None
-
-    def symbol(self, name: str) -> str | None:
-        for scope in reversed(self.symbols):
-            if name in scope:
-                return scope[name]
-        return self.whole.symbol(name)
-
-    def read(self, operand: str, type_: str) -> str:
-        """C++ of an operand read as ``type_``."""
-        negated = operand.startswith("!")
-        operand = operand.lstrip("!").strip()
-        register = self.register(operand)
-        c_type = C_TYPES[type_]
-        if register is not None:
-            if self.registers[register[2:]] == c_type:
-                value = register
-            elif type_ == "pred":
-                raise UnknownPtx(f"PTX register {operand} is read as a predicate")
-            else:
-                value = f"rd<{c_type}>({register})"
-        elif operand in SPECIAL:
-            value = f"({c_type}){SPECIAL[operand]}"
-        elif re.match(r"^[-+~]?\d", operand):
-            value = _immediate(operand, type_)
-        else:
-            value = f"({c_type}){self.address(operand)}"
-        return f"!{value}" if negated else value
-
-    def address(self, text: str) -> str:
-        """C++ of an address: register, symbol or constant, with an offset."""
-        found = re.match(r"^([^+\s]+)\s*(?:\+\s*(-?\w+))?$", text.strip())
-        if found is None:
-            raise UnknownPtx(f"PTX address {text!r} is not understood")
-        base, offset = found[1], found[2]
-        register = self.register(base)
-        if register is not None:
-            value = register if self.registers[register[2:]] == "u64" else f"(u64)(u32){register}"
-        elif re.match(r"^\d", base):
-            value = _immediate(base, "u64")
-        else:
-            symbol = self.symbol(base)
-            if symbol is None:
-                raise UnknownPtx(f"PTX name {base!r} is not known")
-            value = f"(u64){symbol}"
-        return value if not offset else f"({value} + (u64)({int(offset, 0)}ll))"
-
-    def write(self, operand: str, value: str) -> str:
-        """C++ statement that writes a typed C++ value to a register."""
-        if operand == "_":
-            return f"(void)({value});"
-        register = self.register(operand)
-        if register is None:
-            raise UnknownPtx(f"PTX register {operand!r} is not declared")
-        return f"wr({register}, {value});"
-
     # Statements
 
     def translate(self) -> str:
         f = self.function
         self.push()
         for i, p in enumerate(f.params):
-            self.symbols[0][p.name] = f"(u64)C->params[{i}]" if f.entry else _c_name(p.name)
+            self.symbols[0][p.name] = f"(u64)C->params[{i}]" if f.entry else c_name(p.name)
         for p in f.results:
-            self.symbols[0][p.name] = _c_name(p.name)
+            self.symbols[0][p.name] = c_name(p.name)
         self.block()
         for s in f.body or []:
             if s.what == "targets":
@@ -340,7 +200,7 @@ class _Translator:
         for s in f.body or []:
             self.statement(s)
         body = "\n".join(self.lines)
-        name = "Registers" if f.entry else f"Registers_{_c_name(f.name)}"
+        name = "Registers" if f.entry else f"Registers_{c_name(f.name)}"
         fields = "".join(f" {t} {c};" for c, t in self.registers.items())
         depot = f" alignas(16) char local[{self.local_bytes}];" if self.local_bytes else ""
         struct = f"struct {name} {{ u32 resume; bool carry;{fields} }};"
@@ -380,7 +240,7 @@ class _Translator:
             self.lines.append("}")
         elif s.what == "label":
             self.seen_labels.add(s.name)
-            self.lines.append(f"{_c_name(s.name)}: ;")
+            self.lines.append(f"{c_name(s.name)}: ;")
             self.block()
         elif s.what == "registers":
             type_, *names = re.match(r"\.reg\s+\.(\w+)\s+(.*)$", s.text, re.DOTALL).groups()
@@ -405,7 +265,7 @@ class _Translator:
             self.symbols[-1][v.name] = f"((u64)L.local + {self.local_bytes}u)"
             self.local_bytes += v.size
         elif v.space == "param":
-            c = f"{_c_name(v.name)}_{self.scope_names[-1]}"
+            c = f"{c_name(v.name)}_{self.scope_names[-1]}"
             self.lines.append(f"alignas(16) char {c}[{max(v.size, 1)}];")
             self.symbols[-1][v.name] = c
         else:
@@ -437,668 +297,6 @@ class _Translator:
                 self.tally[key] = self.tally.get(key, 0) + n
             if base in ("bra", "brx", "call", "ret", "exit") or base in WAITING:
                 self.block()
-
-    def type_of(self, s: Statement, mods: list[str], allowed: set[str] | frozenset[str] = frozenset()) -> str:
-        """The instruction's one type; other modifiers must be among ``allowed``."""
-        types = [m for m in mods if m in C_TYPES]
-        unknown = [m for m in mods if m not in C_TYPES and m not in allowed]
-        if unknown or len(types) != 1:
-            raise UnknownPtx(
-                f"PTX instruction {s.opcode} (modifiers {', '.join(unknown) or 'of its types'}) is not known"
-            )
-        return types[0]
-
-    def fault(self, what: str, s: Statement) -> str:
-        return f"fault(C, {what}, {self.whole.site(s)}u)"
-
-    # Moves and memory
-
-    def op_mov(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        target, source = ops
-        if target.startswith("{"):
-            parts = split(target[1:-1])
-            bits = 8 * SIZES[type_] // len(parts)
-            value = self.read(source, f"b{8 * SIZES[type_]}")
-            out = [f"{{ const u64 whole_ = {value};"]
-            out += [
-                self.write(p, f"(u{bits})(whole_ >> {k * bits})") for k, p in enumerate(parts) if p != "_"
-            ]
-            return [*out, "}"]
-        if source.startswith("{"):
-            parts = split(source[1:-1])
-            bits = 8 * SIZES[type_] // len(parts)
-            terms = [f"((u64){self.read(p, f'b{bits}')} << {k * bits})" for k, p in enumerate(parts)]
-            return [self.write(target, f"(u{8 * SIZES[type_]})({' | '.join(terms)})")]
-        return [self.write(target, self.read(source, type_))]
-
-    def memory(self, s: Statement, operand: str, space: str, size: int, align: int) -> list[str]:
-        """Statements that leave the host address of ``operand`` in ``at_``; they open a brace."""
-        inner = operand.strip()
-        if not inner.startswith("["):
-            raise UnknownPtx(f"PTX operand {operand!r} is no address")
-        address = self.address(inner[1:-1])
-        out = [f"{{ u64 at_ = {address};"]
-        if space == "param":
-            return out
-        kind = "shared" if space == "shared" else "memory"
-        if space == "shared":
-            bad = f"bad_shared(C, at_, {size}u, {align}u)"
-        else:
-            bad = f"bad_address(at_, {align.bit_length() - 1}u)"
-        out.append(f"if (UNLIKELY({bad})) bad_{kind}_access(C, at_, {self.whole.site(s)}u);")
-        if space == "shared":
-            out.append("at_ = (u64)C->shared + (u32)at_;")
-        return out
-
-    def access(self, s: Statement, mods: list[str]) -> tuple[str, str, int]:
-        """Space, element type and number of elements of a load or store."""
-        type_ = self.type_of(s, mods, SPACES | ORDERS | CACHES | SCOPES | {"v2", "v4", "v8"})
-        space = next((m for m in mods if m in SPACES), "generic")
-        count = next((int(m[1:]) for m in mods if m in ("v2", "v4", "v8")), 1)
-        return space, type_, count
-
-    def op_ld(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        space, type_, count = self.access(s, mods)
-        size = SIZES[type_]
-        targets = split(ops[0][1:-1]) if count > 1 else [ops[0]]
-        if len(targets) != count:
-            raise UnknownPtx(f"PTX {s.opcode} has {len(targets)} registers")
-        out = self.memory(s, ops[1], space, size * count, size * count)
-        c = C_TYPES[type_]
-        out += [self.write(r, f"ldm<{c}>(at_ + {k * size})") for k, r in enumerate(targets) if r != "_"]
-        return [*out, "}"]
-
-    def op_ldu(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.op_ld(s, mods, ops)
-
-    def op_st(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        space, type_, count = self.access(s, mods)
-        size = SIZES[type_]
-        sources = split(ops[1][1:-1]) if count > 1 else [ops[1]]
-        if len(sources) != count:
-            raise UnknownPtx(f"PTX {s.opcode} has {len(sources)} values")
-        out = self.memory(s, ops[0], space, size * count, size * count)
-        c = C_TYPES[type_]
-        out += [f"stm<{c}>(at_ + {k * size}, {self.read(r, type_)});" for k, r in enumerate(sources)]
-        return [*out, "}"]
-
-    def op_cvta(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, SPACES | {"to"})
-        value = self.read(ops[1], type_)
-        if "shared" in mods:
-            if type_ != "u64":
-                raise UnknownPtx(f"PTX {s.opcode} is not known")
-            value = f"{value} - (u64)C->shared" if "to" in mods else f"{value} + (u64)C->shared"
-        return [self.write(ops[0], f"(u64)({value})")]
-
-    def op_isspacep(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        if mods not in (["shared"], ["global"]):
-            raise UnknownPtx(f"PTX {s.opcode} is not known")
-        inside = f"({self.read(ops[1], 'u64')} - (u64)C->shared < C->shared_bytes)"
-        return [self.write(ops[0], inside if mods == ["shared"] else f"!{inside}")]
-
-    def op_prefetch(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return []
-
-    op_prefetchu = op_prefetch
-    op_membar = op_prefetch  # one block runs at a time and memory is the host's
-    op_fence = op_prefetch
-    op_nanosleep = op_prefetch
-
-    # Integers and floats alike
-
-    def op_add(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.sum(s, mods, ops, "+")
-
-    def op_sub(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.sum(s, mods, ops, "-")
-
-    def sum(self, s: Statement, mods: list[str], ops: tuple[str, ...], sign: str) -> list[str]:
-        type_ = self.type_of(s, mods, {*ROUNDINGS, "ftz", "sat", "cc"})
-        a, b = (self.read(x, type_) for x in ops[1:])
-        c = C_TYPES[type_]
-        if type_[0] == "f":
-            return self.float_result(s, ops[0], mods, type_, [a, b], f"sum_{sign}")
-        unsigned = f"u{8 * SIZES[type_]}"
-        if "cc" in mods:
-            which = "add" if sign == "+" else "sub"
-            return [
-                f"{{ {unsigned} y_; R.carry = __builtin_{which}_overflow(({unsigned}){a}, ({unsigned}){b}, &y_);",
-                self.write(ops[0], "y_"),
-                "}",
-            ]
-        if "sat" in mods:
-            return [self.write(ops[0], f"clamped<{c}>((s64){a} {sign} (s64){b})")]
-        return [self.write(ops[0], f"({c})(({unsigned}){a} {sign} ({unsigned}){b})")]
-
-    def op_addc(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.with_carry(s, mods, ops, "+")
-
-    def op_subc(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.with_carry(s, mods, ops, "-")
-
-    def with_carry(self, s: Statement, mods: list[str], ops: tuple[str, ...], sign: str) -> list[str]:
-        type_ = self.type_of(s, mods, {"cc"})
-        a, b = (self.read(x, f"u{8 * SIZES[type_]}") for x in ops[1:])
-        carry = f"R.carry = (y_ >> {8 * SIZES[type_]}) & 1;" if "cc" in mods else ""
-        unsigned = f"u{8 * SIZES[type_]}"
-        return [
-            f"{{ const u128 y_ = (u128){a} {sign} (u128){b} {sign} (u128)R.carry; {carry}",
-            self.write(ops[0], f"({unsigned})y_"),
-            "}",
-        ]
-
-    def float_result(
-        self, s: Statement, target: str, mods: list[str], type_: str, values: list[str], what: str
-    ) -> list[str]:
-        """Sum, product or fused product of floats, rounded, flushed and saturated as the modifiers say."""
-        rounding = ROUNDINGS[next((m for m in mods if m in ROUNDINGS), "rn")]
-        if "ftz" in mods:
-            values = [f"flushed({v})" for v in values]
-        if what == "sum_-":
-            values[1] = f"negated({values[1]})"
-        if rounding == "NEAREST":
-            value = {
-                "sum_+": lambda: f"{values[0]} + {values[1]}",
-                "sum_-": lambda: f"{values[0]} + {values[1]}",
-                "product": lambda: f"{values[0]} * {values[1]}",
-                "fused": lambda: f"fused({', '.join(values)})",
-            }[what]()
-            value = f"({value})"
-        elif what == "fused":
-            if type_ != "f32":
-                raise UnknownPtx(f"PTX {s.opcode} is not known")
-            value = f"fused_to({', '.join(values)}, {rounding})"
-        else:
-            value = f"{'product' if what == 'product' else 'sum'}_to({values[0]}, {values[1]}, {rounding})"
-        if "ftz" in mods:
-            value = f"flushed({value})"
-        if "sat" in mods:
-            value = f"saturated({value})"
-        return [self.write(target, value)]
-
-    def op_mul(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {*ROUNDINGS, "ftz", "sat", "lo", "hi", "wide"})
-        a, b = (self.read(x, type_) for x in ops[1:])
-        if type_[0] == "f":
-            return self.float_result(s, ops[0], mods, type_, [a, b], "product")
-        return [self.write(ops[0], self.product(type_, mods, a, b))]
-
-    def product(self, type_: str, mods: list[str], a: str, b: str) -> str:
-        bits = 8 * SIZES[type_]
-        wide = f"{type_[0].replace('b', 'u')}{2 * bits}" if bits < 64 else f"{type_[0].replace('b', 'u')}128"
-        if "wide" in mods:
-            return f"({wide})({wide}{{{a}}} * {wide}{{{b}}})"
-        if "hi" in mods:
-            return f"({C_TYPES[type_]})(({wide}{{{a}}} * {wide}{{{b}}}) >> {bits})"
-        if "lo" not in mods:
-            raise UnknownPtx("PTX integer product without .lo, .hi or .wide")
-        middle = "u64" if bits == 64 else "u32"
-        return f"({C_TYPES[type_]})(({middle}){a} * ({middle}){b})"
-
-    def op_mad(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {*ROUNDINGS, "ftz", "sat", "lo", "hi", "wide", "cc"})
-        if type_[0] == "f":
-            return self.op_fma(s, mods, ops)
-        return self.multiply_add(s, mods, ops, type_, "0")
-
-    def op_madc(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.multiply_add(s, mods, ops, self.type_of(s, mods, {"lo", "hi", "cc"}), "R.carry")
-
-    def multiply_add(
-        self, s: Statement, mods: list[str], ops: tuple[str, ...], type_: str, carry: str
-    ) -> list[str]:
-        if "sat" in mods:
-            raise UnknownPtx(f"PTX {s.opcode} is not known")
-        a, b = (self.read(x, type_) for x in ops[1:3])
-        bits = 8 * SIZES[type_] * (2 if "wide" in mods else 1)
-        third = self.read(ops[3], f"{type_[0]}{bits}")
-        out = f"({type_[0].replace('b', 'u')}{bits})"
-        total = f"(u128)(u{bits})({self.product(type_, mods, a, b)}) + (u128)(u{bits}){third} + (u128){carry}"
-        keep = f"R.carry = (y_ >> {bits}) & 1;" if "cc" in mods else ""
-        return [f"{{ const u128 y_ = {total}; {keep}", self.write(ops[0], f"{out}y_"), "}"]
-
-    def op_fma(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {*ROUNDINGS, "ftz", "sat"})
-        return self.float_result(s, ops[0], mods, type_, [self.read(x, type_) for x in ops[1:4]], "fused")
-
-    def op_div(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {"rn", "ftz", "approx", "full"})
-        a, b = (self.read(x, type_) for x in ops[1:])
-        if type_[0] != "f":
-            return [self.write(ops[0], f"quotient<{C_TYPES[type_]}>({a}, {b})")]
-        return [self.write(ops[0], self.flush(mods, "({0} / {1})", a, b))]
-
-    def op_rem(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        a, b = (self.read(x, type_) for x in ops[1:])
-        return [self.write(ops[0], f"remainder<{C_TYPES[type_]}>({a}, {b})")]
-
-    def flush(self, mods: list[str], form: str, *values: str) -> str:
-        if "ftz" not in mods:
-            return form.format(*values)
-        return f"flushed({form.format(*(f'flushed({v})' for v in values))})"
-
-    def unary_float(self, s: Statement, mods: list[str], ops: tuple[str, ...], form: str) -> list[str]:
-        type_ = self.type_of(s, mods, {"rn", "ftz", "approx"})
-        if type_[0] != "f":
-            raise UnknownPtx(f"PTX {s.opcode} is not known")
-        if type_ == "f64" and "approx" in mods:
-            return [self.write(ops[0], f"upper({form.format(f'upper({self.read(ops[1], type_)})')})")]
-        return [self.write(ops[0], self.flush(mods, form, self.read(ops[1], type_)))]
-
-    def op_rcp(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.unary_float(s, mods, ops, "(1 / {0})")
-
-    def op_sqrt(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.unary_float(s, mods, ops, "root({0})")
-
-    def op_rsqrt(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.unary_float(s, mods, ops, "(1 / root({0}))")
-
-    def op_ex2(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.approximate(s, mods, ops, "exp2f({0})")
-
-    def op_lg2(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.approximate(s, mods, ops, "log2f({0})")
-
-    def op_sin(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.approximate(s, mods, ops, "sinf({0})")
-
-    def op_cos(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.approximate(s, mods, ops, "cosf({0})")
-
-    def op_tanh(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.approximate(s, mods, ops, "tanhf({0})")
-
-    def approximate(self, s: Statement, mods: list[str], ops: tuple[str, ...], form: str) -> list[str]:
-        if self.type_of(s, mods, {"ftz", "approx"}) != "f32":
-            raise UnknownPtx(f"PTX {s.opcode} is not known")
-        return [self.write(ops[0], self.flush(mods, form, self.read(ops[1], "f32")))]
-
-    def extreme(
-        self, s: Statement, mods: list[str], ops: tuple[str, ...], which: str, sign: str
-    ) -> list[str]:
-        type_ = self.type_of(s, mods, {"ftz", "NaN"})
-        values = [self.read(x, type_) for x in ops[1:]]
-        if type_[0] != "f":
-            return [self.write(ops[0], f"({values[0]} {sign} {values[1]} ? {values[0]} : {values[1]})")]
-        value = self.flush(mods, f"{which}({{0}}, {{1}})", *values)
-        if "NaN" in mods:
-            nan = _immediate("0f7fffffff" if type_ == "f32" else "0d7fffffffffffffff", type_)
-            value = f"(is_nan({values[0]}) || is_nan({values[1]}) ? {nan} : {value})"
-        return [self.write(ops[0], value)]
-
-    def op_min(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.extreme(s, mods, ops, "least", "<")
-
-    def op_max(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.extreme(s, mods, ops, "most", ">")
-
-    def op_abs(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {"ftz"})
-        a = self.read(ops[1], type_)
-        if type_[0] == "f":
-            return [self.write(ops[0], self.flush(mods, "magnitude({0})", a))]
-        c, u = C_TYPES[type_], f"u{8 * SIZES[type_]}"
-        return [self.write(ops[0], f"({c})({a} < 0 ? ({u})0 - ({u}){a} : ({u}){a})")]
-
-    def op_neg(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {"ftz"})
-        a = self.read(ops[1], type_)
-        if type_[0] == "f":
-            return [self.write(ops[0], self.flush(mods, "negated({0})", a))]
-        u = f"u{8 * SIZES[type_]}"
-        return [self.write(ops[0], f"({C_TYPES[type_]})(({u})0 - ({u}){a})")]
-
-    def op_copysign(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        return [self.write(ops[0], f"with_sign({self.read(ops[1], type_)}, {self.read(ops[2], type_)})")]
-
-    # Bits
-
-    def bitwise(self, s: Statement, mods: list[str], ops: tuple[str, ...], form: str) -> list[str]:
-        type_ = self.type_of(s, mods)
-        values = [self.read(x, type_) for x in ops[1:]]
-        return [self.write(ops[0], f"({C_TYPES[type_]})({form.format(*values)})")]
-
-    def op_and(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.bitwise(s, mods, ops, "{0} & {1}")
-
-    def op_or(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.bitwise(s, mods, ops, "{0} | {1}")
-
-    def op_xor(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.bitwise(s, mods, ops, "{0} ^ {1}")
-
-    def op_not(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.bitwise(s, mods, ops, "!{0}" if mods == ["pred"] else "~{0}")
-
-    def op_cnot(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.bitwise(s, mods, ops, "{0} == 0")
-
-    def op_lop3(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        if mods != ["b32"]:
-            raise UnknownPtx(f"PTX {s.opcode} is not known")
-        return [self.write(ops[0], f"logic({', '.join(self.read(x, 'u32') for x in ops[1:5])})")]
-
-    def op_shl(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        return [
-            self.write(
-                ops[0],
-                f"shift_left<{C_TYPES[type_]}>({self.read(ops[1], type_)}, {self.read(ops[2], 'u32')})",
-            )
-        ]
-
-    def op_shr(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        return [
-            self.write(
-                ops[0],
-                f"shift_right<{C_TYPES[type_]}>({self.read(ops[1], type_)}, {self.read(ops[2], 'u32')})",
-            )
-        ]
-
-    def op_shf(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        self.type_of(s, mods, {"l", "r", "wrap", "clamp"})
-        values = ", ".join(self.read(x, "u32") for x in ops[1:4])
-        return [self.write(ops[0], f"funnel({values}, {int('l' in mods)}, {int('wrap' in mods)})")]
-
-    def op_bfe(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        c, u = C_TYPES[type_], f"u{8 * SIZES[type_]}"
-        place, length = (self.read(x, "u32") for x in ops[2:4])
-        return [self.write(ops[0], f"field<{c}, {u}>({self.read(ops[1], type_)}, {place}, {length})")]
-
-    def op_bfi(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        a, b = (self.read(x, type_) for x in ops[1:3])
-        place, length = (self.read(x, "u32") for x in ops[3:5])
-        return [self.write(ops[0], f"with_field<{C_TYPES[type_]}>({a}, {b}, {place}, {length})")]
-
-    def op_bfind(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {"shiftamt"})
-        amount = "true" if "shiftamt" in mods else "false"
-        return [self.write(ops[0], f"highest_bit<{C_TYPES[type_]}>({self.read(ops[1], type_)}, {amount})")]
-
-    def op_brev(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.bitwise(s, mods, ops, "reversed({0})")
-
-    def op_clz(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        return [self.write(ops[0], f"leading_zeros({self.read(ops[1], type_)}, {8 * SIZES[type_]})")]
-
-    def op_popc(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        return [self.write(ops[0], f"(u32)__builtin_popcountll({self.read(ops[1], type_)})")]
-
-    def op_prmt(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        if mods != ["b32"]:
-            raise UnknownPtx(f"PTX {s.opcode} is not known")
-        return [self.write(ops[0], f"permuted({', '.join(self.read(x, 'u32') for x in ops[1:4])})")]
-
-    # Comparisons and conversions
-
-    def compare(self, comparison: str, type_: str, a: str, b: str, ftz: bool) -> str:
-        if type_[0] != "f":
-            return f"({a} {COMPARISONS[comparison]} {b})"
-        if ftz:
-            a, b = f"flushed({a})", f"flushed({b})"
-        if comparison == "num":
-            return f"(!is_nan({a}) && !is_nan({b}))"
-        if comparison == "nan":
-            return f"(is_nan({a}) || is_nan({b}))"
-        if comparison == "ne":  # ordered: false where one is NaN
-            return f"({a} < {b} || {a} > {b})"
-        if comparison in ("equ", "neu", "ltu", "leu", "gtu", "geu"):
-            return f"(is_nan({a}) || is_nan({b}) || {a} {COMPARISONS[comparison[:-1]]} {b})"
-        return f"({a} {COMPARISONS[comparison]} {b})"
-
-    def op_setp(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        booleans = {"and": "&", "or": "|", "xor": "^"}
-        allowed = {*COMPARISONS, "equ", "neu", "ltu", "leu", "gtu", "geu", "num", "nan", "ftz", *booleans}
-        type_ = self.type_of(s, mods, allowed)
-        a, b = (self.read(x, type_) for x in ops[1:3])
-        met = self.compare(mods[0], type_, a, b, "ftz" in mods)
-        targets = split(ops[0], "|")
-        combine = next((m for m in mods[1:] if m in booleans), None)
-        out = [f"{{ const bool met_ = {met};"]
-        if combine:
-            out.append(f"const bool with_ = {self.read(ops[3], 'pred')};")
-        for target, value in zip(targets, ("met_", "!met_"), strict=False):
-            combined = f"(bool)({value} {booleans[combine]} with_)" if combine else value
-            out.append(self.write(target, combined))
-        return [*out, "}"]
-
-    def op_set(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        if len(mods) != 3 or len(ops) != 3:
-            raise UnknownPtx(f"PTX {s.opcode} is not known")
-        met = self.compare(mods[0], mods[2], self.read(ops[1], mods[2]), self.read(ops[2], mods[2]), False)
-        yes = "1.0f" if mods[1] == "f32" else f"({C_TYPES[mods[1]]})-1"
-        return [self.write(ops[0], f"({met} ? {yes} : ({C_TYPES[mods[1]]})0)")]
-
-    def op_selp(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods)
-        a, b = (self.read(x, type_) for x in ops[1:3])
-        return [self.write(ops[0], f"({self.read(ops[3], 'pred')} ? {a} : {b})")]
-
-    def op_testp(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        type_ = self.type_of(s, mods, {"finite", "infinite", "number", "notanumber"})
-        a = self.read(ops[1], type_)
-        infinite = f"magnitude({a}) == ({type_})__builtin_inf()"
-        form = {
-            "finite": f"!is_nan({a}) && !({infinite})", "infinite": infinite, "number": f"!is_nan({a})",
-            "notanumber": f"is_nan({a})",
-        }  # fmt: skip
-        return [self.write(ops[0], f"({form[mods[0]]})")]
-
-    def op_cvt(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        known = {*ROUNDINGS, *WHOLE, "ftz", "sat"}
-        types = [m for m in mods if m in C_TYPES]
-        unknown = [m for m in mods if m not in C_TYPES and m not in known]
-        if unknown or len(types) != 2:
-            raise UnknownPtx(f"PTX instruction {s.opcode} is not known")
-        to, source = types
-        a, c = self.read(ops[1], source), C_TYPES[to]
-        if "ftz" in mods and source == "f32":
-            a = f"flushed({a})"
-        rounding = next((ROUNDINGS[m] for m in mods if m in ROUNDINGS), "NEAREST")
-        whole = next((WHOLE[m] for m in mods if m in WHOLE), None)
-        if source[0] == "f" and to[0] == "f":
-            if source == to:
-                value = f"whole({a}, {whole})" if whole else a
-            elif to == "f32":
-                value = f"narrowed({a}, {rounding})"
-            else:
-                value = f"(f64){a}"
-            if "ftz" in mods and to == "f32":
-                value = f"flushed({value})"
-            value = f"saturated({value})" if "sat" in mods else value
-        elif source[0] == "f":
-            if whole is None:
-                raise UnknownPtx(f"PTX {s.opcode} has no rounding")
-            value = f"to_integer<{c}>({a}, {whole})"
-        elif to[0] == "f":
-            if rounding != "NEAREST":
-                if to != "f32" or SIZES[source] > 4:
-                    raise UnknownPtx(f"PTX {s.opcode} is not known")
-                value = f"narrowed((f64){a}, {rounding})"
-            else:
-                value = f"({c}){a}"
-        else:
-            value = f"clamped<{c}>({a})" if "sat" in mods else f"({c}){a}"
-        return [self.write(ops[0], value)]
-
-    # Atomics: plain, as one thread runs at a time
-
-    def op_atom(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.atomic(s, mods, ops[0], ops[1], ops[2:])
-
-    def op_red(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return self.atomic(s, mods, "_", ops[0], ops[1:])
-
-    def atomic(
-        self, s: Statement, mods: list[str], target: str, place: str, values: tuple[str, ...]
-    ) -> list[str]:
-        kinds = {"add", "min", "max", "inc", "dec", "and", "or", "xor", "exch", "cas"}
-        type_ = self.type_of(s, mods, SPACES | ORDERS | SCOPES | kinds | {"v2", "v4", "v8", "noftz"})
-        kind = next(m for m in mods if m in kinds)
-        space = next((m for m in mods if m in SPACES), "generic")
-        count = next((int(m[1:]) for m in mods if m in ("v2", "v4", "v8")), 1)
-        size, c = SIZES[type_], C_TYPES[type_]
-        lists = [split(v[1:-1]) if count > 1 else [v] for v in values]
-        targets = split(target[1:-1]) if target.startswith("{") else [target] * count
-        out = self.memory(s, place, space, size * count, size * count)
-        for k in range(count):
-            a = [self.read(v[k], type_) for v in lists]
-            fresh = {
-                "add": lambda a=a: f"old_ + {a[0]}",
-                "min": lambda a=a: (
-                    f"least(old_, {a[0]})" if type_[0] == "f" else f"(old_ < {a[0]} ? old_ : {a[0]})"
-                ),
-                "max": lambda a=a: (
-                    f"most(old_, {a[0]})" if type_[0] == "f" else f"(old_ > {a[0]} ? old_ : {a[0]})"
-                ),
-                "inc": lambda a=a: f"(old_ >= {a[0]} ? 0 : old_ + 1)",
-                "dec": lambda a=a: f"(old_ == 0 || old_ > {a[0]} ? {a[0]} : old_ - 1)",
-                "and": lambda a=a: f"old_ & {a[0]}",
-                "or": lambda a=a: f"old_ | {a[0]}",
-                "xor": lambda a=a: f"old_ ^ {a[0]}",
-                "exch": lambda a=a: a[0],
-                "cas": lambda a=a: f"(old_ == {a[0]} ? {a[1]} : old_)",
-            }[kind]()
-            out.append(
-                f"{{ const {c} old_ = ldm<{c}>(at_ + {k * size}); stm<{c}>(at_ + {k * size}, ({c})({fresh}));"
-            )
-            out.append("" if targets[k] == "_" else self.write(targets[k], "old_"))
-            out.append("}")
-        return [*out, "}"]
-
-    # Control
-
-    def jump(self, label: str, s: Statement) -> str:
-        go = f"goto {_c_name(label)};"
-        if label in self.seen_labels:  # backwards: a loop that does not end is found out
-            return f"if (UNLIKELY(--C->budget < 0)) {self.fault('TOO_LONG', s)}; {go}"
-        return go
-
-    def op_bra(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return [self.jump(ops[0], s)]
-
-    def op_brx(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        cases = " ".join(
-            f"case {k}: {{ {self.jump(label, s)} }}" for k, label in enumerate(self.targets[ops[1]])
-        )
-        return [f"switch ({self.read(ops[0], 'u32')}) {{ {cases} default: {self.fault('TRAP', s)}; }}"]
-
-    def op_ret(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return [self.done()]
-
-    def op_exit(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        if not self.function.entry:
-            raise UnknownPtx("PTX exit inside a device function is not known")
-        return [self.done()]
-
-    def op_trap(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return [self.fault("TRAP", s) + ";"]
-
-    op_brkpt = op_trap
-
-    def op_call(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        groups = list(ops)
-        results = split(groups.pop(0)[1:-1]) if groups[0].startswith("(") else []
-        name = groups.pop(0)
-        arguments = split(groups.pop(0)[1:-1]) if groups else []
-        if groups:
-            raise UnknownPtx("PTX indirect call is not known")
-        places = [self.symbol(x) for x in [*results, *arguments]]
-        if any(p is None for p in places):
-            raise UnknownPtx("PTX call passes what is no parameter")
-        if name == "vprintf":
-            text, values = (f"(const char*)ldm<u64>((u64){p})" for p in places[1:])
-            return [f"C->print({text}, {values}); stm<u32>((u64){places[0]}, 0u);"]
-        if name == "__assertfail":
-            return [f"C->address = ldm<u64>((u64){places[0]}); {self.fault('ASSERTION', s)};"]
-        self.whole.require(name)
-        passed = "".join(f", (u64){p}" for p in places)
-        return [f"{_c_name(name)}(C, t{passed});"]
-
-    # What waits for other threads
-
-    def wait(self, s: Statement, wait: str, **fields: str) -> list[str]:
-        """Leave the thread waiting; execution goes on behind."""
-        self.resumes += 1
-        k = self.resumes
-        settings = " ".join(f"T.{name} = {value};" for name, value in fields.items())
-        return [
-            f"T.wait = {wait}; T.state = WAITING; T.site = {self.whole.site(s)}u; {settings}",
-            f"R.resume = {k}; return; resume_{k}: ;",
-        ]
-
-    def op_bar(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        mods = [m for m in mods if m not in ("aligned", "cta")]
-        if mods == ["warp", "sync"]:
-            return self.wait(s, "WARP_BARRIER", mask=self.read(ops[0], "u32"), kind="0")
-        if mods == ["sync"]:
-            count = self.read(ops[1], "u32") if len(ops) > 1 else "0"
-            return self.wait(s, "BARRIER", mask=self.read(ops[0], "u32"), count=count, flag="0", kind="0")
-        if mods == ["arrive"]:
-            return [f"++C->arrived[{self.read(ops[0], 'u32')} & 15];"]
-        if mods in (["red", "and", "pred"], ["red", "or", "pred"], ["red", "popc", "u32"]):
-            count = self.read(ops[2], "u32") if len(ops) > 3 else "0"
-            brought = self.read(ops[-1], "pred")
-            kind = "0" if "and" in mods else "1"
-            out = self.wait(s, "BARRIER", mask=self.read(ops[1], "u32"), count=count, flag=brought, kind=kind)
-            return [*out, self.write(ops[0], "(u32)T.value" if "popc" in mods else "(bool)T.flag")]
-        raise UnknownPtx(f"PTX instruction {s.opcode} is not known")
-
-    op_barrier = op_bar
-
-    def op_shfl(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        kinds = {"up": "0", "down": "1", "bfly": "2", "idx": "3"}
-        if len(mods) != 3 or mods[0] != "sync" or mods[2] != "b32":
-            raise UnknownPtx(f"PTX instruction {s.opcode} is not known")
-        a, b, c, mask = (self.read(x, "u32") for x in ops[1:5])
-        out = self.wait(s, "SHUFFLE", kind=kinds[mods[1]], mask=mask, value=a, lane_from=b, clamp=c)
-        return [*out, *self.results(ops[0], "(u32)T.value")]
-
-    def results(self, operand: str, value: str) -> list[str]:
-        """Write a value, and the predicate that may come with it."""
-        targets = split(operand, "|")
-        return [self.write(targets[0], value), *(self.write(p, "(bool)T.flag") for p in targets[1:])]
-
-    def op_vote(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        kinds = {"all": "0", "any": "1", "uni": "2", "ballot": "3"}
-        if len(mods) != 3 or mods[0] != "sync":
-            raise UnknownPtx(f"PTX instruction {s.opcode} is not known")
-        out = self.wait(
-            s, "VOTE", kind=kinds[mods[1]], mask=self.read(ops[2], "u32"), flag=self.read(ops[1], "pred")
-        )
-        return [*out, self.write(ops[0], "(u32)T.value" if mods[1] == "ballot" else "(bool)T.flag")]
-
-    def op_match(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        kinds = {"any": "0", "all": "1"}
-        if len(mods) != 3 or mods[1] != "sync":
-            raise UnknownPtx(f"PTX instruction {s.opcode} is not known")
-        out = self.wait(
-            s, "MATCH", kind=kinds[mods[0]], mask=self.read(ops[2], "u32"), value=self.read(ops[1], mods[2])
-        )
-        return [*out, *self.results(ops[0], "(u32)T.value")]
-
-    def op_redux(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        kinds = {"add": 0, "min": 1, "max": 2, "and": 5, "or": 6, "xor": 7}
-        if len(mods) != 3 or mods[0] != "sync" or mods[2][0] == "f":
-            raise UnknownPtx(f"PTX instruction {s.opcode} is not known")
-        kind = kinds[mods[1]] + (2 if mods[2] == "s32" and mods[1] in ("min", "max") else 0)
-        out = self.wait(
-            s, "REDUCE", kind=str(kind), mask=self.read(ops[2], "u32"), value=self.read(ops[1], "u32")
-        )
-        return [*out, self.write(ops[0], "(u32)T.value")]
-
-    def op_activemask(self, s: Statement, mods: list[str], ops: tuple[str, ...]) -> list[str]:
-        return [*self.wait(s, "ACTIVE_MASK", kind="0"), self.write(ops[0], "(u32)T.value")]
 
 
 def _classes(base: str, mods: list[str]) -> dict[str, int]:
