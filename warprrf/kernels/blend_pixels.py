@@ -2,9 +2,9 @@
 
 A warp walks its tile's list 32 entries at a time. Each lane looks at one entry, a ballot tells which of them reach the
 warp's two blocks of pixels, and only those are staged in shared memory, by their lanes, and blended. Warps share
-nothing, so nothing waits for a whole tile. `blend_adjoint` adds up a warp's 15 sums by halves, 16 shuffles in all (each
-step halves the lanes that still hold a number *and* the numbers that a lane still holds), and adds them to the
-Gaussian's row in one coalesced atomic operation.
+nothing, so nothing waits for a whole tile. `blend_adjoint` adds up a warp's 15 sums by halves, 16 shuffles in all (at
+each step a lane gives away half of the numbers that it holds), and adds them to the Gaussian's row in one coalesced
+atomic operation.
 
 Rows, masks and tile lists are those of :mod:`.project` and :mod:`.binning`. These kernels are for CUDA alone.
 """
