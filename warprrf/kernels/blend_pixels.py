@@ -150,7 +150,8 @@ def build_masks(real: Any) -> Any:
 @cache
 def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``, one transmittance rule, and 1 to 4 channels at
-    once; each is compiled when first launched. Launch ``PIXELS`` threads a tile, whole blocks of 256 threads."""
+    once (0 for `strongest`); each is compiled when first launched. Launch ``PIXELS`` threads a tile, in blocks of 256.
+    """
     lanes = lanes_of(real)
     coefficients = wp.types.vector(ROW, real)
     entry = wp.types.vector(STAGED, real)
@@ -297,6 +298,46 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         line = (tile / view.tiles_x) * wp.static(TILE // BLOCK) + b / wp.static(TILE // BLOCK)
         return tile, int(3) << (b & -2), column, line, p
 
+    @wp.func
+    def ray_of(rays: Rays, column: int, line: int, p: int):
+        """A pixel's ray, as across, along, down."""
+        return number(rays.across, column, p), number(rays.along, column, p), number(rays.down, line, p)
+
+    @wp.func
+    def next_entries(
+        place: wp.uint64,
+        lane: int,
+        begin: int,
+        last: int,
+        mine: int,
+        ids: wp.array(dtype=int),
+        masks: wp.array(dtype=int),
+        rows: wp.array(dtype=coefficients),
+        features: wp.array(dtype=real),
+        channels: int,
+        first: int,
+    ):
+        """Stage those of the next 32 entries that reach the warp's blocks ``mine``: a bit each."""
+        settle()  # the last ones have been read
+        reached = bool(False)
+        if begin + lane < last:
+            reached = (masks[begin + lane] & mine) != 0
+            if reached:
+                stage(place, lane, rows, features, ids[begin + lane], channels, first)
+        waiting = ballot(reached)
+        settle()
+        return waiting
+
+    @wp.func
+    def look(row: entry, across: real, along: real, down: real):
+        """g0, g1, g2, g1^2 + g2^2 and |g|^2 of an entry on a ray, and whether the ray passes within the cutoff."""
+        g0 = row[G0] * across + row[G0 + 1] * along + row[G0 + 2] * down
+        g1 = row[G1] * across + row[G1 + 1] * along + row[G1 + 2] * down
+        g2 = row[G2] * across + row[G2 + 1] * along + row[G2 + 2] * down
+        n = g1 * g1 + g2 * g2
+        square = wp.max(g0 * g0 + row[FLAT] * n, real(wp.static(tiny)))
+        return g0, g1, g2, n, square, row[CUT] * square > n and g0 > real(0.0)
+
     @wp.kernel(module="unique", enable_backward=False)
     def blend(
         offset: int,
@@ -325,9 +366,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         x = column * wp.static(BLOCK) + p % wp.static(BLOCK)
         y = line * wp.static(BLOCK) + p / wp.static(BLOCK)
         inside = x < view.width and y < view.height
-        across = number(rays.across, column, p)
-        along = number(rays.along, column, p)
-        down = number(rays.down, line, p)
+        across, along, down = ray_of(rays, column, line, p)
         amax = real(rules.alpha_max)
         tmin = real(rules.transmittance_min)
         transmittance = real(1.0)
@@ -346,23 +385,15 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         last = starts[tile + 1]
         begin = starts[tile]
         while begin < last and ballot(transmittance > tmin) != 0:
-            reached = bool(False)
-            if begin + lane < last:
-                reached = (masks[begin + lane] & mine) != 0
-                if reached:
-                    stage(place, lane, rows, features, ids[begin + lane], channels, first)
-            waiting = ballot(reached)
-            settle()
+            waiting = next_entries(
+                place, lane, begin, last, mine, ids, masks, rows, features, channels, first
+            )
             while waiting != 0:
                 at = lowest_bit(waiting)
                 waiting = waiting & (waiting - 1)
                 row = staged(place, at)
-                g0 = row[G0] * across + row[G0 + 1] * along + row[G0 + 2] * down
-                g1 = row[G1] * across + row[G1 + 1] * along + row[G1 + 2] * down
-                g2 = row[G2] * across + row[G2 + 1] * along + row[G2 + 2] * down
-                n = g1 * g1 + g2 * g2
-                square = wp.max(g0 * g0 + row[FLAT] * n, real(wp.static(tiny)))
-                seen = row[CUT] * square > n and g0 > real(0.0) and transmittance > tmin
+                g0, g1, g2, n, square, near = look(row, across, along, down)
+                seen = near and transmittance > tmin
                 if ballot(seen) == 0:
                     continue
                 # From here on lanes that see nothing go along with a weight of zero.
@@ -386,7 +417,6 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                     c2 += row[wp.static(ROW + 2)] * weight
                 if wp.static(width > 3):
                     c3 += row[wp.static(ROW + 3)] * weight
-            settle()
             begin += wp.static(WARP)
         if not inside:
             return
@@ -438,9 +468,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
             tile, mine, column, line, p = place_of(thread, view)
             x = column * wp.static(BLOCK) + p % wp.static(BLOCK)
             y = line * wp.static(BLOCK) + p / wp.static(BLOCK)
-            across = number(rays.across, column, p)
-            along = number(rays.along, column, p)
-            down = number(rays.down, line, p)
+            across, along, down = ray_of(rays, column, line, p)
             amax = real(rules.alpha_max)
             tmin = real(rules.transmittance_min)
             transmittance = tmin  # outside the image: nothing to blend
@@ -473,23 +501,15 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
             last = starts[tile + 1]
             begin = starts[tile]
             while begin < last and ballot(transmittance > tmin) != 0:
-                reached = bool(False)
-                if begin + lane < last:
-                    reached = (masks[begin + lane] & mine) != 0
-                    if reached:
-                        stage(place, lane, rows, features, ids[begin + lane], channels, first)
-                waiting = ballot(reached)
-                settle()
+                waiting = next_entries(
+                    place, lane, begin, last, mine, ids, masks, rows, features, channels, first
+                )
                 while waiting != 0:
                     at = lowest_bit(waiting)
                     waiting = waiting & (waiting - 1)
                     row = staged(place, at)
-                    g0 = row[G0] * across + row[G0 + 1] * along + row[G0 + 2] * down
-                    g1 = row[G1] * across + row[G1 + 1] * along + row[G1 + 2] * down
-                    g2 = row[G2] * across + row[G2 + 1] * along + row[G2 + 2] * down
-                    n = g1 * g1 + g2 * g2
-                    square = wp.max(g0 * g0 + row[FLAT] * n, real(wp.static(tiny)))
-                    seen = row[CUT] * square > n and g0 > real(0.0) and transmittance > tmin
+                    g0, g1, g2, n, square, near = look(row, across, along, down)
+                    seen = near and transmittance > tmin
                     if ballot(seen) == 0:
                         continue
                     # From here on lanes that see nothing go along with q, lever and alpha of zero, and add nothing.
@@ -553,10 +573,84 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
                     found = warp_sums(s, lane)
                     if lane % 2 == 0:
                         add(sums, gaussian(row[wp.static(WHOSE)]), lane / 2, found)
-                settle()
                 begin += wp.static(WARP)
 
         return blend_adjoint
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def strongest(
+        offset: int,
+        rows: wp.array(dtype=coefficients),
+        nothing: wp.array(dtype=real),
+        ids: wp.array(dtype=int),
+        masks: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        rays: Rays,
+        view: View,
+        rules: Rules,
+        capacity: int,
+        index: wp.array(dtype=int),
+        weight_out: wp.array(dtype=real),
+        range_out: wp.array(dtype=real),
+        total_out: wp.array(dtype=real),
+    ):
+        """The ``capacity`` largest blending weights of each pixel, as ``weights.strongest`` finds them; for a ``width``
+        of 0, with ``nothing`` for features."""
+        thread = offset + wp.tid()
+        lane = thread % wp.static(WARP)
+        tile, mine, column, line, p = place_of(thread, view)
+        x = column * wp.static(BLOCK) + p % wp.static(BLOCK)
+        y = line * wp.static(BLOCK) + p / wp.static(BLOCK)
+        inside = x < view.width and y < view.height
+        across, along, down = ray_of(rays, column, line, p)
+        length = wp.sqrt(across * across + along * along + down * down)
+        amax = real(rules.alpha_max)
+        tmin = real(rules.transmittance_min)
+        transmittance = real(1.0)
+        if not inside:
+            transmittance = tmin
+        total = real(0.0)
+        pixel = y * view.width + x
+        home = pixel * capacity
+        kept = int(0)
+        least = real(0.0)  # of the weights kept once there is no room left, and its place
+        at = int(0)
+        place = shelf()
+        last = starts[tile + 1]
+        begin = starts[tile]
+        while begin < last and ballot(transmittance > tmin) != 0:
+            waiting = next_entries(place, lane, begin, last, mine, ids, masks, rows, nothing, 0, 0)
+            while waiting != 0:
+                row = staged(place, lowest_bit(waiting))
+                waiting = waiting & (waiting - 1)
+                g0, g1, g2, n, square, near = look(row, across, along, down)
+                if near and transmittance > tmin:
+                    inverted = inverse(square)
+                    alpha = wp.min(row[OPACITY] * response(n * inverted), amax)
+                    weight = alpha * transmittance
+                    transmittance = thinned(transmittance, alpha, weight)
+                    total += weight
+                    if weight > least:
+                        if kept == capacity:
+                            for c in range(at, capacity - 1):  # close the gap: the order along the ray stays
+                                index[home + c] = index[home + c + 1]
+                                weight_out[home + c] = weight_out[home + c + 1]
+                                range_out[home + c] = range_out[home + c + 1]
+                            kept = capacity - 1
+                        index[home + kept] = gaussian(row[wp.static(WHOSE)])
+                        weight_out[home + kept] = weight
+                        range_out[home + kept] = row[REACH] * g0 * inverted * length
+                        kept += 1
+                        if kept == capacity:
+                            least = weight_out[home]
+                            at = int(0)
+                            for c in range(1, capacity):
+                                if weight_out[home + c] < least:
+                                    least = weight_out[home + c]
+                                    at = c
+            begin += wp.static(WARP)
+        if inside:
+            total_out[pixel] = total
 
     @wp.kernel(module="unique", enable_backward=False)
     def any_gradient(offset: int, values: wp.array(dtype=real), found: wp.array(dtype=int)):
@@ -568,4 +662,5 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         any_gradient=any_gradient,
         blend=blend,
         blend_adjoint=(adjoint_kernel(False), adjoint_kernel(True)),  # with or without gradients of ranges
+        strongest=strongest,
     )
