@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from threading import local
 from types import ModuleType
@@ -44,6 +44,16 @@ def resolve(device: Any = None) -> wp.Device:
     except (ValueError, RuntimeError, TypeError) as error:
         known = ", ".join(str(d) for d in wp.get_devices())
         raise ValueError(f"device: got {device!r}, expected one of {known}") from error
+
+
+def is_cuda(device: wp.Device) -> bool:
+    """Whether work on ``device`` is laid out for a GPU: ask this, not the device."""
+    return device.is_cuda or _stand_in is not None
+
+
+# A function ``(kernel, dim, inputs, *, adjoint)`` in place of CUDA launches: tests set it, to run on a CPU what is
+# compiled for a GPU. While it is set every device passes for CUDA.
+_stand_in: Callable[..., None] | None = None
 
 
 @cache
@@ -83,7 +93,7 @@ def launch(
     if dim <= 0:
         return
     device = resolve(device)
-    if device.is_cuda:
+    if is_cuda(device):
         bounds: Sequence[int] = [0, dim]
     elif cuts is not None:
         bounds = cuts
@@ -94,9 +104,15 @@ def launch(
         elif threads() > 1:
             count = min(PIECES_PER_THREAD * threads(), max(1, dim // grain))
         bounds = [dim * k // count for k in range(count + 1)]
-    kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
     recording: Recording | None = getattr(_recorder, "active", None)
     arguments = [bounds[0], *inputs]
+    if _stand_in is not None:
+        run = partial(_stand_in, kernel, dim, arguments, adjoint=adjoint)
+        run()
+        if recording is not None:
+            recording.again.append(run)
+        return
+    kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
     if recording is not None:
@@ -112,7 +128,7 @@ def launch(
     if recording is None:
         _issue(pieces_of_whole)
     else:
-        recording.launches.append(pieces_of_whole)
+        recording.again.append(partial(_issue, pieces_of_whole))
 
 
 def _cut(whole: wp.Launch, bounds: Sequence[int]) -> list[wp.Launch]:
@@ -160,7 +176,7 @@ class Recording:
     def __init__(self, work: Callable[[], None], device: Any = None) -> None:
         if getattr(_recorder, "active", None) is not None:
             raise RuntimeError("work: a recording was begun while another is being made, expected launches")
-        self.launches: list[list[wp.Launch]] = []
+        self.again: list[Callable[[], None]] = []
         self.kept: list[Sequence[Any]] = []  # arrays that are only pointers to a packed launch
         on = resolve(device)
         work()
@@ -180,8 +196,8 @@ class Recording:
         """Issue all launches again."""
         if self._graph is not None:
             wp.capture_launch(self._graph)
-        for parts in self.launches:
-            _issue(parts)
+        for issue in self.again:
+            issue()
 
 
 _recorder = local()

@@ -344,12 +344,12 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend: got {backend!r}, expected one of {', '.join(BACKENDS)}")
-    if backend == "embree" and device.is_cuda:
+    if backend == "embree" and _device.is_cuda(device):
         raise ValueError(f'backend: got "embree" on {device}, expected "warp" there, or device="cpu"')
     if backend != "auto":
         return backend
     least = EMBREE_RAYS if o3d.loaded() else EMBREE_RAYS_TO_LOAD
-    return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
+    return "embree" if count >= least and not _device.is_cuda(device) and o3d.installed() else "warp"
 
 
 def _packed_rays(size: int) -> wp.array:
