@@ -183,7 +183,7 @@ class Recording:
         _recorder.active = self
         try:
             if on.is_cuda:
-                with wp.ScopedCapture(on) as capture:
+                with wp.ScopedCapture(on, force_module_load=False) as capture:  # loaded by the run before
                     work()
                 self._graph = capture.graph
             else:

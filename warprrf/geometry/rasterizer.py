@@ -89,13 +89,13 @@ class Prepared:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """The lists shared out to blocks of pixels; a GPU blends without."""
+        """The lists shared out to blocks of pixels, which a CPU blends by."""
+        if self.counts is None:
+            raise RuntimeError(
+                "blocks: a GPU blends without lists of blocks, so nothing was counted for them"
+            )
         device, tiles = self.starts.device, len(self.starts) - 1
-        counts = self.counts
-        if counts is None:
-            counts = wp.empty(tiles, dtype=binning.integers, device=device)
-            launch(binning.block_counts, tiles, [self.masks, self.starts, counts], device=device)
-        sums = np.concatenate([[0], np.cumsum(counts.numpy().ravel(), dtype=np.int64)])
+        sums = np.concatenate([[0], np.cumsum(self.counts.numpy().ravel(), dtype=np.int64)])
         starts = wp.array(sums.astype(np.int32), dtype=int, device=device)
         ids = wp.empty(max(int(sums[-1]), 1), dtype=int, device=device)
         launch(

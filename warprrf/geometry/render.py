@@ -12,6 +12,7 @@ from warprrf.device import check_array, launch, resolve
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.rasterizer import RADIO, RULES, TILE_GRAIN, Blending, Rasterizer
+from warprrf.kernels import blend_pixels as pixel_kernels
 from warprrf.kernels import weights as weight_kernels
 from warprrf.kernels.project import LANES
 
@@ -117,14 +118,26 @@ def blend_weights(
     weight = wp.zeros(shape, dtype=wp.float32, device=raster.device)
     range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
     total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
-    launch(
-        weight_kernels.build(wp.float32, RULES[blending.rule]).strongest,
-        len(view.blocks.starts) - 1,
-        [view.rows, view.blocks.ids, view.blocks.starts, view.rays, view.view, raster.rules, shape[2],
-         LANES, *(a.flatten() for a in (index, weight, range_, total))],
-        device=raster.device,
-        grain=TILE_GRAIN,
-    )  # fmt: skip
+    rule = RULES[blending.rule]
+    out = [a.flatten() for a in (index, weight, range_, total)]
+    if raster.on_gpu:
+        nothing = wp.empty(0, dtype=wp.float32, device=raster.device)
+        launch(
+            pixel_kernels.build(wp.float32, rule, 0).strongest,
+            (len(view.starts) - 1) * pixel_kernels.PIXELS,
+            [view.rows, nothing, view.ids, view.masks, view.starts, view.rays, view.view, raster.rules, shape[2],
+             *out],
+            device=raster.device,
+        )  # fmt: skip
+    else:
+        launch(
+            weight_kernels.build(wp.float32, rule).strongest,
+            len(view.blocks.starts) - 1,
+            [view.rows, view.blocks.ids, view.blocks.starts, view.rays, view.view, raster.rules, shape[2], LANES,
+             *out],
+            device=raster.device,
+            grain=TILE_GRAIN,
+        )  # fmt: skip
     weights, indices, alpha = weight.numpy(), index.numpy(), total.numpy()
     best = np.argmax(weights, axis=2)
     dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]

@@ -94,22 +94,6 @@ def tile_starts(offset: int, keys: wp.array(dtype=int), count: int, starts: wp.a
 
 
 @wp.kernel(enable_backward=False)
-def block_counts(
-    offset: int, masks: wp.array(dtype=int), starts: wp.array(dtype=int), counts: wp.array(dtype=integers)
-):
-    """How many of a tile's entries each of its blocks gets."""
-    tile = offset + wp.tid()
-    found = integers()
-    for j in range(starts[tile], starts[tile + 1]):
-        mask = masks[j]
-        while mask != 0:
-            b = lowest_bit(mask)
-            mask = mask & (mask - 1)
-            found[b] = found[b] + 1
-    counts[tile] = found
-
-
-@wp.kernel(enable_backward=False)
 def fill_blocks(
     offset: int,
     ids: wp.array(dtype=int),

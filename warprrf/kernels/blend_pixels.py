@@ -2,9 +2,9 @@
 
 A warp walks its tile's list 32 entries at a time. Each lane looks at one entry, a ballot tells which of them reach the
 warp's two blocks of pixels, and only those are staged in shared memory, by their lanes, and blended. Warps share
-nothing, so nothing waits for a whole tile. `blend_adjoint` adds up a warp's 15 sums by halves, 16 shuffles in all (each
-step halves the lanes that still hold a number *and* the numbers that a lane still holds), and adds them to the
-Gaussian's row in one coalesced atomic operation.
+nothing, so nothing waits for a whole tile. `blend_adjoint` adds up a warp's 15 sums by halves, 16 shuffles in all (at
+each step a lane gives away half of the numbers that it holds), and adds them to the Gaussian's row in one coalesced
+atomic operation.
 
 Rows, masks and tile lists are those of :mod:`.project` and :mod:`.binning`. These kernels are for CUDA alone.
 """
@@ -36,6 +36,7 @@ from warprrf.kernels.project import (
 )
 
 WARP = 32  # threads
+WHOSE = ROW - 1  # of a staged entry: which Gaussian it is, in a place that rows leave free
 PIXELS = TILE * TILE  # threads of a tile: one a pixel
 STAGED = ROW + CHANNELS  # numbers staged per entry: its row, its features
 
@@ -50,10 +51,9 @@ def ballot(yes: bool) -> int:  # type: ignore[empty-body]
     ...
 
 
-@wp.func_native(_cuda("return __shfl_sync(0xffffffffu, value, lane);", "return value;"))
-def from_lane(value: int, lane: int) -> int:  # type: ignore[empty-body]
-    """What lane ``lane`` of the warp holds; all 32 lanes must ask."""
-    ...
+def _approximate(operation: str, argument: str) -> str:
+    """One instruction of the special function unit, without the steps that denormal numbers take."""
+    return f'float y; asm("{operation}.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"({argument})); return y;'
 
 
 def _halving(name: str) -> str:
@@ -150,7 +150,8 @@ def build_masks(real: Any) -> Any:
 @cache
 def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``, one transmittance rule, and 1 to 4 channels at
-    once; each is compiled when first launched. Launch ``PIXELS`` threads a tile, whole blocks of 256 threads."""
+    once (0 for `strongest`); each is compiled when first launched. Launch ``PIXELS`` threads a tile, in blocks of 256.
+    """
     lanes = lanes_of(real)
     coefficients = wp.types.vector(ROW, real)
     entry = wp.types.vector(STAGED, real)
@@ -182,6 +183,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
     {wide}* mine = ({wide}*)place + lane * {STAGED // per_wide};
     _Pragma("unroll") for (int i = 0; i < {ROW // per_wide}; ++i) mine[i] = parts[i];
     wp::{name}* last = (wp::{name}*)(mine + {ROW // per_wide});
+    last[{WHOSE - ROW}] = {"__int_as_float(k)" if single else "(double)k"};
     const wp::{name}* f = features.data + (wp::int64)k * channels + first;
     _Pragma("unroll") for (int i = 0; i < {width}; ++i) last[i] = f[i];
     """)
@@ -219,6 +221,11 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         """What lane ``lane`` staged."""
         ...
 
+    @wp.func_native(_cuda(f"return {'__float_as_int(staged)' if single else '(int)staged'};", "return 0;"))
+    def gaussian(staged: real) -> int:  # type: ignore[valid-type, empty-body]
+        """The number of the Gaussian in place ``WHOSE`` of a staged entry."""
+        ...
+
     @wp.func_native(_halving(name))
     def warp_sums(s: lanes, lane: int) -> real:  # type: ignore[valid-type, empty-body]
         """The total over the warp of number ``lane / 2`` of 16; all 32 lanes must ask."""
@@ -236,14 +243,14 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
 
     if single:
 
-        @wp.func_native(_cuda("return __fdividef(1.0f, x);", "return 1.0f / x;"))
+        @wp.func_native(_cuda(_approximate("rcp", "x"), "return 1.0f / x;"))
         def inverse(x: real) -> real:  # type: ignore[valid-type, empty-body]
             """1 / x to 1 unit in the last place, for normal x below 2^126."""
             ...
 
-        @wp.func_native(_cuda("return __expf(-0.5f * q);", "return expf(-0.5f * q);"))
+        @wp.func_native(_cuda(_approximate("ex2", "q * -0.72134752f"), "return expf(-0.5f * q);"))
         def response(q: real) -> real:  # type: ignore[valid-type, empty-body]
-            """exp(-q/2) for 0 <= q <= 80, to 3e-6 of itself."""
+            """exp(-q/2) for 0 <= q <= 80, to 4e-6 of itself."""
             ...
 
     else:
@@ -291,6 +298,46 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         line = (tile / view.tiles_x) * wp.static(TILE // BLOCK) + b / wp.static(TILE // BLOCK)
         return tile, int(3) << (b & -2), column, line, p
 
+    @wp.func
+    def ray_of(rays: Rays, column: int, line: int, p: int):
+        """A pixel's ray, as across, along, down."""
+        return number(rays.across, column, p), number(rays.along, column, p), number(rays.down, line, p)
+
+    @wp.func
+    def next_entries(
+        place: wp.uint64,
+        lane: int,
+        begin: int,
+        last: int,
+        mine: int,
+        ids: wp.array(dtype=int),
+        masks: wp.array(dtype=int),
+        rows: wp.array(dtype=coefficients),
+        features: wp.array(dtype=real),
+        channels: int,
+        first: int,
+    ):
+        """Stage those of the next 32 entries that reach the warp's blocks ``mine``: a bit each."""
+        settle()  # the last ones have been read
+        reached = bool(False)
+        if begin + lane < last:
+            reached = (masks[begin + lane] & mine) != 0
+            if reached:
+                stage(place, lane, rows, features, ids[begin + lane], channels, first)
+        waiting = ballot(reached)
+        settle()
+        return waiting
+
+    @wp.func
+    def look(row: entry, across: real, along: real, down: real):
+        """g0, g1, g2, g1^2 + g2^2 and |g|^2 of an entry on a ray, and whether the ray passes within the cutoff."""
+        g0 = row[G0] * across + row[G0 + 1] * along + row[G0 + 2] * down
+        g1 = row[G1] * across + row[G1 + 1] * along + row[G1 + 2] * down
+        g2 = row[G2] * across + row[G2 + 1] * along + row[G2 + 2] * down
+        n = g1 * g1 + g2 * g2
+        square = wp.max(g0 * g0 + row[FLAT] * n, real(wp.static(tiny)))
+        return g0, g1, g2, n, square, row[CUT] * square > n and g0 > real(0.0)
+
     @wp.kernel(module="unique", enable_backward=False)
     def blend(
         offset: int,
@@ -319,9 +366,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         x = column * wp.static(BLOCK) + p % wp.static(BLOCK)
         y = line * wp.static(BLOCK) + p / wp.static(BLOCK)
         inside = x < view.width and y < view.height
-        across = number(rays.across, column, p)
-        along = number(rays.along, column, p)
-        down = number(rays.down, line, p)
+        across, along, down = ray_of(rays, column, line, p)
         amax = real(rules.alpha_max)
         tmin = real(rules.transmittance_min)
         transmittance = real(1.0)
@@ -340,45 +385,38 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         last = starts[tile + 1]
         begin = starts[tile]
         while begin < last and ballot(transmittance > tmin) != 0:
-            k = int(0)
-            reached = bool(False)
-            if begin + lane < last:
-                reached = (masks[begin + lane] & mine) != 0
-                if reached:
-                    k = ids[begin + lane]
-                    stage(place, lane, rows, features, k, channels, first)
-            waiting = ballot(reached)
-            settle()
+            waiting = next_entries(
+                place, lane, begin, last, mine, ids, masks, rows, features, channels, first
+            )
             while waiting != 0:
                 at = lowest_bit(waiting)
                 waiting = waiting & (waiting - 1)
                 row = staged(place, at)
-                whose = from_lane(k, at)
-                g0 = row[G0] * across + row[G0 + 1] * along + row[G0 + 2] * down
-                g1 = row[G1] * across + row[G1 + 1] * along + row[G1 + 2] * down
-                g2 = row[G2] * across + row[G2 + 1] * along + row[G2 + 2] * down
-                n = g1 * g1 + g2 * g2
-                square = wp.max(g0 * g0 + row[FLAT] * n, real(wp.static(tiny)))
-                if row[CUT] * square > n and g0 > real(0.0) and transmittance > tmin:
-                    inverted = inverse(square)
+                g0, g1, g2, n, square, near = look(row, across, along, down)
+                seen = near and transmittance > tmin
+                if ballot(seen) == 0:
+                    continue
+                # From here on lanes that see nothing go along with a weight of zero.
+                inverted = inverse(square)
+                alpha = real(0.0)
+                if seen:
                     alpha = wp.min(row[OPACITY] * response(n * inverted), amax)
-                    weight = alpha * transmittance
-                    transmittance = thinned(transmittance, alpha, weight)
-                    t = row[REACH] * g0 * inverted
-                    depth += weight * t
-                    total += weight
-                    if weight > best:
-                        owner = whose
-                        peak = t
-                        best = weight
-                    c0 += row[wp.static(ROW)] * weight
-                    if wp.static(width > 1):
-                        c1 += row[wp.static(ROW + 1)] * weight
-                    if wp.static(width > 2):
-                        c2 += row[wp.static(ROW + 2)] * weight
-                    if wp.static(width > 3):
-                        c3 += row[wp.static(ROW + 3)] * weight
-            settle()
+                weight = alpha * transmittance
+                transmittance = thinned(transmittance, alpha, weight)
+                t = row[REACH] * g0 * inverted
+                depth += weight * t
+                total += weight
+                if weight > best:
+                    owner = gaussian(row[wp.static(WHOSE)])
+                    peak = t
+                    best = weight
+                c0 += row[wp.static(ROW)] * weight
+                if wp.static(width > 1):
+                    c1 += row[wp.static(ROW + 1)] * weight
+                if wp.static(width > 2):
+                    c2 += row[wp.static(ROW + 2)] * weight
+                if wp.static(width > 3):
+                    c3 += row[wp.static(ROW + 3)] * weight
             begin += wp.static(WARP)
         if not inside:
             return
@@ -430,9 +468,7 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
             tile, mine, column, line, p = place_of(thread, view)
             x = column * wp.static(BLOCK) + p % wp.static(BLOCK)
             y = line * wp.static(BLOCK) + p / wp.static(BLOCK)
-            across = number(rays.across, column, p)
-            along = number(rays.along, column, p)
-            down = number(rays.down, line, p)
+            across, along, down = ray_of(rays, column, line, p)
             amax = real(rules.alpha_max)
             tmin = real(rules.transmittance_min)
             transmittance = tmin  # outside the image: nothing to blend
@@ -465,91 +501,156 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
             last = starts[tile + 1]
             begin = starts[tile]
             while begin < last and ballot(transmittance > tmin) != 0:
-                k = int(0)
-                reached = bool(False)
-                if begin + lane < last:
-                    reached = (masks[begin + lane] & mine) != 0
-                    if reached:
-                        k = ids[begin + lane]
-                        stage(place, lane, rows, features, k, channels, first)
-                waiting = ballot(reached)
-                settle()
+                waiting = next_entries(
+                    place, lane, begin, last, mine, ids, masks, rows, features, channels, first
+                )
                 while waiting != 0:
                     at = lowest_bit(waiting)
                     waiting = waiting & (waiting - 1)
                     row = staged(place, at)
-                    whose = from_lane(k, at)
-                    g0 = row[G0] * across + row[G0 + 1] * along + row[G0 + 2] * down
-                    g1 = row[G1] * across + row[G1 + 1] * along + row[G1 + 2] * down
-                    g2 = row[G2] * across + row[G2 + 1] * along + row[G2 + 2] * down
-                    n = g1 * g1 + g2 * g2
-                    square = wp.max(g0 * g0 + row[FLAT] * n, real(wp.static(tiny)))
-                    seen = row[CUT] * square > n and g0 > real(0.0) and transmittance > tmin
+                    g0, g1, g2, n, square, near = look(row, across, along, down)
+                    seen = near and transmittance > tmin
                     if ballot(seen) == 0:
                         continue
-                    s = lanes()
+                    # From here on lanes that see nothing go along with q, lever and alpha of zero, and add nothing.
+                    inverted = inverse(square)
+                    q = real(0.0)
+                    lever = real(0.0)
+                    kept = real(0.0)
                     if seen:
-                        inverted = inverse(square)
                         q = n * inverted
                         lever = g0 * inverted
                         kept = response(q)
-                        raw = row[OPACITY] * kept
-                        alpha = wp.min(raw, amax)
-                        weight = alpha * transmittance
-                        value = row[wp.static(ROW)] * v[0] + of_weight
-                        s[10] = weight * v[0]
-                        if wp.static(width > 1):
-                            value += row[wp.static(ROW + 1)] * v[1]
-                            s[11] = weight * v[1]
-                        if wp.static(width > 2):
-                            value += row[wp.static(ROW + 2)] * v[2]
-                            s[12] = weight * v[2]
-                        if wp.static(width > 3):
-                            value += row[wp.static(ROW + 3)] * v[3]
-                            s[13] = weight * v[3]
-                        if wp.static(with_range):
-                            value += row[REACH] * lever * of_range
-                        goal -= weight * value
-                        slope = real(
-                            0.0
-                        )  # dL/da times the response: dL/d opacity, where alpha is not clamped
-                        if raw <= amax:
-                            slope = (transmittance * value - behind(goal, alpha)) * kept
-                        y1 = lever * g1
-                        y2 = lever * g2
-                        bent = slope * q
-                        p1 = slope * y1
-                        s[0] = bent
-                        s[1] = p1
-                        s[2] = slope * y2
-                        s[3] = bent * q
-                        s[4] = bent * y1
-                        s[5] = bent * y2
-                        s[6] = p1 * y1
-                        s[7] = p1 * y2
-                        s[9] = slope
-                        s[14] = weight
-                        if wp.static(with_range):
-                            half = weight * of_range * inverted
-                            h0 = row[LIFT] * half * g0
-                            h1 = row[TILT] * half * g1
-                            h2 = row[TILT] * half * g2
-                            s[1] = s[1] - h1
-                            s[2] = s[2] - h2
-                            s[3] = s[3] - real(2.0) * h0 * q
-                            s[4] = s[4] - (h0 * y1 + h1 * q)
-                            s[5] = s[5] - (h0 * y2 + h2 * q)
-                            s[6] = s[6] - real(2.0) * h1 * y1
-                            s[7] = s[7] - (h1 * y2 + h2 * y1)
-                            s[8] = h0
-                        transmittance = thinned(transmittance, alpha, weight)
+                    raw = row[OPACITY] * kept
+                    alpha = wp.min(raw, amax)
+                    weight = alpha * transmittance
+                    value = row[wp.static(ROW)] * v[0] + of_weight
+                    s = lanes()
+                    s[10] = weight * v[0]
+                    if wp.static(width > 1):
+                        value += row[wp.static(ROW + 1)] * v[1]
+                        s[11] = weight * v[1]
+                    if wp.static(width > 2):
+                        value += row[wp.static(ROW + 2)] * v[2]
+                        s[12] = weight * v[2]
+                    if wp.static(width > 3):
+                        value += row[wp.static(ROW + 3)] * v[3]
+                        s[13] = weight * v[3]
+                    if wp.static(with_range):
+                        value += row[REACH] * lever * of_range
+                    goal -= weight * value
+                    slope = real(0.0)  # dL/da times the response: dL/d opacity, where alpha is not clamped
+                    if raw <= amax:
+                        slope = (transmittance * value - behind(goal, alpha)) * kept
+                    y1 = lever * g1
+                    y2 = lever * g2
+                    bent = slope * q
+                    p1 = slope * y1
+                    s[0] = bent
+                    s[1] = p1
+                    s[2] = slope * y2
+                    s[3] = bent * q
+                    s[4] = bent * y1
+                    s[5] = bent * y2
+                    s[6] = p1 * y1
+                    s[7] = p1 * y2
+                    s[9] = slope
+                    s[14] = weight
+                    if wp.static(with_range):
+                        half = weight * of_range * inverted
+                        h0 = row[LIFT] * half * g0
+                        h1 = row[TILT] * half * g1
+                        h2 = row[TILT] * half * g2
+                        s[1] = s[1] - h1
+                        s[2] = s[2] - h2
+                        s[3] = s[3] - real(2.0) * h0 * q
+                        s[4] = s[4] - (h0 * y1 + h1 * q)
+                        s[5] = s[5] - (h0 * y2 + h2 * q)
+                        s[6] = s[6] - real(2.0) * h1 * y1
+                        s[7] = s[7] - (h1 * y2 + h2 * y1)
+                        s[8] = h0
+                    transmittance = thinned(transmittance, alpha, weight)
                     found = warp_sums(s, lane)
                     if lane % 2 == 0:
-                        add(sums, whose, lane / 2, found)
-                settle()
+                        add(sums, gaussian(row[wp.static(WHOSE)]), lane / 2, found)
                 begin += wp.static(WARP)
 
         return blend_adjoint
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def strongest(
+        offset: int,
+        rows: wp.array(dtype=coefficients),
+        nothing: wp.array(dtype=real),
+        ids: wp.array(dtype=int),
+        masks: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        rays: Rays,
+        view: View,
+        rules: Rules,
+        capacity: int,
+        index: wp.array(dtype=int),
+        weight_out: wp.array(dtype=real),
+        range_out: wp.array(dtype=real),
+        total_out: wp.array(dtype=real),
+    ):
+        """The ``capacity`` largest blending weights of each pixel, as ``weights.strongest`` finds them; for a ``width``
+        of 0, with ``nothing`` for features."""
+        thread = offset + wp.tid()
+        lane = thread % wp.static(WARP)
+        tile, mine, column, line, p = place_of(thread, view)
+        x = column * wp.static(BLOCK) + p % wp.static(BLOCK)
+        y = line * wp.static(BLOCK) + p / wp.static(BLOCK)
+        inside = x < view.width and y < view.height
+        across, along, down = ray_of(rays, column, line, p)
+        length = wp.sqrt(across * across + along * along + down * down)
+        amax = real(rules.alpha_max)
+        tmin = real(rules.transmittance_min)
+        transmittance = real(1.0)
+        if not inside:
+            transmittance = tmin
+        total = real(0.0)
+        pixel = y * view.width + x
+        home = pixel * capacity
+        kept = int(0)
+        least = real(0.0)  # of the weights kept once there is no room left, and its place
+        at = int(0)
+        place = shelf()
+        last = starts[tile + 1]
+        begin = starts[tile]
+        while begin < last and ballot(transmittance > tmin) != 0:
+            waiting = next_entries(place, lane, begin, last, mine, ids, masks, rows, nothing, 0, 0)
+            while waiting != 0:
+                row = staged(place, lowest_bit(waiting))
+                waiting = waiting & (waiting - 1)
+                g0, g1, g2, n, square, near = look(row, across, along, down)
+                if near and transmittance > tmin:
+                    inverted = inverse(square)
+                    alpha = wp.min(row[OPACITY] * response(n * inverted), amax)
+                    weight = alpha * transmittance
+                    transmittance = thinned(transmittance, alpha, weight)
+                    total += weight
+                    if weight > least:
+                        if kept == capacity:
+                            for c in range(at, capacity - 1):  # close the gap: the order along the ray stays
+                                index[home + c] = index[home + c + 1]
+                                weight_out[home + c] = weight_out[home + c + 1]
+                                range_out[home + c] = range_out[home + c + 1]
+                            kept = capacity - 1
+                        index[home + kept] = gaussian(row[wp.static(WHOSE)])
+                        weight_out[home + kept] = weight
+                        range_out[home + kept] = row[REACH] * g0 * inverted * length
+                        kept += 1
+                        if kept == capacity:
+                            least = weight_out[home]
+                            at = int(0)
+                            for c in range(1, capacity):
+                                if weight_out[home + c] < least:
+                                    least = weight_out[home + c]
+                                    at = c
+            begin += wp.static(WARP)
+        if inside:
+            total_out[pixel] = total
 
     @wp.kernel(module="unique", enable_backward=False)
     def any_gradient(offset: int, values: wp.array(dtype=real), found: wp.array(dtype=int)):
@@ -561,4 +662,5 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
         any_gradient=any_gradient,
         blend=blend,
         blend_adjoint=(adjoint_kernel(False), adjoint_kernel(True)),  # with or without gradients of ranges
+        strongest=strongest,
     )
