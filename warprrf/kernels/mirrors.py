@@ -23,14 +23,21 @@ class Chains:
     half: wp.array(dtype=wp.vec3d)
 
 
+IN_PLANE = 1.0e-9  # [m]
+
+
 @wp.func
 def step_back(chains: Chains, link: int, here: wp.vec3d):
-    """Where the way from ``here`` to the image of chain ``link`` meets its last patch; whether that is in the box."""
+    """Where the way from ``here`` to the image of chain ``link`` meets its last patch; whether that is in the box.
+
+    What is no further from the patch's plane than ``IN_PLANE`` is in it: rounding does not decide about a way through
+    the edge between two mirrors.
+    """
     p = chains.patch[link]
     side = wp.dot(chains.normal[p], here) - chains.plane_offset[p]
     inside = bool(False)
     point = here
-    if side > wp.float64(0.0):
+    if side > wp.float64(wp.static(IN_PLANE)):
         share = side / wp.max(side + chains.depth[link], wp.float64(1.0e-12))
         point = here + share * (chains.image[link] - here)
         gap = point - chains.middle[p]

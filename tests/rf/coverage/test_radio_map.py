@@ -198,6 +198,7 @@ def test_map_of_a_furnished_room_has_a_hole(found: RadioMap) -> None:
     assert (found.total_path_gain[found.free] >= 0.999999 * found.best_path_gain[found.free]).all()
 
 
+@pytest.mark.on_cuda_too
 def test_all_chains_of_mirrors_are_tried(scene: RadioScene) -> None:
     tree = MirrorTree(Surface.of(scene), TX, 3)
     for order in (1, 2, 3):
@@ -211,7 +212,7 @@ def test_all_chains_of_mirrors_are_tried(scene: RadioScene) -> None:
                     p = level.patch[link, -1]
                     side = tree.normal[p] @ here - tree.offset[p]
                     here = here + side / (side + level.depth[link]) * (level.image[link] - here)
-                    if side <= 0 or (here < tree.low[p] - 0.1).any() or (here > tree.high[p] + 0.1).any():
+                    if side <= 1e-9 or (here < tree.low[p] - 0.1).any() or (here > tree.high[p] + 0.1).any():
                         break
                     way.insert(0, here)
                     link = level.parent[link]
