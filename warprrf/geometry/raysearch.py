@@ -37,8 +37,10 @@ EMBREE_RAYS = 2_000
 EMBREE_RAYS_TO_LOAD = 200_000
 """From this many rays on it is loaded for them: that takes one to three seconds, once a process."""
 
-# Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
-_EMBREE_CHUNK = 262_144
+# Rays that Embree gets at a time, at most: a call and its launches cost 0.5 ms, and a ray 60 bytes.
+_EMBREE_CHUNK = 1_048_576
+# Blocks of 16 rays that are worth another thread: waking it costs 60 us.
+_BLOCKS_A_THREAD = 1_024
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
 _FREE_SHARE = 0.5
@@ -193,16 +195,15 @@ class RaySearch:
             _given(o, wp.vec3d, cpu), _given(d, wp.vec3d, cpu),
         ]  # fmt: skip
         out = [_given(t, wp.float64, cpu), _given(face, wp.int32, cpu)]
-        pieces = _device.threads()
         for first in range(0, count, chunk):
             size = min(chunk, count - first)
             blocks = -(-size // LANES)
             inputs = [first, size, center, self._radius, *given, rays, _given(keys, wp.uint16, cpu)]
-            _device.launch(pack_rays, blocks, inputs, device=cpu, pieces=pieces)
+            _launch(pack_rays, blocks, inputs, cpu)
             met_at, met = _cast(scene, rays, size, keys[:size])
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
             inputs = [first, size, center, self._radius, planes, faces, *given, *hits, *out]
-            _device.launch(place_hits, blocks, inputs, device=cpu, pieces=pieces)
+            _launch(place_hits, blocks, inputs, cpu)
         if face.min() == AGAIN:
             again = np.flatnonzero(face == AGAIN)
             t[again], face[again] = self._nearest_embree(
@@ -246,7 +247,7 @@ class RaySearch:
         faces that block most, if there are such, before the hierarchy is asked. What a search finds is still judged.
         """
         scene, names = self._embree
-        count, pieces = len(sight), _device.threads()
+        count = len(sight)
         chunk = min(count, _EMBREE_CHUNK)
         rays = _packed_rays(chunk)
         keys = np.empty(chunk if len(self._faces) >= _FACES_TO_SORT else 0, dtype=np.uint16)
@@ -263,7 +264,7 @@ class RaySearch:
                 first, size, center, self._radius, *given, _given(known, wp.float64, cpu), rays,
                 _given(kept, wp.uint16, cpu), out,
             ]  # fmt: skip
-            _device.launch(pack_segments, -(-size // LANES), inputs, device=cpu, pieces=pieces)
+            _launch(pack_segments, -(-size // LANES), inputs, cpu)
             part = sight[first:end]
             if mostly_free:
                 which = np.flatnonzero(scene.blocked(_rows_of(rays, size)))
@@ -276,7 +277,7 @@ class RaySearch:
                     first, len(which), chosen, center, self._radius, planes, faces, *given,
                     _given(met, wp.int32, cpu), out,
                 ]  # fmt: skip
-                _device.launch(judge_segments, -(-len(which) // LANES), inputs, device=cpu, pieces=pieces)
+                _launch(judge_segments, -(-len(which) // LANES), inputs, cpu)
             if first == 0 and end < count and len(which):
                 frequent = self._frequent_blockers(met[part[which] == BLOCKED], size)
             mostly_free = int(np.count_nonzero(part == FREE)) > _FREE_SHARE * size
@@ -352,6 +353,12 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
 
 
+def _launch(kernel: Any, blocks: int, inputs: list[Any], cpu: wp.Device) -> None:
+    """Launch a kernel on blocks of rays, on as many threads as they are worth."""
+    pieces = min(_device.threads(), 1 + blocks // _BLOCKS_A_THREAD)
+    _device.launch(kernel, blocks, inputs, device=cpu, pieces=pieces)
+
+
 def _packed_rays(size: int) -> wp.array:
     """Room for ``size`` packed rays, the same at each call in a thread: pages that are new cost more than packing."""
     if getattr(_scratch, "rays", None) is None or len(_scratch.rays) < 2 * size:
@@ -388,7 +395,7 @@ def _picked(rays: wp.array, which: np.ndarray) -> np.ndarray:
     """Packed rays that ``which`` names, in this order."""
     picked = wp.empty(2 * len(which), dtype=wp.vec3, device="cpu")
     inputs = [len(which), rays, _given(which, wp.int64, picked.device), picked]
-    _device.launch(pick_rays, -(-len(which) // LANES), inputs, device="cpu", pieces=_device.threads())
+    _launch(pick_rays, -(-len(which) // LANES), inputs, picked.device)
     return _rows_of(picked, len(which))
 
 
