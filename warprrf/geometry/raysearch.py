@@ -39,6 +39,8 @@ EMBREE_RAYS_TO_LOAD = 200_000
 
 # Rays that Embree gets at a time, at most: a call and its launches cost 0.5 ms, and a ray 60 bytes.
 _EMBREE_CHUNK = 1_048_576
+# Copies of rays that are kept for the next ones, none longer than a chunk: those of a hit, and of one made before it.
+_ROOMS = 4
 # Blocks of 16 rays that are worth another thread: waking it costs 60 us.
 _BLOCKS_A_THREAD = 1_024
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
@@ -153,19 +155,32 @@ class RaySearch:
         return scene, names if len(names) < len(self._faces) else names[:0]
 
     def nearest(
-        self, o: np.ndarray, d: np.ndarray, *, reach: np.ndarray, clearance: float, device: Any, backend: str
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        *,
+        reach: np.ndarray,
+        clearance: float,
+        device: Any,
+        backend: str,
+        own: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Distance (N,) [m], float64, and face (N,) of what rays meet beyond ``clearance`` [m]; inf and -1 at a miss.
 
-        ``o`` and ``d`` hold one row or N, ``reach`` [m] one number or N: no need to look further.
+        ``o`` and ``d`` hold one row or N, ``reach`` [m] one number or N: no need to look further. ``own``, if given,
+        become copies of both.
 
         Raises:
             ValueError: if a ray is not finite or has no direction, or on an unknown back end, or Embree on a GPU.
         """
         where = _device.resolve(device)
         count = max(len(o), len(d)) if min(len(o), len(d)) else 0
-        if choose_backend(backend, where, count) == "embree" and count:
-            t, face = self._nearest_embree(o, d, clearance, where)
+        by_embree = choose_backend(backend, where, count) == "embree" and count > 0
+        for copy, rays in zip(own or (), (o, d), strict=False):
+            if not by_embree or len(rays) == 1:  # Embree's are copied where they are packed
+                copy[:] = rays
+        if by_embree:
+            t, face = self._nearest_embree(o, d, clearance, where, own=own)
         else:
             mesh, planes = self._built(where)
             distance = wp.empty(count, dtype=wp.float64, device=where)
@@ -181,7 +196,13 @@ class RaySearch:
         return t, face
 
     def _nearest_embree(
-        self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device, start: np.ndarray | None = None
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        clearance: float,
+        cpu: wp.Device,
+        start: np.ndarray | None = None,
+        own: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         scene, names = self._embree
         count = max(len(o), len(d))
@@ -195,10 +216,11 @@ class RaySearch:
             _given(o, wp.vec3d, cpu), _given(d, wp.vec3d, cpu),
         ]  # fmt: skip
         out = [_given(t, wp.float64, cpu), _given(face, wp.int32, cpu)]
+        copies = [_given(copy, wp.vec3d, cpu) for copy in own or (np.empty((0, 3)), np.empty((0, 3)))]
         for first in range(0, count, chunk):
             size = min(chunk, count - first)
             blocks = -(-size // LANES)
-            inputs = [first, size, center, self._radius, *given, rays, _given(keys, wp.uint16, cpu)]
+            inputs = [first, size, center, self._radius, *given, rays, _given(keys, wp.uint16, cpu), *copies]
             _launch(pack_rays, blocks, inputs, cpu)
             met_at, met = _cast(scene, rays, size, keys[:size])
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
@@ -400,6 +422,31 @@ def _picked(rays: wp.array, which: np.ndarray) -> np.ndarray:
 
 
 _scratch = local()
+_rooms: list[np.ndarray] = []
+
+
+class _Lease:
+    """Room for rows that goes back to ``_rooms`` once no array on it is left."""
+
+    def __init__(self, room: np.ndarray, count: int) -> None:
+        self._room = room
+        self.__array_interface__ = room[:count].__array_interface__
+
+    def __del__(self) -> None:
+        if len(_rooms) < _ROOMS and len(self._room) <= _EMBREE_CHUNK:
+            _rooms.append(self._room)
+
+
+def room_for_copy(rays: np.ndarray) -> np.ndarray:
+    """Room for a copy of ``rays``, the same again once its last array is gone: new pages cost more than the copy."""
+    if len(rays) < EMBREE_RAYS:
+        return np.empty_like(rays)
+    room = np.empty((0, 3))
+    while _rooms and len(room) < len(rays):
+        room = _rooms.pop()
+    if len(room) < len(rays):
+        room = np.empty_like(rays)
+    return np.asarray(_Lease(room, len(rays)))
 
 
 def rows(array: np.ndarray, index: np.ndarray) -> np.ndarray:
