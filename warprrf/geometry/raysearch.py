@@ -41,7 +41,8 @@ EMBREE_RAYS_TO_LOAD = 200_000
 _EMBREE_CHUNK = 1_048_576
 # Copies of rays that are kept for the next ones, none longer than a chunk: those of a hit, and of one made before it.
 _ROOMS = 4
-# Blocks of 16 rays that are worth another thread: waking it costs 60 us.
+# Blocks of 16 rays that are worth another thread: waking it costs 60 us. Where a kernel only moves rays, memory limits
+# it: two threads of two take as long as one, and twice the processor.
 _BLOCKS_A_THREAD = 1_024
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
@@ -221,7 +222,7 @@ class RaySearch:
             size = min(chunk, count - first)
             blocks = -(-size // LANES)
             inputs = [first, size, center, self._radius, *given, rays, _given(keys, wp.uint16, cpu), *copies]
-            _launch(pack_rays, blocks, inputs, cpu)
+            _launch(pack_rays, blocks, inputs, cpu, streams=True)
             met_at, met = _cast(scene, rays, size, keys[:size])
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
             inputs = [first, size, center, self._radius, planes, faces, *given, *hits, *out]
@@ -286,7 +287,7 @@ class RaySearch:
                 first, size, center, self._radius, *given, _given(known, wp.float64, cpu), rays,
                 _given(kept, wp.uint16, cpu), out,
             ]  # fmt: skip
-            _launch(pack_segments, -(-size // LANES), inputs, cpu)
+            _launch(pack_segments, -(-size // LANES), inputs, cpu, streams=len(known) == 0)
             part = sight[first:end]
             if mostly_free:
                 which = np.flatnonzero(scene.blocked(_rows_of(rays, size)))
@@ -375,16 +376,17 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
 
 
-def _launch(kernel: Any, blocks: int, inputs: list[Any], cpu: wp.Device) -> None:
-    """Launch a kernel on blocks of rays, on as many threads as they are worth."""
-    pieces = min(_device.threads(), 1 + blocks // _BLOCKS_A_THREAD)
+def _launch(kernel: Any, blocks: int, inputs: list[Any], cpu: wp.Device, *, streams: bool = False) -> None:
+    """Launch a kernel on blocks of rays, on as many threads as they are worth; half of all if it ``streams`` them."""
+    threads = max(1, _device.threads() // 2) if streams else _device.threads()
+    pieces = min(threads, 1 + blocks // _BLOCKS_A_THREAD)
     _device.launch(kernel, blocks, inputs, device=cpu, pieces=pieces)
 
 
 def _packed_rays(size: int) -> wp.array:
     """Room for ``size`` packed rays, the same at each call in a thread: pages that are new cost more than packing."""
     if getattr(_scratch, "rays", None) is None or len(_scratch.rays) < 2 * size:
-        _scratch.rays = wp.empty(2 * size, dtype=wp.vec3, device="cpu")
+        _scratch.rays = _given(_aligned(2 * size, np.float32), wp.vec3, wp.get_device("cpu"))
     return _scratch.rays
 
 
@@ -425,6 +427,14 @@ _scratch = local()
 _rooms: list[np.ndarray] = []
 
 
+def _aligned(count: int, dtype: Any) -> np.ndarray:
+    """Room for ``count`` rows of three numbers, on a boundary of 64 bytes as kernels write past the cache."""
+    size = 3 * count * np.dtype(dtype).itemsize
+    room = np.empty(size + 64, dtype=np.uint8)
+    skip = -room.ctypes.data % 64
+    return room[skip : skip + size].view(dtype).reshape(count, 3)
+
+
 class _Lease:
     """Room for rows that goes back to ``_rooms`` once no array on it is left."""
 
@@ -440,12 +450,12 @@ class _Lease:
 def room_for_copy(rays: np.ndarray) -> np.ndarray:
     """Room for a copy of ``rays``, the same again once its last array is gone: new pages cost more than the copy."""
     if len(rays) < EMBREE_RAYS:
-        return np.empty_like(rays)
+        return _aligned(len(rays), np.float64)
     room = np.empty((0, 3))
     while _rooms and len(room) < len(rays):
         room = _rooms.pop()
     if len(room) < len(rays):
-        room = np.empty_like(rays)
+        room = _aligned(len(rays), np.float64)
     return np.asarray(_Lease(room, len(rays)))
 
 

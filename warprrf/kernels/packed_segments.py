@@ -261,7 +261,9 @@ def pack_segments(
     if blockers.shape[0] > 0:
         blocked = known_to_block(blockers, i, center, radius, clearance, starts, ends)
     tell(sight, i, blocked)
-    plain = positive_bits_of_singles(singles(_MOST) - scale) & positive_bits_of_singles(singles(_MOST) - square)
+    plain = positive_bits_of_singles(singles(_MOST) - scale) & positive_bits_of_singles(
+        singles(_MOST) - square
+    )
     rare = wp.static(EVERY) - plain
     while rare != 0:
         j = lowest_bit(rare)

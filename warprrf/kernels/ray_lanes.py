@@ -34,6 +34,7 @@ EVERY = (1 << LANES) - 1
 """A bit for each lane."""
 HALF_LANES = f"""
     typedef wp::float64 half_lanes __attribute__((vector_size({_HALF} * sizeof(wp::float64)), aligned(8)));
+    typedef wp::float64 line __attribute__((vector_size({_HALF} * sizeof(wp::float64))));
     typedef wp::float64 quarter __attribute__((vector_size(4 * sizeof(wp::float64)), aligned(8)));
     typedef wp::float32 narrow_lanes __attribute__((vector_size({LANES} * sizeof(wp::float32)), aligned(4)));
     typedef wp::float32 narrow_half __attribute__((vector_size({_HALF} * sizeof(wp::float32)), aligned(4)));
@@ -173,10 +174,12 @@ _ROUND = f"""
 def _relative(rows: str, source: str) -> str:
     """C++ that makes ``rows`` the 16 rows ``i`` to ``i + 16`` of ``source``, or its only one, less the centre."""
     patterns = ", ".join(
-        "half_lanes{" + ", ".join(f"center[{(_HALF * n + j) % 3}]" for j in range(_HALF)) + "}" for n in range(3)
+        "half_lanes{" + ", ".join(f"center[{(_HALF * n + j) % 3}]" for j in range(_HALF)) + "}"
+        for n in range(3)
     )
     alone = ", ".join(
-        "half_lanes{" + ", ".join(f"only[{(_HALF * n + j) % 3}]" for j in range(_HALF)) + "}" for n in range(3)
+        "half_lanes{" + ", ".join(f"only[{(_HALF * n + j) % 3}]" for j in range(_HALF)) + "}"
+        for n in range(3)
     )
     return f"""
     half_lanes {rows}[6];
@@ -242,11 +245,11 @@ def _pack() -> str:
             two = [ray + _HALF * pair if pair < 2 else -1 for ray, pair in places]
             third = [j if pair < 2 else _HALF + ray for j, (ray, pair) in enumerate(places)]
             whole = _shuffle(_shuffle(f"p0{side}", f"p1{side}", two), f"p2{side}", third)
-            stores.append(f"to[{3 * side + part}] = {whole};")
+            stores.append(f"__builtin_nontemporal_store((line){whole}, to + {3 * side + part});")
     return f"""{HALF_LANES}
     const narrow_lanes x = *(const narrow_lanes*)&sx, y = *(const narrow_lanes*)&sy, z = *(const narrow_lanes*)&sz;
     const narrow_lanes u = *(const narrow_lanes*)&dx, v = *(const narrow_lanes*)&dy, w = *(const narrow_lanes*)&dz;
-    half_lanes* to = (half_lanes*)(rays.data + 2 * k);
+    line* to = (line*)(rays.data + 2 * k);
     {" ".join(pairs)}
     {" ".join(stores)}
     """
@@ -263,17 +266,20 @@ def put_rays(
     dy: singles,  # type: ignore[valid-type]
     dz: singles,  # type: ignore[valid-type]
 ) -> None:
-    """Write rays ``k`` to ``k + 16``, start and direction each."""
+    """Write rays ``k`` to ``k + 16``, start and direction each, past the cache.
+
+    The first ray lies on a boundary of 64 bytes. The lock that the interpreter takes next makes them seen by others.
+    """
     ...
 
 
 @wp.func_native(f"""{HALF_LANES}
     const half_lanes* from = (const half_lanes*)(source.data + i);
-    half_lanes* to = (half_lanes*)(copy.data + i);
-    for (int n = 0; n < 6; ++n) to[n] = from[n];
+    line* to = (line*)(copy.data + i);
+    for (int n = 0; n < 6; ++n) __builtin_nontemporal_store((line)from[n], to + n);
 """)
 def copy_rows(source: wp.array(dtype=wp.vec3d), copy: wp.array(dtype=wp.vec3d), i: int) -> None:
-    """Copy rows ``i`` to ``i + 16``."""
+    """Copy rows ``i`` to ``i + 16``, past the cache; the copy's first lies on a boundary of 64 bytes."""
     ...
 
 
