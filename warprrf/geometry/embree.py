@@ -13,7 +13,6 @@ import numpy as np
 from warprrf.device import threads
 from warprrf.geometry import o3d
 
-
 # Rays that are worth another thread: starting and stopping it takes 0.1 ms of a processor, as a thousand rays do.
 _RAYS_A_THREAD = 4_096
 

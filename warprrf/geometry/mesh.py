@@ -15,7 +15,8 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.geometry.raysearch import Hit, RaySearch, ray_arrays, room_for_copy
+from warprrf.geometry.ray_room import room_for_copy
+from warprrf.geometry.raysearch import Hit, RaySearch, ray_arrays
 from warprrf.kernels.rays import closest_faces
 
 ENDPOINT_CLEARANCE = 1e-4

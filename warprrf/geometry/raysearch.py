@@ -7,7 +7,6 @@ Both answer in float32 which face a ray meets; distances [m] are then taken in f
 from __future__ import annotations
 
 from functools import cached_property
-from threading import local
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.geometry import embree, o3d
+from warprrf.geometry.ray_room import ROWS_KEPT, room_for_packed
 from warprrf.kernels.lanes import LANES
 from warprrf.kernels.packed_rays import pack_rays, pick_rays, place_hits
 from warprrf.kernels.packed_segments import judge_segments, pack_segments
@@ -38,9 +38,7 @@ EMBREE_RAYS_TO_LOAD = 200_000
 """From this many rays on it is loaded for them: that takes one to three seconds, once a process."""
 
 # Rays that Embree gets at a time, at most: a call and its launches cost 0.5 ms, and a ray 60 bytes.
-_EMBREE_CHUNK = 1_048_576
-# Copies of rays that are kept for the next ones, none longer than a chunk: those of a hit, and of one made before it.
-_ROOMS = 4
+_EMBREE_CHUNK = ROWS_KEPT
 # Blocks of 16 rays that are worth another thread: waking it costs 60 us. Where a kernel only moves rays, memory limits
 # it: two threads of two take as long as one, and twice the processor.
 _BLOCKS_A_THREAD = 1_024
@@ -209,7 +207,7 @@ class RaySearch:
         count = max(len(o), len(d))
         chunk = min(count, _EMBREE_CHUNK)
         t, face = np.empty(count), np.empty(count, dtype=np.int32)
-        rays = _packed_rays(chunk)
+        rays = room_for_packed(chunk)
         keys = np.empty(chunk if len(self._faces) >= _FACES_TO_SORT else 0, dtype=np.uint16)
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [
@@ -272,7 +270,7 @@ class RaySearch:
         scene, names = self._embree
         count = len(sight)
         chunk = min(count, _EMBREE_CHUNK)
-        rays = _packed_rays(chunk)
+        rays = room_for_packed(chunk)
         keys = np.empty(chunk if len(self._faces) >= _FACES_TO_SORT else 0, dtype=np.uint16)
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [clearance, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu)]
@@ -383,13 +381,6 @@ def _launch(kernel: Any, blocks: int, inputs: list[Any], cpu: wp.Device, *, stre
     _device.launch(kernel, blocks, inputs, device=cpu, pieces=pieces)
 
 
-def _packed_rays(size: int) -> wp.array:
-    """Room for ``size`` packed rays, the same at each call in a thread: pages that are new cost more than packing."""
-    if getattr(_scratch, "rays", None) is None or len(_scratch.rays) < 2 * size:
-        _scratch.rays = _given(_aligned(2 * size, np.float32), wp.vec3, wp.get_device("cpu"))
-    return _scratch.rays
-
-
 def _rows_of(rays: wp.array, size: int) -> np.ndarray:
     """The first ``size`` packed rays, as Embree takes them."""
     packed: np.ndarray = rays.numpy().reshape(-1, 6)[:size]
@@ -421,42 +412,6 @@ def _picked(rays: wp.array, which: np.ndarray) -> np.ndarray:
     inputs = [len(which), rays, _given(which, wp.int64, picked.device), picked]
     _launch(pick_rays, -(-len(which) // LANES), inputs, picked.device)
     return _rows_of(picked, len(which))
-
-
-_scratch = local()
-_rooms: list[np.ndarray] = []
-
-
-def _aligned(count: int, dtype: Any) -> np.ndarray:
-    """Room for ``count`` rows of three numbers, on a boundary of 64 bytes as kernels write past the cache."""
-    size = 3 * count * np.dtype(dtype).itemsize
-    room = np.empty(size + 64, dtype=np.uint8)
-    skip = -room.ctypes.data % 64
-    return room[skip : skip + size].view(dtype).reshape(count, 3)
-
-
-class _Lease:
-    """Room for rows that goes back to ``_rooms`` once no array on it is left."""
-
-    def __init__(self, room: np.ndarray, count: int) -> None:
-        self._room = room
-        self.__array_interface__ = room[:count].__array_interface__
-
-    def __del__(self) -> None:
-        if len(_rooms) < _ROOMS and len(self._room) <= _EMBREE_CHUNK:
-            _rooms.append(self._room)
-
-
-def room_for_copy(rays: np.ndarray) -> np.ndarray:
-    """Room for a copy of ``rays``, the same again once its last array is gone: new pages cost more than the copy."""
-    if len(rays) < EMBREE_RAYS:
-        return _aligned(len(rays), np.float64)
-    room = np.empty((0, 3))
-    while _rooms and len(room) < len(rays):
-        room = _rooms.pop()
-    if len(room) < len(rays):
-        room = _aligned(len(rays), np.float64)
-    return np.asarray(_Lease(room, len(rays)))
 
 
 def rows(array: np.ndarray, index: np.ndarray) -> np.ndarray:

@@ -127,7 +127,9 @@ def pack_segment(
     scale = rounding_scale(origin, radius)
     step = ROUNDING * scale
     inner = length - wp.float64(2.0) * clearance
-    reach = wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan))
+    reach = wp.where(
+        inner > wp.float64(0.0), wp.min(inner + wp.float64(2.0) * step, wp.float64(_MOST)), wp.float64(wp.nan)
+    )
     rays[2 * k] = narrow(origin + (clearance - step) * unit)
     rays[2 * k + 1] = narrow(reach * unit)
     sight[i] = wp.int8(wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD))

@@ -29,7 +29,7 @@ roots_of_singles = _of_singles.roots
 
 _HALF = LANES // 2  # numbers of float64 that a register of 512 bits holds
 _AHEAD = 16  # blocks of 16 rows, 6 KiB
-_CELLS = 4  # that a key tells apart along each axis
+_CELLS = 16  # that a key tells apart along each axis: with eight octants, all that 15 bits hold
 EVERY = (1 << LANES) - 1
 """A bit for each lane."""
 HALF_LANES = f"""
@@ -163,11 +163,11 @@ def _row_part(c: int) -> Any:
     return row_part
 
 
+_HALVES = [f"__builtin_convertvector(r[2 * n + {h}], narrow_half)" for h in (0, 1)]
 # Rows turn into columns after they are rounded: that takes a third of the shuffles.
 _ROUND = f"""
     narrow_lanes* to = (narrow_lanes*)&out;
-    for (int n = 0; n < 3; ++n)
-        to[n] = {_shuffle("__builtin_convertvector(r[2 * n], narrow_half)", "__builtin_convertvector(r[2 * n + 1], narrow_half)", list(range(LANES)))};
+    for (int n = 0; n < 3; ++n) to[n] = {_shuffle(*_HALVES, list(range(LANES)))};
 """
 
 
