@@ -343,6 +343,8 @@ def test_bad_rays_are_refused_by_both(backend):
         mesh.cast([0, 0, 1], [[1, 0, 0], [0, np.inf, 0]], backend=backend, device="cpu")
     with pytest.raises(ValueError, match="origins.*NaN"):
         mesh.cast([[0, 0, 1], [0, 0, np.nan]], [1, 0, 0], backend=backend, device="cpu")
+    with pytest.raises(ValueError, match="b: got 30000 values that are NaN"):
+        mesh.visible([0, 0, 1], np.full((10_000, 3), np.nan), backend=backend, device="cpu")
     assert mesh.cast(np.zeros((0, 3)), np.zeros((0, 3)), backend=backend, device="cpu").t.shape == (0,)
 
 

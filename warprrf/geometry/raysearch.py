@@ -45,7 +45,7 @@ _BLOCKS_A_THREAD = 1_024
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
 _FREE_SHARE = 0.5
-_PROBE = 2_048
+_PROBE = 1_024
 # Faces that block most, asked before the hierarchy: at most so many, each the first to block this share of segments at
 # least. Asking costs a segment 1 ns a face, and searching it 100 to 500.
 _BLOCKERS = 16
@@ -299,9 +299,11 @@ class RaySearch:
                     _given(met, wp.int32, cpu), out,
                 ]  # fmt: skip
                 _launch(judge_segments, -(-len(which) // LANES), inputs, cpu)
-            if first == 0 and end < count and len(which):
-                frequent = self._frequent_blockers(met[part[which] == BLOCKED], size)
+            if end == count:
+                break
             mostly_free = int(np.count_nonzero(part == FREE)) > _FREE_SHARE * size
+            if first == 0 and len(which) and not mostly_free:
+                frequent = self._frequent_blockers(met[part[which] == BLOCKED], size)
         if sight.min() == AGAIN:
             again = np.flatnonzero(sight == AGAIN)
             start = rows(a, again)
