@@ -45,7 +45,7 @@ _BLOCKS_A_THREAD = 1_024
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
 _FREE_SHARE = 0.5
-_PROBE = 1_024
+_PROBE = 2_048
 # Faces that block most, asked before the hierarchy: at most so many, each the first to block this share of segments at
 # least. Asking costs a segment 1 ns a face, and searching it 100 to 500.
 _BLOCKERS = 16
