@@ -200,9 +200,28 @@ class RaySearch:
         d: np.ndarray,
         clearance: float,
         cpu: wp.Device,
+        own: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        t, face = self._embree_pass(o, d, clearance, cpu, own=own)
+        again = np.flatnonzero(face == AGAIN if face.min() == AGAIN else [])
+        # A ray that leaves its face at a slope of 1e-5 meets it for thousands of passes: few rays take more than two.
+        while len(again):
+            t[again], face[again] = self._embree_pass(
+                rows(o, again), rows(d, again), clearance, cpu, start=t[again]
+            )
+            again = again[face[again] == AGAIN]
+        return t, face
+
+    def _embree_pass(
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        clearance: float,
+        cpu: wp.Device,
         start: np.ndarray | None = None,
         own: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`nearest`, but rays that met a surface at their start are AGAIN, to go on from the distance."""
         scene, names = self._embree
         count = max(len(o), len(d))
         chunk = min(count, _EMBREE_CHUNK)
@@ -225,11 +244,6 @@ class RaySearch:
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
             inputs = [first, size, center, self._radius, planes, faces, *given, *hits, *out]
             _launch(place_hits, blocks, inputs, cpu)
-        if face.min() == AGAIN:
-            again = np.flatnonzero(face == AGAIN)
-            t[again], face[again] = self._nearest_embree(
-                rows(o, again), rows(d, again), clearance, cpu, t[again]
-            )
         return t, face
 
     def free(
