@@ -343,6 +343,8 @@ def test_bad_rays_are_refused_by_both(backend):
         mesh.cast([0, 0, 1], [[1, 0, 0], [0, np.inf, 0]], backend=backend, device="cpu")
     with pytest.raises(ValueError, match="origins.*NaN"):
         mesh.cast([[0, 0, 1], [0, 0, np.nan]], [1, 0, 0], backend=backend, device="cpu")
+    with pytest.raises(ValueError, match="b: got 30000 values that are NaN"):
+        mesh.visible([0, 0, 1], np.full((10_000, 3), np.nan), backend=backend, device="cpu")
     assert mesh.cast(np.zeros((0, 3)), np.zeros((0, 3)), backend=backend, device="cpu").t.shape == (0,)
 
 
@@ -356,3 +358,56 @@ def test_points_and_normals_are_computed_when_asked_for(backend):
     np.testing.assert_allclose(hit.point, origin + t[:, None] * unit, atol=1e-12)
     assert ((hit.normal * unit).sum(axis=1) > 0).all()
     np.testing.assert_allclose(np.abs(hit.normal).max(axis=1), 1.0)
+
+
+def test_points_stand_whatever_is_cast_later(backend):
+    """Copies of rays lie in memory that is used again, but not while a hit may still ask for them."""
+    mesh, rng = Mesh(*box(*ROOM)), np.random.default_rng(20)
+    origin, toward, hits = rng.uniform(0.5, 1.5, (6, 3_001, 3)), rng.standard_normal((6, 3_001, 3)), []
+    for o, d in zip(origin, toward, strict=True):
+        given = o.copy(), d.copy()
+        hits.append(mesh.cast(*given, backend=backend, device="cpu"))
+        for array in given:
+            array[:] = np.nan
+        mesh.cast(d, o, backend=backend, device="cpu")
+    for o, d, hit in zip(origin, toward, hits, strict=True):
+        unit = d / np.linalg.norm(d, axis=1, keepdims=True)
+        np.testing.assert_allclose(
+            hit.point, o + box_exit(o, unit, *ROOM)[:, None] * unit, rtol=0, atol=1e-11
+        )
+
+
+def test_segments_too_long_for_float32_are_judged_and_those_too_long_for_float64_refused(backend):
+    mesh, outward = sphere(), directions(35, seed=21)
+    start = np.where(np.arange(35)[:, None] % 2, 1.0, 9.0) * outward
+    start[::7] = 1e17 * outward[::7]
+    for length in (1e16, 1e25, 1e60):
+        seen = mesh.visible(start, length * outward, backend=backend, device="cpu")
+        expected = np.arange(35) % 2 == 0
+        expected[::7] = True
+        np.testing.assert_array_equal(seen, expected)
+    for place in (3, 34):
+        end = 7.0 * outward
+        end[place] *= 1e200
+        with pytest.raises(ValueError, match="a, b: got numbers too large"):
+            mesh.visible(start, end, backend=backend, device="cpu")
+
+
+@no_embree
+def test_rays_that_leave_their_surface_slowly_meet_the_next_one(monkeypatch):
+    """In float32 the floor lies higher than it is, and they meet it over and over, here for thousands of steps."""
+    rng, casts, floor = np.random.default_rng(22), [], 0.1
+    low, high = np.array([-7.0, -6.0, floor]), np.array([8.0, 6.0, 4.07])
+    origin = np.column_stack([rng.uniform(-6, 7, 300), rng.uniform(-5, 5, 300), np.full(300, floor)])
+    azimuth, slope = rng.uniform(-np.pi, np.pi, 300), 10.0 ** rng.uniform(-5, -3, 300)
+    d = np.column_stack([np.cos(azimuth), np.sin(azimuth), slope])
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    cast = raysearch.embree.EmbreeScene.cast
+    monkeypatch.setattr(
+        raysearch.embree.EmbreeScene, "cast", lambda self, r: casts.append(len(r)) or cast(self, r)
+    )
+    hit = Mesh(*box(low, high)).cast(origin, d, backend="embree", device="cpu")
+    t = box_exit(origin, d, low, high)
+    foot = t * d[:, 2] < 1e-5  # there float32 may give either face
+    assert foot.mean() < 0.1 and len(casts) > 1_000
+    np.testing.assert_allclose(hit.t[~foot], t[~foot], rtol=1e-9)

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
+from warprrf.geometry.ray_room import room_for_copy
 from warprrf.geometry.raysearch import Hit, RaySearch, ray_arrays
 from warprrf.kernels.rays import closest_faces
 
@@ -155,16 +156,13 @@ class Mesh:
             ImportError: if Embree is asked for and Open3D is not installed.
         """
         o, d = ray_arrays(origins, directions)
+        # Points may be asked for after the caller has changed its arrays.
+        own = room_for_copy(o), room_for_copy(d)
         t, face = self._rays.nearest(
-            o, d, reach=np.full(1, np.inf), clearance=0.0, device=device, backend=backend
+            o, d, reach=np.full(1, np.inf), clearance=0.0, device=device, backend=backend, own=own
         )
         if face.min(initial=0) < 0 and self.is_closed:
             self._rays.recast(o, d, t, face, device=device, backend=backend)
-        # Points may be asked for after the caller has changed its arrays.
-        own = [
-            x if x.flags.owndata and x is not given else x.copy()
-            for x, given in ((o, origins), (d, directions))
-        ]
         return Hit(t, face, self.face_normals, *own)
 
     def visible(

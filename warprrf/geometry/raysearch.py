@@ -7,7 +7,6 @@ Both answer in float32 which face a ray meets; distances [m] are then taken in f
 from __future__ import annotations
 
 from functools import cached_property
-from threading import local
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.geometry import embree, o3d
+from warprrf.geometry.ray_room import ROWS_KEPT, room_for_packed
 from warprrf.kernels.lanes import LANES
 from warprrf.kernels.packed_rays import pack_rays, pick_rays, place_hits
 from warprrf.kernels.packed_segments import judge_segments, pack_segments
@@ -37,8 +37,11 @@ EMBREE_RAYS = 2_000
 EMBREE_RAYS_TO_LOAD = 200_000
 """From this many rays on it is loaded for them: that takes one to three seconds, once a process."""
 
-# Rays that Embree gets at a time: enough to outweigh the launches, few enough for their copy to stay in the cache.
-_EMBREE_CHUNK = 262_144
+# Rays that Embree gets at a time, at most: a call and its launches cost 0.5 ms, and a ray 60 bytes.
+_EMBREE_CHUNK = ROWS_KEPT
+# Blocks of 16 rays that are worth another thread: waking it costs 60 us. Where a kernel only moves rays, memory limits
+# it: two threads of two take as long as one, and twice the processor.
+_BLOCKS_A_THREAD = 1_024
 # Beyond this share of free segments a search for any hit, before one for the first, saves time: it takes about half as
 # long, and blocked segments need both.
 _FREE_SHARE = 0.5
@@ -151,19 +154,32 @@ class RaySearch:
         return scene, names if len(names) < len(self._faces) else names[:0]
 
     def nearest(
-        self, o: np.ndarray, d: np.ndarray, *, reach: np.ndarray, clearance: float, device: Any, backend: str
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        *,
+        reach: np.ndarray,
+        clearance: float,
+        device: Any,
+        backend: str,
+        own: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Distance (N,) [m], float64, and face (N,) of what rays meet beyond ``clearance`` [m]; inf and -1 at a miss.
 
-        ``o`` and ``d`` hold one row or N, ``reach`` [m] one number or N: no need to look further.
+        ``o`` and ``d`` hold one row or N, ``reach`` [m] one number or N: no need to look further. ``own``, if given,
+        become copies of both.
 
         Raises:
             ValueError: if a ray is not finite or has no direction, or on an unknown back end, or Embree on a GPU.
         """
         where = _device.resolve(device)
         count = max(len(o), len(d)) if min(len(o), len(d)) else 0
-        if choose_backend(backend, where, count) == "embree" and count:
-            t, face = self._nearest_embree(o, d, clearance, where)
+        by_embree = choose_backend(backend, where, count) == "embree" and count > 0
+        for copy, rays in zip(own or (), (o, d), strict=False):
+            if not by_embree or len(rays) == 1:  # Embree's are copied where they are packed
+                copy[:] = rays
+        if by_embree:
+            t, face = self._nearest_embree(o, d, clearance, where, own=own)
         else:
             mesh, planes = self._built(where)
             distance = wp.empty(count, dtype=wp.float64, device=where)
@@ -179,13 +195,38 @@ class RaySearch:
         return t, face
 
     def _nearest_embree(
-        self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device, start: np.ndarray | None = None
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        clearance: float,
+        cpu: wp.Device,
+        own: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
+        t, face = self._embree_pass(o, d, clearance, cpu, own=own)
+        again = np.flatnonzero(face == AGAIN if face.min() == AGAIN else [])
+        # A ray that leaves its face at a slope of 1e-5 meets it for thousands of passes: few rays take more than two.
+        while len(again):
+            t[again], face[again] = self._embree_pass(
+                rows(o, again), rows(d, again), clearance, cpu, start=t[again]
+            )
+            again = again[face[again] == AGAIN]
+        return t, face
+
+    def _embree_pass(
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        clearance: float,
+        cpu: wp.Device,
+        start: np.ndarray | None = None,
+        own: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`nearest`, but rays that met a surface at their start are AGAIN, to go on from the distance."""
         scene, names = self._embree
         count = max(len(o), len(d))
         chunk = min(count, _EMBREE_CHUNK)
         t, face = np.empty(count), np.empty(count, dtype=np.int32)
-        rays = _packed_rays(chunk)
+        rays = room_for_packed(chunk)
         keys = np.empty(chunk if len(self._faces) >= _FACES_TO_SORT else 0, dtype=np.uint16)
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [
@@ -193,21 +234,16 @@ class RaySearch:
             _given(o, wp.vec3d, cpu), _given(d, wp.vec3d, cpu),
         ]  # fmt: skip
         out = [_given(t, wp.float64, cpu), _given(face, wp.int32, cpu)]
-        pieces = _device.threads()
+        copies = [_given(copy, wp.vec3d, cpu) for copy in own or (np.empty((0, 3)), np.empty((0, 3)))]
         for first in range(0, count, chunk):
             size = min(chunk, count - first)
             blocks = -(-size // LANES)
-            inputs = [first, size, center, self._radius, *given, rays, _given(keys, wp.uint16, cpu)]
-            _device.launch(pack_rays, blocks, inputs, device=cpu, pieces=pieces)
+            inputs = [first, size, center, self._radius, *given, rays, _given(keys, wp.uint16, cpu), *copies]
+            _launch(pack_rays, blocks, inputs, cpu, streams=True)
             met_at, met = _cast(scene, rays, size, keys[:size])
             hits = [_given(met_at, wp.float32, cpu), _given(met, wp.int32, cpu)]
             inputs = [first, size, center, self._radius, planes, faces, *given, *hits, *out]
-            _device.launch(place_hits, blocks, inputs, device=cpu, pieces=pieces)
-        if face.min() == AGAIN:
-            again = np.flatnonzero(face == AGAIN)
-            t[again], face[again] = self._nearest_embree(
-                rows(o, again), rows(d, again), clearance, cpu, t[again]
-            )
+            _launch(place_hits, blocks, inputs, cpu)
         return t, face
 
     def free(
@@ -246,9 +282,9 @@ class RaySearch:
         faces that block most, if there are such, before the hierarchy is asked. What a search finds is still judged.
         """
         scene, names = self._embree
-        count, pieces = len(sight), _device.threads()
+        count = len(sight)
         chunk = min(count, _EMBREE_CHUNK)
-        rays = _packed_rays(chunk)
+        rays = room_for_packed(chunk)
         keys = np.empty(chunk if len(self._faces) >= _FACES_TO_SORT else 0, dtype=np.uint16)
         center, planes, faces = wp.vec3d(*self._center), self._built(cpu)[1], _given(names, wp.int32, cpu)
         given = [clearance, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu)]
@@ -263,7 +299,7 @@ class RaySearch:
                 first, size, center, self._radius, *given, _given(known, wp.float64, cpu), rays,
                 _given(kept, wp.uint16, cpu), out,
             ]  # fmt: skip
-            _device.launch(pack_segments, -(-size // LANES), inputs, device=cpu, pieces=pieces)
+            _launch(pack_segments, -(-size // LANES), inputs, cpu, streams=len(known) == 0)
             part = sight[first:end]
             if mostly_free:
                 which = np.flatnonzero(scene.blocked(_rows_of(rays, size)))
@@ -276,10 +312,12 @@ class RaySearch:
                     first, len(which), chosen, center, self._radius, planes, faces, *given,
                     _given(met, wp.int32, cpu), out,
                 ]  # fmt: skip
-                _device.launch(judge_segments, -(-len(which) // LANES), inputs, device=cpu, pieces=pieces)
-            if first == 0 and end < count and len(which):
-                frequent = self._frequent_blockers(met[part[which] == BLOCKED], size)
+                _launch(judge_segments, -(-len(which) // LANES), inputs, cpu)
+            if end == count:
+                break
             mostly_free = int(np.count_nonzero(part == FREE)) > _FREE_SHARE * size
+            if first == 0 and len(which) and not mostly_free:
+                frequent = self._frequent_blockers(met[part[which] == BLOCKED], size)
         if sight.min() == AGAIN:
             again = np.flatnonzero(sight == AGAIN)
             start = rows(a, again)
@@ -352,11 +390,11 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     return "embree" if count >= least and not _device.is_cuda(device) and o3d.installed() else "warp"
 
 
-def _packed_rays(size: int) -> wp.array:
-    """Room for ``size`` packed rays, the same at each call in a thread: pages that are new cost more than packing."""
-    if getattr(_scratch, "rays", None) is None or len(_scratch.rays) < 2 * size:
-        _scratch.rays = wp.empty(2 * size, dtype=wp.vec3, device="cpu")
-    return _scratch.rays
+def _launch(kernel: Any, blocks: int, inputs: list[Any], cpu: wp.Device, *, streams: bool = False) -> None:
+    """Launch a kernel on blocks of rays, on as many threads as they are worth; half of all if it ``streams`` them."""
+    threads = max(1, _device.threads() // 2) if streams else _device.threads()
+    pieces = min(threads, 1 + blocks // _BLOCKS_A_THREAD)
+    _device.launch(kernel, blocks, inputs, device=cpu, pieces=pieces)
 
 
 def _rows_of(rays: wp.array, size: int) -> np.ndarray:
@@ -388,11 +426,8 @@ def _picked(rays: wp.array, which: np.ndarray) -> np.ndarray:
     """Packed rays that ``which`` names, in this order."""
     picked = wp.empty(2 * len(which), dtype=wp.vec3, device="cpu")
     inputs = [len(which), rays, _given(which, wp.int64, picked.device), picked]
-    _device.launch(pick_rays, -(-len(which) // LANES), inputs, device="cpu", pieces=_device.threads())
+    _launch(pick_rays, -(-len(which) // LANES), inputs, picked.device)
     return _rows_of(picked, len(which))
-
-
-_scratch = local()
 
 
 def rows(array: np.ndarray, index: np.ndarray) -> np.ndarray:

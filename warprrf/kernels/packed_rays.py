@@ -15,6 +15,7 @@ from warprrf.kernels.ray_lanes import (
     column_x,
     column_y,
     column_z,
+    copy_rows,
     doubles,
     faces_met,
     fetch_ahead,
@@ -35,8 +36,12 @@ from warprrf.kernels.ray_lanes import (
     put_rays,
     roots,
     roots_of_singles,
+    round_rows,
     rounded,
     row,
+    row_x,
+    row_y,
+    row_z,
     singles,
 )
 from warprrf.kernels.rays import (
@@ -104,11 +109,14 @@ def pack_rays(
     directions: wp.array(dtype=wp.vec3d),
     rays: wp.array(dtype=wp.vec3),
     keys: wp.array(dtype=wp.uint16),
+    own_origins: wp.array(dtype=wp.vec3d),
+    own_directions: wp.array(dtype=wp.vec3d),
 ):
     """``size`` rays from number ``first`` on as pairs (start, unit direction) in float32; a bad one meets nothing.
 
     ``start`` holds the distance [m] at which each begins; if empty, all begin at ``clearance``, less the rounding.
-    ``keys``, if not empty, become numbers that rays near each other share.
+    ``keys``, if not empty, become numbers that rays near each other share, and ``own_origins`` and ``own_directions``,
+    if longer than one row, copies.
     """
     k = wp.static(LANES) * (offset + wp.tid())
     i = first + k
@@ -117,12 +125,18 @@ def pack_rays(
     if count == wp.static(LANES):
         fetch_rows(origins, i)
         fetch_rows(directions, i)
-        x = rounded(column_x(origins, i) - doubles(center[0]))
-        y = rounded(column_y(origins, i) - doubles(center[1]))
-        z = rounded(column_z(origins, i) - doubles(center[2]))
-        dx = rounded(column_x(directions, i))
-        dy = rounded(column_y(directions, i))
-        dz = rounded(column_z(directions, i))
+        if own_origins.shape[0] > 1:
+            copy_rows(origins, own_origins, i)
+        if own_directions.shape[0] > 1:
+            copy_rows(directions, own_directions, i)
+        near = round_rows(origins, i, center)
+        x = row_x(near)
+        y = row_y(near)
+        z = row_z(near)
+        toward = round_rows(directions, i, wp.vec3d())
+        dx = row_x(toward)
+        dy = row_y(toward)
+        dz = row_z(toward)
         scale = singles(wp.float32(radius)) + magnitude_of_singles(x)
         scale = scale + magnitude_of_singles(y) + magnitude_of_singles(z)
         begin = singles(wp.float32(clearance)) - wp.float32(ROUNDING) * scale
@@ -141,9 +155,14 @@ def pack_rays(
         low = positive_bits_of_singles(square - singles(_LEAST_SQUARE))
         high = positive_bits_of_singles(singles(_MOST_SQUARE) - square)
         rare = wp.static(EVERY) - (low & high)
-    elif keys.shape[0] > 0:
+    else:
         for j in range(count):
-            keys[k + j] = wp.uint16(0)
+            if keys.shape[0] > 0:
+                keys[k + j] = wp.uint16(0)
+            if own_origins.shape[0] > 1:
+                own_origins[i + j] = origins[i + j]
+            if own_directions.shape[0] > 1:
+                own_directions[i + j] = directions[i + j]
     while rare != 0:
         j = lowest_bit(rare)
         rare = rare & (rare - 1)

@@ -27,18 +27,24 @@ from warprrf.kernels.ray_lanes import (
     higher,
     lower,
     magnitude,
+    magnitude_of_singles,
     met_bits,
     plane_w,
     plane_x,
     plane_y,
     plane_z,
     positive_bits,
+    positive_bits_of_singles,
     put_keys,
     put_rays,
     roots,
     roots_of_singles,
-    rounded,
+    round_rows,
+    round_ways,
     row,
+    row_x,
+    row_y,
+    row_z,
     singles,
 )
 from warprrf.kernels.rays import (
@@ -56,6 +62,8 @@ from warprrf.kernels.rays import (
 BLOCKER = 12
 """Numbers that :func:`pack_segments` knows a blocker by: its plane, and two barycentric coordinates of points."""
 
+# Beyond this [m, and its square] a segment's numbers may overflow in float32, and each is packed by itself.
+_MOST = wp.constant(wp.float32(1e30))
 # A known blocker is not asked about points nearer than this, in barycentric coordinates, to its edges.
 _INSIDE = wp.constant(wp.float64(1e-6))
 
@@ -84,10 +92,10 @@ def along(
 
 @wp.func_native(f"""
     for (int j = 0; j < {LANES}; ++j)
-        sight.data[i + j] = (bad >> j) & 1 ? {BAD} : (blocked >> j) & 1 ? {BLOCKED} : {FREE};
+        sight.data[i + j] = (blocked >> j) & 1 ? {BLOCKED} : {FREE};
 """)
-def tell(sight: wp.array(dtype=wp.int8), i: int, blocked: int, bad: int) -> None:
-    """Write FREE, BLOCKED and BAD for segments ``i`` to ``i + 16``."""
+def tell(sight: wp.array(dtype=wp.int8), i: int, blocked: int) -> None:
+    """Write FREE and BLOCKED for segments ``i`` to ``i + 16``."""
     ...
 
 
@@ -119,7 +127,9 @@ def pack_segment(
     scale = rounding_scale(origin, radius)
     step = ROUNDING * scale
     inner = length - wp.float64(2.0) * clearance
-    reach = wp.where(inner > wp.float64(0.0), inner + wp.float64(2.0) * step, wp.float64(wp.nan))
+    reach = wp.where(
+        inner > wp.float64(0.0), wp.min(inner + wp.float64(2.0) * step, wp.float64(_MOST)), wp.float64(wp.nan)
+    )
     rays[2 * k] = narrow(origin + (clearance - step) * unit)
     rays[2 * k + 1] = narrow(reach * unit)
     sight[i] = wp.int8(wp.where(wp.isfinite(scale) and wp.isfinite(length), FREE, BAD))
@@ -165,6 +175,33 @@ def block_margin(
     return lower(wp.cw_mul(slope, slope) - STEEP_SQUARE * square, margin)
 
 
+@wp.func
+def known_to_block(
+    blockers: wp.array(dtype=wp.float64),
+    i: int,
+    center: wp.vec3d,
+    radius: wp.float64,
+    clearance: wp.float64,
+    starts: wp.array(dtype=wp.vec3d),
+    ends: wp.array(dtype=wp.vec3d),
+):
+    """Bit j is set where one of ``blockers`` surely lies between the ends of segment ``i + j``."""
+    x = column_x(starts, i) - doubles(center[0])
+    y = column_y(starts, i) - doubles(center[1])
+    z = column_z(starts, i) - doubles(center[2])
+    dx = (column_x(ends, i) - doubles(center[0])) - x
+    dy = (column_y(ends, i) - doubles(center[1])) - y
+    dz = (column_z(ends, i) - doubles(center[2])) - z
+    square = wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz)
+    scale = doubles(radius) + magnitude(x) + magnitude(y) + magnitude(z)
+    length = roots(square)
+    most = doubles()
+    for f in range(0, blockers.shape[0], wp.static(BLOCKER)):
+        margin = block_margin(blockers, f, x, y, z, dx, dy, dz, square, length, scale, clearance)
+        most = higher(margin, most)
+    return positive_bits(most)
+
+
 @wp.kernel(module="unique", module_options=RAY_OPTIONS, enable_backward=False)
 def pack_segments(
     offset: int,
@@ -197,26 +234,23 @@ def pack_segments(
         return
     fetch_rows(starts, i)
     fetch_rows(ends, i)
-    x = column_x(starts, i) - doubles(center[0])
-    y = column_y(starts, i) - doubles(center[1])
-    z = column_z(starts, i) - doubles(center[2])
-    dx = (column_x(ends, i) - doubles(center[0])) - x
-    dy = (column_y(ends, i) - doubles(center[1])) - y
-    dz = (column_z(ends, i) - doubles(center[2])) - z
-    square = wp.cw_mul(dx, dx) + wp.cw_mul(dy, dy) + wp.cw_mul(dz, dz)
-    scale = doubles(radius) + magnitude(x) + magnitude(y) + magnitude(z)
-    sx = rounded(x)
-    sy = rounded(y)
-    sz = rounded(z)
-    wx = rounded(dx)
-    wy = rounded(dy)
-    wz = rounded(dz)
+    near = round_rows(starts, i, center)
+    sx = row_x(near)
+    sy = row_y(near)
+    sz = row_z(near)
+    ways = round_ways(starts, ends, i, center)
+    wx = row_x(ways)
+    wy = row_y(ways)
+    wz = row_z(ways)
     if keys.shape[0] > 0:
         put_keys(keys, k, wp.float32(radius), sx, sy, sz, wx, wy, wz)
     one = singles(wp.float32(1.0))
-    length = roots_of_singles(wp.cw_mul(wx, wx) + wp.cw_mul(wy, wy) + wp.cw_mul(wz, wz))
+    square = wp.cw_mul(wx, wx) + wp.cw_mul(wy, wy) + wp.cw_mul(wz, wz)
+    length = roots_of_singles(square)
+    scale = singles(wp.float32(radius)) + magnitude_of_singles(sx)
+    scale = scale + magnitude_of_singles(sy) + magnitude_of_singles(sz)
     # Over the length: where the segment begins, and how much of it is left.
-    begin = wp.cw_div(rounded(doubles(clearance) - ROUNDING * scale), length)
+    begin = wp.cw_div(singles(wp.float32(clearance)) - wp.float32(ROUNDING) * scale, length)
     left = above_of_singles(
         length, singles(wp.float32(2.0) * wp.float32(clearance)), one, singles(wp.float32(wp.nan))
     )
@@ -227,15 +261,16 @@ def pack_segments(
     )  # fmt: skip
     blocked = int(0)
     if blockers.shape[0] > 0:
-        long = roots(square)
-        most = doubles()
-        for f in range(0, blockers.shape[0], wp.static(BLOCKER)):
-            most = higher(
-                block_margin(blockers, f, x, y, z, dx, dy, dz, square, long, scale, clearance), most
-            )
-        blocked = positive_bits(most)
-    finite = positive_bits(doubles(wp.float64(wp.inf)) - (scale + square))
-    tell(sight, i, blocked, wp.static(EVERY) - finite)
+        blocked = known_to_block(blockers, i, center, radius, clearance, starts, ends)
+    tell(sight, i, blocked)
+    plain = positive_bits_of_singles(singles(_MOST) - scale) & positive_bits_of_singles(
+        singles(_MOST) - square
+    )
+    rare = wp.static(EVERY) - plain
+    while rare != 0:
+        j = lowest_bit(rare)
+        rare = rare & (rare - 1)
+        pack_segment(i + j, k + j, center, radius, clearance, starts, ends, rays, sight)
 
 
 @wp.func

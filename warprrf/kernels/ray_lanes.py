@@ -19,6 +19,8 @@ RAY_OPTIONS = {
 doubles = lanes_of(wp.float64)
 singles = lanes_of(wp.float32)
 integers = lanes_of(int)
+rounded_rows = wp.types.vector(3 * LANES, wp.float32)
+"""16 rows in float32, one behind the other."""
 _of = lane_functions(wp.float64)
 _of_singles = lane_functions(wp.float32)
 above, higher, lower, positive_bits, roots = _of.above, _of.higher, _of.lower, _of.positive_bits, _of.roots
@@ -27,13 +29,15 @@ roots_of_singles = _of_singles.roots
 
 _HALF = LANES // 2  # numbers of float64 that a register of 512 bits holds
 _AHEAD = 16  # blocks of 16 rows, 6 KiB
-_CELLS = 4  # that a key tells apart along each axis
+_CELLS = 16  # that a key tells apart along each axis: with eight octants, all that 15 bits hold
 EVERY = (1 << LANES) - 1
 """A bit for each lane."""
 HALF_LANES = f"""
     typedef wp::float64 half_lanes __attribute__((vector_size({_HALF} * sizeof(wp::float64)), aligned(8)));
+    typedef wp::float64 line __attribute__((vector_size({_HALF} * sizeof(wp::float64))));
     typedef wp::float64 quarter __attribute__((vector_size(4 * sizeof(wp::float64)), aligned(8)));
     typedef wp::float32 narrow_lanes __attribute__((vector_size({LANES} * sizeof(wp::float32)), aligned(4)));
+    typedef wp::float32 narrow_half __attribute__((vector_size({_HALF} * sizeof(wp::float32)), aligned(4)));
 """
 
 
@@ -140,7 +144,87 @@ def fetch_rows_at(source: wp.array(dtype=wp.vec3d), first: int, which: wp.array(
     ...
 
 
+def _row_part(c: int) -> Any:
+    """Coordinate ``c`` of 16 rows in float32."""
+    flat = [3 * j + c for j in range(LANES)]
+    two = [f if f < 2 * LANES else -1 for f in flat]
+    third = [j if f < 2 * LANES else f - LANES for j, f in enumerate(flat)]
+
+    @wp.func_native(f"""{HALF_LANES}
+    wp::vec_t<{LANES}, wp::float32> out;
+    const narrow_lanes* p = (const narrow_lanes*)&rows;
+    *(narrow_lanes*)&out = {_shuffle(_shuffle("p[0]", "p[1]", two), "p[2]", third)};
+    return out;
+    """)
+    def row_part(rows: rounded_rows) -> singles:  # type: ignore[valid-type, empty-body]
+        """A coordinate of each row."""
+        ...
+
+    return row_part
+
+
+_HALVES = [f"__builtin_convertvector(r[2 * n + {h}], narrow_half)" for h in (0, 1)]
+# Rows turn into columns after they are rounded: that takes a third of the shuffles.
+_ROUND = f"""
+    narrow_lanes* to = (narrow_lanes*)&out;
+    for (int n = 0; n < 3; ++n) to[n] = {_shuffle(*_HALVES, list(range(LANES)))};
+"""
+
+
+def _relative(rows: str, source: str) -> str:
+    """C++ that makes ``rows`` the 16 rows ``i`` to ``i + 16`` of ``source``, or its only one, less the centre."""
+    patterns = ", ".join(
+        "half_lanes{" + ", ".join(f"center[{(_HALF * n + j) % 3}]" for j in range(_HALF)) + "}"
+        for n in range(3)
+    )
+    alone = ", ".join(
+        "half_lanes{" + ", ".join(f"only[{(_HALF * n + j) % 3}]" for j in range(_HALF)) + "}"
+        for n in range(3)
+    )
+    return f"""
+    half_lanes {rows}[6];
+    {{
+        const half_lanes away[3] = {{{patterns}}};
+        if ({source}.shape[0] == 1) {{
+            const wp::vec3d only = {source}.data[0];
+            const half_lanes same[3] = {{{alone}}};
+            for (int n = 0; n < 6; ++n) {rows}[n] = same[n % 3] - away[n % 3];
+        }} else {{
+            const half_lanes* from = (const half_lanes*)({source}.data + i);
+            for (int n = 0; n < 6; ++n) {rows}[n] = from[n] - away[n % 3];
+        }}
+    }}
+    """
+
+
+@wp.func_native(f"""{HALF_LANES}
+    wp::vec_t<{3 * LANES}, wp::float32> out;
+    {_relative("r", "source")}
+    {_ROUND}
+    return out;
+""")
+def round_rows(source: wp.array(dtype=wp.vec3d), i: int, center: wp.vec3d) -> rounded_rows:  # type: ignore[valid-type, empty-body]
+    """Rows ``i`` to ``i + 16``, less ``center``; the only row if there is one."""
+    ...
+
+
+@wp.func_native(f"""{HALF_LANES}
+    wp::vec_t<{3 * LANES}, wp::float32> out;
+    {_relative("a", "starts")}
+    {_relative("r", "ends")}
+    for (int n = 0; n < 6; ++n) r[n] -= a[n];
+    {_ROUND}
+    return out;
+""")
+def round_ways(
+    starts: wp.array(dtype=wp.vec3d), ends: wp.array(dtype=wp.vec3d), i: int, center: wp.vec3d
+) -> rounded_rows:  # type: ignore[valid-type, empty-body]
+    """Rows ``i`` to ``i + 16`` of ``ends`` less those of ``starts``, both taken less ``center``."""
+    ...
+
+
 column_x, column_y, column_z = (_column(c) for c in range(3))
+row_x, row_y, row_z = (_row_part(c) for c in range(3))
 column_x_at, column_y_at, column_z_at = (_column_at(c) for c in range(3))
 plane_x, plane_y, plane_z, plane_w = (_plane_number(c) for c in range(4))
 
@@ -161,11 +245,11 @@ def _pack() -> str:
             two = [ray + _HALF * pair if pair < 2 else -1 for ray, pair in places]
             third = [j if pair < 2 else _HALF + ray for j, (ray, pair) in enumerate(places)]
             whole = _shuffle(_shuffle(f"p0{side}", f"p1{side}", two), f"p2{side}", third)
-            stores.append(f"to[{3 * side + part}] = {whole};")
+            stores.append(f"__builtin_nontemporal_store((line){whole}, to + {3 * side + part});")
     return f"""{HALF_LANES}
     const narrow_lanes x = *(const narrow_lanes*)&sx, y = *(const narrow_lanes*)&sy, z = *(const narrow_lanes*)&sz;
     const narrow_lanes u = *(const narrow_lanes*)&dx, v = *(const narrow_lanes*)&dy, w = *(const narrow_lanes*)&dz;
-    half_lanes* to = (half_lanes*)(rays.data + 2 * k);
+    line* to = (line*)(rays.data + 2 * k);
     {" ".join(pairs)}
     {" ".join(stores)}
     """
@@ -182,7 +266,20 @@ def put_rays(
     dy: singles,  # type: ignore[valid-type]
     dz: singles,  # type: ignore[valid-type]
 ) -> None:
-    """Write rays ``k`` to ``k + 16``, start and direction each."""
+    """Write rays ``k`` to ``k + 16``, start and direction each, past the cache.
+
+    The first ray lies on a boundary of 64 bytes. The lock that the interpreter takes next makes them seen by others.
+    """
+    ...
+
+
+@wp.func_native(f"""{HALF_LANES}
+    const half_lanes* from = (const half_lanes*)(source.data + i);
+    line* to = (line*)(copy.data + i);
+    for (int n = 0; n < 6; ++n) __builtin_nontemporal_store((line)from[n], to + n);
+""")
+def copy_rows(source: wp.array(dtype=wp.vec3d), copy: wp.array(dtype=wp.vec3d), i: int) -> None:
+    """Copy rows ``i`` to ``i + 16``, past the cache; the copy's first lies on a boundary of 64 bytes."""
     ...
 
 

@@ -6,8 +6,8 @@ and directions of any length, and so packs and normalises them in NumPy first. `
 besides. ``Mesh.visible`` is compared with Embree's search for any hit, which judges the ends of a segment in float32.
 The yardsticks take rays as they come; ``Mesh`` sorts those without order on a large mesh, and asks the few faces that
 block most segments before the hierarchy: so it can be faster than they are. They would gain nothing from its chunks.
-All of one row are run in turn in one process, and the best of the repeats counts: by the clock, and by processor time,
-which other work on the machine disturbs less.
+All of one row are run in turn in one process, in another order each time, and the best of the repeats counts: by the
+clock, and by processor time, which other work on the machine disturbs less.
 """
 
 from __future__ import annotations
@@ -194,10 +194,15 @@ def _pack(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray
 def _best_times(
     runners: dict[str, Callable[[], Any]], repeats: int
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Shortest run of each [s], by the clock and in processor time, run in turn after one that doesn't count."""
+    """Shortest run of each [s], by the clock and in processor time, run in turn after one that doesn't count.
+
+    Each turn has an order of its own: what a runner leaves of the heap, the next one pays for in page faults.
+    """
     clock, processor = dict.fromkeys(runners, np.inf), dict.fromkeys(runners, np.inf)
+    rng = np.random.default_rng(0)
     for turn in range(repeats + 1):
-        for name, run in runners.items():
+        for name in rng.permutation(list(runners)).tolist():
+            run = runners[name]
             began, used = time.perf_counter(), time.process_time()
             run()
             if turn:
