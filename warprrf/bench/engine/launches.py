@@ -57,7 +57,7 @@ def pair_costs(
         passing = passing_pairs(prepared)
         times = {
             "forward_ns": _least(partial(raster.blend, prepared, features), repeats),
-            "prepare_ns": _least(partial(raster.prepare, *inputs, cam), repeats),
+            "prepare_ns": _least(lambda: raster.prepare(*inputs, cam).blocks, repeats),
             "backward_ns": _least(adjoint, repeats),
         }
         found[name] = {
