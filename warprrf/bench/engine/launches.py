@@ -19,6 +19,7 @@ import warp as wp
 
 from warprrf.bench.engine.scenes import gaussians, panorama, photo, room
 from warprrf.device import launch, threads
+from warprrf.geometry.camera import Camera
 from warprrf.geometry.rasterizer import RADIO, TILE_GRAIN, Prepared, Rasterizer
 from warprrf.geometry.render import blend_weights, render
 from warprrf.kernels import weights
@@ -57,7 +58,7 @@ def pair_costs(
         passing = passing_pairs(prepared)
         times = {
             "forward_ns": _least(partial(raster.blend, prepared, features), repeats),
-            "prepare_ns": _least(lambda: raster.prepare(*inputs, cam).blocks, repeats),
+            "prepare_ns": _least(partial(_prepare, raster, inputs, cam), repeats),
             "backward_ns": _least(adjoint, repeats),
         }
         found[name] = {
@@ -176,6 +177,14 @@ def _scene(n: int, seed: int) -> tuple[Rasterizer, tuple[wp.array, wp.array, wp.
     for array in inputs:
         array.requires_grad = True
     return raster, inputs, wp.array(room(n, seed)[4], dtype=wp.float32, device="cpu", requires_grad=True)
+
+
+def _prepare(raster: Rasterizer, inputs: tuple[wp.array, ...], cam: Camera) -> Prepared:
+    """Project and list, down to blocks of pixels."""
+    means, quaternions, scales, opacities = inputs
+    prepared = raster.prepare(means, quaternions, scales, opacities, cam)
+    _ = prepared.blocks
+    return prepared
 
 
 def _forward(n: int, width: int, height: int, seed: int) -> tuple[Callable[..., None], np.ndarray]:
