@@ -203,11 +203,14 @@ def test_features_need_not_be_contiguous():
 
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-@pytest.mark.parametrize("rule", ["product", "exp"])
-@pytest.mark.parametrize("real", [wp.float32, wp.float64], ids=["float32", "float64"])
-def test_a_gpu_blends_what_a_cpu_does(real, rule, camera, pretended_cuda):
+@pytest.mark.parametrize(
+    ("real", "rule", "channels"),
+    [(wp.float32, "product", 5), (wp.float64, "exp", 3)],
+    ids=["float32", "float64"],
+)
+def test_a_gpu_blends_what_a_cpu_does(real, rule, channels, camera, pretended_cuda):
     """Image, ranges, owners, seen weights and every gradient; five channels take two launches."""
-    g, how = mixed(7, 400), {"channels": 5, "real": real, "blending": Blending(rule=rule)}
+    g, how = mixed(7, 400), {"channels": channels, "real": real, "blending": Blending(rule=rule)}
     expected = image_and_gradients(g, camera, **how)
     with pretended_cuda() as launched:
         found = image_and_gradients(g, camera, **how)
