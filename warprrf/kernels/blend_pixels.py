@@ -202,7 +202,10 @@ def build(real: Any, rule: int, width: int = CHANNELS) -> SimpleNamespace:
 
     @wp.func_native(_cuda("__syncwarp();"))
     def settle():  # type: ignore[empty-body]
-        """What the warp's lanes wrote to the shelf before is there for all of them after."""
+        """What the warp's lanes wrote to the shelf before is there for all of them after.
+
+        A ballot brings the lanes together too, but gives no order to what they read and write.
+        """
         ...
 
     @wp.func_native(f"""
