@@ -18,11 +18,12 @@ from warprrf.device import MIN_SPLIT, PIECES_PER_THREAD, is_cuda, launch, resolv
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.tape import active_tape, gradient, with_gradients
-from warprrf.kernels import binning
+from warprrf.kernels import binning, entry_masks
 from warprrf.kernels import blend as blend_kernels
 from warprrf.kernels import blend_pixels as pixel_kernels
 from warprrf.kernels import project as kernels
 from warprrf.kernels import sh as sh_kernels
+from warprrf.kernels.warps import PIXELS
 
 STRIPES = 4096  # partial sums
 TILE_GRAIN = 8  # a tile or a block is work enough for few of them to be worth a thread
@@ -235,7 +236,7 @@ class Rasterizer:
         counts = None
         if self.on_gpu:
             launch(
-                pixel_kernels.build_masks(self.real),
+                entry_masks.build(self.real),
                 entries,
                 [rows, centres, keys, slots, whose, rays, view.tiles_x, ids, masks],
                 device=device,
@@ -321,7 +322,7 @@ class Rasterizer:
         flat = [a.flatten() for a in (image, alpha, depth, left, dominant, peak)]
         flat_features = _flat(features)
         if self.on_gpu:
-            count, grain = (len(prepared.starts) - 1) * pixel_kernels.PIXELS, MIN_SPLIT
+            count, grain = (len(prepared.starts) - 1) * PIXELS, MIN_SPLIT
             lists = [prepared.ids, prepared.masks, prepared.starts]
         else:
             count, grain = len(prepared.blocks.starts) - 1, TILE_GRAIN
@@ -435,7 +436,7 @@ class Rasterizer:
         nothing = wp.empty(0, dtype=self.real, device=device)
         launch(
             kernel,
-            (len(prepared.starts) - 1) * pixel_kernels.PIXELS,
+            (len(prepared.starts) - 1) * PIXELS,
             [prepared.rows, _flat(features), features.shape[1], first, prepared.ids, prepared.masks,
              prepared.starts, prepared.rays, prepared.view, self.rules, *flat, sums,
              background.grad if background.requires_grad else nothing],

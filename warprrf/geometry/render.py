@@ -12,9 +12,10 @@ from warprrf.device import check_array, launch, resolve
 from warprrf.geometry.camera import Camera
 from warprrf.geometry.gaussians import Gaussians
 from warprrf.geometry.rasterizer import RADIO, RULES, TILE_GRAIN, Blending, Rasterizer
-from warprrf.kernels import blend_pixels as pixel_kernels
+from warprrf.kernels import pixel_weights
 from warprrf.kernels import weights as weight_kernels
 from warprrf.kernels.project import LANES
+from warprrf.kernels.warps import PIXELS
 
 
 @dataclass(frozen=True)
@@ -123,8 +124,8 @@ def blend_weights(
     if raster.on_gpu:
         nothing = wp.empty(0, dtype=wp.float32, device=raster.device)
         launch(
-            pixel_kernels.build(wp.float32, rule, 0).strongest,
-            (len(view.starts) - 1) * pixel_kernels.PIXELS,
+            pixel_weights.build(wp.float32, rule),
+            (len(view.starts) - 1) * PIXELS,
             [view.rows, nothing, view.ids, view.masks, view.starts, view.rays, view.view, raster.rules, shape[2],
              *out],
             device=raster.device,

@@ -117,7 +117,12 @@ def run_engine(
         stages = _Stages(run, str(found["machine"]["device"]), seed)
         _knobs(stages, size, seed, device, found)
         _growth(stages, size, seed, device, found)
-        options = {"scene": scene, "triangles": size.triangles, "rays": size.rays, "repeats": 3 * size.repeats}
+        options = {
+            "scene": scene,
+            "triangles": size.triangles,
+            "rays": size.rays,
+            "repeats": 3 * size.repeats,
+        }
         found["rays"] = stages.rows(
             "rays",
             lambda tell: run_rays(**options, seed=seed, device=device, progress=tell),  # type: ignore[arg-type]
