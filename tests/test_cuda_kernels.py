@@ -19,8 +19,9 @@ import warprrf.kernels
 
 # They arrange rays for Embree, which is a CPU's, in a CPU compiler's vector types.
 FOR_A_CPU_ALONE = {"pack_rays", "pick_rays", "place_hits", "pack_segments", "judge_segments"}
-# A GPU blends by `blend_pixels`, weights included.
-MODULES = sorted({m.name for m in pkgutil.iter_modules(warprrf.kernels.__path__)} - {"blend", "weights"})
+# A GPU blends by `blend_pixels` and `pixel_weights`, whose functions are in `warps`.
+WITHOUT = {"blend", "weights", "warps"}
+MODULES = sorted({m.name for m in pkgutil.iter_modules(warprrf.kernels.__path__)} - WITHOUT)
 
 
 def kernels_of(name):
