@@ -357,6 +357,7 @@ class Rasterizer:
         means, quaternions, scales, opacities = prepared.inputs
         seen = wp.zeros(n, dtype=real, device=device)
         feature_grad = gradient(features)
+        rows = features if features.is_contiguous else features.contiguous()
         slopes = [gradient(array) for array in (out.features, out.alpha, out.depth)]
         flat = [a.flatten() for a in (out.features, out.alpha, out.depth, left, *slopes)]
         add_sums = self._sums_of_pixels if self.on_gpu else self._sums_of_tiles
@@ -364,7 +365,7 @@ class Rasterizer:
         for first in range(0, channels, kernels.CHANNELS):
             blend = self.kernels_for(channels - first)
             kernel = blend.blend_adjoint[with_range if first == 0 else 0]
-            begins, sums = add_sums(blend, kernel, prepared, features, first, flat, background)
+            begins, sums = add_sums(blend, kernel, prepared, rows, first, flat, background)
             launch(
                 self.project_kernels.chain,
                 n,
@@ -405,7 +406,7 @@ class Rasterizer:
         launch(
             kernel,
             tiles,
-            [wp.array(cuts, dtype=int, device=device), prepared.rows, _flat(features), channels, first,
+            [wp.array(cuts, dtype=int, device=device), prepared.rows, features.flatten(), channels, first,
              prepared.ids, prepared.slots, prepared.masks, prepared.starts, prepared.rays, prepared.view, self.rules,
              *flat, seeds, sums, background_sums],
             device=device,
@@ -437,7 +438,7 @@ class Rasterizer:
         launch(
             kernel,
             (len(prepared.starts) - 1) * PIXELS,
-            [prepared.rows, _flat(features), features.shape[1], first, prepared.ids, prepared.masks,
+            [prepared.rows, features.flatten(), features.shape[1], first, prepared.ids, prepared.masks,
              prepared.starts, prepared.rays, prepared.view, self.rules, *flat, sums,
              background.grad if background.requires_grad else nothing],
             device=device,
