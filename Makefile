@@ -57,10 +57,10 @@ setup: $(VENV)/.lobby
 setup-test: $(VENV)/.test
 
 lobby: $(VENV)/.lobby
-	@$(BIN)/warprrf lobby $(ARGS)
+	@$(RUN) -m benchmarks lobby $(ARGS)
 
 data: $(VENV)/.sionna
-	@$(BIN)/warprrf data $(ARGS)
+	@$(RUN) -m benchmarks data $(ARGS)
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

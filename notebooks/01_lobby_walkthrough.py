@@ -42,7 +42,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 from PIL import Image
 
 import warprrf as wr
-from warprrf.bench.lobby import pipeline, report
+from benchmarks.lobby import pipeline, report
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 WORK = DATA.parent.parent / "runs" / "notebook"
@@ -84,8 +84,8 @@ plt.show()
 # errors well below a pixel mean a stiff model.
 
 # %%
-from warprrf.geometry.sfm import structure_from_motion
-from warprrf.geometry.sparse import align_to_known
+from warprrf.geometry.photos.sfm import structure_from_motion
+from warprrf.geometry.photos.sparse import align_to_known
 
 start = time.perf_counter()
 sparse = structure_from_motion(

@@ -38,7 +38,7 @@ import numpy as np
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 import warprrf as wr
-from warprrf.bench.beams.links import Links, ends, gains
+from benchmarks.beams.links import Links, ends, gains
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 RECEIVERS = 24

@@ -38,10 +38,10 @@ import numpy as np
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 import warprrf as wr
-from warprrf.bench.engine import knobs
-from warprrf.rf.bistatic.field import BistaticField
-from warprrf.rf.bistatic.terms import Terms
+from benchmarks.engine import knobs
 from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.terms import Terms
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 set_matplotlib_formats("png")

@@ -6,7 +6,11 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [
+    str(Path(__file__).parent / "helpers"),
+    str(Path(__file__).parent),
+    str(Path(__file__).parent.parent),
+]
 import ptx  # noqa: E402
 
 import warprrf.device  # noqa: E402

@@ -10,20 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
-from warprrf.rf.coverage.radio_map import RadioMap
+from warprrf.rf.maps.radio_map import RadioMap
 
-ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = (
-    "lobby", "reconstruct", "simulate", "fit", "relevance", "render", "evaluate", "map", "twin", "bench", "data",
+    "reconstruct", "simulate", "fit", "relevance", "render", "evaluate", "map", "twin",
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("command", (*COMMANDS, "bench newrf", "bench bistatic", "bench beams"))
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_an_example_that_the_parser_takes(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -105,8 +105,6 @@ BAD = {
     "map of no kind": (["map", "{tmp}/bad.safetensors", "-o", "{tmp}/m.tif"], "m.tif"),
     "map of a corrupt field": (["map", "{tmp}/bad.safetensors", "-o", "{tmp}/m.nc"], "bad.safetensors"),
     "field without receiver": ([*RENDER, "{tmp}/bad.safetensors"], "--receiver"),
-    "no rays": (["bench", "newrf", "--data", "{tmp}", "--out", "{tmp}/run"], "newrf_conference.npz"),
-    "no lobby": (["lobby", "--data", "{tmp}", "--out", "{tmp}/run"], "photos"),
     "positions that are no positions": (
         ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/words.txt"],
         "words.txt",

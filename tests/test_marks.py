@@ -5,7 +5,7 @@ import re
 import pytest
 
 from warprrf import marks
-from warprrf.geometry import from_photos
+from warprrf.geometry.photos import pipeline as from_photos
 from warprrf.marks import code_mark
 
 SOURCES = {

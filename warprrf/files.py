@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -38,3 +40,30 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
             np.savez_compressed(out, **arrays)  # type: ignore[arg-type]
 
     write_atomically(path, write)
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> None:
+    """Write `value` as strict JSON: arrays become lists, NaN and infinities null."""
+    text = json.dumps(plain(value), indent=1, allow_nan=False)
+    write_atomically(path, lambda file: file.write_text(text + "\n", encoding="utf-8"))
+
+
+def plain(value: Any) -> Any:
+    """`value` in terms of what strict JSON holds; numbers keep their value, NaN and infinities become None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise TypeError(
+        f"value: got {type(value).__name__}, expected numbers, text, arrays, lists or dictionaries"
+    )

@@ -26,7 +26,7 @@ def code_mark(*modules: str, packages: Sequence[str] = ()) -> str:
     functions, nor those for type checkers. Where a result depends on what a function imports, name that too.
 
     Args:
-        modules: full names, ``"warprrf.geometry.sfm"``; a package stands for all modules below it.
+        modules: full names, ``"warprrf.geometry.photos.sfm"``; a package stands for all modules below it.
         packages: import names of other packages whose version counts, ``"pycolmap"``; one may be missing.
 
     Raises:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from warprrf.device import resolve
-from warprrf.geometry import raysearch
+from warprrf.geometry import rays as raysearch
 from warprrf.geometry.mesh import Mesh
 
 ROOM = (np.array([-7.0, -6.0, 0.0]), np.array([8.0, 6.0, 4.0]))

@@ -3,30 +3,27 @@
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from views import look  # noqa: E402
+from places import LOBBY
+from views import look
 
 import warprrf as wr
-from warprrf.geometry import from_photos, sparse
-from warprrf.geometry.config import ReconstructionConfig
-from warprrf.geometry.discs import discs_on_mesh
-from warprrf.geometry.from_photos import reconstruct
-from warprrf.geometry.initial import initial_gaussians, plane_mesh, seen_cells
-from warprrf.geometry.planes import Plane, occupancy, plane_axes
+from warprrf.geometry.photos import pipeline as from_photos
+from warprrf.geometry.photos import sparse
+from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.initial_gaussians import initial_gaussians, plane_mesh, seen_cells
+from warprrf.geometry.photos.pipeline import reconstruct
+from warprrf.geometry.photos.planes import Plane, occupancy, plane_axes
+from warprrf.geometry.photos.refine import RefineConfig
 from warprrf.geometry.reconstruction import Reconstruction
-from warprrf.geometry.refine import RefineConfig
+from warprrf.geometry.splats.discs import discs_on_mesh
 
 pytest.importorskip("open3d")
 pycolmap = pytest.importorskip("pycolmap")
 
-LOBBY = Path(__file__).parents[2] / "data" / "lobby"
 VIEWS = [f"view_{k:03d}.jpg" for k in range(10)]
 SMALL = ReconstructionConfig(
     max_features=1500,

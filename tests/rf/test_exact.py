@@ -1,18 +1,13 @@
 """Single-bounce scattering against closed forms, the formula written out in NumPy, and conservation laws."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square  # noqa: E402
+from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
 
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection
-from warprrf.rf.spectrum import pixel_of, pixel_solid_angles
+from warprrf.rf.spectra.spectrum import pixel_of, pixel_solid_angles
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F

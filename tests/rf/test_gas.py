@@ -3,34 +3,31 @@
 At 380.2 GHz, on a line of water vapour, standard air takes 0.3 dB a metre: enough to see in any total.
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-
-sys.path.insert(0, str(Path(__file__).parent))
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined  # noqa: E402
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.absorption import Air
-from warprrf.rf.bistatic.field import BistaticField
-from warprrf.rf.bistatic.fit import Parameters
-from warprrf.rf.bistatic.second_bounce import mirrored_scene
-from warprrf.rf.bistatic.surface import Surface
-from warprrf.rf.bistatic.terms import Terms
-from warprrf.rf.bistatic.training import trace
-from warprrf.rf.channel.path_set import Paths
-from warprrf.rf.dataset import SpectrumDataset
+from warprrf.rf.em.absorption import Air
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.field import RadioField
-from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.metrics import evaluate
-from warprrf.rf.relevance_model import full_field
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.fit import Parameters
+from warprrf.rf.fields.bistatic.second_bounce import mirrored_scene
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.relevance.model import full_field
 from warprrf.rf.simulate import simulate
-from warprrf.rf.spectrum import to_db
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.metrics import evaluate
+from warprrf.rf.spectra.spectrum import to_db
 
 F = 380.2e9
 WAVELENGTH = SPEED_OF_LIGHT / F
@@ -134,7 +131,7 @@ def test_a_carrier_that_the_recommendation_does_not_know_is_refused(scene: Radio
 
 
 def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:
-    from test_sionna_engine import sionna_or_skip, write_scene
+    from sionna_room import sionna_or_skip, write_scene
 
     sionna = sionna_or_skip()
     common = {

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import LOBBY
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.meshio import enclosed_volume, is_closed, read_mesh, write_mesh
-from warprrf.rf.materials import Material
+from warprrf.geometry.mesh_files import enclosed_volume, is_closed, read_mesh, write_mesh
+from warprrf.rf.em.materials import Material
 from warprrf.rf.scene import Scene
-
-LOBBY = Path(__file__).parents[2] / "data" / "lobby"
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def test_each_face_has_the_material_of_its_object(lobby: Scene) -> None:
 
 
 def test_sionna_opens_the_scene_with_the_same_objects_and_materials(lobby: Scene) -> None:
-    from warprrf.rf.llvm import select_llvm
+    from warprrf.rf.interop.llvm import select_llvm
 
     select_llvm()
     rt = pytest.importorskip("sionna.rt", reason="sionna-rt is not installed")

@@ -1,16 +1,11 @@
 """simulate: bad places are refused, a killed run goes on, receivers are drawn from the air."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-from radio_scenes import box_mesh, joined  # noqa: E402
+from radio_scenes import box_mesh, joined
 
 import warprrf.rf.simulate as module
-from warprrf.rf.materials import Band, Material
+from warprrf.rf.em.materials import Band, Material
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import sample_receivers, simulate
 

@@ -1,4 +1,4 @@
-"""The command line: every step of the library as a command, and the lobby as one.
+"""The command line: every step of the library as a command.
 
 `main` parses, calls one public function and writes what came back; nothing is computed here. Bad input ends with one
 line on standard error and status 2 (`--debug` shows the traceback instead), an interrupt with 130.
@@ -13,14 +13,12 @@ from typing import Any
 
 import warprrf as wr
 from warprrf.cli.bars import Bars
-from warprrf.cli.bench import add_benches
-from warprrf.cli.lobby import add_data, add_lobby
+from warprrf.cli.inputs import Add
 from warprrf.cli.steps import add_evaluate, add_fit, add_reconstruct, add_relevance, add_simulate
 from warprrf.cli.views import add_map, add_render, add_twin
 
 EPILOG = """\
-a walk through, in a checkout:
-  warprrf lobby                                    photos -> geometry -> radio -> evaluation, into runs/lobby/
+a walk through:
   warprrf reconstruct photos/ -o room --known-positions surveyed.json
   warprrf simulate data/lobby/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv
   warprrf fit room spectra.nc -o field.safetensors --model rf3dgs+
@@ -35,18 +33,22 @@ Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status: 0 done, 2 bad input, 130 interrupted."""
-    parser = _parser()
+    return run(_parser(), argv)
+
+
+def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> int:
+    """Run one command of ``parser`` (see :func:`make_parser`) and return its exit status."""
     args = parser.parse_args(argv)
     try:
         with Bars(quiet=args.quiet) as bars:
             args.command(args, bars)
     except KeyboardInterrupt:
-        print("warprrf: interrupted; what is finished is kept", file=sys.stderr)
+        print(f"{parser.prog}: interrupted; what is finished is kept", file=sys.stderr)
         return 130
     except (ValueError, OSError, ImportError) as error:
         if args.debug:
             raise
-        print(f"warprrf: error: {_one_line(error)}", file=sys.stderr)
+        print(f"{parser.prog}: error: {_one_line(error)}", file=sys.stderr)
         return 2
     return 0
 
@@ -58,6 +60,18 @@ def _one_line(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
+    return make_parser(
+        "warprrf",
+        "Radio radiance fields from photos and a few radio measurements.",
+        EPILOG,
+        (add_reconstruct, add_simulate, add_fit, add_relevance, add_render, add_evaluate, add_map, add_twin),
+    )
+
+
+def make_parser(
+    prog: str, description: str, epilog: str, definitions: Sequence[Callable[[Add], None]]
+) -> argparse.ArgumentParser:
+    """A parser of commands, each with the common options; every one of ``definitions`` adds some."""
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--seed", type=int, default=0, help="every random choice follows from it (default 0)")
     common.add_argument("--device", default=None, help="cpu or cuda:0 (default: the GPU where there is one)")
@@ -65,12 +79,12 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
     parser = argparse.ArgumentParser(
-        prog="warprrf",
-        description="Radio radiance fields from photos and a few radio measurements.",
-        epilog=EPILOG,
+        prog=prog,
+        description=description,
+        epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"warprrf {wr.__version__}")
+    parser.add_argument("--version", action="version", version=f"{prog} {wr.__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
     def add(
@@ -87,9 +101,6 @@ def _parser() -> argparse.ArgumentParser:
         one.set_defaults(command=run)
         return one
 
-    for define in (
-        add_lobby, add_reconstruct, add_simulate, add_fit, add_relevance, add_render, add_evaluate, add_map, add_twin,
-        add_benches, add_data,
-    ):  # fmt: skip
+    for define in definitions:
         define(add)
     return parser

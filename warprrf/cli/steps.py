@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from warprrf.bench.stages import write_json
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add, existing, load_geometry, read_positions, read_receivers
 from warprrf.cli.tables import table
-from warprrf.files import write_text
+from warprrf.files import write_json, write_text
 
 HELP_RECONSTRUCT = """\
 The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
@@ -212,7 +211,7 @@ def add_evaluate(add: Add) -> None:
 
 
 def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
-    from warprrf.rf import lookups, metrics
+    from warprrf.rf.spectra import lookups, metrics
 
     field = wr.RadioField.load(existing(args.field))
     dataset = wr.SpectrumDataset.load(existing(args.spectra))

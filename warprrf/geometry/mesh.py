@@ -16,8 +16,8 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.geometry.ray_room import room_for_copy
-from warprrf.geometry.raysearch import Hit, RaySearch, ray_arrays
-from warprrf.kernels.rays import closest_faces
+from warprrf.geometry.rays import Hit, RaySearch, ray_arrays
+from warprrf.kernels.rays.mesh import closest_faces
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -144,7 +144,7 @@ class Mesh:
             origins: Ray starts [m], shape ``(N, 3)`` or ``(3,)`` for all.
             directions: Ray directions, any length but zero, shape ``(N, 3)`` or ``(3,)`` for all.
             device: Where the hierarchy is searched.
-            backend: One of :data:`~warprrf.geometry.raysearch.BACKENDS`. All agree on distances; on an edge they may
+            backend: One of :data:`~warprrf.geometry.rays.BACKENDS`. All agree on distances; on an edge they may
                 name either face.
 
         Returns:
@@ -182,7 +182,7 @@ class Mesh:
             clearance: Surfaces nearer than this to either end, measured along the segment, don't block [m]: ends may
                 lie on surfaces. Distances are judged in float64, so it need not cover float32 errors.
             device: Where the hierarchy is searched.
-            backend: One of :data:`~warprrf.geometry.raysearch.BACKENDS`.
+            backend: One of :data:`~warprrf.geometry.rays.BACKENDS`.
 
         Returns:
             Shape ``(N,)``, bool.

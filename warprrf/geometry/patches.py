@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.planes import Plane, detect_planes
+from warprrf.geometry.photos.planes import Plane, detect_planes
 
 
 @dataclass(frozen=True)

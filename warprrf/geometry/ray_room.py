@@ -1,6 +1,6 @@
 """Memory for rays on a CPU, kept from call to call: new pages cost more than what is written to them.
 
-Rows of three numbers begin on a boundary of 64 bytes, as :mod:`warprrf.kernels.ray_lanes` writes them past the cache. A
+Rows of three numbers begin on a boundary of 64 bytes, as :mod:`warprrf.kernels.rays.ray_lanes` writes them past the cache. A
 thread keeps room for the packed rays of its largest call and for the copies of four sets of origins or directions, of
 at most :data:`ROWS_KEPT` rows each: 24 bytes a row.
 """

@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.geometry import sfm, stored, surface
-from warprrf.geometry.camera import Camera
-from warprrf.geometry.config import ReconstructionConfig
-from warprrf.geometry.fusion import complete_seen, fuse_gaussians
-from warprrf.geometry.gaussians import Gaussians
+from warprrf.geometry import geometry_files as stored
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.meshio import read_mesh
-from warprrf.geometry.planes import Plane
-from warprrf.geometry.surface import PlanarPatch
+from warprrf.geometry.mesh_files import read_mesh
+from warprrf.geometry.photos import sfm, surface
+from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.fusion import complete_seen, fuse_gaussians
+from warprrf.geometry.photos.planes import Plane
+from warprrf.geometry.photos.surface import PlanarPatch
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
 
 FILE = "reconstruction.safetensors"
 FORMAT = 1

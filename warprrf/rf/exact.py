@@ -1,6 +1,6 @@
 """Spectra of a single bounce without sampling noise: line of sight, mirror reflections and diffuse scattering.
 
-Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths`). Diffuse scattering is evaluated along 64
+Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths.trace`). Diffuse scattering is evaluated along 64
 directions per pixel, each with one receiver ray and one shadow ray on the mesh, as a path of its own: path gain
 (lambda / 4 pi)^2 S^2 |Gamma|^2 f_s cos(theta_i) / (cos(theta_s) d1^2) times its share of the pixel's solid angle, with
 |Gamma|^2 the mean over transmit polarisations. All paths are spread by one receiver beam. Absorption by the air, where
@@ -21,11 +21,11 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
-from warprrf.kernels.scatter import scatter_to_receiver
-from warprrf.rf.absorption import air_of
-from warprrf.rf.fresnel import SPEED_OF_LIGHT, SurfaceTable
-from warprrf.rf.paths import MirrorTracer, Paths
-from warprrf.rf.spectrum import (
+from warprrf.kernels.radio.scatter import scatter_to_receiver
+from warprrf.rf.em.absorption import air_of
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, SurfaceTable
+from warprrf.rf.paths.trace import MirrorTracer, Paths
+from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     angles_from_directions,
     check_shape,

@@ -17,8 +17,8 @@ import numpy as np
 
 from warprrf.device import check_array
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.meshio import read_mesh
-from warprrf.rf.materials import Material, load_materials
+from warprrf.geometry.mesh_files import read_mesh
+from warprrf.rf.em.materials import Material, load_materials
 
 
 class Scene:

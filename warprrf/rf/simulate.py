@@ -15,13 +15,13 @@ from warprrf import device as _device
 from warprrf.device import Progress
 from warprrf.files import write_atomically
 from warprrf.geometry.mesh import as_mesh
-from warprrf.rf.absorption import air_of
-from warprrf.rf.dataset import SpectrumDataset
+from warprrf.rf.em.absorption import air_of
+from warprrf.rf.em.fresnel import surface_table
+from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
-from warprrf.rf.fresnel import surface_table
-from warprrf.rf.sionna_engine import SionnaEngine
-from warprrf.rf.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
-from warprrf.rf.waves import check_frequency
+from warprrf.rf.interop.sionna_engine import SionnaEngine
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
 
 ENGINES = ("exact", "sionna")
 WALL_CLEARANCE_M = 1e-4

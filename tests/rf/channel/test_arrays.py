@@ -1,22 +1,17 @@
 """Arrays: symmetries, limits and the patterns' own definitions."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from path_makers import random_directions
 
-sys.path.insert(0, str(Path(__file__).parent))
-from path_makers import random_directions  # noqa: E402
-
-from warprrf.rf.channel.arrays import (  # noqa: E402
+from warprrf.rf.channel.arrays import (
     PATTERNS,
     PlanarArray,
     orientation_towards,
     plane_wave_error,
     rotation_matrix,
 )
-from warprrf.rf.spectrum import pixel_directions, pixel_solid_angles, transverse_basis  # noqa: E402
+from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles, transverse_basis
 
 WAVELENGTH = 1e-3
 

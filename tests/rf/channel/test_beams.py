@@ -9,7 +9,7 @@ import pytest
 
 import warprrf as wr
 from warprrf.rf.channel.beams import signal_over_interference
-from warprrf.rf.spectrum import angles_from_directions, pixel_directions
+from warprrf.rf.spectra.spectrum import angles_from_directions, pixel_directions
 
 F_HZ = 300e9
 WAVELENGTH_M = 299792458.0 / F_HZ

@@ -1,19 +1,14 @@
 """Spreads: hand-made channels, invariances, bounds."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from path_makers import random_paths
 
-sys.path.insert(0, str(Path(__file__).parent))
-from path_makers import random_paths  # noqa: E402
-
-from warprrf.rf.channel.dispersion import angular_spread, coherence_bandwidth, delay_spread  # noqa: E402
-from warprrf.rf.channel.path_set import Paths  # noqa: E402
+from warprrf.rf.channel.dispersion import angular_spread, coherence_bandwidth, delay_spread
+from warprrf.rf.paths.path_set import Paths
 
 powers = arrays(np.float64, 6, elements=st.floats(1e-3, 1.0))
 delays = arrays(np.float64, 6, elements=st.floats(0.0, 1e-7))

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 import warprrf as wr
 from warprrf.rf.channel.beams import signal_over_interference
-from warprrf.rf.spectrum import angles_from_directions
+from warprrf.rf.spectra.spectrum import angles_from_directions
 
 F_HZ = 300e9
 USERS, ELEMENTS = 4, 12

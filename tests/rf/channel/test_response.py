@@ -1,25 +1,21 @@
 """Channels against closed forms, brute sums and identities."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from path_makers import CARRIER, random_paths
+from radio_scenes import METAL, RadioScene, SlabMaterial
 
-sys.path[:0] = [str(folder) for folder in Path(__file__).parents[:2]]
-from path_makers import CARRIER, random_paths  # noqa: E402
-from radio_scenes import METAL, RadioScene, SlabMaterial  # noqa: E402
-
-from warprrf.geometry.mesh import Mesh  # noqa: E402
-from warprrf.rf.absorption import Air, gas_attenuation_db_per_m  # noqa: E402
-from warprrf.rf.channel import sums  # noqa: E402
-from warprrf.rf.channel.arrays import PlanarArray  # noqa: E402
-from warprrf.rf.channel.band_plan import thz_channel  # noqa: E402
-from warprrf.rf.channel.path_set import Paths  # noqa: E402
-from warprrf.rf.fresnel import SPEED_OF_LIGHT, slab_reflection  # noqa: E402
-from warprrf.rf.paths import trace_paths  # noqa: E402
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.channel import sums
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.band_plan import thz_channel
+from warprrf.rf.em.absorption import Air, gas_attenuation_db_per_m
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, slab_reflection
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.trace import trace_paths
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F

@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.rf.antenna import _sampled
-from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.spectrum import angles_from_directions, transverse_basis
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.spectra.antenna import _sampled
+from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
 
 PATTERNS = ("isotropic", "dipole", "half_wave_dipole", "tr38901")
 SLANTS_RAD = {

@@ -26,8 +26,8 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
-from warprrf.rf.channel.path_set import Paths
-from warprrf.rf.spectrum import Spectrum, directions_from_angles, pixel_directions
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions
 
 MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
 _TERMS = 1 << 18  # numbers held at once while paths are summed: what fits a cache

@@ -16,7 +16,7 @@ import numpy as np
 from warprrf import device as _device
 
 if TYPE_CHECKING:
-    from warprrf.rf.channel.path_set import Paths
+    from warprrf.rf.paths.path_set import Paths
 
 COHERENCE = 0.5
 """Default share of the maximum that defines the coherence bandwidth."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from warprrf.rf.channel.path_set import Paths
+    from warprrf.rf.paths.path_set import Paths
 
 
 @dataclass(frozen=True)

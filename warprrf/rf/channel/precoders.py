@@ -29,8 +29,8 @@ import numpy as np
 from scipy.linalg import eigh
 
 from warprrf.rf.channel.beams import _chunks, _codebook, _rays, _squared
-from warprrf.rf.channel.path_set import Paths
-from warprrf.rf.spectrum import Spectrum
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.spectra.spectrum import Spectrum
 
 METHODS = ("mr", "zf", "slnr")
 LEAST_APART = 1e-9

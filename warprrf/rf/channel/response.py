@@ -46,11 +46,11 @@ from warprrf.rf.channel.sums import (
     gridded_sum,
     squint_sum,
 )
-from warprrf.rf.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.waves import carrier_phase
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import carrier_phase
 
 if TYPE_CHECKING:
-    from warprrf.rf.channel.path_set import Paths
+    from warprrf.rf.paths.path_set import Paths
 
 DENSE_TERMS = 1e6
 """``method="auto"`` sums more terms than that (pairs x paths x frequencies) on a grid."""

@@ -28,7 +28,7 @@ import warp as wp
 from scipy.special import i0
 
 from warprrf import device as _device
-from warprrf.kernels.delays import (
+from warprrf.kernels.radio.delays import (
     DEGREE,
     TAPS,
     join_cells,
@@ -38,7 +38,7 @@ from warprrf.kernels.delays import (
     taps_vector,
 )
 from warprrf.rf.channel.lengths import PairLengths
-from warprrf.rf.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 
 OVERSAMPLING = 2
 LEAST_FREQUENCIES = 2 * TAPS

@@ -1,0 +1,327 @@
+"""What the table of methods does not say: which term is worth what, how sure the field is, how fast it learns, delays.
+
+Each function makes one row from a fitted field or from a fit of its own, and returns plain figures.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+
+from benchmarks.bistatic.methods import sight_of
+from benchmarks.setting import Geometry, Truth
+from warprrf.device import Progress
+from warprrf.rf.fields.bistatic import fit as group_fit
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.training import ROWS
+from warprrf.rf.fields.bistatic.uncertainty import negative_log_likelihood
+from warprrf.rf.paths.trace import MirrorTracer
+from warprrf.rf.simulate import simulate
+from warprrf.rf.spectra import metrics
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import pixel_directions, to_db
+
+ABLATION: dict[str, dict[str, Any]] = {
+    "no line of sight": {"line_of_sight": False},
+    "no mirrors": {"mirror_order": 0, "mirror_scatter": False, "scatter_mirror": False},
+    "no scattering": {"diffuse": False},
+    "Lambertian lobe alone": {"lobes": (0,)},
+    "nothing after the first bounce": {
+        "mirror_scatter": False,
+        "scatter_mirror": False,
+        "diffuse_order": 1,
+        "indirect": False,
+    },
+    "no residual per element": {"residual": False},
+    "true mesh, its materials as groups": {},
+}
+"""Options of the fit that leave a part of the model out. The last one fits on the true scene instead."""
+TRUE_MESH = "true mesh, its materials as groups"
+
+ADAM_STEPS = 300
+LEVELS = (*np.round(np.arange(0.05, 1.0, 0.05), 2).tolist(), 0.99)
+"""Shares of pixels at which the reliability curve is read."""
+MATCH_DEG = 3.0  # a path of ours within this angle of a true one is that path
+NEAR_A_PATH_SIGMA = (
+    5.0  # a pixel further than this from every specular path holds scattering: its beam is 54 dB down
+)
+
+
+def ablation(
+    options: dict[str, Any], true: bool, truth: Truth, count: int, geometry: Geometry, progress: Progress
+) -> dict[str, Any]:
+    """Figures of a bistatic field fitted with ``options`` on ``count`` receivers, on the true mesh if ``true``.
+
+    Receivers are asked with cached rays, so ``seconds_per_spectrum`` is without them.
+    """
+    train = truth.train(count)
+    rays = geometry.rays(train, true=true, lobes=options.get("lobes"), progress=progress)
+    place = geometry.scene if true else geometry.reconstruction
+    field = BistaticField.fit(
+        place, train, transport=rays, device=geometry.device, progress=progress, **options
+    )
+    sight = sight_of(geometry.rays(truth.test, slot="test", true=true, progress=progress))
+    found = metrics.evaluate(
+        truth.test, lambda rx: field.spectrum(rx, sight=sight(rx)), progress=progress
+    )  # fmt: skip
+    return {"fit_s": field.report["fit_time_s"], "choices": field.report["choices"], **found}
+
+
+def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[str, Any]:
+    """How often the truth lies as near to the prediction as its standard deviation says, over the test pixels.
+
+    Returns ``within_1_sigma`` and ``within_2_sigma`` (also ``..._blocked``, and ``..._lit`` of pixels whose truth or
+    prediction exceeds N0: the others are easy, and many); negative log likelihood of a pixel [nat] of the stated
+    standard deviations and of the best constant one, both with the field's share of outliers, and as pure Gaussians
+    (``..._gaussian``); the reliability curve
+    ``levels`` (stated share) and ``shares`` (found). ``{}`` if the field was fitted to too few receivers to know it.
+    """
+    if field.errors is None:
+        return {}
+    test = truth.test
+    errors, deviations, levels = [], [], []
+    for i, receiver in enumerate(test.receivers):
+        found = field.spectrum(receiver, uncertainty=True)
+        errors.append(to_db(found.path_gain, test.floor) - to_db(test.path_gain[i], test.floor))
+        deviations.append(np.asarray(found.std_db, np.float64))
+        levels.append(np.maximum(found.path_gain, test.path_gain[i]))
+        progress("uncertainty", i + 1, len(test))
+    e, s = np.stack(errors), np.stack(deviations)
+    blocked = ~test.line_of_sight
+    lit = np.stack(levels) > test.floor
+    rms = float(np.sqrt(np.mean(e**2)))
+    normal, outlier = NormalDist(), float(np.asarray(field.errors.outlier_db).item())
+    row: dict[str, Any] = {
+        "sigma_median_db": float(np.median(s)),
+        "rms_error_db": rms,
+        "nll": negative_log_likelihood(e, s, outlier),
+        "nll_constant": min(
+            negative_log_likelihood(e, c, outlier) for c in np.geomspace(0.01, 3.0, 200) * rms
+        ),
+        "nll_gaussian": float(0.5 * np.log(2.0 * np.pi) + np.mean(np.log(s) + 0.5 * (e / s) ** 2)),
+        "nll_gaussian_constant": float(0.5 * np.log(2.0 * np.pi) + np.log(rms) + 0.5),
+        "outlier_db": outlier,
+        "levels": list(LEVELS),
+        "shares": [float(np.mean(np.abs(e) <= normal.inv_cdf(0.5 * (1.0 + p)) * s)) for p in LEVELS],
+    }
+    for k in (1, 2):
+        inside = np.abs(e) <= k * s
+        row[f"within_{k}_sigma"] = float(inside.mean())
+        row[f"within_{k}_sigma_lit"] = float(inside[lit].mean()) if lit.any() else None
+        row[f"within_{k}_sigma_blocked"] = float(inside[blocked].mean()) if blocked.any() else None
+    return row
+
+
+def optimisers(truth: Truth, count: int, geometry: Geometry, seed: int, progress: Progress) -> dict[str, Any]:
+    """Gauss-Newton and Adam on the same cached views of ``count`` receivers, single bounces, all materials free.
+
+    Returns for each ``seconds``, ``steps``, the final ``objective`` per pixel [dB^2] and the curves ``at_s`` and
+    ``losses``; ``adam_reaches_s``, when Adam is first within 1 % of what Gauss-Newton ends at (None: never).
+    """
+    train = truth.train(count)
+    rays = geometry.rays(train, progress=progress)
+    start = BistaticField.prior(rays.surface, train, device=geometry.device)
+    rng = np.random.default_rng(seed)
+    pixels = train.shape[0] * train.shape[1]
+    target = to_db(train.path_gain, train.floor) - 10.0 * np.log10(train.floor)
+    views = []
+    for r, sight in enumerate(rays.sights):
+        chosen = np.sort(rng.choice(pixels, min(pixels, max(200, ROWS // count)), replace=False))
+        views.append(start.view(sight, chosen, target[r]).tied(rays.surface.material))
+        progress("views", r + 1, len(rays.sights))
+    surface = rays.surface
+    area = np.bincount(surface.material[surface.group], surface.mesh.areas)
+    prior = group_fit.Parameters.prior(len(area), len(start.terms.lobes))
+    group_fit.objective(views, prior)  # tables are made on first use, which is no fit's time
+    times: list[float] = []
+    began = time.perf_counter()
+    newton = group_fit.fit_groups(
+        views, prior, area, progress=lambda *_: times.append(time.perf_counter() - began)
+    )
+    newton_s = time.perf_counter() - began
+    progress("optimisers", 1, 2)
+    began = time.perf_counter()
+    adam = group_fit.fit_groups_adam(views, prior, area, steps=ADAM_STEPS)
+    adam_s = time.perf_counter() - began
+    progress("optimisers", 2, 2)
+    losses = [adam.losses[0], *newton.losses]  # both start from the same parameters
+    at = [0.0, *times[: len(newton.losses)]]
+    adam_at = np.arange(len(adam.losses)) * adam_s / len(adam.losses)
+    near = np.flatnonzero(np.array(adam.losses) <= 1.01 * losses[-1])
+    return {
+        "gauss_newton": {
+            "seconds": newton_s, "steps": newton.steps, "objective": losses[-1], "at_s": at, "losses": losses,
+        },
+        "adam": {
+            "seconds": adam_s, "steps": adam.steps, "objective": adam.losses[-1], "at_s": adam_at,
+            "losses": adam.losses,
+        },
+        "adam_reaches_s": float(adam_at[near[0]]) if len(near) else None,
+        "parameters": newton.layout.size,
+        "pixels": sum(len(v.target_db) for v in views),
+    }  # fmt: skip
+
+
+def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Progress) -> dict[str, Any]:
+    """Delay errors [ns] of line of sight and mirror paths, and of the pixels that hold scattering.
+
+    True specular paths are those of the image method on the true scene, one reflection at most (the exact engine's;
+    Sionna's agree with them), where their path gain exceeds N0. A pixel is compared with the data set's delay there.
+
+    Returns for ``line_of_sight`` and ``mirror``: ``paths``, the share ``found`` within 3 degrees, and ``median_ns`` and
+    ``p90_ns`` of those; for ``scattering``: ``pixels``, ``median_ns``, ``p90_ns`` and the power-weighted
+    ``median_by_power_ns``, a missing delay counted as infinite.
+    """
+    test = truth.test
+    tracer = MirrorTracer(
+        geometry.scene, transmitter=test.transmitter, frequency_hz=test.frequency_hz, device=geometry.device
+    )
+    directions = pixel_directions(test.shape)
+    names = {"los": "line_of_sight", "mirror": "mirror"}
+    errors: dict[str, list[float]] = {kind: [] for kind in names}
+    paths = dict.fromkeys(names, 0)
+    scattered: list[np.ndarray] = []
+    weights: list[np.ndarray] = []
+    for i, receiver in enumerate(test.receivers):
+        true, ours = tracer.trace(receiver, 1), field.paths(receiver)
+        for kind in names:
+            mine = np.flatnonzero(ours.kind == kind)
+            for k in np.flatnonzero((true.kind == kind) & (true.power > test.floor)):
+                paths[kind] += 1
+                apart = metrics.angle_deg(ours.arrival[mine], true.arrival[k])
+                if len(mine) and apart.min() <= MATCH_DEG:
+                    errors[kind].append(1e9 * float(abs(ours.tau[mine[apart.argmin()]] - true.tau[k])))
+        away = np.ones(test.shape, dtype=bool)
+        for arrival in true.arrival:
+            away &= np.radians(metrics.angle_deg(directions, arrival)) > (
+                NEAR_A_PATH_SIGMA * test.beam_sigma_rad
+            )
+        away &= (test.path_gain[i] > test.floor) & np.isfinite(test.delay_s[i])
+        predicted = np.asarray(field.spectrum(receiver).delay_s)
+        error = 1e9 * np.abs(predicted - test.delay_s[i])[away]
+        scattered.append(np.where(np.isnan(error), np.inf, error))
+        weights.append(test.path_gain[i][away].astype(np.float64))
+        progress("delays", i + 1, len(test))
+    row: dict[str, Any] = {
+        name: {
+            "paths": paths[kind],
+            "found": len(errors[kind]) / paths[kind] if paths[kind] else None,
+            **_quantiles(np.array(errors[kind])),
+        }
+        for kind, name in names.items()
+    }
+    everywhere = np.concatenate(scattered)
+    by_power = metrics.weighted_median(everywhere, np.concatenate(weights))
+    return row | {
+        "scattering": {"pixels": len(everywhere), **_quantiles(everywhere), "median_by_power_ns": by_power}
+    }
+
+
+def _quantiles(errors_ns: np.ndarray) -> dict[str, float | None]:
+    if len(errors_ns) == 0:
+        return {"median_ns": None, "p90_ns": None}
+    median, p90 = np.quantile(errors_ns, (0.5, 0.9), method="inverted_cdf")
+    return {"median_ns": float(median), "p90_ns": float(p90)}
+
+
+def repeat(
+    truth: Truth, count: int, geometry: Geometry, workspace: Path, progress: Progress
+) -> dict[str, Any]:
+    """How well a sampled truth predicts itself: another seed of the same engine, on ``count`` test receivers.
+
+    No prediction can be expected to score better than this on the data set.
+    """
+    chosen = np.unique(np.linspace(0, len(truth.test) - 1, min(count, len(truth.test))).round().astype(int))
+    test = truth.test.subset(chosen)
+    settings = {name: int(test.attributes[name]) for name in ("depth", "samples") if name in test.attributes}
+    again = simulate(
+        geometry.scene,
+        transmitter=test.transmitter,
+        receivers=test.receivers,
+        frequency_hz=test.frequency_hz,
+        shape=test.shape,
+        engine=test.engine,
+        beam_sigma_rad=test.beam_sigma_rad,
+        refraction=bool(test.attributes.get("refraction", 0)),
+        seed=test.seed + 1,
+        floor=test.floor,
+        workspace=workspace,
+        progress=progress,
+        device=geometry.device,
+        **settings,  # type: ignore[arg-type]
+    )
+    place = {receiver.tobytes(): again[i] for i, receiver in enumerate(again.receivers)}
+    found = metrics.evaluate(test, lambda receiver: place[np.asarray(receiver).tobytes()])
+    return {**found, "seconds_per_spectrum": None, "seeds": [test.seed, test.seed + 1], **settings}
+
+
+def second_spectra(
+    truth: Truth, transmitter: Any, geometry: Geometry, workspace: Path, progress: Progress
+) -> SpectrumDataset:
+    """Spectra of all test receivers under another transmitter, by the exact engine."""
+    test = truth.data.split(truth.few)[1]
+    return simulate(
+        geometry.scene,
+        transmitter=transmitter,
+        receivers=test.receivers,
+        frequency_hz=test.frequency_hz,
+        shape=test.shape,
+        beam_sigma_rad=test.beam_sigma_rad,
+        roles=["test"] * len(test),
+        workspace=workspace,
+        progress=progress,
+        device=geometry.device,
+    )
+
+
+def second_transmitter(
+    field: Any, ds: SpectrumDataset, truth: Truth, geometry: Geometry, progress: Progress
+) -> dict[str, Any]:
+    """A field asked for a transmitter that it was not fitted for.
+
+    Returns figures by the range of ``ds`` itself, and under ``first_range`` by floor and range of the data set that it
+    was fitted to, which its PSNR on the first transmitter has.
+
+    Raises:
+        ValueError: if ``ds`` lacks a test receiver.
+    """
+    other = _same_receivers(ds, truth.test)
+    if isinstance(field, BistaticField):
+        found = {rx.tobytes(): field.spectrum(rx, other.transmitter) for rx in other.receivers}
+    else:
+        seen = geometry.weights(truth.test, slot=truth.name, progress=progress)[0]
+        found = {
+            rx.tobytes(): field.spectrum(rx, other.transmitter, transport=seen.at(rx))
+            for rx in truth.test.receivers
+        }
+
+    def predict(receiver: Any) -> Any:
+        return found[np.asarray(receiver).tobytes()]
+
+    progress("evaluate", 0, 2)
+    first = metrics.evaluate(_in_range_of(other, truth.test), predict)
+    progress("evaluate", 1, 2)
+    own = metrics.evaluate(other, predict)
+    return {**own, "seconds_per_spectrum": None, "first_range": {**first, "seconds_per_spectrum": None}}
+
+
+def _same_receivers(ds: SpectrumDataset, test: SpectrumDataset) -> SpectrumDataset:
+    """The receivers of ``test`` in ``ds``, at exactly the positions of ``test``."""
+    apart = np.linalg.norm(ds.receivers[None] - test.receivers[:, None], axis=-1)
+    nearest = apart.argmin(axis=1)
+    if apart.min(axis=1).max() > 1e-6:
+        lacking = test.receivers[int(apart.min(axis=1).argmax())]
+        raise ValueError(
+            f"second: the data set of the second transmitter lacks the test receiver {lacking.tolist()}; expected all "
+            "test receivers of the first"
+        )
+    return replace(ds.subset(nearest), receivers=test.receivers)
+
+
+def _in_range_of(ds: SpectrumDataset, other: SpectrumDataset) -> SpectrumDataset:
+    return replace(ds, floor=other.floor, range_db=other.range_db)

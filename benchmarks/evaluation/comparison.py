@@ -1,0 +1,121 @@
+"""What the kept runs come to: the better variant of each, means over seeds, and how methods stand to each other.
+
+Two comparisons: the paper's finding, RF-3DGS+ ahead of RF-3DGS, and ours against the best of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.evaluation.methods import OURS
+from benchmarks.evaluation.protocol import TRUTHS
+from benchmarks.evaluation.runs import SPREAD, Row
+
+PAIRS = {"rf3dgs+": "rf3dgs", "rf3dgs+alpha": "rf3dgs-alpha"}
+"""What the paper's finding compares: with lengths, and without."""
+AHEAD = (
+    ("psnr_db", 1), ("ssim", 1), ("rmse_db", -1), ("direction_within_3deg", 1), ("beam_gain_loss_db", -1),
+    ("psnr_db_blocked", 1), ("ssim_blocked", 1), ("rmse_db_blocked", -1), ("direction_within_3deg_blocked", 1),
+    ("beam_gain_loss_db_blocked", -1),
+)  # fmt: skip
+"""Figures in which ours is compared with the best of the others, and the sign of better."""
+
+
+def summarise(rows: Iterable[Row]) -> list[Row]:
+    """One row a truth, split, count and method: the better variant of each seed, then the mean over seeds.
+
+    Of smallest and largest values the smallest and largest over seeds are kept.
+    """
+    seeds: dict[tuple[Any, ...], dict[int, Row]] = {}
+    for row in rows:
+        place = seeds.setdefault((row["truth"], row["split"], row["count"], row["method"]), {})
+        if row["seed"] not in place or row["psnr_db"] > place[row["seed"]]["psnr_db"]:
+            place[row["seed"]] = row
+    return [_mean(list(group.values())) for group in seeds.values()]
+
+
+def _mean(group: list[Row]) -> Row:
+    first = group[0]
+    merged: Row = {name: first[name] for name in ("truth", "split", "count", "method", "note")}
+    merged |= {
+        "variants": sorted({row["variant"] for row in group}),
+        "seeds": len(group),
+        "keys": [row["key"] for row in group],
+        "lpips_reason": first.get("lpips_reason"),
+        "receivers": first["receivers"],
+        "receivers_blocked": first["receivers_blocked"],
+        "devices": sorted({f"{row['device']}, {row['cores']} cores, {row['processor']}" for row in group}),
+    }
+    ends = {f"{name}_{end}": fold for name in SPREAD for end, fold in (("min", min), ("max", max))}
+    for name in first:
+        values = [row.get(name) for row in group]
+        numbers = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
+        if name not in merged and len(numbers) + values.count(None) == len(values):
+            merged[name] = ends.get(name, np.mean)(numbers) if numbers else None
+    spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in group]
+    merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
+    merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
+    on_gpu = [row["peak_gpu_bytes"] for row in group if row.get("peak_gpu_bytes") is not None]
+    merged["peak_gpu_gib"] = max(on_gpu) / 2**30 if on_gpu else None
+    merged["model_mib"] = None if merged.get("model_bytes") is None else merged["model_bytes"] / 2**20
+    return {k: v for k, v in merged.items() if k not in ("per_receiver", "details", "shown", "seed")}
+
+
+def paper_finding(rows: Sequence[Row]) -> list[Row]:
+    """RF-3DGS+ less RF-3DGS on every subset, a row a truth, split, count and whether opacity was trained."""
+    known = {(r["truth"], r["split"], r["count"], r["method"]): r for r in rows}
+    found = []
+    for (truth, split, count, method), plus in known.items():
+        other = known.get((truth, split, count, PAIRS.get(method, "")))
+        if other is None:
+            continue
+        line: Row = {"truth": truth, "split": split, "count": count, "opacity": method != "rf3dgs+"}
+        for key in ("psnr_db", "psnr_db_blocked", "ssim", "rmse_db"):
+            a, b = plus.get(key), other.get(key)
+            difference = None if a is None or b is None else a - b
+            line[key] = {"rf3dgs+": a, "rf3dgs": b, "difference": difference}
+        found.append(line)
+    order = list(TRUTHS)
+    return sorted(
+        found, key=lambda line: (line["opacity"], order.index(line["truth"]), line["split"], line["count"])
+    )
+
+
+def ours_against_all(rows: Sequence[Row]) -> list[Row]:
+    """Ours less the best of the others in each figure, a row a truth, split, count and one of :data:`OURS`.
+
+    ``train_ratio`` and ``spectrum_ratio`` are how many times faster than RF-3DGS+ ours is.
+    """
+    found = []
+    for ours in (row for row in rows if row["method"] in OURS):
+        place = (ours["truth"], ours["split"], ours["count"])
+        others = [
+            row
+            for row in rows
+            if (row["truth"], row["split"]) == place[:2]
+            and row["count"] in (0, ours["count"])
+            and row["method"] not in OURS
+        ]
+        line: Row = dict(zip(("truth", "split", "count"), place, strict=True)) | {"ours": ours["method"]}
+        for key, sign in AHEAD:
+            rated = [row for row in others if row.get(key) is not None]
+            if ours.get(key) is None or not rated:
+                continue
+            best = max(rated, key=lambda row: sign * float(row[key]))
+            margin = float(ours[key]) - float(best[key])
+            line[key] = {
+                "ours": ours[key],
+                "best": best[key],
+                "method": best["method"],
+                "margin": margin,
+                "ahead": bool(sign * margin >= 0),
+            }
+        plus = next((row for row in others if row["method"] == "rf3dgs+"), None)
+        if plus is not None:
+            line["train_ratio"] = plus["train_s"] / ours["train_s"]
+            line["spectrum_ratio"] = plus["seconds_per_spectrum"] / ours["seconds_per_spectrum"]
+        found.append(line)
+    return found

@@ -1,0 +1,378 @@
+"""Runs carried out one by one, here or on the workers of a dask cluster; each finished one is kept in its own files.
+
+A worker takes a run and the setting, which is plain values and paths: on several machines they must see the same files.
+It returns figures and pictures, and the process that started the sweep writes them, under a temporary name that is then
+replaced. A worker that dies has written nothing: its run goes to another one. A sweep that is killed loses the runs at
+work; trainings of networks go on from their checkpoint.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from benchmarks.evaluation.methods import AFTER, METHODS, UNTAUGHT, Task, code_of
+from benchmarks.evaluation.protocol import Run, Setting, shown_receivers, truth_of
+from benchmarks.machine import processor_name
+from benchmarks.methods import Fitted
+from benchmarks.setting import Geometry, Truth
+from benchmarks.stages import fingerprint, plain, write_json
+from warprrf.device import Progress, require, resolve, threads
+from warprrf.files import write_arrays
+from warprrf.rf.spectra import metrics
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import to_db
+
+SPREAD = ("psnr_db", "ssim", "rmse_db", "beam_gain_loss_db")
+"""Figures of which the smallest and the largest over the test receivers are kept."""
+
+Row = dict[str, Any]
+Execute = Callable[[Run, Setting, "float | None"], "tuple[Row, dict[str, np.ndarray]]"]
+
+
+class Lab:
+    """What a process keeps between runs: data sets and what receivers see of the geometry."""
+
+    def __init__(self, setting: Setting) -> None:
+        self.setting = setting
+        self.geometry = Geometry(Path(setting.geometry), Path(setting.scene), setting.device)
+        self._data: dict[str, SpectrumDataset] = {}
+
+    def truth(self, name: str, split: str) -> Truth:
+        """The data set of a truth, with the receivers of a split."""
+        if name not in self._data:
+            self._data[name] = SpectrumDataset.load(self.setting.file(name))
+        return truth_of(name, self.setting.mark(name), self._data[name], split, self.setting.every)
+
+
+@lru_cache(maxsize=1)
+def _lab(setting: Setting) -> Lab:
+    return Lab(setting)
+
+
+def execute(
+    run: Run, setting: Setting, budget_s: float | None = None, progress: Progress | None = None
+) -> tuple[Row, dict[str, np.ndarray]]:
+    """Carry out ``run``: its figures, and the dB images of the shown receivers.
+
+    Args:
+        run: what to do.
+        setting: where everything lies.
+        budget_s: seconds that the run may take, where another one sets them; see :data:`AFTER`.
+        progress: called with ``"transport"``, ``"fit"`` and ``"evaluate"``.
+    """
+    tick = progress or (lambda stage, done, total: None)
+    lab, method = _lab(setting), METHODS[run.method]
+    truth = lab.truth(run.truth, run.split)
+    test = truth.test
+    lab.geometry.forget(keep=method.traces)
+    train = truth.data.subset([]) if run.method in UNTAUGHT else truth.train(run.count, run.seed)
+    task = Task(
+        train=train,
+        test=test,
+        slot=f"{run.truth}-{run.split}",
+        geometry=lab.geometry,
+        variant=run.variant,
+        seed=run.seed,
+        effort=setting.effort,
+        depth=int(truth.data.attributes.get("depth", 1)),
+        budget_s=budget_s,
+        checkpoint=Path(setting.scratch) / f"{run.key}.safetensors",
+        progress=tick,
+    )
+    with peak_memory(setting.device) as peak:
+        fitted = method.fit(task)
+        found = metrics.evaluate(test, fitted.predict, progress=tick)
+    found["seconds_per_spectrum"] += fitted.before_s
+    shown = shown_receivers(test)
+    images = [to_db(fitted.predict(test.receivers[i]).path_gain, test.floor) for i in shown]
+    row: Row = {
+        **vars(run),
+        "key": run.key,
+        "transport_s": fitted.transport_s,
+        "fit_s": fitted.fit_s,
+        **found,
+        **_extremes(found["per_receiver"]),
+        **peak,
+        "model_bytes": _size(fitted),
+        **_ends(fitted.losses),
+        "details": fitted.details,
+        "note": method.note,
+        "processor": processor_name(),
+        "device": str(resolve(setting.device)),
+        "cores": threads(),
+        "host": platform.node(),
+        "shown": {"receivers": test.receivers[shown], "blocked": ~test.line_of_sight[shown]},
+    }
+    arrays = {
+        "prediction_db": np.stack(images).astype(np.float32),
+        "truth_db": to_db(test.path_gain[shown], test.floor).astype(np.float32),
+        "range_db": np.array(test.range_db),
+    }
+    return row, arrays
+
+
+def _extremes(per_receiver: dict[str, np.ndarray]) -> Row:
+    found: Row = {}
+    for name in SPREAD:
+        values = np.asarray(per_receiver[name], np.float64)
+        values = values[np.isfinite(values)]
+        found[f"{name}_min"] = float(values.min()) if len(values) else None
+        found[f"{name}_max"] = float(values.max()) if len(values) else None
+    return found
+
+
+def _ends(losses: list[float] | None) -> Row:
+    """Mean loss of the first and the last tenth of the steps."""
+    if not losses:
+        return {"loss_first": None, "loss_last": None}
+    tenth = max(1, len(losses) // 10)
+    return {"loss_first": float(np.mean(losses[:tenth])), "loss_last": float(np.mean(losses[-tenth:]))}
+
+
+def _size(fitted: Fitted) -> int | None:
+    """Bytes of the saved model."""
+    if fitted.size_bytes is not None or fitted.field is None:
+        return fitted.size_bytes
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "field.safetensors"
+        fitted.field.save(file)
+        return file.stat().st_size
+
+
+@contextmanager
+def peak_memory(device: Any = None) -> Iterator[Row]:
+    """Fills what it yields with the process's largest resident memory inside the block, and the GPU's where one works.
+
+    ``peak_memory_bytes`` is of the whole process, what was loaded before included. Where the kernel does not let the
+    mark be reset it is that of the process's life.
+    """
+    found: Row = {}
+    marked = Path("/proc/self/clear_refs")
+    try:
+        marked.write_text("5")  # resets VmHWM, man 5 proc
+    except OSError:
+        found["peak_memory_of_life"] = True
+    where = resolve(device)
+    torch = sys.modules.get("torch") if where.is_cuda else None
+    if torch is not None:
+        torch.cuda.reset_peak_memory_stats()
+    yield found
+    found["peak_memory_bytes"] = _high_water_mark()
+    if where.is_cuda:
+        torch = sys.modules.get("torch")
+        warp_bytes = wp.get_mempool_used_mem_high(where)
+        found["peak_gpu_bytes"] = int(warp_bytes) + (
+            int(torch.cuda.max_memory_allocated()) if torch is not None else 0
+        )
+
+
+def _high_water_mark() -> int:
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+class Store:
+    """Finished runs: ``runs/<key>.json`` with the figures, ``runs/<key>.npz`` with the pictures."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "runs"
+
+    def load(self, run: Run, mark: str) -> Row | None:
+        """The figures of ``run`` if it was finished with the same inputs, else None."""
+        file = self.folder / f"{run.key}.json"
+        if not file.is_file() or not self.pictures(run).is_file():
+            return None
+        try:
+            row: Row = json.loads(file.read_text())
+        except ValueError as error:
+            raise ValueError(
+                f"{file}: not readable ({error}); remove it or start over with --fresh"
+            ) from error
+        return row if row.get("mark") == mark else None
+
+    def save(self, run: Run, mark: str, row: Row, arrays: dict[str, np.ndarray]) -> Row:
+        """Keep a finished run; the figures last, so that they never stand without their pictures."""
+        write_arrays(self.pictures(run), arrays)
+        kept: Row = {**plain(row), "mark": mark}
+        write_json(self.folder / f"{run.key}.json", kept)
+        return kept
+
+    def pictures(self, run: Run) -> Path:
+        """The file of a run's pictures."""
+        return self.folder / f"{run.key}.npz"
+
+
+def mark_of(run: Run, setting: Setting) -> str:
+    """Fingerprint of what a run's figures depend on."""
+    return fingerprint(
+        [run.key, setting.mark(run.truth), setting.geometry_mark, setting.every if run.split == "random" else 1,
+         _effort(run, setting), code_of(run.method)]
+    )  # fmt: skip
+
+
+def _effort(run: Run, setting: Setting) -> dict[str, Any]:
+    """The part of the effort that a method feels."""
+    heads: dict[str, tuple[str, ...]] = {
+        **dict.fromkeys(("rf3dgs+", "rf3dgs", "rf3dgs+alpha", "rf3dgs-alpha"), ("harmonic",)),
+        "nerf2": ("nerf2",),
+        "cgan": ("cgan",),
+        "sionna": ("sionna",),
+        "sionna-calibrated": ("calibration", "sionna"),
+    }
+    return {k: v for k, v in vars(setting.effort).items() if k.startswith(heads.get(run.method, ("none",)))}
+
+
+def sweep(
+    runs: Iterable[Run],
+    setting: Setting,
+    store: Store,
+    *,
+    scheduler: str | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+    work: Execute = execute,
+) -> dict[Run, Row]:
+    """Carry out the runs that are not in ``store`` and return the figures of all.
+
+    Args:
+        runs: what to do; see :func:`benchmarks.evaluation.protocol.plan`.
+        setting: where everything lies.
+        store: where finished runs are kept.
+        scheduler: address of a running dask scheduler, such as ``"tcp://lab:8786"``.
+        workers: processes of a local cluster otherwise; 0 works in this process, without dask.
+        progress: called with ``"runs"``, and in this process with the steps of each.
+        work: what carries out one run; :func:`execute` but for tests.
+
+    Raises:
+        ImportError: without dask.distributed, where it is needed.
+        ValueError: for a negative number of workers.
+        RuntimeError: naming the run that failed; those that were finished are kept.
+    """
+    if isinstance(workers, bool) or not isinstance(workers, int | np.integer) or workers < 0:
+        raise ValueError(f"workers: got {workers!r}, expected a whole number of at least 0")
+    everything = list(dict.fromkeys(runs))
+    marks = {run: mark_of(run, setting) for run in everything}
+    found = {run: row for run in everything if (row := store.load(run, marks[run])) is not None}
+    pending = [run for run in everything if run not in found]
+    # What takes another run's seconds comes after that run.
+    first = [run for run in pending if run.method not in AFTER]
+    rest = [run for run in pending if run.method in AFTER]
+
+    def keep(run: Run, result: tuple[Row, dict[str, np.ndarray]]) -> None:
+        found[run] = store.save(run, marks[run], *result)
+        if progress is not None:
+            progress("runs", len(found), len(everything))
+
+    if progress is not None:
+        progress("runs", len(found), len(everything))
+    if not pending:
+        return {run: found[run] for run in everything}
+    carry_out = partial(_here, progress) if workers == 0 and scheduler is None else None
+    with _cluster(scheduler, workers) if carry_out is None else _nothing() as client:
+        for part in (first, rest):
+            jobs = [(run, _budget(run, found)) for run in part]
+            if carry_out is not None:
+                carry_out(jobs, setting, work, keep)
+            else:
+                _there(client, jobs, setting, work, keep)
+    return {run: found[run] for run in everything}
+
+
+def _budget(run: Run, found: dict[Run, Row]) -> float | None:
+    """Seconds that the run before took from raw spectra to a model."""
+    if run.method not in AFTER:
+        return None
+    other = found.get(Run(run.truth, run.split, run.count, run.seed, AFTER[run.method]))
+    return None if other is None else float(other["transport_s"]) + float(other["fit_s"])
+
+
+def _here(
+    progress: Progress | None,
+    jobs: list[tuple[Run, float | None]],
+    setting: Setting,
+    work: Execute,
+    keep: Any,
+) -> None:
+    for run, budget in jobs:
+        tick = None
+        if progress is not None:
+
+            def tick(stage: str, done: int, total: int, run: Run = run) -> None:
+                progress(f"{run.key}: {stage}", done, total)
+
+        try:
+            options = {"progress": tick} if work is execute else {}
+            result = work(run, setting, budget, **options)
+        except Exception as error:
+            raise RuntimeError(f"{run.key}: {type(error).__name__}: {error}") from error
+        keep(run, result)
+
+
+def _there(
+    client: Any, jobs: list[tuple[Run, float | None]], setting: Setting, work: Execute, keep: Any
+) -> None:
+    distributed = require("distributed", extra="cluster")
+    futures = {}
+    for place, (run, budget) in enumerate(jobs):
+        # One prefix for all keys: dask would else hand out small groups of other prefixes first, and runs of one set of
+        # receivers would not meet what was traced for them. The first asked for is the first done.
+        name = f"run-{place}-{time.time_ns()}"
+        futures[client.submit(work, run, setting, budget, key=name, pure=False, priority=-place)] = run
+    try:
+        for future in distributed.as_completed(list(futures), loop=client.loop):
+            run = futures[future]
+            try:
+                result = future.result()
+            except Exception as error:
+                raise RuntimeError(f"{run.key}: {type(error).__name__}: {error}") from error
+            keep(run, result)
+            future.release()
+    finally:
+        client.cancel(list(futures))
+
+
+@contextmanager
+def _nothing() -> Iterator[None]:
+    yield None
+
+
+@contextmanager
+def _cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
+    """A client of the scheduler, or of a local cluster whose processes share the cores."""
+    distributed = require("distributed", extra="cluster")
+    if scheduler is not None:
+        with distributed.Client(scheduler, set_as_default=False) as client:
+            yield client
+        return
+    share = str(max(1, (os.cpu_count() or 1) // workers))
+    environment = {"WARPRRF_THREADS": share, "OMP_NUM_THREADS": share} if workers > 1 else {}
+    with (
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,  # a run may need what the machine has: no worker is stopped for it
+            dashboard_address=None,
+            env=environment,
+            silence_logs="ERROR",
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

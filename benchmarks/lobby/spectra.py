@@ -1,0 +1,160 @@
+"""The lobby's spectra: one transmitter in a corner, 800 receivers, both engines.
+
+The transmitter hangs at 2.5 m in the north-eastern corner, over the lounge; screen, kiosk, pillars, partition and
+gallery throw its shadows. The full plan is 700 training and 100 test receivers; the committed sample is its first 60
+training receivers and all test receivers, so that subsets of up to 60 are the same in both.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import Progress
+from warprrf.files import write_text
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.interop.sionna_engine import SionnaEngine
+from warprrf.rf.scene import Scene
+from warprrf.rf.simulate import sample_receivers, simulate
+from warprrf.rf.spectra.dataset import assign_roles
+
+TRANSMITTER = (13.6, 11.2, 2.5)  # [m]
+FREQUENCY_HZ = 300e9
+SHAPE = (60, 120)
+RECEIVERS = 800
+TEST_RECEIVERS = 100
+SAMPLE_TRAINING = 60
+SEED = 0
+FILES = {"exact": "spectra.nc", "sionna": "spectra_sionna.nc"}
+"""Committed sample of each engine; the full sets end in ``_full.nc``."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Who receives.
+
+    Attributes:
+        receivers: Positions [m], shape ``(800, 3)``.
+        role: "train" or "test", shape ``(800,)``.
+        sample: Indices of the committed receivers, training first, shape ``(160,)``.
+    """
+
+    receivers: np.ndarray
+    role: np.ndarray
+    sample: np.ndarray
+
+
+def plan(scene: Scene) -> Plan:
+    """The 800 receivers, the same every time for one scene."""
+    receivers = np.round(sample_receivers(scene, RECEIVERS, seed=SEED), 4)
+    role = assign_roles(RECEIVERS, test=TEST_RECEIVERS, seed=SEED)
+    train, test = np.flatnonzero(role == "train"), np.flatnonzero(role == "test")
+    return Plan(receivers, role, np.concatenate([train[:SAMPLE_TRAINING], test]))
+
+
+def make(
+    data: str | os.PathLike[str] = "data/lobby",
+    *,
+    full: bool = False,
+    engines: tuple[str, ...] = ("exact", "sionna"),
+    workspace: str | os.PathLike[str] = "runs/data/spectra",
+    replace: bool = False,
+    progress: Progress | None = None,
+    device: Any = None,
+) -> None:
+    """Write ``receivers.json`` and the spectra that are missing.
+
+    Args:
+        data: The lobby's folder, with its scene.
+        full: All 800 receivers instead of the sample, at full precision (about 40 minutes on two cores with Sionna).
+        engines: Which engines.
+        workspace: Folder of finished receivers: a killed run goes on where it stopped.
+        replace: Make files that are there already again.
+    """
+    folder = Path(data)
+    scene = Scene.load(folder / "scene.xml")
+    who = plan(scene)
+    chosen = np.arange(RECEIVERS) if full else who.sample
+    _write_receivers(folder / "receivers.json", scene, who)
+    for engine in engines:
+        target = folder / FILES[engine]
+        if full:
+            target = target.with_name(f"{target.stem}_full.nc")
+        if target.is_file() and not replace:
+            continue
+
+        def report(stage: str, done: int, total: int, engine: str = engine) -> None:
+            if progress is not None:
+                progress(f"{stage} {engine}", done, total)
+
+        simulate(
+            scene,
+            transmitter=TRANSMITTER,
+            receivers=who.receivers[chosen],
+            frequency_hz=FREQUENCY_HZ,
+            shape=SHAPE,
+            engine=engine,
+            seed=SEED,
+            roles=who.role[chosen],
+            workspace=workspace,
+            progress=report,
+            device=device,
+        ).save(target, compact=not full)
+
+
+def _write_receivers(path: Path, scene: Scene, who: Plan) -> None:
+    seen = scene.mesh.visible(np.array(TRANSMITTER), who.receivers)
+    text = {
+        "transmitter_m": TRANSMITTER,
+        "frequency_hz": FREQUENCY_HZ,
+        "seed": SEED,
+        "sample": who.sample.tolist(),
+        "receivers_m": who.receivers.tolist(),
+        "role": who.role.tolist(),
+        "line_of_sight": seen.tolist(),
+    }
+    lines = ",\n".join(f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in text.items())
+    write_text(path, "{\n" + lines + "\n}\n")
+
+
+def compare_engines(
+    scene: Scene, *, receivers: int = 5, samples: int = 1_000_000, device: Any = None
+) -> dict[str, list[float]]:
+    """Both engines at depth 1 on the first test receivers: ratios less one, and seconds.
+
+    Returns:
+        Lists with an entry a receiver: ``diffuse`` (Sionna scatters every ray: its noise is about 3e-4),
+        ``diffuse_mixed`` (as in its data sets, rays shared with specular reflection: noise of about 5e-3), ``mirror``
+        and ``los`` (NaN where there is none), ``exact_s``, ``sionna_s``.
+    """
+    who = plan(scene)
+    points = who.receivers[who.sample[SAMPLE_TRAINING : SAMPLE_TRAINING + receivers]]
+    common: dict[str, Any] = {"transmitter": TRANSMITTER, "frequency_hz": FREQUENCY_HZ, "shape": SHAPE}
+    ours = ExactEngine(scene, **common, device=device)
+    theirs = SionnaEngine(scene, **common, depth=1, samples=samples, device=device)
+    ours.receive(points[0])
+    theirs.receive(points[0])
+    figures: dict[str, list[float]] = {
+        name: [] for name in ("diffuse", "diffuse_mixed", "mirror", "los", "exact_s", "sionna_s")
+    }
+    for point in points:
+        start = time.perf_counter()
+        exact = ours.receive(point).totals
+        figures["exact_s"].append(time.perf_counter() - start)
+        start = time.perf_counter()
+        sionna = theirs.receive(point).totals
+        figures["sionna_s"].append(time.perf_counter() - start)
+        scattered = theirs.solve(point, specular=False)
+        figures["diffuse"].append(
+            exact["diffuse"] / float(scattered["power"][scattered["diffuse"]].sum()) - 1.0
+        )
+        figures["diffuse_mixed"].append(exact["diffuse"] / sionna["diffuse"] - 1.0)
+        for name in ("mirror", "los"):
+            figures[name].append(exact[name] / sionna[name] - 1.0 if sionna[name] > 0 else float("nan"))
+    return figures

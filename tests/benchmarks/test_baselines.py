@@ -1,0 +1,264 @@
+"""Learned baselines on a handful of tiny spectra: they learn, repeat themselves bit by bit, resume, and read files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from benchmarks.baselines import (
+    CGAN,
+    CGANOptions,
+    NeRF2,
+    NeRF2Options,
+    SpectrumImages,
+    load_nerf2_spectra,
+    training,
+)
+from benchmarks.baselines import nerf2 as nerf2_module
+from benchmarks.baselines.images import path_gain_of
+from warprrf.rf.spectra import lookups, metrics
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import pixel_directions
+
+SHAPE = (10, 20)
+TRANSMITTER = np.array([4.0, 1.0, 2.0])
+SMALL = NeRF2Options(far_m=8.0, samples=8, depth=3, width=32, skip=1, octaves=3, scale_m=2.5)
+FIT: dict[str, dict[str, Any]] = {
+    "NeRF2": {"iterations": 250, "rays": 128},
+    "CGAN": {"iterations": 60, "batch": 4},
+}
+
+
+def spectra(count: int = 12) -> SpectrumDataset:
+    """A glow around the transmitter's direction, weaker with distance, above a gradient from floor to ceiling."""
+    rng = np.random.default_rng(0)
+    receivers = rng.uniform([0.5, 0.5, 1.0], [3.5, 3.5, 2.0], (count, 3))
+    directions = pixel_directions(SHAPE)
+    images = []
+    for receiver in receivers:
+        toward = TRANSMITTER - receiver
+        distance = np.linalg.norm(toward)
+        glow = np.exp(6.0 * (directions @ (toward / distance) - 1.0)) / distance**2
+        images.append(1e-9 * (glow + 0.002 * (1.2 + directions[..., 2])))
+    return SpectrumDataset.from_spectra(
+        receivers=receivers,
+        transmitter=TRANSMITTER,
+        frequency_hz=300e9,
+        path_gain=np.array(images, np.float32),
+        delay_s=np.full((count, *SHAPE), np.nan),
+        aod=np.full((count, *SHAPE, 2), np.nan),
+        line_of_sight=np.ones(count, bool),
+        beam_sigma_rad=0.1,
+        engine="exact",
+        floor=1e-13,
+        role=["train"] * (count - 3) + ["test"] * 3,
+    )
+
+
+def fit(name: str, data: Any, **changed: Any) -> Any:
+    options = {**FIT[name], "device": "cpu", **changed}
+    if name == "NeRF2":
+        return NeRF2.fit(data, SMALL, **options)
+    return CGAN.fit(data, CGANOptions.around(SpectrumImages.of(data).receivers, channels=8), **options)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> dict[str, Any]:
+    train, _ = spectra().split(9)
+    return {name: fit(name, train) for name in FIT}
+
+
+@pytest.mark.parametrize("name", FIT)
+def test_loss_falls_and_the_constant_is_beaten_on_held_out_receivers(
+    name: str, fitted: dict[str, Any]
+) -> None:
+    train, test = spectra().split(9)
+    losses = fitted[name].report["losses"]
+    assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])
+    constant = metrics.evaluate(test, lookups.constant(train))
+    found = metrics.evaluate(test, fitted[name].spectrum)
+    assert found["psnr_db"] > constant["psnr_db"] + 1.0
+    assert found["rmse_db"] < constant["rmse_db"]
+
+
+@pytest.mark.parametrize("name", FIT)
+def test_a_seed_repeats_bit_by_bit_and_another_one_differs(name: str) -> None:
+    train, test = spectra().split(4)
+    few = {"iterations": 6}
+    first, again, other = (fit(name, train, seed=s, **few) for s in (3, 3, 4))
+    assert first.report["losses"] == again.report["losses"]
+    assert np.array_equal(first.image(test.receivers[0]), again.image(test.receivers[0]))
+    assert not np.array_equal(first.image(test.receivers[0]), other.image(test.receivers[0]))
+
+
+@pytest.mark.parametrize("name", FIT)
+def test_resumed_training_ends_as_an_uninterrupted_one(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "CHECKPOINT_S", -1.0)  # after every step
+    train, test = spectra().split(4)
+    whole = fit(name, train, iterations=9)
+    file = tmp_path / "half.safetensors"
+    done = []
+
+    def killed(stage: str, step: int, total: int) -> None:
+        done.append(step)
+        if step == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(name, train, iterations=9, checkpoint=file, progress=killed)
+    assert file.exists()
+    with pytest.raises(ValueError, match="checkpoint: .* other data or options"):
+        fit(name, train, iterations=9, checkpoint=file, seed=1)
+    done.clear()
+    resumed = fit(name, train, iterations=9, checkpoint=file, progress=lambda _, step, __: done.append(step))
+    assert done == [5, 6, 7, 8, 9]  # the step at which it was killed had not been saved yet
+    assert resumed.report["losses"] == whole.report["losses"]
+    assert np.array_equal(resumed.image(test.receivers[0]), whole.image(test.receivers[0]))
+    assert not file.exists()
+
+
+@pytest.mark.parametrize("name", FIT)
+def test_a_saved_model_draws_the_same(name: str, fitted: dict[str, Any], tmp_path: Path) -> None:
+    model = fitted[name]
+    model.save(tmp_path / "model.safetensors")
+    loaded = type(model).load(tmp_path / "model.safetensors", device="cpu")
+    receiver = np.array([1.0, 2.0, 1.5])
+    assert np.array_equal(loaded.spectrum(receiver).path_gain, model.spectrum(receiver).path_gain)
+    assert loaded.spectrum(receiver).range_db == model.spectrum(receiver).range_db
+    assert model.model_bytes <= (tmp_path / "model.safetensors").stat().st_size
+    other = CGAN if name == "NeRF2" else NeRF2
+    with pytest.raises(ValueError, match=f"holds a '{name}'"):
+        other.load(tmp_path / "model.safetensors")
+
+
+def test_a_ray_is_the_sum_of_what_its_points_send_through_those_before_them() -> None:
+    """NeRF2's renderer against complex numbers, point by point."""
+    options = NeRF2Options(far_m=6.0, near_m=0.5, samples=5, depth=2, width=8, octaves=2)
+    network = NeRF2._build(options, SHAPE, 1)
+    rng = np.random.default_rng(2)
+    origin, source = rng.normal(size=(2, 3)).astype(np.float32)
+    toward = np.array([0.6, 0.0, 0.8], np.float32)
+    asked: list[Any] = []
+    for name in ("attenuation", "signal"):
+        network[name].register_forward_hook(lambda _, __, out: asked.append(out.detach().numpy()[0]))
+    row = lambda v: torch.from_numpy(v)[None]  # noqa: E731
+    shown = float(nerf2_module.render(network, options, row(origin), row(toward), row(source)).detach()[0])
+    attenuation, signal = (a.astype(np.float64) for a in asked)
+
+    def positive(x: np.ndarray) -> np.ndarray:
+        return np.abs(np.where(x > 0, x, 0.01 * x))
+
+    def angle(x: np.ndarray) -> np.ndarray:
+        return 2 * np.pi / (1 + np.exp(-x))
+
+    t = np.linspace(0.5, 6.0, 5)
+    through, total = 1.0 + 0j, 0j
+    for i in range(5):
+        distance = t[i + 1] if i < 4 else 1e10
+        total += positive(signal[i, 0]) * np.exp(1j * angle(signal[i, 1])) * through * 0.025 / distance
+        if i < 4:
+            step = t[i + 1] - t[i]
+            through *= np.exp(-positive(attenuation[i, 0]) * step) * np.exp(
+                1j * angle(attenuation[i, 1]) * step
+            )
+    assert shown == pytest.approx(abs(total), rel=1e-4)
+
+
+def test_pictures_are_the_db_image_in_the_stated_range_and_back() -> None:
+    ds = spectra()
+    known = SpectrumImages.of(ds)
+    low, high = ds.range_db
+    expected = (10 * np.log10(ds.path_gain[2, 3, 4] + ds.floor) - low) / (high - low)
+    assert known.images[2, 3, 4] == pytest.approx(expected, abs=1e-6)
+    back = path_gain_of(known.images, ds.floor, ds.range_db)
+    assert np.allclose(back, ds.path_gain, rtol=1e-4)
+    assert path_gain_of(np.array([-3.0]), ds.floor, ds.range_db)[0] == 0.0
+
+
+def test_errors_name_the_argument(fitted: dict[str, Any]) -> None:
+    train, _ = spectra().split(4)
+    with pytest.raises(ValueError, match="near_m, far_m"):
+        NeRF2Options(far_m=0.0)
+    with pytest.raises(ValueError, match="iterations: got 0"):
+        NeRF2.fit(train, SMALL, iterations=0)
+    with pytest.raises(ValueError, match="channels: got 12"):
+        CGANOptions.around(train.receivers, channels=12)
+    with pytest.raises(ValueError, match="rx"):
+        fitted["CGAN"].spectrum([np.nan, 0.0, 0.0])
+    with pytest.raises(ValueError, match="transmitter: got"):
+        fitted["CGAN"].image([1.0, 1.0, 1.0], [0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="device"):
+        NeRF2.fit(train, SMALL, iterations=1, device="cpu0x")
+
+
+# ------------------------------------------------------------------------------------------- NeRF2's own files
+
+
+@pytest.fixture
+def public(tmp_path: Path) -> Path:
+    """Four views of NeRF2's layout: a bright spot at the transmitter's azimuth, a gateway turned by 90 degrees."""
+    image = pytest.importorskip("PIL.Image")
+    (tmp_path / "spectrum").mkdir()
+    rows = ["x,y,z"]
+    for k in range(4):
+        picture = np.zeros((9, 36), np.uint8)
+        picture[3, 9 * k] = 255
+        picture[5] = 51
+        picture[6:] = 200
+        image.fromarray(picture).save(tmp_path / "spectrum" / f"{k + 1}.png")
+        rows.append(f"{k + 0.5},1.0,1.5")
+    (tmp_path / "tx_pos.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "gateway_info.yml").write_text(
+        "gateway1:\n  position: [1.0, 2.0, 0.5]\n  orientation: [0.0, 0.0, 0.7071067811865476, 0.7071067811865476]\n"
+    )
+    (tmp_path / "train_index.txt").write_text("4\n2\n1\n")
+    (tmp_path / "test_index.txt").write_text("3\n")
+    return tmp_path
+
+
+def test_public_layout_is_read_by_its_own_conventions(public: Path) -> None:
+    known = load_nerf2_spectra(public)
+    assert (len(known), known.shape) == (4, (9, 36))
+    assert known.images[2, 3, 18] == 1.0
+    assert known.images[0, 5, 7] == pytest.approx(0.2)
+    assert np.array_equal(known.transmitters[:, 0], [0.5, 1.5, 2.5, 3.5])
+    assert np.array_equal(known.receivers, np.tile([1.0, 2.0, 0.5], (4, 1)))
+    # Elevation 1 degree, azimuth 1 degree; the gateway's x axis points along the world's y.
+    e, a = np.radians(1.0), np.radians(1.0)
+    assert np.allclose(known.directions[0, 0], [-np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)])
+    assert np.allclose(known.directions[-1, 5], [0.0, 0.0, 1.0])
+    train = load_nerf2_spectra(public, "train")
+    assert np.array_equal(train.transmitters[:, 0], [3.5, 1.5, 0.5])
+    assert np.array_equal(load_nerf2_spectra(public, "test").images[0], known.images[2])
+
+
+def test_nerf2_trains_on_its_public_layout(public: Path) -> None:
+    model = fit("NeRF2", load_nerf2_spectra(public, "train"), iterations=300, rays=64)
+    losses = model.report["losses"]
+    assert np.mean(losses[-10:]) < 0.6 * np.mean(losses[:10])
+    drawn = model.image([1.0, 2.0, 0.5], [1.5, 1.0, 1.5])
+    assert drawn.shape == (9, 36)
+    with pytest.raises(ValueError, match="without a dB range"):
+        model.spectrum([1.0, 2.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("break_it", "said"),
+    [
+        (lambda p: (p / "tx_pos.csv").unlink(), "tx_pos.csv is missing"),
+        (lambda p: (p / "tx_pos.csv").write_text("x,y,z\n1,2,3\n"), "got 1 positions"),
+        (lambda p: (p / "gateway_info.yml").write_text("gateway1: 3\n"), "expected gateway1"),
+        (lambda p: (p / "spectrum" / "1.png").rename(p / "spectrum" / "0.png"), "named '0'"),
+    ],
+)
+def test_broken_layouts_name_the_file(public: Path, break_it: Any, said: str) -> None:
+    break_it(public)
+    with pytest.raises((ValueError, FileNotFoundError), match=said):
+        load_nerf2_spectra(public)

@@ -1,0 +1,336 @@
+"""The evaluation of the bistatic field on a small room: whole once, then resumed, changed, and read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_room import SHAPE, TRANSMITTER, small_room
+
+import warprrf as wr
+from benchmarks import bistatic, setting
+from benchmarks.bistatic import checks, report, table
+from benchmarks.bistatic.methods import HARMONIC, UNTAUGHT, VARIANTS, point_at_transmitter
+from warprrf import cli
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.spectra import lookups
+from warprrf.rf.spectra.metrics import angle_deg, strongest_direction
+
+COUNTS = {"exact": (4, 10), "sionna": (4,)}
+OPTIONS: dict[str, Any] = {
+    "counts": (4, 10, 400),
+    "repeat": 0,
+    "second_at": (4.3, 3.2, 2.4),
+    "device": "cpu",
+}
+FILLED = (
+    "psnr_db",
+    "ssim",
+    "rmse_db",
+    "direction_within_3deg",
+    "beam_gain_loss_db_blocked",
+    "seconds_per_spectrum",
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_room(tmp_path_factory.mktemp("room"))
+
+
+def whole(out: Path, data: Path, **changed: Any) -> dict[str, Any]:
+    return bistatic.run(out, data, geometry=data / "reconstruction", **{**OPTIONS, **changed})
+
+
+def fewer_steps(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(checks, "ADAM_STEPS", 20)
+    for options in HARMONIC.values():
+        patch.setitem(options, "iterations", 40)
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        fewer_steps(patch)
+        return out, whole(out, data)
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the rows that are computed, in order."""
+    names: list[str] = []
+    stage = table.StagedRun.stage
+
+    def recorded(self: Any, name: str, work: Any, **options: Any) -> Any:
+        def noted(progress: Any) -> Any:
+            names.append(name)
+            return work(progress)
+
+        return stage(self, name, noted, **options)
+
+    monkeypatch.setattr(table.StagedRun, "stage", recorded)
+    monkeypatch.setattr(report, "write", lambda folder: None)  # pictures are looked at once
+    fewer_steps(monkeypatch)
+    return names
+
+
+def test_every_method_has_a_row_for_every_truth_and_count(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, found = finished
+    rows = {(row["truth"], row["n_train"], row["method"]): row for row in found["rows"]}
+    expected = {
+        (truth, count, method)
+        for truth, counts in COUNTS.items()
+        for method in VARIANTS
+        for count in ((0,) if method in UNTAUGHT else counts)
+    }
+    assert set(rows) == expected
+    assert len(found["rows"]) == len(expected)
+    assert [(key, name) for key, row in rows.items() for name in FILLED if row.get(name) is None] == []
+    assert [found["data"][truth]["left_out"] for truth in COUNTS] == [[400], [10, 400]]
+    assert [len(found[name]) for name in ("calibration", "delays", "second", "shown")] == [3, 3, 3, 2]
+    assert len(found["ablation"]) == 2 * (3 + len(checks.ABLATION))
+    assert json.loads((out / "bistatic.json").read_text()) == found
+
+
+def test_the_better_variant_is_compared(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, found = finished
+    rows = {(row["truth"], row["n_train"], row["method"]): row for row in found["rows"]}
+    for margin in report.margins(found["rows"]):
+        case = margin["truth"], margin["n_train"]
+        for base in ("rf3dgs+", "rf3dgs+los"):
+            row = rows[(*case, base)]
+            assert set(row["variants"]) == {"exp", "linear"}
+            assert row["psnr_db"] == row["variants"][row["variant"]] == max(row["variants"].values())
+            assert margin[base]["margin_db"] == rows[(*case, "bistatic")]["psnr_db"] - row["psnr_db"]
+            own = json.loads((out / f"rows/{case[0]}-{case[1]}-{base}-{row['variant']}.json").read_text())
+            assert own["psnr_db"] == row["psnr_db"]
+
+
+def test_on_the_true_mesh_delays_are_right_and_the_model_is_ahead(
+    finished: tuple[Path, dict[str, Any]],
+) -> None:
+    _, found = finished
+    for row in found["delays"]:
+        assert row["line_of_sight"]["found"] == 1.0
+        assert row["line_of_sight"]["p90_ns"] < 1e-6
+        assert row["mirror"]["found"] > 0.9
+        assert row["mirror"]["median_ns"] < 1e-6
+        assert row["scattering"]["pixels"] > 100
+        assert row["scattering"]["median_ns"] < 1.0  # pixels are 15 degrees wide
+        assert row["scattering"]["median_by_power_ns"] < 1.0
+    assert all(
+        m[base]["margin_db"] > 3 for m in report.margins(found["rows"]) for base in ("rf3dgs+", "rf3dgs+los")
+    )
+    parts = {row["model"]: row["psnr_db"] for row in found["ablation"] if row["truth"] == "exact"}
+    assert parts["no scattering"] < parts["everything"] - 3
+    newton, adam = found["optimisers"]["gauss_newton"], found["optimisers"]["adam"]
+    assert newton["losses"][0] == adam["losses"][0]
+    assert newton["objective"] < 0.7 * newton["losses"][0]
+    assert newton["objective"] < adam["objective"]  # of few steps
+
+
+def test_the_second_transmitter_is_scored_by_both_ranges(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, found = finished
+    ours = found["second"][0]
+    first = next(
+        r for r in found["rows"] if (r["method"], r["truth"], r["n_train"]) == ("bistatic", "exact", 4)
+    )
+    second = wr.SpectrumDataset.load(out / "second_exact.nc")
+    assert np.allclose(second.transmitter, OPTIONS["second_at"])
+    assert ours["seen"]["psnr_db"] == first["psnr_db"]
+    field = wr.RadioField.load(out / first["field"])
+    assert (second.floor, second.range_db) != (field.floor, field.range_db)
+    assert ours["psnr_db"] != ours["first_range"]["psnr_db"]
+    assert ours["psnr_db"] > 22
+    assert ours["psnr_db"] > max(row["psnr_db"] for row in found["second"][1:])
+
+
+def test_text_has_what_was_asked_beside_what_was_measured(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, found = finished
+    text = (out / "bistatic.md").read_text()
+    margin = next(m for m in report.margins(found["rows"]) if (m["truth"], m["n_train"]) == ("exact", 10))
+    measured = margin["rf3dgs+"]["margin_db"]
+    verdict = "met" if measured >= 9 else "NOT met"
+    assert (
+        f"| PSNR over RF-3DGS+, exact, 10 receivers | at least +9 dB | {measured:+.2f} dB | {verdict} |"
+        in text
+    )
+    assert "pixels within 1 sigma, exact, 10 receivers | 60% to 76% |" in text
+    assert f"| {measured:+.2f} | +9 |" in text
+    for name in (
+        "psnr.png",
+        "ablation.png",
+        "reliability.png",
+        "optimisers.png",
+        "spectra-exact-blocked.png",
+    ):
+        assert f"({name})" in text
+        assert (out / name).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_figure_that_misses_what_was_asked_says_so() -> None:
+    def row(method: str, psnr: float) -> dict[str, Any]:
+        variant = "exp" if method.startswith("rf") else ""
+        return {
+            "truth": "sionna",
+            "n_train": 50,
+            "method": method,
+            "variant": variant,
+            "psnr_db": psnr,
+            "fit_s": 15.5,
+        }
+
+    rows = [row("bistatic", 27.9), row("rf3dgs+", 23.9), row("rf3dgs+los", 24.5)]
+    calibration = [{"truth": "sionna", "n_train": 50, "within_1_sigma": 0.7, "within_2_sigma": 0.99}]
+    lines = report.asked({"rows": rows, "calibration": calibration})
+    assert [(line[1], line[2], line[3]) for line in lines] == [
+        ("at least +4 dB", "+4.00 dB", "met"),
+        ("at least 28 dB", "27.90 dB", "NOT met"),
+        ("at most 15 s", "15.5 s", "NOT met"),
+        ("60% to 76%", "70.0%", "met"),
+        ("90% to 98%", "99.0%", "NOT met"),
+    ]
+
+
+def test_finished_rows_are_not_made_again(
+    finished: tuple[Path, dict[str, Any]], data: Path, made: list[str]
+) -> None:
+    out, found = finished
+    again = whole(out, data)
+    assert made == []
+    assert again == found
+
+
+def test_a_lost_row_is_made_again_alone(
+    finished: tuple[Path, dict[str, Any]], data: Path, made: list[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(finished[0], out)
+    (out / "rows/exact-4-nearest.json").unlink()
+    whole(out, data)
+    assert made == ["exact-4-nearest"]
+
+
+def test_a_killed_run_loses_the_row_it_was_at_and_a_changed_option_makes_all_again(
+    finished: tuple[Path, dict[str, Any]],
+    data: Path,
+    made: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def killed(train: Any) -> Any:
+        raise KeyboardInterrupt
+
+    out = tmp_path / "copy"
+    shutil.copytree(finished[0], out)
+    fewer = {"counts": (4,), "truths": ("exact",), "every": 2}
+    with monkeypatch.context() as patch:
+        patch.setattr(lookups, "constant", killed)
+        with pytest.raises(KeyboardInterrupt):
+            whole(out, data, **fewer)
+        variants = [f"exact-4-{m}-{v}" for m in HARMONIC for v in VARIANTS[m]]
+        untaught = [f"exact-0-{m}" for m in UNTAUGHT]
+        idw = ["exact-4-idw-db", "exact-4-idw-linear"]
+        assert made == [*untaught, "exact-4-bistatic", *variants, "exact-4-nearest", *idw, "exact-4-constant"]
+        made.clear()
+        with pytest.raises(KeyboardInterrupt):
+            whole(out, data, **fewer)
+        assert made == ["exact-4-constant"]
+    assert json.loads((out / "rows/exact-4-nearest.json").read_text())["receivers"] == 2
+
+
+def test_point_at_the_transmitter_is_a_beam_of_friis_gain(data: Path) -> None:
+    ds = wr.SpectrumDataset.load(data / "spectra.nc")
+    receiver = ds.receivers[0]
+    spectrum = point_at_transmitter(ds)(receiver)
+    toward = ds.transmitter - receiver
+    distance = np.linalg.norm(toward)
+    friis = (SPEED_OF_LIGHT / 300e9 / (4 * np.pi * distance)) ** 2
+    assert spectrum.path_gain.sum() == pytest.approx(friis, rel=1e-5)
+    assert angle_deg(strongest_direction(spectrum.path_gain), toward / distance) < 180 / SHAPE[0]
+    lit = spectrum.path_gain > 0
+    assert np.allclose(spectrum.delay_s[lit], distance / SPEED_OF_LIGHT)
+    assert np.isnan(spectrum.delay_s[~lit]).all()
+
+
+def test_calibration_of_errors_that_are_as_large_as_stated(data: Path) -> None:
+    truth = setting.Truth.load(data / "spectra.nc", (4,), 1)
+    flat = replace(truth.data, path_gain=np.full_like(truth.data.path_gain, 1e3 * truth.data.floor))
+    truth = replace(truth, data=flat)
+    rng = np.random.default_rng(0)
+
+    def spectrum(receiver: np.ndarray, uncertainty: bool) -> Any:
+        sigma = np.exp(rng.normal(0.0, 0.8, SHAPE))
+        error = rng.normal(0.0, sigma)
+        gain = (1e3 + 1) * flat.floor * 10 ** (error / 10) - flat.floor
+        return SimpleNamespace(path_gain=gain, std_db=sigma)
+
+    field: Any = SimpleNamespace(errors=SimpleNamespace(outlier_db=30.0), spectrum=spectrum)
+    row = checks.calibration(field, truth, lambda *_: None)
+    # 4 x 288 independent pixels: the standard deviation of a share is at most 1.5 %.
+    assert row["within_1_sigma"] == pytest.approx(0.683, abs=0.05)
+    assert row["within_1_sigma_lit"] == row["within_1_sigma"]  # all are 30 dB above the floor
+    assert row["within_2_sigma"] == pytest.approx(0.954, abs=0.03)
+    assert np.abs(np.array(row["shares"]) - row["levels"]).max() < 0.06
+    assert row["nll_gaussian"] == pytest.approx(
+        0.5 + 0.5 * np.log(2 * np.pi), abs=0.12
+    )  # mean of ln sigma is 0
+    assert row["nll"] == pytest.approx(row["nll_gaussian"] - np.log(0.95), abs=0.03)  # none is an outlier
+    assert row["nll"] < row["nll_constant"] - 0.3
+
+
+def test_bad_options_are_named(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for options, name in (
+        ({"counts": (11, 400)}, "counts"),
+        ({"every": 0}, "every"),
+        ({"truths": ("measured",)}, "truths"),
+        ({"repeat": -1}, "repeat"),
+    ):
+        with pytest.raises(ValueError, match=f"^{name}: got"):
+            whole(tmp_path, data, **options)
+    with pytest.raises(ValueError, match=r"geometry: .*none.*warprrf lobby"):
+        bistatic.run(tmp_path, data, geometry=tmp_path / "none")
+    with pytest.raises(ValueError, match="both exact"):
+        bistatic.run(tmp_path, [data / "spectra.nc"] * 2, geometry=data / "reconstruction")
+    words = [
+        "bench",
+        "bistatic",
+        "--data",
+        str(tmp_path),
+        "--geometry",
+        str(data),
+        "--out",
+        str(tmp_path),
+        "--quiet",
+    ]
+    assert cli.main(words) == 2
+    assert "spectra_full.nc or spectra.nc" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_another_seed_of_sionna_is_near_but_not_the_same(data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
+    truth = setting.Truth.load(data / "spectra.nc", (4,), 1)
+    geometry = setting.Geometry(data / "reconstruction", data / "scene.xml")
+    test = truth.test.subset([0])
+    solved = wr.simulate(
+        geometry.scene, transmitter=TRANSMITTER, receivers=test.receivers, frequency_hz=300e9, shape=SHAPE,
+        engine="sionna", depth=2, samples=200_000, beam_sigma_rad=test.beam_sigma_rad, roles=["test"],
+    )  # fmt: skip
+    ready = wr.SpectrumDataset.from_spectra(
+        receivers=np.concatenate([truth.train(4).receivers, solved.receivers]), transmitter=TRANSMITTER,
+        frequency_hz=300e9, path_gain=np.concatenate([truth.train(4).path_gain, solved.path_gain]),
+        delay_s=np.concatenate([truth.train(4).delay_s, solved.delay_s]),
+        aod=np.concatenate([truth.train(4).aod, solved.aod]), line_of_sight=[True] * 5, engine="sionna",
+        beam_sigma_rad=solved.beam_sigma_rad, role=["train"] * 4 + ["test"], attributes=solved.attributes,
+    )  # fmt: skip
+    row = checks.repeat(replace(truth, data=ready), 3, geometry, tmp_path, lambda *_: None)
+    assert (row["receivers"], row["seeds"]) == (1, [0, 1])
+    assert 20 < row["psnr_db"] < 100

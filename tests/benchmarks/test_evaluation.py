@@ -1,0 +1,460 @@
+"""The paper's evaluation on a small room: whole once, resumed, spread over workers of which one is killed, and read."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_room import SHAPE, small_room
+
+import warprrf as wr
+from benchmarks import evaluation
+from benchmarks.evaluation import comparison, protocol, report, runs
+from benchmarks.evaluation.methods import METHODS, UNTAUGHT, Effort, code_of
+from benchmarks.evaluation.paper_law import law_reach, paper_law_spectra
+from benchmarks.evaluation.protocol import Run, Setting
+from benchmarks.evaluation.runs import Store, sweep
+from warprrf import cli, marks
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.spectra.metrics import angle_deg
+from warprrf.rf.spectra.spectrum import pixel_directions
+
+EFFORT = Effort(
+    harmonic_iterations=40, nerf2_iterations=3, nerf2_rays=16, nerf2_samples=4, cgan_iterations=2, cgan_batch=2,
+    calibration_s=1.0, sionna_samples=20_000,
+)  # fmt: skip
+OPTIONS: dict[str, Any] = {
+    "counts": (4,), "splits": ("random",), "every": 1, "workers": 0, "device": "cpu", "effort": EFFORT,
+}  # fmt: skip
+FILLED = (
+    "psnr_db", "psnr_db_min", "psnr_db_max", "ssim", "rmse_db", "seconds_per_spectrum", "peak_memory_gib", "model_mib",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_room(tmp_path_factory.mktemp("room"))
+
+
+def whole(kind: str, out: Path, data: Path, **changed: Any) -> dict[str, Any]:
+    return evaluation.run(kind, out, data, geometry=data / "reconstruction", **{**OPTIONS, **changed})
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """Every method on four receivers of both truths that need no Sionna."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    return out, whole("table1", out, data, truths=("exact", "paper-law"))
+
+
+def test_every_method_has_a_row_that_is_filled(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, found = finished
+    rows = {(row["truth"], row["method"]): row for row in found["rows"]}
+    expected = {("exact", m) for m in METHODS} | {("paper-law", m) for m in protocol.LAW_METHODS}
+    assert set(rows) == expected
+    assert [(key, name) for key, row in rows.items() for name in FILLED if row.get(name) is None] == []
+    for (_, method), row in rows.items():
+        assert row["count"] == (0 if method in UNTAUGHT else 4)
+        assert row["psnr_db_min"] <= row["psnr_db"] <= row["psnr_db_max"]
+        assert row["receivers"] == 4
+    assert json.loads((out / "table1.json").read_text()) == found
+    assert rows["exact", "bistatic"]["psnr_db"] > rows["exact", "rf3dgs+"]["psnr_db"] + 3
+    for method in ("rf3dgs+", "rf3dgs", "rf3dgs+alpha", "rf3dgs-alpha"):
+        assert rows["exact", method]["loss_last"] < rows["exact", method]["loss_first"]
+        assert rows["exact", method]["psnr_db"] > rows["exact", "constant"]["psnr_db"]
+
+
+def test_the_reach_of_the_papers_law_is_what_directions_leave() -> None:
+    wall = Mesh(np.array([[40.0, 0, 0], [41, 0, 0], [40, 1, 0]]), np.array([[0, 1, 2]]))
+    rng = np.random.default_rng(3)
+    around = rng.standard_normal((400, 3))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    point, transmitter = np.zeros((1, 3)), np.array([0.0, 0.0, 1.0])
+    # a length that is a polynomial of the direction has nothing left, one that is drawn at random everything
+    length = 10.0 ** (0.05 * (8.0 + around[:, 0] - 2.0 * around[:, 1] ** 3)) - 1.0
+    found = law_reach(wall, point, length[:, None] * around, transmitter)
+    assert found is not None and found["varies_db"] > 0.5 and found["left_db"] < 1e-9
+    length = 10.0 ** (0.05 * (8.0 + rng.standard_normal(400))) - 1.0
+    found = law_reach(wall, point, length[:, None] * around, transmitter)
+    assert found is not None and found["left_db"] > 0.9 * found["varies_db"]
+    assert law_reach(wall, point, around[:10], transmitter) is None
+
+
+def test_tables_state_what_was_published_and_where_ours_stands(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, found = finished
+    text = (out / "table1.md").read_text()
+    assert "| published | RF-3DGS+ (published) | 19.68 |" in text
+    assert "other data and other hardware" in text
+    assert "LPIPS: not computed" in text
+    for name in ("spectra-exact.png", "speed-exact.png", "table1-law.png"):
+        assert f"({name})" in text
+        assert (out / name).read_bytes()[:4] == b"\x89PNG"
+    with (out / "table1.csv").open() as lines:
+        table = list(csv.DictReader(lines))
+    assert len(table) == len(found["rows"]) + len(report.PUBLISHED)
+    assert [row["psnr_db"] for row in table if row["published"] == "1"] == ["19.68", "13.5", "13.34", "10.33"]
+
+
+def test_what_others_are_given_is_what_ours_took(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, _ = finished
+    ours, other = (
+        json.loads((out / f"runs/exact-random-4-s0-{m}.json").read_text())
+        for m in ("bistatic", "sionna-calibrated")
+    )
+    assert other["details"]["budget_s"] == pytest.approx(ours["transport_s"] + ours["fit_s"])
+    assert other["details"]["steps"] >= 1
+    assert other["fit_s"] > 0.9 * other["details"]["budget_s"] or other["details"]["steps"] == 1
+
+
+def test_sparsity_shares_the_runs_and_draws_bands(
+    finished: tuple[Path, dict[str, Any]], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(finished[0], out)
+    done = counted(monkeypatch)
+    found = whole("sparsity", out, data, truths=("exact", "paper-law"), counts=(4, 7))
+    assert [run.count for run in done] == [7] * len(done)  # those of 4 are there
+    assert {run.method for run in done} == set(protocol.CURVE_METHODS)
+    text = (out / "sparsity.md").read_text()
+    for name in ("sparsity.png", "sparsity-law.png"):
+        assert (out / name).read_bytes()[:4] == b"\x89PNG" and f"({name})" in text
+    assert "RF-3DGS+ is ahead on" in text
+    pairs = {(line["truth"], line["count"]) for line in found["finding"]}
+    assert pairs == {(t, n) for t in ("exact", "paper-law") for n in (4, 7)}
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[Run]:
+    """Runs that are carried out."""
+    done: list[Run] = []
+    original = runs.Store.save
+
+    def noted(self: Store, run: Run, *rest: Any) -> Any:
+        done.append(run)
+        return original(self, run, *rest)
+
+    monkeypatch.setattr(runs.Store, "save", noted)
+    return done
+
+
+def test_finished_runs_are_kept_and_changed_options_are_not_mistaken(
+    finished: tuple[Path, dict[str, Any]], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(finished[0], out)
+    done = counted(monkeypatch)
+    few = {"methods": ("rf3dgs", "nearest"), "truths": ("exact",)}
+    whole("table1", out, data, **few)
+    assert done == []
+    (out / "runs/exact-random-4-s0-nearest.json").unlink()
+    whole("table1", out, data, **few)
+    assert [run.key for run in done] == ["exact-random-4-s0-nearest"]
+    done.clear()
+    whole("table1", out, data, **few, effort=replace(EFFORT, harmonic_iterations=41))
+    assert [run.method for run in done] == ["rf3dgs", "rf3dgs"]  # a lookup does not feel the effort
+    (out / "runs/exact-random-4-s0-nearest.json").write_text("{")
+    with pytest.raises(ValueError, match="not readable"):
+        whole("table1", out, data, **few)
+
+
+# --------------------------------------------------------------------------------------------------- the sets
+
+
+def test_a_method_is_marked_by_the_code_that_it_runs() -> None:
+    behind = {name: set(marks._sources(method.code)) for name, method in METHODS.items()}
+    own = {
+        "bistatic": "warprrf.rf.fields.bistatic.fit",
+        "rf3dgs+": "warprrf.rf.fields.harmonic.fitting",
+        "nerf2": "benchmarks.baselines.training",
+        "sionna": "warprrf.rf.interop.sionna_paths",
+        "nearest": "warprrf.rf.spectra.lookups",
+    }
+    for name, module in own.items():
+        assert module in behind[name]
+        # A change in one method's code leaves the others' runs as they are.
+        assert not [other for other in own if other != name and module in behind[other]]
+    assert all("warprrf.rf.spectra.metrics" in modules for modules in behind.values())
+    assert len({code_of(name) for name in own}) == len(own)
+
+
+def test_plan_has_nested_counts_one_run_for_what_is_untaught_and_networks_where_asked() -> None:
+    scale = protocol.SCALES["small"]
+    held = {(t, s): range(1, 401) for t in scale.truths for s in scale.splits}
+    planned = protocol.plan("table1", scale, held=held)
+    assert len(planned) == len(set(planned))
+    networks = {(r.count, r.split) for r in planned if r.method == "nerf2"}
+    assert networks == {(10, "random"), (50, "random"), (400, "random")}
+    assert {(r.count, r.split) for r in planned if r.method == "rf3dgs-alpha"} == {
+        (10, "random"),
+        (50, "random"),
+    }
+    assert [r.count for r in planned if r.method == "zero" and r.split == "random"] == [0]
+    assert {r.method for r in planned if r.truth == "paper-law"} == set(protocol.LAW_METHODS)
+    assert {r.count for r in planned if r.split == "region"} == {0, 50}
+    curve = protocol.plan("sparsity", scale, held={**held, ("exact", "random"): range(1, 101)})
+    assert {r.count for r in curve if r.truth == "exact"} == {10, 15, 20, 25, 50, 100}
+    paper = protocol.SCALES["paper"]
+    everything = protocol.plan(
+        "table1", paper, held={(t, s): range(1, 701) for t in paper.truths for s in paper.splits}
+    )
+    assert {r.seed for r in everything if r.method == "bistatic"} == {0, 1, 2}
+    assert {r.count for r in everything if r.method == "nerf2"} == set(protocol.PUBLISHED_COUNTS)
+
+
+def test_region_split_holds_out_a_part_of_the_room(data: Path) -> None:
+    ds = wr.SpectrumDataset.load(data / "spectra.nc")
+    part = protocol.split_data(ds, "region")
+    border = ds.receivers[:, 0].min() + 0.75 * np.ptp(
+        ds.receivers[:, 0]
+    )  # the transmitter stands at the other end
+    assert (part.receivers[part.role == "test", 0] > border).all()
+    assert (part.receivers[part.role == "train", 0] <= border).all()
+    assert 0 < np.count_nonzero(part.role == "train") < 10
+    assert np.array_equal(protocol.split_data(ds, "random").receivers, ds.receivers)
+    with pytest.raises(ValueError, match="split: got 'half'"):
+        protocol.split_data(ds, "half")
+
+
+def test_paper_law_scales_scattering_by_the_share_of_the_first_leg(data: Path) -> None:
+    ds = wr.SpectrumDataset.load(data / "spectra.nc")
+    scene = wr.Scene.load(data / "scene.xml")
+    exact, law = ds.subset([0, 1]), paper_law_spectra(scene, ds.subset([0, 1]), device="cpu")
+    directions = pixel_directions(SHAPE)
+    checked = 0
+    for i, receiver in enumerate(exact.receivers):
+        beyond = scene.mesh.cast(np.tile(receiver, (directions[..., 0].size, 1)), directions.reshape(-1, 3)).t
+        second = beyond.reshape(SHAPE)
+        total = exact.delay_s[i] * SPEED_OF_LIGHT
+        expected = ((total - second) / total) ** 2
+        toward = (ds.transmitter - receiver) / np.linalg.norm(ds.transmitter - receiver)
+        ratio = law.path_gain[i].astype(float) / np.maximum(exact.path_gain[i], 1e-30)
+        # Scattering alone: away from line of sight, where the delay is that of the surface in the pixel's direction.
+        bounced = np.linalg.norm(receiver + second[..., None] * directions - ds.transmitter, axis=-1) + second
+        alone = (np.abs(bounced - total) < 0.15) & (angle_deg(directions, toward) > 60)
+        alone &= exact.path_gain[i] > ds.floor
+        checked += int(alone.sum())
+        assert np.median(np.abs(ratio[alone] / expected[alone] - 1)) < 0.2  # pixels are 15 degrees wide
+    assert checked > 30
+    assert (law.path_gain <= exact.path_gain * (1 + 1e-5)).all()
+    assert np.array_equal(law.role, exact.role)
+
+
+# --------------------------------------------------------------------------------------- figures from given rows
+
+
+def row(method: str, count: int, seed: int, variant: str = "", **figures: Any) -> dict[str, Any]:
+    every = {"psnr_db": 20.0, "ssim": 0.5, "rmse_db": 5.0, "seconds_per_spectrum": 0.1, **figures}
+    ends = {f"{n}_{e}": every.get(n, 1.0) for n in runs.SPREAD for e in ("min", "max")}
+    return {
+        "truth": "exact", "split": "random", "count": count, "seed": seed, "method": method, "variant": variant,
+        "key": f"{method}{variant}{seed}", "note": "", "receivers": 4, "receivers_blocked": 1, "device": "cpu",
+        "cores": 2, "processor": "x", "transport_s": 1.0, "fit_s": 2.0, "peak_memory_bytes": 2**30,
+        "model_bytes": 2**20, "lpips": None, **ends, **every,
+    }  # fmt: skip
+
+
+def test_the_better_variant_of_each_seed_counts_and_seeds_are_averaged() -> None:
+    rows = [
+        row("rf3dgs+", 10, 0, "exp", psnr_db=21.0, psnr_db_min=10.0),
+        row("rf3dgs+", 10, 0, "linear", psnr_db=22.0, psnr_db_min=9.0),
+        row("rf3dgs+", 10, 1, "exp", psnr_db=26.0, psnr_db_min=12.0),
+        row("rf3dgs+", 10, 1, "linear", psnr_db=25.0, psnr_db_min=2.0),
+    ]
+    (found,) = comparison.summarise(rows)
+    assert (found["psnr_db"], found["psnr_db_min"], found["seeds"]) == (24.0, 9.0, 2)
+    assert found["variants"] == ["exp", "linear"]
+    assert (found["train_s"], found["model_mib"], found["lpips"]) == (3.0, 1.0, None)
+    assert report.name_of(found) == "RF-3DGS+ (gain exp or gain linear)"
+
+
+def test_finding_has_the_sign_that_was_found_and_margins_name_the_best_other() -> None:
+    rows = comparison.summarise(
+        [
+            row("rf3dgs+", 10, 0, "exp", psnr_db=21.0, fit_s=5.0, seconds_per_spectrum=0.4),
+            row("rf3dgs", 10, 0, "exp", psnr_db=22.5),
+            row("zero", 0, 0, psnr_db=24.0, rmse_db=6.0, transport_s=None, fit_s=None),
+            row("bistatic", 10, 0, psnr_db=23.0, rmse_db=4.0),
+            row("nearest", 50, 0, psnr_db=40.0),
+        ]
+    )
+    (finding,) = comparison.paper_finding(rows)
+    assert finding["psnr_db"]["difference"] == -1.5
+    (ours,) = comparison.ours_against_all(rows)
+    assert (ours["psnr_db"]["method"], ours["psnr_db"]["margin"], ours["psnr_db"]["ahead"]) == (
+        "zero",
+        -1.0,
+        False,
+    )
+    assert (ours["rmse_db"]["margin"], ours["rmse_db"]["ahead"]) == (-1.0, True)
+    assert (ours["train_ratio"], ours["spectrum_ratio"]) == (2.0, 4.0)
+    assert "psnr_db_blocked" not in ours
+
+
+def test_text_says_what_the_law_is_worth() -> None:
+    def line(truth: str, count: int, difference: float) -> dict[str, Any]:
+        return {
+            "truth": truth, "split": "random", "count": count, "opacity": False, "psnr_db": {"difference": difference},
+        }  # fmt: skip
+
+    lines = [
+        line("exact", 10, -0.6),
+        line("exact", 25, -0.4),
+        line("paper-law", 10, 0.2),
+        line("sionna", 10, 9.0),
+    ]
+    text = report._law_worth(lines)
+    assert "by +0.80 dB in the mean, from -0.60 to +0.20 dB, so that the paper's finding holds" in text
+    assert "not ahead even there" in report._law_worth([*lines[:2], line("paper-law", 25, -0.1)])
+    assert report._law_worth(lines[:2]) == ""
+
+
+# ---------------------------------------------------------------------------------------- workers of a cluster
+
+
+def slow_job(
+    folder: str, run: Run, setting: Setting, budget_s: float | None
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Leaves a file named by run and process when it starts, and takes a while."""
+    (Path(folder) / f"{run.count}.{os.getpid()}").touch()
+    time.sleep(1.5)
+    return {**vars(run), "seconds": 1.5}, {"prediction_db": np.full((1, 2, 2), float(run.count))}
+
+
+def setting_of(data: Path) -> Setting:
+    return Setting(
+        files=(("exact", str(data / "spectra.nc")),), marks=(("exact", "m"),), geometry=str(data / "reconstruction"),
+        geometry_mark="g", scene=str(data / "scene.xml"), scratch=str(data / "scratch"), every=1, effort=EFFORT,
+        device="cpu",
+    )  # fmt: skip
+
+
+def test_a_killed_worker_loses_nothing(data: Path, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    cloudpickle = pytest.importorskip("cloudpickle")
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    started = tmp_path / "started"
+    started.mkdir()
+    planned = [Run("exact", "random", n, 0, "nearest") for n in (1, 2, 3, 4)]
+    killed: list[int] = []
+
+    def kill_the_first() -> None:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and not killed:
+            for file in started.iterdir():
+                killed.append(int(file.suffix[1:]))
+                os.kill(killed[0], signal.SIGKILL)
+                break
+            time.sleep(0.02)
+
+    killer = threading.Thread(target=kill_the_first)
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL"
+    ) as cluster:
+        killer.start()
+        rows = sweep(
+            planned, setting_of(data), Store(tmp_path), scheduler=cluster.scheduler_address,
+            work=partial(slow_job, str(started)),
+        )  # fmt: skip
+    killer.join()
+    assert killed
+    assert [rows[run]["count"] for run in planned] == [1, 2, 3, 4]
+    starts = [file.stem for file in started.iterdir()]
+    again = [file.stem for file in started.iterdir() if file.suffix == f".{killed[0]}"]
+    assert len(starts) > len(planned)  # what the killed one was at was done again, by another process
+    assert all(starts.count(stem) >= 2 for stem in again[:1])
+    for run in planned:
+        with np.load(Store(tmp_path).pictures(run)) as stored:
+            assert stored["prediction_db"][0, 0, 0] == run.count
+    assert not list(tmp_path.rglob("*.partial*"))
+
+
+def test_a_killed_sweep_loses_the_run_it_was_at(data: Path, tmp_path: Path) -> None:
+    planned = [Run("exact", "random", n, 0, "nearest") for n in (1, 2, 3)]
+    done: list[int] = []
+
+    def job(run: Run, setting: Setting, budget_s: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
+        done.append(run.count)
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        return vars(run) | {}, {"prediction_db": np.zeros((1, 2, 2))}
+
+    options = {"workers": 0, "work": job}
+    with pytest.raises(KeyboardInterrupt):
+        sweep(planned, setting_of(data), Store(tmp_path), **options)
+    rows = sweep(planned, setting_of(data), Store(tmp_path), **options)
+    assert done == [1, 2, 2, 3]
+    assert [rows[run]["count"] for run in planned] == [1, 2, 3]
+
+
+def test_a_run_that_fails_is_named(data: Path, tmp_path: Path) -> None:
+    def job(*_: Any) -> Any:
+        raise OSError("disk full")
+
+    with pytest.raises(RuntimeError, match="exact-random-1-s0-nearest: OSError: disk full"):
+        sweep(
+            [Run("exact", "random", 1, 0, "nearest")], setting_of(data), Store(tmp_path), workers=0, work=job
+        )
+
+
+# ------------------------------------------------------------------------------------------------- the command
+
+
+def test_command_line_hands_on_its_options(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    asked: list[Any] = []
+
+    def run(kind: str, out: str, **options: Any) -> Any:
+        asked.append((kind, out, options))
+        return {}
+
+    monkeypatch.setattr(evaluation, "run", run)
+    monkeypatch.setattr(evaluation, "markdown", lambda kind, found: "the tables")
+    assert cli.main(
+        ["bench", "sparsity", "--counts", "10", "50", "--scheduler", "tcp://lab:8786", "--data", "a.nc", "b.nc",
+         "--scale", "paper", "--quiet"]
+    ) == 0  # fmt: skip
+    kind, out, options = asked[0]
+    assert (kind, out) == ("sparsity", "runs/evaluation")
+    assert options["counts"] == [10, 50]
+    assert options["data"] == ["a.nc", "b.nc"]
+    assert (options["scheduler"], options["scale"], options["workers"]) == ("tcp://lab:8786", "paper", 1)
+    assert "methods" not in options
+    assert "the tables" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"methods": ("nerf3",)}, "methods: got nerf3"),
+        ({"counts": (0,)}, "counts: got"),
+        ({"counts": (4000,), "methods": ("nearest",)}, "nothing is left to do"),
+        ({"scale": "huge"}, "scale: got huge"),
+        ({"truths": ("sionna", "fake")}, "truths: got fake"),
+        ({"workers": -1, "methods": ("nearest",)}, "workers: got -1"),
+        ({"geometry": Path("nowhere")}, "geometry: there is no folder nowhere"),
+    ],
+)
+def test_bad_options_are_named(data: Path, tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
+    options = {**OPTIONS, "geometry": data / "reconstruction", "truths": ("exact",), **wrong}
+    with pytest.raises(ValueError, match=said):
+        evaluation.run("table1", tmp_path, data, **options)
+
+
+def test_shown_receivers_are_one_with_line_of_sight_and_one_without() -> None:
+    gain = np.arange(1, 6, dtype=float)[:, None, None] * np.ones((5, 2, 2))
+    test = SimpleNamespace(path_gain=gain, line_of_sight=np.array([True, True, False, False, True]))
+    assert protocol.shown_receivers(test).tolist() == [1, 2]

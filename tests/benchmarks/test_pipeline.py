@@ -1,0 +1,177 @@
+"""The lobby run on a few tiny photos and spectra, with the true mesh in place of the reconstruction."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from places import LOBBY
+
+import warprrf as wr
+from benchmarks import stages
+from benchmarks.lobby import pipeline, report
+from warprrf.geometry.splats.discs import discs_on_mesh
+
+SIZES = pipeline.Sizes(steps=20, train=6, test=4)
+MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
+KEYS = (
+    "psnr_db",
+    "ssim",
+    "rmse_db",
+    "direction_median_deg",
+    "direction_within_3deg",
+    "direction_within_3deg_blocked",
+)
+GEOMETRY_KEYS = (
+    "photo_psnr_db",
+    "photo_noise_psnr_db",
+    "camera_rms_m",
+    "mesh_distance_median_m",
+    "mesh_distance_p90_m",
+    "mesh_normal_median_deg",
+    "pipeline_time_s",
+    "fit_time_s",
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A lobby of four photos of 64 x 48 pixels and ten spectra of 12 x 24."""
+    images = pytest.importorskip("PIL.Image")
+    folder = tmp_path_factory.mktemp("lobby")
+    for name in ("scene.xml", "meshes", "textures", "materials.json"):
+        (folder / name).symlink_to(LOBBY / name)
+    scene = wr.Scene.load(folder / "scene.xml")
+    lens = {"fx": 40.0, "fy": 40.0, "cx": 32.0, "cy": 24.0}
+    views, rng = {}, np.random.default_rng(0)
+    for sub in ("photos", "photos_noise"):
+        (folder / sub).mkdir()
+    for index in range(4):
+        pose = np.array([[0, -1, 0, 5.0 + index], [0, 0, -1, 1.5], [1, 0, 0, -2.0], [0, 0, 0, 1.0]])
+        views[f"v{index}.png"] = {"world_to_camera": pose.tolist()}
+        for sub in ("photos", "photos_noise"):
+            pixels = rng.integers(100, 140, (48, 64, 3)).astype(np.uint8)
+            images.fromarray(pixels).save(folder / sub / f"v{index}.jpg")
+    views = {name.replace("png", "jpg"): view for name, view in views.items()}
+    names = list(views)
+    stages.write_json(folder / "poses_true.json", {"width": 64, "height": 48, **lens, "views": views})
+    stages.write_json(folder / "photos.json", {"photos": names, "held_out": names[1:3]})
+    stages.write_json(folder / "surveyed.json", {name: [0.0, 0.0, 0.0] for name in names})
+    places = rng.uniform([1.0, 1.0, 1.0], [14.0, 11.0, 2.0], (200, 3))
+    places = places[scene.is_free(places, clearance_m=0.3)][:10]
+    dataset = wr.simulate(
+        scene,
+        transmitter=(13.6, 11.2, 2.5),
+        receivers=places,
+        frequency_hz=300e9,
+        shape=(12, 24),
+        roles=["train"] * 6 + ["test"] * 4,
+    )
+    for name in pipeline.TRUTHS.values():
+        dataset.save(folder / name)
+    return folder
+
+
+def _true_geometry(
+    out: Path, data: Path, sizes: Any, seed: int, device: Any, progress: Any
+) -> dict[str, Any]:
+    mesh = wr.Scene.load(data / "scene.xml").mesh
+    cameras = pipeline.truth_scores.true_cameras(data / "poses_true.json")
+    reconstruction = wr.Reconstruction(discs_on_mesh(mesh), mesh, cameras)
+    reconstruction.save(out / "reconstruction")
+    reconstruction.gaussians.save_ply(out / "geometry.ply")
+    for name in ("mesh.ply", "cameras.json"):
+        (out / name).write_text("")
+    return {
+        "photos": 4,
+        "held_out": 2,
+        "gaussians": len(reconstruction.gaussians),
+        "triangles": len(mesh.faces),
+    }
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "_geometry", _true_geometry)
+    monkeypatch.setattr(pipeline, "REDUCED", SIZES)
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "_geometry", _true_geometry)
+        patch.setattr(pipeline, "REDUCED", SIZES)
+        return out, pipeline.run(out, data, reduced=True, device="cpu")
+
+
+def test_report_holds_every_figure(finished: tuple[Path, dict[str, Any]]) -> None:
+    out, _ = finished
+    figures = json.loads((out / "report.json").read_text())
+    assert [key for key in GEOMETRY_KEYS if not isinstance(figures.get(key), float)] == []
+    for methods in (figures["methods"], figures["methods_sionna"]):
+        assert set(methods) == {*MODELS, "nearest", "idw", "constant", "mean"}
+        assert [(name, key) for name in methods for key in KEYS if key not in methods[name]] == []
+        assert all(methods[name]["tof_error_median_ns"] is not None for name in MODELS)
+    assert figures["mesh_distance_p90_m"] < 1e-4  # the mesh is the true one
+    assert figures["camera_rms_m"] == 0.0
+    for name in ("geometry.ply", "mesh.ply", "field.safetensors", "report.html", "cameras.json"):
+        assert (out / name).is_file()
+    assert figures["pipeline_time_s"] == pytest.approx(sum(s["seconds"] for s in figures["stages"].values()))
+
+
+def test_page_needs_no_other_file(finished: tuple[Path, dict[str, Any]]) -> None:
+    text = (finished[0] / "report.html").read_text()
+    assert text.count("<img ") >= 8
+    sources = re.findall(r"(?:src|href)='([^']{0,30})", text)
+    assert sources
+    assert [source for source in sources if not source.startswith("data:image/")] == []
+
+
+def test_second_run_computes_nothing(
+    finished: tuple[Path, dict[str, Any]], data: Path, small: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, first = finished
+
+    def refuse(*args: Any, **options: Any) -> None:
+        raise AssertionError("computed again")
+
+    for name in ("_geometry", "_geometry_error", "_fit", "_evaluation", "_pictures"):
+        monkeypatch.setattr(pipeline, name, refuse)
+    assert pipeline.run(out, data, reduced=True, device="cpu")["methods"] == first["methods"]
+
+
+def test_killed_run_ends_with_the_same_figures(
+    finished: tuple[Path, dict[str, Any]], data: Path, small: None, tmp_path: Path
+) -> None:
+    def kill(stage: str, done: int, total: int) -> None:
+        if stage == "fit" and done > 8:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run(tmp_path, data, reduced=True, device="cpu", progress=kill)
+    again = pipeline.run(tmp_path, data, reduced=True, device="cpu")
+    assert again["stages"]["fit bistatic, exact"]["attempts"] == 2
+    assert again["stages"]["geometry"]["attempts"] == 1
+    for name, figures in finished[1]["methods"].items():
+        for key in KEYS:
+            assert again["methods"][name][key] == figures[key], (name, key)
+
+
+def test_missing_data_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"photos.*warprrf data"):
+        pipeline.run(tmp_path / "out", tmp_path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_section_of_a_box_is_its_outline() -> None:
+    corners = np.array([[x, y, z] for x in (0.0, 4.0) for y in (0.0, 3.0) for z in (0.0, 2.0)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    lines = report.section(corners, faces, 1.2)
+    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * (4 + 3))
+    assert report.section(corners, faces, 2.5).shape == (0, 2, 2)

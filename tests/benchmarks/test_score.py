@@ -1,0 +1,88 @@
+"""Scores of a reconstruction, on errors that are put in by hand."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.lobby import score
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.splats.camera import Camera
+
+LOW, HIGH = np.array([-2.0, -3.0, 0.0]), np.array([2.0, 3.0, 2.5])
+
+
+def room(low=LOW, high=HIGH, without=()):
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [t for k, (a, b, c, d) in enumerate(quads) if k not in without for t in ((a, b, c), (a, c, d))]
+    return Mesh(low + corners * (high - low), faces)
+
+
+def camera(angle=0.0, position=(0.0, 0.0, 1.2)):
+    c, s = np.cos(angle), np.sin(angle)
+    pose = np.eye(4)
+    pose[:3, :3] = [[s, -c, 0], [0, 0, -1], [c, s, 0]]
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return Camera.pinhole(80, 60, fx=50, fy=50, cx=40, cy=30, world_to_camera=pose)
+
+
+CAMERAS = [camera(a) for a in np.arange(8) * np.pi / 4]
+
+
+def test_the_truth_itself_has_no_error():
+    result = score.score_mesh(room(), room(), CAMERAS, samples=2000, device="cpu")
+    f = result.figures
+    assert f["mesh_distance_p90_m"] < 1e-6 and f["mesh_normal_p90_deg"] < 1e-3
+    assert f["mesh_missed"] == 0 and f["mesh_complete"] == 1
+    assert len(result.points) == len(result.distance_m) == len(result.normal_deg)
+
+
+def test_a_room_too_large_by_3_cm_is_3_cm_off_in_distance_but_not_in_normal():
+    result = score.score_mesh(room(LOW - 0.03, HIGH + 0.03), room(), CAMERAS, samples=2000, device="cpu")
+    assert result.figures["mesh_distance_median_m"] == pytest.approx(0.03, abs=1e-6)
+    assert result.figures["mesh_surface_median_m"] == pytest.approx(0.03, abs=1e-6)
+    assert result.figures["mesh_normal_median_deg"] < 1e-3
+    assert result.figures["mesh_range_median_m"] > 0.03  # longer along slanting rays
+
+
+def test_a_turned_mesh_has_that_normal_error():
+    c, s = np.cos(np.radians(5)), np.sin(np.radians(5))
+    turned = Mesh((room().vertices - [0, 0, 1.2]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [0, 0, 1.2],
+                  room().faces)  # fmt: skip
+    level = score.score_mesh(turned, room(), CAMERAS, samples=2000, device="cpu")
+    walls = np.abs(level.points[:, 2] - 1.25) < 1.0
+    assert np.median(level.normal_deg[walls]) == pytest.approx(5, abs=1e-2)
+    assert np.median(level.normal_deg[~walls]) < 0.1  # floor and ceiling turn within themselves
+
+
+def test_a_missing_wall_is_missed_and_incomplete():
+    whole = score.score_mesh(room(without=(0,)), room(), CAMERAS, samples=2000, device="cpu").figures
+    seen = room().cast(
+        np.concatenate([np.broadcast_to(c.position, (4800, 3)) for c in CAMERAS]),
+        np.concatenate([c.directions().reshape(-1, 3) for c in CAMERAS]),
+        device="cpu",
+    )
+    share = np.mean(seen.face < 2)
+    assert whole["mesh_missed"] == pytest.approx(share, abs=0.02)
+    assert whole["mesh_complete"] == pytest.approx(1 - share, abs=0.03)
+
+
+def test_camera_errors_count_all_cameras():
+    truth = {str(k): camera(0.1 * k, (k, 0.0, 1.0)) for k in range(4)}
+    posed = {str(k): camera(0.1 * k, (k, 0.04 * (k == 2), 1.0)) for k in range(4)}
+    figures = score.score_cameras(posed, truth)
+    assert figures["camera_rms_m"] == pytest.approx(0.02)
+    assert figures["camera_max_m"] == pytest.approx(0.04)
+    assert figures["cameras_posed"] == figures["cameras_total"] == 4
+    with pytest.raises(ValueError, match="no true pose for 9"):
+        score.score_cameras({"9": truth["0"]}, truth)
+
+
+def test_true_cameras_are_read(tmp_path):
+    pose = camera(0.3, (1.0, 2.0, 3.0)).world_to_camera
+    content = {"width": 80, "height": 60, "fx": 50, "fy": 50, "cx": 40, "cy": 30,
+               "views": {"a.jpg": {"world_to_camera": pose.tolist()}}}  # fmt: skip
+    (tmp_path / "poses.json").write_text(json.dumps(content))
+    (read,) = score.true_cameras(tmp_path / "poses.json").values()
+    np.testing.assert_allclose(read.position, [1, 2, 3])

@@ -1,0 +1,58 @@
+"""Calibration with Sionna RT's own gradients on a small room whose materials are known."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import ROOT
+
+pytest.importorskip("sionna.rt")
+sys.path.insert(0, str(ROOT / "bench"))
+from small_room import small_room
+
+import warprrf as wr
+from benchmarks.baselines.sionna_calibration import _bound, _physical, _slopes, _unbound, calibrate_sionna
+
+
+def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) -> None:
+    folder = small_room(tmp_path)
+    train = wr.SpectrumDataset.load(folder / "spectra.nc").split(4)[0]
+    true = wr.Scene.load(folder / "scene.xml")
+    truth = [m.scattering_coefficient(300e9) for m in true.materials]
+    wrong = true.with_materials(
+        [replace(m, scattering=0.5 * s) for m, s in zip(true.materials, truth, strict=True)]
+    )
+    found = calibrate_sionna(
+        wrong, train, seconds=60.0, most_steps=12, samples=20_000, rate=0.5, device="cpu"
+    )
+    assert len(found.losses) == 12
+    assert np.mean(found.losses[-4:]) < 0.7 * np.mean(found.losses[:4])
+    walls = next(k for k, m in enumerate(true.materials) if m.name == "concrete")
+    learned = found.scene.materials[walls].scattering_coefficient(300e9)
+    assert abs(learned - truth[walls]) < 0.5 * (0.5 * truth[walls])  # it began at half of the truth
+    assert found.scene.materials[walls].name == "concrete"
+
+
+def test_unbound_values_go_there_and_back_and_slopes_are_theirs(tmp_path: Path) -> None:
+    material = wr.Scene.load(small_room(tmp_path) / "scene.xml").materials[0]
+    given = replace(material, scattering=0.4)
+    values = _unbound([given], 300e9)
+    (back,) = _bound([given], values, 300e9)
+    assert back.permittivity(300e9) == pytest.approx(given.permittivity(300e9), rel=1e-9)
+    assert back.scattering_coefficient(300e9) == pytest.approx(0.4)
+    for k in range(3):
+        step = np.zeros((1, 3))
+        step[0, k] = 1e-6
+        slope = (_physical(values + step) - _physical(values - step))[0, k] / 2e-6
+        assert _slopes(values)[0, k] == pytest.approx(slope, rel=1e-5)
+
+
+def test_bad_times_are_named() -> None:
+    with pytest.raises(ValueError, match="seconds: got 0"):
+        calibrate_sionna(None, None, seconds=0)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="most_steps: got 0"):
+        calibrate_sionna(None, None, seconds=1.0, most_steps=0)  # type: ignore[arg-type]

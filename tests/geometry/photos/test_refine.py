@@ -1,0 +1,172 @@
+"""Refinement: the loss and its derivative, learning, and that stopping does not change the result."""
+
+import numpy as np
+import pytest
+import warp as wp
+from skimage.metrics import structural_similarity
+
+from warprrf.geometry.photos.planes import Plane
+from warprrf.geometry.photos.refine import PhotoLoss, RefineConfig, refine
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.render import render
+
+
+def ring_of_cameras(count=8, radius=4.0, width=64, height=48):
+    cameras = []
+    for angle in np.arange(count) * 2 * np.pi / count:
+        position = np.array([radius * np.cos(angle), radius * np.sin(angle), 0.3])
+        forward = -position / np.linalg.norm(position)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, 3] = -pose[:3, :3] @ position
+        cameras.append(
+            Camera.pinhole(
+                width,
+                height,
+                fx=0.9 * width,
+                fy=0.9 * width,
+                cx=width / 2,
+                cy=height / 2,
+                world_to_camera=pose,
+            )
+        )
+    return cameras
+
+
+@pytest.fixture(scope="module")
+def problem():
+    rng = np.random.default_rng(0)
+    n = 300
+    truth = Gaussians(
+        rng.uniform([-1.5, -1.5, -0.5], [1.5, 1.5, 0.5], (n, 3)), rng.normal(size=(n, 4)),
+        rng.uniform(0.05, 0.2, (n, 3)), rng.uniform(0.5, 0.95, n), rng.normal(size=(n, 1, 3)) * 0.8,
+    )  # fmt: skip
+    cameras = ring_of_cameras()
+    photos = [np.clip(render(truth, c, device="cpu").features, 0, 1) for c in cameras]
+    start = Gaussians(
+        truth.means + rng.normal(size=(n, 3)) * 0.03, truth.quaternions, np.full((n, 3), 0.1), np.full(n, 0.5),
+        np.zeros((n, 1, 3)),
+    )  # fmt: skip
+    return start, photos, cameras
+
+
+CONFIG = RefineConfig(
+    iterations=60, downscale=1, densify_from=20, densify_every=20, max_scale_m=1.0, thickness_m=1.0, mean_rate=2e-3,
+    checkpoint_every=20,
+)  # fmt: skip
+
+
+def psnr(g, photos, cameras):
+    errors = [
+        np.mean((render(g, c, device="cpu").features - p) ** 2) for c, p in zip(cameras, photos, strict=True)
+    ]
+    return float(np.mean(-10 * np.log10(errors)))
+
+
+def test_refinement_learns_the_photos_and_densifies(problem):
+    start, photos, cameras = problem
+    end = refine(start, photos, cameras, config=CONFIG, device="cpu")
+    assert psnr(end, photos, cameras) > psnr(start, photos, cameras) + 4
+    assert len(end) > len(start)
+
+
+def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp_path):
+    start, photos, cameras = problem
+    whole = refine(start, photos, cameras, config=CONFIG, device="cpu")
+
+    class Killed(Exception):
+        pass
+
+    def kill_after_the_second_checkpoint(stage, done, total):
+        if done >= 50:
+            raise Killed
+
+    file = tmp_path / "refine.safetensors"
+    config = CONFIG
+    with pytest.raises(Killed):
+        refine(start, photos, cameras, config=config, checkpoint=file, device="cpu",
+               progress=lambda stage, done, total: kill_after_the_second_checkpoint(stage, done, total))  # fmt: skip
+    resumed = refine(start, photos, cameras, config=config, checkpoint=file, device="cpu")
+    for name in ("means", "quaternions", "scales", "opacities", "sh"):
+        assert np.array_equal(getattr(resumed, name), getattr(whole, name)), name
+
+
+def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(problem, tmp_path):
+    start, photos, cameras = problem
+    file = tmp_path / "refine.safetensors"
+    short = RefineConfig(iterations=20, downscale=1, checkpoint_every=20)
+    refine(start, photos, cameras, config=short, checkpoint=file, device="cpu")
+    with pytest.raises(ValueError, match="other settings"):
+        refine(start, photos, cameras, config=CONFIG, checkpoint=file, device="cpu")
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ValueError, match="cannot be read"):
+        refine(start, photos, cameras, config=short, checkpoint=file, device="cpu")
+
+
+@pytest.mark.on_cuda_too
+def test_gaussians_near_a_plane_are_pulled_flat_into_it():
+    rng = np.random.default_rng(1)
+    n = 200
+    uv = rng.uniform(-0.8, 0.8, (n, 2))
+    noisy = np.column_stack([uv, rng.normal(size=n) * 0.01])
+    tilt = np.column_stack([np.ones(n), rng.normal(size=(n, 2)) * 0.05, np.zeros(n)])
+    start = Gaussians(
+        noisy, tilt, np.tile([0.06, 0.06, 0.003], (n, 1)), np.full(n, 0.8), rng.normal(size=(n, 1, 3))
+    )
+    cameras = ring_of_cameras(4)
+    photos = [np.clip(render(start, c, device="cpu").features, 0, 1) for c in cameras]
+    plane = Plane(
+        normal=np.array([0, 0, 1.0]), offset=0.0, inliers=np.arange(n), axes=np.eye(3)[:2],
+        corner=np.array([-1.0, -1.0]),
+        cell_m=0.5, occupied=np.ones((4, 4), bool),
+    )  # fmt: skip
+    config = RefineConfig(iterations=60, downscale=1, densify_from=999)
+    free = refine(start, photos, cameras, config=config, device="cpu")
+    held = refine(start, photos, cameras, config=config, planes=[plane], device="cpu")
+    assert np.abs(held.means[:, 2]).max() < 1e-3 < np.abs(free.means[:, 2]).mean()
+    assert np.degrees(np.arccos(np.clip(np.abs(held.normals[:, 2]), 0, 1))).max() < 1.0
+
+
+@pytest.mark.on_cuda_too
+def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right():
+    rng = np.random.default_rng(2)
+    shape = (24, 20, 3)
+    image, target = rng.random(shape), rng.random(shape)
+    loss = PhotoLoss("cpu", 0.2, real=wp.float64)
+
+    def evaluate(values):
+        x = wp.array(values, dtype=wp.float64, device="cpu")
+        t = wp.array(target.reshape(-1), dtype=wp.float64, device="cpu")
+        gradient = wp.zeros(shape, dtype=wp.float64, device="cpu")
+        score = loss(x, t, loss.moments(t, t, shape), gradient).numpy().reshape(shape)
+        return 0.8 * np.abs(values - target).mean() + 0.2 * (1 - score.mean()), gradient.numpy(), score
+
+    _, gradient, score = evaluate(image)
+    _, published = structural_similarity(
+        image, target, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        full=True,
+    )  # fmt: skip
+    assert (
+        np.abs(score - published)[6:-6, 6:-6].max() < 1e-4
+    )  # the border differs: zeros here, mirrored there
+    v = rng.normal(size=shape)
+    h = 1e-6
+    difference = (evaluate(image + h * v)[0] - evaluate(image - h * v)[0]) / (2 * h)
+    assert (gradient * v).sum() == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"images": []}, "^images: got 0"),
+        ({"images": [np.zeros((10, 10, 3))] * 8}, r"^images\[0\]"),
+        ({"cameras": [Camera.spherical(64, 48, position=(0, 0, 0))] * 8}, r"^cameras\[0\]"),
+    ],
+)
+def test_bad_input_is_named(problem, change, complaint):
+    start, photos, cameras = problem
+    with pytest.raises(ValueError, match=complaint):
+        refine(**{"gaussians": start, "images": photos, "cameras": cameras, "device": "cpu", **change})

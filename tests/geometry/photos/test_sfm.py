@@ -1,0 +1,327 @@
+"""Structure from motion on real image files, and the similarity to metres."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from places import LOBBY
+
+from warprrf.geometry.photos import sfm
+from warprrf.geometry.photos.photo_files import find_photos, match_names
+from warprrf.geometry.photos.sparse import SparseModel, align_to_known, fit_similarity
+from warprrf.geometry.splats.camera import Camera
+
+pytest.importorskip("pycolmap")
+Image = pytest.importorskip("PIL.Image")
+
+VIEWS = [f"view_{k:03d}.jpg" for k in range(10)]
+
+
+def rotation(rng):
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else q[:, ::-1]
+
+
+def model(rng, names="abcdefgh"):
+    cameras = {}
+    for name in names:
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation(rng), rng.standard_normal(3)
+        cameras[f"{name}.jpg"] = Camera.pinhole(
+            640, 480, fx=400, fy=410, cx=320, cy=240, world_to_camera=pose
+        )
+    points = rng.standard_normal((50, 3))
+    return SparseModel(
+        cameras, points, np.full((50, 3), 0.5), np.full(50, 0.3), np.full(50, 2), np.arange(0, 101, 2),
+        np.tile([0, 1], 50),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def lobby():
+    """Ten photos of the walk, and their true positions."""
+    missing = [n for n in VIEWS if not (LOBBY / "photos" / n).is_file()]
+    assert not missing, f"the committed lobby photos are gone: {missing}"
+    views = json.loads((LOBBY / "poses_true.json").read_text())["views"]
+    truth = {}
+    for name in VIEWS:
+        pose = np.array(views[name]["world_to_camera"])
+        truth[name] = -pose[:3, :3].T @ pose[:3, 3]
+    return [LOBBY / "photos" / n for n in VIEWS], truth
+
+
+@pytest.fixture(scope="module")
+def posed(lobby, tmp_path_factory):
+    workspace = tmp_path_factory.mktemp("sfm")
+    return workspace, sfm.structure_from_motion(lobby[0], workspace=workspace, max_features=1500)
+
+
+# ------------------------------------------------------------------------------------------- similarity
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_similarity_is_recovered(seed):
+    rng = np.random.default_rng(seed)
+    scale, turn, shift = np.exp(rng.uniform(-3, 3)), rotation(rng), 10 * rng.standard_normal(3)
+    source = rng.standard_normal((4 + seed, 3))
+    got = fit_similarity(source, scale * source @ turn.T + shift)
+    assert got[0] == pytest.approx(scale, rel=1e-9)
+    np.testing.assert_allclose(got[1], turn, atol=1e-9)
+    np.testing.assert_allclose(got[2], shift, atol=1e-9 * (1 + scale))
+
+
+def test_similarity_is_proper_even_where_a_mirror_image_would_fit_better():
+    source = np.random.default_rng(0).standard_normal((6, 3))
+    _, turn, _ = fit_similarity(source, source * [1, 1, -1])
+    assert np.linalg.det(turn) == pytest.approx(1)
+
+
+def test_no_similarity_nearby_fits_noisy_points_better():
+    rng = np.random.default_rng(3)
+    source = rng.standard_normal((8, 3))
+    target = 2.5 * source @ rotation(rng).T + rng.standard_normal(3) + 0.1 * rng.standard_normal((8, 3))
+
+    def cost(s, r, t):
+        return ((s * source @ r.T + t - target) ** 2).sum()
+
+    s, r, t = fit_similarity(source, target)
+    least = cost(s, r, t)
+    for _ in range(200):
+        spin = np.cross(np.eye(3), 1e-2 * rng.standard_normal(3))
+        u, _, vt = np.linalg.svd(np.eye(3) + spin)
+        assert (
+            cost(s * (1 + 1e-2 * rng.standard_normal()), u @ vt @ r, t + 1e-2 * rng.standard_normal(3))
+            > least
+        )
+
+
+def test_points_on_a_line_fix_no_rotation():
+    line = np.outer(np.arange(5.0), [1, 2, 3])
+    with pytest.raises(ValueError, match="one line"):
+        fit_similarity(line, line)
+
+
+def test_alignment_moves_world_and_cameras_together():
+    rng = np.random.default_rng(1)
+    sparse = model(rng)
+    scale, turn, shift = 3.7, rotation(rng), np.array([5.0, -2.0, 1.0])
+    known = {n: scale * turn @ c.position + shift for n, c in list(sparse.cameras.items())[:4]}
+    aligned = align_to_known(sparse, known)
+    assert aligned.metric and aligned.scale_rms_m < 1e-12
+    np.testing.assert_allclose(aligned.points, scale * sparse.points @ turn.T + shift, atol=1e-12)
+    for name, camera in sparse.cameras.items():
+        # What a camera sees does not depend on the unit or the axes of the world.
+        before, after = camera.project(sparse.points), aligned.cameras[name].project(aligned.points)
+        np.testing.assert_allclose(after[0], before[0], atol=1e-8)
+        np.testing.assert_allclose(after[1], scale * before[1], atol=1e-9)
+
+
+def test_alignment_reports_the_rms_that_is_left():
+    sparse = model(np.random.default_rng(2))
+    off = 0.02 * np.random.default_rng(5).standard_normal((8, 3))
+    known = {n: c.position + e for (n, c), e in zip(sparse.cameras.items(), off, strict=True)}
+    aligned = align_to_known(sparse, known)
+    left = [np.linalg.norm(aligned.cameras[n].position - p) for n, p in known.items()]
+    assert aligned.scale_rms_m == pytest.approx(np.sqrt(np.mean(np.square(left))))
+    assert 0.005 < aligned.scale_rms_m < np.sqrt((off**2).sum(axis=1).mean())
+
+
+def test_bad_surveyed_positions_are_refused():
+    sparse = model(np.random.default_rng(4))
+    known = {n: c.position for n, c in sparse.cameras.items()}
+    with pytest.raises(ValueError, match="at least 3"):
+        align_to_known(sparse, dict(list(known.items())[:2]))
+    with pytest.raises(ValueError, match=r"no such photo: z\.jpg"):
+        align_to_known(sparse, known | {"z.jpg": [0, 0, 0]})
+    with pytest.raises(ValueError, match="NaN"):
+        align_to_known(sparse, known | {"a.jpg": [0, np.nan, 0]})
+    with pytest.raises(ValueError, match="one line"):
+        align_to_known(sparse, {"a.jpg": [0, 0, 0], "b.jpg": [1, 1, 1], "c.jpg": [2, 2, 2]})
+    lost = replace(sparse, cameras=dict(list(sparse.cameras.items())[:2]), unposed=tuple(known)[2:])
+    with pytest.raises(ValueError, match=r"only 2 of the surveyed photos were posed.*c\.jpg"):
+        align_to_known(lost, known)
+
+
+# ------------------------------------------------------------------------------------------- real photos
+
+
+def test_poses_of_rendered_photos_agree_with_the_truth(posed, lobby):
+    sparse, truth = posed[1], lobby[1]
+    assert set(sparse.cameras) == set(VIEWS) and sparse.unposed == ()
+    aligned = align_to_known(sparse, truth)
+    assert aligned.scale_rms_m < 0.03  # ten neighbouring views; the whole walk does better
+    assert sparse.cameras[VIEWS[0]].fx == pytest.approx(395, rel=0.03)  # estimated from the images alone
+
+
+def test_a_point_projects_to_where_its_photos_saw_it(posed):
+    sparse = posed[1]
+    cameras = list(sparse.cameras.values())
+    k = np.repeat(np.arange(len(sparse.points)), sparse.track_length)
+    inside = 0
+    for c, camera in enumerate(cameras):
+        uv, depth = camera.project(sparse.points[k[sparse.track_camera == c]])
+        assert (depth > 0).all()
+        inside += ((uv > -2) & (uv < (camera.width + 2, camera.height + 2))).all(axis=1).sum()
+    assert inside == len(sparse.track_camera)
+    assert (sparse.track_length >= 2).all() and sparse.track_start[-1] == len(sparse.track_camera)
+
+
+def test_finished_work_is_reused_and_repeats_itself(posed, lobby, tmp_path):
+    workspace, first = posed
+    stages = []
+    again = sfm.structure_from_motion(
+        lobby[0], workspace=workspace, max_features=1500, progress=lambda s, d, n: stages.append(s)
+    )
+    assert stages == []
+    np.testing.assert_array_equal(again.points, first.points)
+    # Stopped while mapping, with rubbish left behind: the same model comes out of the matches.
+    shutil.copytree(workspace, tmp_path / "w", symlinks=True)
+    shutil.rmtree(tmp_path / "w" / "sfm" / "model")
+    (tmp_path / "w" / "sfm" / "working.db").write_bytes(b"half written")
+    (tmp_path / "w" / "sfm" / "mapping" / "0").mkdir(parents=True)
+    resumed = sfm.structure_from_motion(
+        lobby[0], workspace=tmp_path / "w", max_features=1500, progress=lambda s, d, n: stages.append(s)
+    )
+    assert set(stages) == {"mapping"}
+    np.testing.assert_array_equal(resumed.points, first.points)
+
+
+def test_other_photos_do_not_reuse_old_work(posed, lobby, tmp_path):
+    shutil.copytree(posed[0], tmp_path / "w", symlinks=True)
+    stages = set()
+    sparse = sfm.structure_from_motion(
+        lobby[0][:9], workspace=tmp_path / "w", max_features=1500, progress=lambda s, d, n: stages.add(s)
+    )
+    assert stages == {"features", "matching", "mapping"}
+    assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:9])
+
+
+def test_work_of_other_code_is_done_again_and_says_so(posed, lobby, tmp_path, monkeypatch, caplog):
+    shutil.copytree(posed[0], tmp_path / "w", symlinks=True)
+    options = {"workspace": tmp_path / "w", "max_features": 1500}
+    stages = set()
+    monkeypatch.setattr(sfm, "code_mark", lambda *modules, packages: f"new code, {packages}")
+    sparse = sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == {"features", "matching", "mapping"}
+    assert len(caplog.messages) == 1 and "other code" in caplog.messages[0]
+    # COLMAP's threads leave a little to chance.
+    assert sparse.cameras.keys() == posed[1].cameras.keys()
+    assert len(sparse.points) == pytest.approx(len(posed[1].points), rel=0.1)
+    # The same mark again: resumed. A workspace from before there were marks: done again.
+    stages.clear()
+    sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
+    assert stages == set() and len(caplog.messages) == 1
+    stamp = tmp_path / "w" / "sfm" / "photos.json"
+    old = json.loads(stamp.read_text())
+    assert "pycolmap" in old.pop("code")
+    stamp.write_text(json.dumps(old))
+
+    class Begun(Exception):
+        pass
+
+    def begin(stage, done, total):
+        raise Begun(stage)
+
+    with pytest.raises(Begun, match="features"):
+        sfm.structure_from_motion(lobby[0], progress=begin, **options)
+    assert len(caplog.messages) == 2
+
+
+def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
+    import pycolmap
+
+    source = pycolmap.Reconstruction(str(posed[0] / "sfm" / "model"))
+    (tmp_path / "text").mkdir()
+    source.write_text(str(tmp_path / "text"))
+    for folder in (posed[0] / "sfm" / "model", tmp_path / "text"):
+        read = sfm.read_colmap(folder)
+        assert list(read.cameras) == VIEWS
+        for name, camera in posed[1].cameras.items():
+            np.testing.assert_allclose(read.cameras[name].world_to_camera, camera.world_to_camera, atol=1e-12)
+    (tmp_path / "text" / "images.txt").write_text("1 2 three\n")
+    with pytest.raises(ValueError, match="does not read as a COLMAP model"):
+        sfm.read_colmap(tmp_path / "text")
+    with pytest.raises(ValueError, match="holds no COLMAP model"):
+        sfm.read_colmap(tmp_path)
+
+
+# ------------------------------------------------------------------------------------------- bad input
+
+
+def save(path, pixels):
+    Image.fromarray(np.asarray(pixels, dtype=np.uint8)).save(path)
+    return path
+
+
+def test_photos_that_are_not_there_are_named(tmp_path):
+    with pytest.raises(ValueError, match="not a folder"):
+        find_photos(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="got 0 photos"):
+        find_photos(tmp_path)
+    with pytest.raises(ValueError, match=r"2 of 2 files do not exist.*b\.jpg"):
+        find_photos([tmp_path / "a.jpg", tmp_path / "b.jpg"])
+
+
+def test_hidden_files_are_no_photos(tmp_path):
+    for name in ("a.jpg", "b.png", "c.JPG", ".d.123.partial.jpg", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert list(find_photos(tmp_path)) == ["a.jpg", "b.png", "c.JPG"]
+
+
+def test_unreadable_and_odd_photos_are_named(tmp_path, lobby):
+    good = [shutil.copy(p, tmp_path) for p in lobby[0][:3]]
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(lobby[0][0].read_bytes()[:2000])
+    with pytest.raises(ValueError, match=r"1 of 4 files do not read as images: broken\.jpg"):
+        sfm.structure_from_motion([*good, broken], workspace=tmp_path / "w")
+    broken.unlink()
+    save(tmp_path / "small.jpg", np.zeros((24, 32, 3)))
+    with pytest.raises(ValueError, match=r"not 640 x 480.*small\.jpg \(32 x 24\)"):
+        sfm.structure_from_motion(tmp_path, workspace=tmp_path / "w")
+
+
+def test_photos_without_anything_in_common_are_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    grey = [save(tmp_path / f"grey{k}.png", np.full((120, 160, 3), 128)) for k in range(3)]
+    with pytest.raises(ValueError, match=r"3 of 3 photos show fewer than 8 features.*grey0\.png"):
+        sfm.structure_from_motion(grey, workspace=tmp_path / "w1")
+    noise = [
+        save(tmp_path / f"noise{k}.png", np.kron(rng.integers(0, 256, (15, 20, 3)), np.ones((8, 8, 1))))
+        for k in range(3)
+    ]
+    with pytest.raises(ValueError, match=r"too few matches between the 3 photos.*noise0\.png"):
+        sfm.structure_from_motion(noise, workspace=tmp_path / "w2")
+
+
+def test_distorted_camera_models_are_refused(tmp_path, lobby):
+    with pytest.raises(ValueError, match="undistorted"):
+        sfm.structure_from_motion(lobby[0], workspace=tmp_path, camera_model="OPENCV")
+
+
+def test_short_names_serve_where_they_are_unique():
+    names = ["left/a.jpg", "left/b.jpg", "right/b.jpg"]
+    assert match_names("held_out", ["a.jpg", "right/b.jpg"], names) == ["left/a.jpg", "right/b.jpg"]
+    with pytest.raises(ValueError, match=r"held_out: several photos have the file name of b\.jpg"):
+        match_names("held_out", ["b.jpg"], names)
+
+
+def test_promising_pairs_hold_the_true_neighbours(posed, monkeypatch):
+    """Pairs that match well must not be lost by the coarse comparison."""
+    import pycolmap
+
+    monkeypatch.setattr(sfm, "COARSE_NEIGHBOURS", 4)
+    with pycolmap.Database.open(str(posed[0] / "sfm" / "matches.db")) as database:
+        chosen = set(sfm._promising_pairs(database, VIEWS, lambda *a: None))
+        ids = {i.name: i.image_id for i in database.read_all_images()}
+        inliers = {
+            (a, b): len(database.read_two_view_geometry(ids[a], ids[b]).inlier_matches)
+            for i, a in enumerate(VIEWS)
+            for b in VIEWS[i + 1 :]
+            if database.exists_two_view_geometry(ids[a], ids[b])
+        }
+    best = sorted(inliers, key=inliers.get)[-8:]
+    assert set(best) <= chosen
+    assert len(chosen) < 45

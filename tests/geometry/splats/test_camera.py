@@ -1,0 +1,62 @@
+"""Cameras: pixel grids, poses, and that projecting a direction finds its pixel."""
+
+import numpy as np
+import pytest
+
+from warprrf.geometry.splats.camera import Camera
+
+
+def test_spherical_grid_is_the_stated_one():
+    d = Camera.spherical(180, 90, position=(1, 2, 3)).directions()
+    zenith, azimuth = (0 + 0.5) * np.pi / 90, -np.pi + (10 + 0.5) * 2 * np.pi / 180
+    expected = [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
+    assert np.allclose(d[0, 10], expected, atol=1e-15)
+    assert np.allclose(np.linalg.norm(d, axis=2), 1)
+
+
+def looking_along_x(width=64, height=48):
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    pose[:3, 3] = -pose[:3, :3] @ [1.0, 2.0, 3.0]
+    return Camera.pinhole(width, height, fx=50, fy=60, cx=30, cy=20, world_to_camera=pose)
+
+
+@pytest.mark.parametrize("camera", [looking_along_x(), Camera.spherical(40, 20, position=(1, 2, 3))])
+def test_projection_inverts_directions(camera):
+    points = camera.position + 2.5 * camera.directions().reshape(-1, 3)
+    uv, _ = camera.project(points)
+    v, u = np.meshgrid(np.arange(camera.height) + 0.5, np.arange(camera.width) + 0.5, indexing="ij")
+    assert np.allclose(uv, np.stack([u, v], axis=-1).reshape(-1, 2), atol=1e-9)
+
+
+def test_opencv_axes_and_position():
+    camera = looking_along_x()
+    assert np.allclose(camera.position, [1, 2, 3])
+    uv, depth = camera.project([[2.0, 2.0, 3.0], [2.0, 1.9, 2.9], [0.0, 2.0, 3.0]])
+    assert np.allclose(uv[0], [30, 20]) and depth[0] == pytest.approx(1)
+    assert (uv[1] > uv[0]).all()  # right is -y, down is -z
+    assert np.isnan(uv[2]).all()  # behind
+
+
+def test_resizing_keeps_the_field_of_view():
+    camera = looking_along_x()
+    half = camera.resized(32, 24)
+    points = camera.position + camera.directions().reshape(-1, 3)
+    assert np.allclose(half.project(points)[0] * 2, camera.project(points)[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"width": 0}, "^width"),
+        ({"fx": -1}, "^fx"),
+        ({"cy": np.nan}, "^cy"),
+        ({"world_to_camera": np.diag([2.0, 2, 2, 1])}, "not a rotation"),
+        ({"world_to_camera": np.diag([-1.0, 1, 1, 1])}, "not a rotation"),
+        ({"world_to_camera": np.eye(3)}, "^world_to_camera"),
+    ],
+)
+def test_bad_cameras_are_refused(change, complaint):
+    arguments = {"width": 4, "height": 3, "fx": 5, "fy": 5, "cx": 2, "cy": 1, "world_to_camera": np.eye(4)}
+    with pytest.raises(ValueError, match=complaint):
+        Camera.pinhole(**{**arguments, **change})

@@ -1,0 +1,116 @@
+"""Gaussians: what they refuse, and the INRIA PLY layout there and back."""
+
+import numpy as np
+import pytest
+
+from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotations_of
+
+
+def some(n=5, coefficients=16, seed=0):
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.normal(size=(n, 3)), rng.normal(size=(n, 4)), rng.uniform(0.01, 1, (n, 3)), rng.uniform(0.01, 0.99, n),
+        rng.normal(size=(n, coefficients, 3)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_ply_holds_every_attribute(tmp_path, coefficients):
+    g = some(coefficients=coefficients)
+    g.save_ply(tmp_path / "g.ply")
+    back = Gaussians.load_ply(tmp_path / "g.ply")
+    for name in ("means", "quaternions", "scales", "opacities", "sh"):
+        assert np.allclose(getattr(back, name), getattr(g, name), rtol=1e-5, atol=1e-6), name
+
+
+def test_ply_layout_is_the_one_that_other_viewers_read(tmp_path):
+    g = some(n=2, coefficients=4)
+    g.save_ply(tmp_path / "g.ply")
+    header, body = (tmp_path / "g.ply").read_bytes().split(b"end_header\n")
+    names = [line.split()[-1] for line in header.decode().split("\n") if line.startswith("property")]
+    assert (
+        names
+        == (
+            "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 f_rest_0 f_rest_1 f_rest_2 f_rest_3 f_rest_4 f_rest_5 f_rest_6 "
+            "f_rest_7 f_rest_8 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+        ).split()
+    )
+    row = dict(zip(names, np.frombuffer(body, "<f4").reshape(2, -1)[1], strict=True))
+    assert row["f_rest_1"] == g.sh[1, 2, 0]  # channel-major: second harmonic of red
+    assert row["f_rest_3"] == g.sh[1, 1, 1]  # first harmonic of green
+    assert row["opacity"] == pytest.approx(np.log(g.opacities[1] / (1 - g.opacities[1])), rel=1e-4)
+    assert row["scale_2"] == pytest.approx(np.log(g.scales[1, 2]), rel=1e-5)
+    assert row["rot_0"] == g.quaternions[1, 0]
+
+
+def test_ascii_and_shuffled_properties_are_read(tmp_path):
+    lines = ["ply", "format ascii 1.0", "comment hand-written", "element vertex 1"]
+    values = {"opacity": 0, "x": 1, "y": 2, "z": 3, "f_dc_0": 0.1, "f_dc_1": 0.2, "f_dc_2": 0.3}
+    values |= {f"scale_{k}": np.log(0.5) for k in range(3)} | {"rot_0": 2, "rot_1": 0, "rot_2": 0, "rot_3": 0}
+    lines += [f"property float {name}" for name in values]
+    lines += ["end_header", " ".join(str(v) for v in values.values()), ""]
+    (tmp_path / "a.ply").write_text("\n".join(lines))
+    g = Gaussians.load_ply(tmp_path / "a.ply")
+    assert g.means.tolist() == [[1, 2, 3]] and g.opacities[0] == 0.5
+    assert np.allclose(g.scales, 0.5) and np.allclose(g.quaternions, [[1, 0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"not a ply at all", "not a PLY"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\nab",
+            "cut short",
+        ),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
+            "lacks the vertex properties",
+        ),
+        (b"ply\nformat ascii 1.0\nelement face 1\nend_header\n1\n", "first element is 'face'"),
+    ],
+)
+def test_a_corrupt_ply_is_refused_by_name(tmp_path, content, complaint):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=complaint) as caught:
+        Gaussians.load_ply(path)
+    assert "bad.ply" in str(caught.value)
+
+
+def test_a_truncated_file_of_ours_is_refused(tmp_path):
+    some().save_ply(tmp_path / "g.ply")
+    whole = (tmp_path / "g.ply").read_bytes()
+    (tmp_path / "g.ply").write_bytes(whole[:-10])
+    with pytest.raises(ValueError, match="cut short"):
+        Gaussians.load_ply(tmp_path / "g.ply")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("means", np.full((5, 3), np.nan)),
+        ("means", np.zeros((5, 2))),
+        ("quaternions", np.zeros((5, 4))),
+        ("scales", np.zeros((5, 3))),
+        ("scales", np.full((5, 3), 1e-40)),
+        ("scales", np.full((5, 3), np.inf)),
+        ("opacities", np.full(5, 1.5)),
+        ("opacities", np.zeros(4)),
+        ("sh", np.zeros((5, 5, 3))),
+    ],
+)
+def test_bad_attributes_are_refused_by_name(name, value):
+    g = some()
+    fields = {n: getattr(g, n) for n in ("means", "quaternions", "scales", "opacities", "sh")}
+    with pytest.raises(ValueError, match=f"^{name}:"):
+        Gaussians(**{**fields, name: value})
+
+
+def test_quaternions_are_normalised_and_turn_back_from_rotations():
+    g = some(200)
+    assert np.allclose(np.linalg.norm(g.quaternions, axis=1), 1, atol=1e-6)
+    r = rotations_of(g.quaternions)
+    assert np.allclose(r @ r.transpose(0, 2, 1), np.eye(3), atol=1e-12)
+    back = quaternions_of(r)
+    assert np.allclose(np.abs(np.sum(back * g.quaternions, axis=1)), 1, atol=1e-6)

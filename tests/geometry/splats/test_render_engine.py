@@ -1,0 +1,266 @@
+"""How the rasteriser gets through its work changes nothing about the result: lists of blocks, threads, shared tiles."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import warp as wp
+
+from benchmarks.engine.scenes import gaussians, panorama, photo, room
+from warprrf import device
+from warprrf.geometry.splats import rasterizer
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
+from warprrf.geometry.splats.render import blend_weights, render
+from warprrf.kernels.raster.lanes import BLOCK, LANES
+from warprrf.kernels.raster.lanes import build as lane_functions
+
+CAMERAS = {
+    "pinhole": photo(70, 45),
+    "spherical": panorama(33, 66),
+    "inside": Camera.spherical(40, 20, position=(0.5, 0.2, 0.1)),
+}
+
+
+def mixed(seed, n=150):
+    """Discs, needles and balls of very different sizes round the camera, some with it inside."""
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        rng.uniform(0, 1, (n, 3)) * (18, 12, 4), rng.normal(size=(n, 4)), np.exp(rng.uniform(-4, 0.7, (n, 3))),
+        rng.uniform(0.05, 1, n), np.zeros((n, 1, 3)),
+    )  # fmt: skip
+
+
+def alphas(g, cam, blending):
+    """Of every Gaussian on every ray in float64, by the definition: shape (H, W, N); zero below the cutoff."""
+    d = cam.directions()
+    out = np.zeros((*d.shape[:2], len(g)))
+    for k in range(len(g)):
+        whiten = g.rotations[k].T / g.scales[k].astype(np.float64)[:, None]
+        m = g.means[k].astype(np.float64) - cam.position
+        a, b = d @ whiten.T, whiten @ m
+        t = a @ b / np.sum(a * a, axis=-1)
+        raw = g.opacities[k] * np.exp(-0.5 * np.sum((a * t[..., None] - b) ** 2, axis=-1))
+        out[..., k] = np.where((raw >= blending.alpha_min) & (t > 0), raw, 0)
+    return out
+
+
+def block_lists(raster, g, cam):
+    """Gaussians of every block of pixels (column, row), in the order of blending."""
+    prepared = raster.prepare(*raster.upload(g), cam)
+    ids, starts = prepared.blocks.ids.numpy(), prepared.blocks.starts.numpy()
+    lists = {}
+    for block in range(len(starts) - 1):
+        tile, b = divmod(block, LANES)
+        row, column = divmod(tile, prepared.view.tiles_x)
+        lists[4 * column + b % 4, 4 * row + b // 4] = ids[starts[block] : starts[block + 1]]
+    return lists
+
+
+@pytest.mark.parametrize("blending", [Blending(), RADIO], ids=["photos", "radio"])
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+@pytest.mark.parametrize("seed", range(3))
+def test_a_block_lists_every_gaussian_that_its_pixels_see(seed, camera, blending):
+    g = mixed(seed)
+    lists = block_lists(Rasterizer(device="cpu", blending=blending, real=wp.float64), g, camera)
+    seen = alphas(g, camera, blending) > 0
+    assert seen.any()
+    ranges = np.linalg.norm(g.means.astype(np.float64) - camera.position, axis=1)
+    for (column, row), listed in lists.items():
+        pixels = seen[row * BLOCK : (row + 1) * BLOCK, column * BLOCK : (column + 1) * BLOCK]
+        assert set(np.flatnonzero(pixels.any(axis=(0, 1)))) <= set(listed.tolist())
+        assert len(set(listed.tolist())) == len(listed)
+        assert (np.diff(ranges[listed].astype(np.float32)) >= 0).all()  # near to far
+
+
+def test_few_blocks_are_listed_in_vain():
+    g, cam, blending = gaussians(3000), photo(160, 120), Blending()
+    lists = block_lists(Rasterizer(device="cpu"), g, cam)
+    seen = alphas(g, cam, blending) > 0
+    useful = sum(
+        int(
+            seen[r * BLOCK : (r + 1) * BLOCK, c * BLOCK : (c + 1) * BLOCK][..., listed].any(axis=(0, 1)).sum()
+        )
+        for (c, r), listed in lists.items()
+        if len(listed)
+    )
+    assert useful > 0.8 * sum(map(len, lists.values()))
+
+
+def image_and_gradients(g, cam, *, channels=3, real=wp.float32, blending=None):
+    raster = Rasterizer(device="cpu", real=real, blending=blending)
+    inputs = raster.upload(g)
+    rng = np.random.default_rng(5)
+    features = wp.array(rng.random((len(g), channels)), dtype=real, device="cpu")
+    background = wp.array(rng.random(channels), dtype=real, device="cpu")
+    for array in (*inputs, features, background):
+        array.requires_grad = True
+    image, adjoint = raster.blend_with_adjoint(raster.prepare(*inputs, cam), features, background)
+    for out in (image.features, image.alpha, image.depth):
+        out.grad.assign(rng.normal(size=out.shape))
+    seen = adjoint()
+    arrays = (image.features, image.alpha, image.depth, image.dominant, image.peak, seen)
+    return [a.numpy().copy() for a in arrays] + [
+        a.grad.numpy().copy() for a in (*inputs, features, background)
+    ]
+
+
+@pytest.mark.parametrize("camera", ["pinhole", "spherical"])
+def test_the_number_of_threads_changes_no_bit(camera, monkeypatch):
+    g = mixed(7, 400)
+    results = []
+    for count in (1, 2, 5):
+        with ThreadPoolExecutor(5) as pool:
+            for module in (device, rasterizer):
+                monkeypatch.setattr(module, "threads", lambda count=count: count)
+            monkeypatch.setattr(device, "_pool", lambda pool=pool: pool)
+            results.append(image_and_gradients(g, CAMERAS[camera], channels=5))
+    assert np.abs(results[0][6]).max() > 0
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            assert np.array_equal(a, b)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+def test_seen_weights_are_those_of_pixels_of_the_image(camera):
+    """Blocks reach beyond the image where its size is no multiple of four: nothing there counts."""
+    image, alpha, _, _, _, seen, *_ = image_and_gradients(mixed(7, 400), camera, real=wp.float64)
+    assert camera.width % BLOCK or camera.height % BLOCK or camera.width % 16
+    assert np.isclose(seen.sum(), alpha.sum(), rtol=1e-12)
+    assert alpha.sum() > 0.1 * alpha.size
+
+
+def test_the_exponential_of_float32_errs_by_less_than_1e_6():
+    # One broad Gaussian on the axis of a narrow view: directions are nearly exact, q runs from 0 to 80.
+    g = Gaussians([[0, 0, 1.0]], [[1, 0, 0, 0]], [[0.01] * 3], [1.0], np.zeros((1, 1, 1)))
+    cam = Camera.pinhole(256, 1, fx=2560, fy=2560, cx=0.5, cy=0.5, world_to_camera=np.eye(4))
+    blending = Blending(alpha_min=1e-20, alpha_max=1.0, transmittance_min=-0.5)
+    found = render(g, cam, np.ones((1, 1)), device="cpu", blending=blending).alpha[0]
+    x = np.arange(256) / 2560.0
+    q = (x / 0.01) ** 2 / (1 + x * x)
+    assert q.max() > 80
+    assert np.abs(found - np.exp(-q / 2)).max() < 1e-6
+
+
+@pytest.mark.parametrize("real", [wp.float32, wp.float64])
+def test_sixteen_vectors_are_summed_each(real):
+    of = lane_functions(real)
+    lanes = wp.types.vector(LANES, real)
+    sums = of.sums
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def run(source: wp.array(dtype=lanes), target: wp.array(dtype=lanes)):
+        target[0] = sums(
+            source[0], source[1], source[2], source[3], source[4], source[5], source[6], source[7],
+            source[8], source[9], source[10], source[11], source[12], source[13], source[14], source[15],
+        )  # fmt: skip
+
+    values = np.random.default_rng(0).integers(-9, 9, (LANES, LANES))
+    target = wp.zeros(1, dtype=lanes, device="cpu")
+    wp.launch(run, dim=1, inputs=[wp.array(values, dtype=lanes, device="cpu"), target], device="cpu")
+    assert np.array_equal(target.numpy()[0], values.sum(axis=1))
+
+
+@wp.kernel(enable_backward=False)
+def count_visits(offset: int, visits: wp.array(dtype=int)):
+    i = offset + wp.tid()
+    visits[i] = visits[i] + i + 1
+
+
+@pytest.mark.parametrize(
+    ("how", "first", "last"),
+    [
+        ({}, 0, 1000),
+        ({"grain": 1}, 0, 1000),
+        ({"pieces": 7}, 0, 1000),
+        ({"cuts": [0, 10, 10, 999, 1000]}, 0, 1000),
+        ({"cuts": [200, 300]}, 200, 300),
+        ({"cuts": [200, 250, 300]}, 200, 300),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_launch_visits_every_index_once(how, first, last, count, monkeypatch):
+    with ThreadPoolExecutor(3) as pool:
+        monkeypatch.setattr(device, "threads", lambda: count)
+        monkeypatch.setattr(device, "_pool", lambda: pool)
+        visits = wp.zeros(1000, dtype=int, device="cpu")
+        device.launch(count_visits, 1000, [visits], device="cpu", **how)
+    index = np.arange(1000)
+    assert np.array_equal(visits.numpy(), np.where((index >= first) & (index < last), index + 1, 0))
+
+
+def test_features_need_not_be_contiguous():
+    g, cam = gaussians(500), photo(40, 30)
+    raster = Rasterizer(device="cpu")
+    prepared = raster.prepare(*raster.upload(g), cam)
+    table = wp.array(np.tile(room(500)[4], (1, 2)), dtype=wp.float32, device="cpu")
+    part = table[:, :3]
+    assert not part.is_contiguous
+    straight = raster.blend(prepared, wp.array(room(500)[4], dtype=wp.float32, device="cpu"))
+    assert np.array_equal(raster.blend(prepared, part).features.numpy(), straight.features.numpy())
+    assert straight.features.numpy().max() > 0.3
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+@pytest.mark.parametrize(
+    ("real", "rule", "channels"),
+    [(wp.float32, "product", 5), (wp.float64, "exp", 3)],
+    ids=["float32", "float64"],
+)
+def test_a_gpu_blends_what_a_cpu_does(real, rule, channels, camera, pretended_cuda):
+    """Image, ranges, owners, seen weights and every gradient; five channels take two launches."""
+    g, how = mixed(7, 400), {"channels": channels, "real": real, "blending": Blending(rule=rule)}
+    expected = image_and_gradients(g, camera, **how)
+    with pretended_cuda() as launched:
+        found = image_and_gradients(g, camera, **how)
+    assert {"entry_masks", "blend", "blend_adjoint", "chain"} <= set(launched)
+    tolerance = 2e-5 if real is wp.float32 else 1e-12
+    for k, (a, b) in enumerate(zip(expected, found, strict=True)):
+        assert np.abs(a).max() > 0
+        if k == 3:  # owners
+            assert np.array_equal(a, b)
+        assert np.abs(a - b).max() <= tolerance * np.abs(a).max()
+
+
+def test_a_gpu_lists_the_blocks_that_a_cpu_lists(pretended_cuda):
+    for camera in CAMERAS.values():
+        raster = Rasterizer(device="cpu", blending=RADIO, real=wp.float64)
+        expected = raster.prepare(*raster.upload(mixed(3, 300)), camera)
+        with pretended_cuda():
+            raster = Rasterizer(device="cpu", blending=RADIO, real=wp.float64)
+            found = raster.prepare(*raster.upload(mixed(3, 300)), camera)
+            with pytest.raises(RuntimeError, match="without lists of blocks"):
+                _ = found.blocks
+        for name in ("ids", "masks", "starts"):
+            assert np.array_equal(getattr(expected, name).numpy(), getattr(found, name).numpy())
+        assert np.bitwise_count(found.masks.numpy()).sum() > 300
+
+
+@pytest.mark.parametrize("order", ["reversed", 5])
+def test_what_a_gpu_blends_does_not_depend_on_who_runs_first(order, pretended_cuda):
+    """No barrier is missing: a wrong one would show as NaN or another sum. Additions may be done in another order."""
+    g, camera = mixed(9, 300), CAMERAS["pinhole"]
+    with pretended_cuda():
+        expected = image_and_gradients(g, camera, real=wp.float64)
+    with pretended_cuda(order=order):
+        found = image_and_gradients(g, camera, real=wp.float64)
+    for k, (a, b) in enumerate(zip(expected, found, strict=True)):
+        if k < 5:  # the image: a pixel is one thread's
+            assert np.array_equal(a, b)
+        assert np.abs(a - b).max() <= 1e-12 * np.abs(a).max()
+
+
+@pytest.mark.parametrize("top_k", [1, 3, 16])
+def test_a_gpu_finds_the_strongest_weights_that_a_cpu_finds(top_k, pretended_cuda):
+    for camera in CAMERAS.values():
+        expected = blend_weights(mixed(7, 400), camera, top_k=top_k, device="cpu")
+        with pretended_cuda() as launched:
+            found = blend_weights(mixed(7, 400), camera, top_k=top_k, device="cpu")
+        assert "strongest" in launched
+        assert np.array_equal(expected.index, found.index)
+        assert np.array_equal(expected.dominant, found.dominant)
+        for name in ("weight", "range", "alpha", "dropped"):
+            a, b = getattr(expected, name), getattr(found, name)
+            assert np.abs(a - b).max() <= 3e-6 * max(1, np.abs(a).max())
+        assert expected.weight.max() > 0.1

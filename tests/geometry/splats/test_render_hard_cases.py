@@ -1,0 +1,352 @@
+"""Hard cases of the rasteriser, each with the right answer: from a closed form, or from the definition evaluated in
+NumPy with long doubles where a double would cancel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.special import spence
+
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
+from warprrf.geometry.splats.render import render
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+SMOOTH = Blending(alpha_min=1e-6, alpha_max=1.0, transmittance_min=-0.5)
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+def gaussians(means, scales, opacities=0.8, quaternions=UPRIGHT):
+    means = np.atleast_2d(np.asarray(means, dtype=np.float64))
+    n = len(means)
+    return Gaussians(
+        means, np.broadcast_to(quaternions, (n, 4)), np.broadcast_to(np.asarray(scales, dtype=float), (n, 3)),
+        np.broadcast_to(opacities, n), np.zeros((n, 1, 1)),
+    )  # fmt: skip
+
+
+def pinhole(width=33, height=33, *, focal=30.0, position=ORIGIN):
+    """Looks along +z; its middle pixel's ray is the axis."""
+    pose = np.eye(4)
+    pose[:3, 3] = -np.asarray(position)
+    return Camera.pinhole(
+        width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, world_to_camera=pose
+    )
+
+
+def alpha_of_one(g, cam, blending, dtype=np.longdouble):
+    """Alpha of a single Gaussian on every ray, by its definition: the response at the ray's closest approach."""
+    d = cam.directions().astype(dtype)
+    d /= np.sqrt(np.sum(d * d, axis=-1, keepdims=True))
+    q = g.quaternions[0].astype(dtype)
+    w, x, y, z = q / np.sqrt(np.sum(q * q))
+    r = np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+    whiten = r.T / g.scales[0].astype(dtype)[:, None]
+    m = g.means[0].astype(dtype) - cam.position.astype(dtype)
+    a, b = d @ whiten.T, whiten @ m
+    t = a @ b / np.sum(a * a, axis=-1)
+    distance2 = np.sum((a * t[..., None] - b) ** 2, axis=-1)
+    raw = dtype(g.opacities[0]) * np.exp(-distance2 / 2)
+    return np.where((raw > blending.alpha_min) & (t > 0), np.minimum(raw, blending.alpha_max), 0).astype(
+        float
+    )
+
+
+def ours64(g, cam, blending=SMOOTH):
+    """Alpha of the float64 rasteriser."""
+    raster = Rasterizer(device="cpu", blending=blending, real=wp.float64)
+    table = wp.ones((len(g), 1), dtype=wp.float64, device="cpu")
+    return raster.rasterize(*raster.upload(g), table, cam).alpha.numpy()
+
+
+def ours32(g, cam, blending=SMOOTH):
+    return render(g, cam, np.ones((len(g), 1)), device="cpu", blending=blending).alpha
+
+
+@pytest.mark.parametrize("scale", [0.0, -0.1, 1e-40, np.inf, np.nan], ids=str)
+def test_zero_negative_denormal_infinite_and_nan_scales_are_refused(scale):
+    with pytest.raises(ValueError, match="^scales:"):
+        gaussians([0, 0, 5.0], [0.1, scale, 0.1])
+
+
+def test_the_smallest_scales_accepted_are_seen_by_the_ray_through_them_alone():
+    smallest = float(np.finfo(np.float32).tiny)
+    for scale in (smallest, 1e-30, 1e-15):
+        for alpha in (ours32, ours64):
+            seen = alpha(gaussians([0, 0, 5.0], [scale] * 3), pinhole())
+            expected = np.zeros((33, 33))
+            expected[16, 16] = 0.8  # the middle pixel's ray passes exactly through the mean
+            assert np.allclose(seen, expected, atol=1e-6), (scale, alpha)
+
+
+def test_a_zero_quaternion_is_refused():
+    with pytest.raises(ValueError, match="^quaternions:"):
+        gaussians([0, 0, 5.0], [0.1] * 3, quaternions=(0, 0, 0, 0))
+
+
+@pytest.mark.parametrize("length", [1e-6, 0.5, 3.0, 1e6])
+def test_the_length_of_a_quaternion_changes_no_pixel(length):
+    q = np.array([0.4, -0.2, 0.7, 0.3])
+    q /= np.linalg.norm(q)
+    g = gaussians([0, 0, 5.0], [0.5, 0.1, 1.0], quaternions=q)
+    raster = Rasterizer(device="cpu", blending=SMOOTH, real=wp.float64)
+    inputs = raster.upload(g)
+    table = wp.ones((1, 1), dtype=wp.float64, device="cpu")
+    unit, scaled = (
+        raster.rasterize(
+            inputs[0], wp.array([q * s], dtype=wp.vec4d, device="cpu"), *inputs[2:], table, pinhole()
+        ).alpha.numpy()
+        for s in (1.0, length)
+    )
+    assert unit.max() > 0.5
+    assert np.allclose(unit, scaled, rtol=1e-12, atol=1e-14)
+    entered = gaussians([0, 0, 5.0], [0.5, 0.1, 1.0], quaternions=q * length)
+    assert np.allclose(ours32(entered, pinhole()), unit, atol=1e-5)
+
+
+@pytest.mark.on_cuda_too
+@pytest.mark.parametrize("seed", range(6))
+def test_needles_of_one_to_ten_thousand(seed):
+    rng = np.random.default_rng(seed)
+    g = gaussians(
+        [rng.uniform(-1, 1), rng.uniform(-1, 1), 5.0], [2.0, 2e-4, 2e-4], quaternions=rng.normal(size=4)
+    )
+    cam = pinhole(201, 201, focal=300.0) if seed % 2 == 0 else _looking_at(g.means[0], 201, 20_000.0)
+    blending = Blending(alpha_min=1e-4, alpha_max=1.0, transmittance_min=-0.5)
+    expected = alpha_of_one(g, cam, blending)
+    assert expected.max() > 0
+    assert np.abs(ours64(g, cam, blending) - expected).max() < 1e-6
+    # float32: a direction is rounded to 6e-8, which at 5 m is 3e-7 m, 1.5e-3 of the needle's width.
+    assert np.abs(ours32(g, cam, blending) - expected).max() < 5e-3
+
+
+def _looking_at(target, size, focal):
+    """A camera at the origin whose middle pixel looks at ``target``."""
+    forward = np.asarray(target, dtype=np.float64) / np.linalg.norm(target)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    return Camera.pinhole(size, size, fx=focal, fy=focal, cx=size / 2, cy=size / 2, world_to_camera=pose)
+
+
+def test_ten_micrometre_gaussians_at_ten_metres():
+    # Pixels of 2 urad, 20 um at 10 m: two standard deviations apart.
+    g = gaussians([0, 0, 10.0], [1e-5] * 3)
+    cam = pinhole(focal=5e5)
+    expected = alpha_of_one(g, cam, SMOOTH)
+    assert expected[16, 16] == pytest.approx(0.8) and expected[16, 17] == pytest.approx(
+        0.8 * np.exp(-2), rel=1e-6
+    )
+    assert np.abs(ours64(g, cam) - expected).max() < 1e-6
+    assert np.abs(ours32(g, cam) - expected).max() < 1e-5  # on the axis small components keep their digits
+    # Off the axes the direction is rounded to about 4e-8: 0.04 standard deviations, times the steepest slope 0.61.
+    aside = gaussians([5.77, 5.77, 5.78], [1e-5] * 3)
+    cam = _looking_at(aside.means[0], 33, 5e5)
+    expected = alpha_of_one(aside, cam, SMOOTH)
+    assert expected.max() > 0.79
+    assert np.abs(ours64(aside, cam) - expected).max() < 1e-6
+    assert np.abs(ours32(aside, cam) - expected).max() < 0.05
+
+
+@pytest.mark.on_cuda_too
+@pytest.mark.parametrize("mean", [(3.0, -2.0, 5.0), (0.0, 0.0, 250.0), (80.0, 0.0, 0.0)])
+@pytest.mark.parametrize("kind", ["pinhole", "spherical"])
+def test_hundred_metre_gaussians(mean, kind):
+    g = gaussians(mean, [100.0, 100.0, 100.0])
+    cam = pinhole() if kind == "pinhole" else Camera.spherical(64, 32, position=ORIGIN)
+    expected = alpha_of_one(g, cam, SMOOTH)
+    assert expected.max() > 0.1
+    assert np.abs(ours64(g, cam) - expected).max() < 1e-9
+    assert np.abs(ours32(g, cam) - expected).max() < 1e-5
+
+
+@pytest.mark.parametrize("offset", [0.3, 1e-3, 1e-6])
+def test_camera_inside_a_gaussian_sees_the_half_space_ahead_of_its_peak(offset):
+    g = gaussians([0, 0, offset], [1.0, 0.5, 2.0])
+    cam = Camera.spherical(64, 32, position=ORIGIN)
+    expected = alpha_of_one(g, cam, SMOOTH)
+    upper = cam.directions()[..., 2] > 0  # the peak's range is positive exactly here: cov^-1 m is along z
+    assert (expected[upper] > 0.7).all() and (expected[~upper] == 0).all()
+    assert np.abs(ours64(g, cam) - expected).max() < 1e-9
+    assert np.abs(ours32(g, cam) - expected).max() < 1e-5
+
+
+def test_camera_exactly_at_a_centre_does_not_see_that_gaussian():
+    behind_it = gaussians([[0.5, 0.25, 0.125], [2.0, 0.25, 0.125]], [0.3] * 3)
+    cam = Camera.spherical(64, 32, position=(0.5, 0.25, 0.125))
+    for alpha in (ours32, ours64):
+        assert np.array_equal(alpha(behind_it, cam), alpha(behind_it[1:], cam))
+        assert alpha(behind_it, cam).max() > 0.7
+
+
+def test_a_gaussian_behind_the_camera_is_not_seen_by_a_photo_and_is_by_a_panorama():
+    g = gaussians([0, 0, -2.0], [0.3] * 3)
+    assert (ours32(g, pinhole()) == 0).all() and (ours64(g, pinhole()) == 0).all()
+    panorama = Camera.spherical(64, 32, position=ORIGIN)
+    assert np.abs(ours64(g, panorama) - alpha_of_one(g, panorama, SMOOTH)).max() < 1e-9
+    assert ours64(g, panorama)[-1].min() > 0.7  # the last row looks down
+
+
+def test_a_long_gaussian_whose_centre_is_behind_reaches_into_the_photo():
+    g = gaussians([0.5, 0, -0.2], [0.3, 0.3, 3.0])
+    expected = alpha_of_one(g, pinhole(), SMOOTH)
+    assert expected.max() > 0.05
+    assert np.abs(ours64(g, pinhole()) - expected).max() < 1e-9
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_round_gaussian_at_a_pole_is_the_same_at_every_azimuth(side):
+    g = gaussians([0, 0, 3.0 * side], [0.5] * 3)
+    cam = Camera.spherical(80, 40, position=ORIGIN)
+    rows = (np.arange(40) + 0.5) * np.pi / 40
+    sine = 3.0 * np.sin(rows)  # distance of the mean from the ray
+    raw = np.float32(0.8) * np.exp(-0.5 * (sine / 0.5) ** 2)
+    expected = np.where((np.cos(rows) * side > 0) & (raw > SMOOTH.alpha_min), raw, 0)
+    for alpha, tolerance in ((ours32, 2e-6), (ours64, 1e-8)):
+        assert np.abs(alpha(g, cam) - expected[:, None]).max() < tolerance
+
+
+def test_turning_a_scene_over_the_seam_rolls_its_panorama():
+    rng = np.random.default_rng(0)
+    width = 96
+    azimuth = np.concatenate([[np.pi, -np.pi + 1e-7, np.pi - 1e-7], rng.uniform(-np.pi, np.pi, 20)])
+    height, radius = rng.uniform(-1, 1, 23), rng.uniform(1, 3, 23)
+
+    def image(turn):
+        angle = azimuth + turn
+        means = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+        half = turn / 2
+        g = gaussians(means, [0.4, 0.1, 0.2], quaternions=(np.cos(half), 0, 0, np.sin(half)))
+        return ours64(g, Camera.spherical(width, width // 2, position=ORIGIN), SMOOTH)
+
+    still = image(0.0)
+    assert still[:, 0].max() > 0.5 and still[:, -1].max() > 0.5  # something lies on the seam
+    for columns in (1, 16, 47, 48, 95):
+        turned = image(columns * 2 * np.pi / width)
+        # Means are stored in float32: 6e-8 of 3 m is 2e-6 of the thinnest scale.
+        assert np.abs(np.roll(still, columns, axis=1) - turned).max() < 2e-5
+
+
+@pytest.mark.on_cuda_too
+def test_equal_ranges_are_blended_in_the_order_given():
+    g = gaussians([[0, 0, 2.0]] * 3, [0.3] * 3, opacities=(0.5, 0.25, 0.75))
+    for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
+        chosen = g[np.array(order)]
+        a, b, c = chosen.opacities
+        out = render(chosen, pinhole(), np.eye(3), device="cpu", blending=SMOOTH)
+        expected = [a, (1 - a) * b, (1 - a) * (1 - b) * c]
+        assert out.features[16, 16] == pytest.approx(expected, abs=1e-6)
+        assert out.dominant[16, 16] == int(np.argmax(expected))
+    # Also where ranges are equal and places are not: mirror images about the axis.
+    pair = gaussians([[0.1, 0, 2.0], [-0.1, 0, 2.0]], [0.3] * 3, opacities=0.5)
+    response = 0.5 * np.exp(-0.5 * (2.0 * 0.1 / np.hypot(2.0, 0.1) / 0.3) ** 2 * (1 + 0.1**2 / 4))
+    out = render(pair, pinhole(), np.eye(2), device="cpu", blending=SMOOTH)
+    assert out.features[16, 16] == pytest.approx([response, (1 - response) * response], abs=1e-6)
+
+
+def test_opacity_zero_contributes_nothing_and_opacity_one_hides_what_is_behind():
+    g = gaussians([[0, 0, 2.0], [0, 0, 3.0], [0, 0, 4.0]], [0.3] * 3, opacities=(0.0, 1.0, 0.5))
+    out = render(g, pinhole(), np.eye(3), device="cpu", blending=SMOOTH)
+    assert out.features[16, 16] == pytest.approx([0, 1, 0], abs=0)
+    assert out.depth[16, 16] == pytest.approx(3.0) and out.dominant[16, 16] == 1
+    assert (out.features[..., 0] == 0).all()
+    photo = render(g, pinhole(), np.eye(3), device="cpu")  # clamped at 0.99, so that a hundredth passes
+    assert photo.features[16, 16] == pytest.approx([0, 0.99, 0.01 * 0.5], abs=1e-6)
+
+
+@pytest.mark.on_cuda_too
+@pytest.mark.parametrize("rule", ["product", "exp"])
+def test_gradients_at_opacity_zero_and_one_are_those_of_the_blend(rule):
+    """On the axis the image is a1 + T(a1) a2 with features one and two behind: derivatives in closed form."""
+    for first, blending in ((1.0, SMOOTH), (0.0, SMOOTH), (1.0, Blending())):
+        blending = Blending(blending.alpha_min, blending.alpha_max, blending.transmittance_min, rule)
+        raster = Rasterizer(device="cpu", blending=blending, real=wp.float64)
+        g = gaussians([[0, 0, 2.0], [0, 0, 3.0]], [0.3] * 3, opacities=(first, 0.5))
+        inputs = raster.upload(g)
+        for array in inputs:
+            array.requires_grad = True
+        table = wp.array([[1.0], [2.0]], dtype=wp.float64, device="cpu")
+        with wp.Tape() as tape:
+            out = raster.rasterize(*inputs, table, pinhole(1, 1))
+        tape.backward(grads={out.features: wp.ones_like(out.features)})
+        alpha = min(first, blending.alpha_max)
+        left, slope = (1 - alpha, -1.0) if rule == "product" else (np.exp(-alpha), -np.exp(-alpha))
+        clamped = first > blending.alpha_max
+        # Opacity 0 is below the cutoff and sees no gradient, a clamped one neither. An alpha of exactly one hides what
+        # is behind from its own gradient too, under the product rule: its weights are zero.
+        behind = 0.0 if left == 0 else slope * 0.5 * 2.0
+        d_first = 0.0 if clamped or first == 0 else 1.0 + behind
+        assert inputs[3].grad.numpy() == pytest.approx([d_first, 2.0 * left], abs=1e-12)
+        for array in inputs:
+            assert np.isfinite(array.grad.numpy()).all()
+
+
+@pytest.mark.on_cuda_too
+@pytest.mark.parametrize("count", [0, 3])
+def test_none_visible_is_the_background_and_has_no_gradient_but_the_backgrounds(count):
+    raster = Rasterizer(device="cpu", real=wp.float64)
+    g = gaussians(np.full((count, 3), -50.0).reshape(count, 3), [0.1] * 3) if count else None
+    shapes = {"means": (wp.vec3d, 3), "quaternions": (wp.vec4d, 4), "scales": (wp.vec3d, 3)}
+    if g is None:
+        inputs = [wp.zeros(0, dtype=d, device="cpu", requires_grad=True) for d, _ in shapes.values()]
+        inputs.append(wp.zeros(0, dtype=wp.float64, device="cpu", requires_grad=True))
+    else:
+        inputs = list(raster.upload(g))
+        for array in inputs:
+            array.requires_grad = True
+    features = wp.ones((count, 2), dtype=wp.float64, device="cpu", requires_grad=True)
+    background = wp.array([0.25, 0.5], dtype=wp.float64, device="cpu", requires_grad=True)
+    with wp.Tape() as tape:
+        out = raster.rasterize(*inputs, features, pinhole(20, 10), background)
+    assert (out.features.numpy() == [0.25, 0.5]).all()
+    assert (out.alpha.numpy() == 0).all() and (out.dominant.numpy() == -1).all()
+    tape.backward(grads={out.features: wp.ones_like(out.features), out.depth: wp.ones_like(out.depth)})
+    assert background.grad.numpy() == pytest.approx([200.0, 200.0])
+    for array in (*inputs, features):
+        assert (array.grad.numpy() == 0).all()
+
+
+def test_no_gaussians_at_all_render_the_background():
+    g = Gaussians(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 1, 3)))
+    out = render(g, pinhole(), background=0.5, device="cpu")
+    assert (out.features == 0.5).all() and np.isinf(out.depth).all() and (out.dominant == -1).all()
+
+
+def test_one_million_gaussians_in_a_plane_let_through_what_the_dilogarithm_says():
+    """A lattice of pitch h, scale s = h, opacity o: along a ray at angle theta to the plane's normal
+    -ln T = 2 pi s^2 / (h^2 cos theta) (Li2(o) - Li2(alpha_min)), the integral of -ln(1 - alpha) over the lattice."""
+    side, pitch, opacity = 1000, 0.01, 0.3
+    grid = (np.arange(side) - (side - 1) / 2) * pitch
+    x, y = np.meshgrid(grid, grid)
+    g = gaussians(np.stack([x, y, np.full_like(x, 2.0)], axis=-1).reshape(-1, 3), [pitch] * 3, opacity)
+    assert len(g) == 1_000_000
+    cam = pinhole(25, 25, focal=12.5)
+    blending = Blending(alpha_min=1e-3, alpha_max=1.0, transmittance_min=-0.5)
+    out = render(g, cam, np.ones((len(g), 1)), background=0.0, device="cpu", blending=blending)
+
+    def dilogarithm(v):
+        return spence(1 - v)  # SciPy's spence(z) is Li2(1 - z)
+
+    cosine = cam.directions()[..., 2]
+    optical = 2 * np.pi / cosine * (dilogarithm(opacity) - dilogarithm(blending.alpha_min))
+    # The cutoff's edge leaves alpha_min times the number of lattice points near it, a few.
+    assert np.abs(out.alpha - (1 - np.exp(-optical))).max() < 4e-3
+    assert np.abs(out.depth * cosine - 2.0).max() < 0.03
+
+
+def test_a_gaussian_a_kilometre_away_is_where_it_should_be():
+    g = gaussians([0, 0, 1000.0], [0.5, 0.5, 0.5])
+    cam = pinhole(focal=2000.0)  # a pixel is half a metre there
+    expected = alpha_of_one(g, cam, SMOOTH)
+    out = render(g, cam, np.ones((1, 1)), device="cpu", blending=SMOOTH)
+    assert expected[16, 17] == pytest.approx(0.8 * np.exp(-0.5), rel=1e-4)
+    assert np.abs(ours64(g, cam) - expected).max() < 1e-9
+    assert np.abs(out.alpha - expected).max() < 1e-5
+    assert out.depth[16, 16] == pytest.approx(1000.0, rel=1e-6)

@@ -1,0 +1,85 @@
+"""Small radio scenes for tests: what propagation asks of a scene and of a material, and nothing else."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.spectra.dataset import SpectrumDataset
+
+EPSILON_0 = 8.8541878128e-12
+
+
+@dataclass(frozen=True)
+class SlabMaterial:
+    name: str = "slab"
+    relative_permittivity: float = 5.0
+    conductivity: float = 0.5
+    thickness_m: float = 0.1
+    scattering: float = 0.0
+    pattern: str = "lambertian"
+    alpha_r: int = 1
+
+    def permittivity(self, frequency_hz):
+        return self.relative_permittivity - 1j * self.conductivity / (2 * np.pi * frequency_hz * EPSILON_0)
+
+    def scattering_coefficient(self, frequency_hz):
+        return self.scattering
+
+
+METAL = SlabMaterial("metal", 1.0, 1e7, 0.1)
+
+
+@dataclass(frozen=True)
+class RadioScene:
+    mesh: Mesh
+    face_material: np.ndarray
+    materials: list
+    face_object: np.ndarray | None = None
+    object_names: tuple = ()
+    xml_path: object = None
+
+    @property
+    def bounds(self):
+        return self.mesh.bounds
+
+
+def box_mesh(low, high, inward=False):
+    """Vertices and faces of a closed box, 6 sides of 2 faces."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    return low + corners * (high - low), faces[:, ::-1] if inward else faces
+
+
+def joined(*parts):
+    """One mesh of several (vertices, faces), and the part each face came from."""
+    shift = np.cumsum([0] + [len(v) for v, _ in parts])
+    mesh = Mesh(
+        np.concatenate([v for v, _ in parts]),
+        np.concatenate([f + s for (_, f), s in zip(parts, shift, strict=False)]),
+    )
+    return mesh, np.repeat(np.arange(len(parts)), [len(f) for _, f in parts])
+
+
+def square(half, z=0.0):
+    """A horizontal square sheet, normal up."""
+    v = [[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]
+    return np.array(v, float), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, sub_pixels=6):
+    """Spectra of ``receivers`` by the exact engine, as a data set."""
+    engine = ExactEngine(
+        scene, transmitter=transmitter, frequency_hz=frequency_hz, shape=shape, beam_sigma_rad=sigma,
+        sub_pixels=sub_pixels,
+    )  # fmt: skip
+    found = [engine.receive(r) for r in receivers]
+    return SpectrumDataset.from_spectra(
+        receivers=receivers, transmitter=transmitter, frequency_hz=frequency_hz,
+        path_gain=np.stack([f.path_gain for f in found]), delay_s=np.stack([f.delay_s for f in found]),
+        aod=np.stack([f.aod for f in found]), line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=sigma,
+        engine="exact",
+    )  # fmt: skip

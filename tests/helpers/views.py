@@ -1,0 +1,19 @@
+"""Cameras for geometry tests."""
+
+import numpy as np
+
+from warprrf.geometry.splats.camera import Camera
+
+
+def look(position, target, width=64, height=48, f=40.0, off=(0.0, 0.0)):
+    """A pinhole camera at ``position`` towards ``target``, z up; ``off`` moves the principal point [pixels]."""
+    ahead = np.asarray(target, float) - position
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = [right, np.cross(ahead, right), ahead]
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return Camera.pinhole(
+        width, height, fx=f, fy=f, cx=width / 2 + off[0], cy=height / 2 + off[1], world_to_camera=pose
+    )

@@ -1,0 +1,155 @@
+"""Radio materials: the recommendation's rows, their bands, and scattering from roughness."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+from warprrf.rf.em.materials import Band, Material, load_materials, roughness_scattering, table_entry
+
+TABLE = ROOT / "data" / "lobby" / "materials.json"
+
+
+@pytest.fixture(scope="module")
+def table() -> dict[str, Material]:
+    return load_materials(TABLE)
+
+
+def test_concrete_at_300_ghz_has_the_recommended_permittivity(table: dict[str, Material]) -> None:
+    # ITU-R P.2040-4: 5.17 and 0.0145 f^1.09 S/m; sigma / (2 pi f eps0) = 17.98 sigma / f[GHz]
+    eta = table["concrete"].permittivity(300e9)
+    assert eta.real == pytest.approx(5.17)
+    assert eta.imag == pytest.approx(-17.975 * 0.0145 * 300**1.09 / 300, rel=1e-3)
+
+
+def test_every_lobby_material_is_known_at_140_and_300_ghz(table: dict[str, Material]) -> None:
+    for material in table.values():
+        for frequency in (140e9, 300e9):
+            assert material.permittivity(frequency).real >= 1
+            assert material.permittivity(frequency).imag <= 0
+            assert 0 <= material.scattering_coefficient(frequency) <= 1
+
+
+def test_our_rows_are_those_of_sionna(table: dict[str, Material]) -> None:
+    itu = pytest.importorskip("sionna.rt.radio_materials.itu", reason="sionna-rt is not installed")
+    for material in table.values():
+        if material.itu is None:
+            continue
+        for ghz in (140.0, 300.0):
+            rows = itu.ITU_MATERIALS_PROPERTIES[material.itu]
+            a, b, c, d = next(v for (low, high), v in rows.items() if low <= ghz <= high)
+            assert material.relative_permittivity(ghz * 1e9) == pytest.approx(a * ghz**b)
+            assert material.conductivity(ghz * 1e9) == pytest.approx(c * ghz**d)
+
+
+def test_lobby_holds_mirrors_and_diffusers(table: dict[str, Material]) -> None:
+    s = {name: m.scattering_coefficient(300e9) for name, m in table.items()}
+    assert all(s[name] < 0.3 for name in ("glass", "metal", "marble"))
+    assert all(s[name] > 0.5 for name in ("concrete", "brick", "plasterboard", "carpet_tile"))
+
+
+@pytest.mark.parametrize("frequency", [60e9, 500e9])
+def test_frequency_outside_the_band_names_material_frequency_and_band(
+    table: dict[str, Material], frequency: float
+) -> None:
+    for question in ("permittivity", "scattering_coefficient"):
+        with pytest.raises(ValueError, match=rf"{frequency / 1e9:g} GHz.*brick.*110 to 330 GHz"):
+            getattr(table["brick"], question)(frequency)
+
+
+@pytest.mark.parametrize(("sigma_mm", "expected"), [(0.02, 0.25), (0.05, 0.57), (0.1, 0.89), (0.15, 0.99)])
+def test_scattering_at_300_ghz_from_roughness(sigma_mm: float, expected: float) -> None:
+    assert roughness_scattering(sigma_mm * 1e-3, 300e9) == pytest.approx(expected, abs=0.005)
+
+
+def test_roughness_keeps_the_energy_of_the_mirror_direction() -> None:
+    # S^2 + rho^2 = 1 with rho the Rayleigh factor
+    wavelength = 299792458.0 / 140e9
+    rho = math.exp(-8 * (math.pi * 0.08e-3 / wavelength) ** 2)
+    assert roughness_scattering(0.08e-3, 140e9) ** 2 + rho**2 == pytest.approx(1)
+    assert roughness_scattering(0.0, 140e9) == 0
+
+
+def test_the_first_row_that_holds_counts() -> None:
+    rows = (Band(200e9, 400e9, 2, 0, 0, 0), Band(100e9, 400e9, 3, 0, 0, 0))
+    material = Material("two rows", rows)
+    assert material.relative_permittivity(300e9) == 2
+    assert material.relative_permittivity(150e9) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pattern": "backscattering"}, "pattern"),
+        ({"scattering": 1.2}, "scattering"),
+        ({"thickness_m": 0.0}, "thickness_m"),
+        ({"roughness_m": float("nan")}, "roughness_m"),
+        ({"alpha_r": 0}, "alpha_r"),
+        ({"bands": ()}, "bands"),
+    ],
+)
+def test_bad_values_are_refused_by_name(change: dict, message: str) -> None:
+    good = {"name": "m", "bands": (Band(1e9, 2e9, 1, 0, 0, 0),)}
+    with pytest.raises(ValueError, match=message):
+        Material(**(good | change))
+
+
+def test_a_broken_table_says_which_material_and_what(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no table"):
+        load_materials(tmp_path / "none.json")
+    broken = tmp_path / "broken.json"
+    broken.write_text("{")
+    with pytest.raises(ValueError, match="not JSON"):
+        load_materials(broken)
+    content = json.loads(TABLE.read_text())
+    del content["materials"][0]["thickness_m"]
+    broken.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"marble.*thickness_m"):
+        load_materials(broken)
+
+
+def test_a_table_may_give_the_scattering_coefficient_itself(tmp_path: Path) -> None:
+    content = json.loads(TABLE.read_text())
+    brick = next(entry for entry in content["materials"] if entry["name"] == "brick")
+    del brick["roughness_m"]
+    file = tmp_path / "materials.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"brick.*neither 'roughness_m' nor 'scattering'"):
+        load_materials(file)
+    brick["scattering"] = {"value": 0.43, "source": "fitted"}
+    file.write_text(json.dumps(content))
+    read = load_materials(file)["brick"]
+    assert read.scattering_coefficient(300e9) == read.scattering_coefficient(140e9) == 0.43
+    assert read.sources is not None
+    assert read.sources["scattering"] == "fitted"
+    brick["scattering"]["value"] = 1.43
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"scattering.*1\.43.*brick"):
+        load_materials(file)
+
+
+def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], tmp_path: Path) -> None:
+    given = [
+        *table.values(),
+        Material.custom("own", relative_permittivity=2.5, scattering=0.3, pattern="directive", alpha_r=7),
+    ]
+    file = tmp_path / "materials.json"
+    file.write_text(json.dumps({"materials": [table_entry(material) for material in given]}))
+    read = load_materials(file)
+    for material in given:
+        again = read[material.name]
+        assert again.bands == material.bands
+        for name in ("thickness_m", "pattern", "roughness_m", "scattering", "itu"):
+            assert getattr(again, name) == getattr(material, name)
+        if material.pattern == "directive":
+            assert again.alpha_r == material.alpha_r
+
+
+def test_every_value_of_the_table_has_a_source() -> None:
+    for entry in json.loads(TABLE.read_text())["materials"]:
+        parts = [*entry["permittivity"], *(entry[k] for k in ("thickness_m", "roughness_m", "pattern"))]
+        assert all(p["source"].startswith(("ITU-R P.2040-4", "assumed")) for p in parts)

@@ -1,0 +1,182 @@
+"""Chains of mirrors: what several reflect of unpolarised light, against Jones matrices and laws that they obey."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.fields.bistatic.chains import chain_reflection, turns
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.specular import specular_paths
+from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.paths.trace import MirrorTracer
+
+F = 300e9
+TX = np.array([0.8, 0.9, 2.2])
+RX = np.array([4.2, 3.1, 1.2])
+
+
+def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stops (L, k + 2, 3), normals and cosines (L, k, ...) of random chains that obey the law of reflection."""
+    rng = np.random.default_rng(seed)
+    normal = rng.normal(size=(count, mirrors, 3))
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    along = rng.normal(size=(count, 3))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    stops, cosine = [-along, np.zeros((count, 3))], []
+    for k in range(mirrors):
+        height = (along * normal[:, k]).sum(axis=1)
+        cosine.append(np.abs(height))
+        along = along - 2.0 * height[:, None] * normal[:, k]
+        stops.append(stops[-1] + (1.0 + k) * along)
+    return np.stack(stops, axis=1), normal, np.stack(cosine, axis=1)
+
+
+@pytest.mark.on_cuda_too
+def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
+    """The image method on the true scene multiplies Jones matrices; means of single mirrors miss them by decibels."""
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.0])
+    )
+    room = [
+        SlabMaterial("walls", 3.0, 0.0, np.inf, 0.5),
+        SlabMaterial("box", 7.0, 0.0, np.inf, 0.6),
+    ]
+    scene = RadioScene(mesh, part, room)
+    ds = exact_spectra(
+        scene, RX[None], transmitter=TX, frequency_hz=F, shape=(12, 24), sigma=np.radians(10.0)
+    )
+    field = BistaticField.prior(scene, ds, terms=Terms(mirror_order=2))
+    permittivity = np.array([m.relative_permittivity for m in room])
+    mirrored = 1.0 - np.array([m.scattering for m in room]) ** 2
+    p = replace(field.parameters, log_excess=np.log(permittivity - 1.0), log_mirror=np.log(mirrored))
+    field = replace(field, parameters=p)
+    found = specular_paths(field.surface, TX, RX[None], field.wavelength_m, order=2)
+    true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
+    power = field.path_power(found)
+    means = []
+    for path in np.flatnonzero(found.order == 2):
+        same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (
+            true.arrival @ found.arrival[path] > 1 - 1e-9
+        )
+        assert same.sum() == 1
+        assert power[path] == pytest.approx(true.power[same][0], rel=1e-6)
+        group = field.surface.patch_group[found.patch[path, :2]]
+        mean = mirrored[group] * fresnel_curves().value(p.log_excess[group], found.cosine[path, :2])[0]
+        free = (field.wavelength_m / (4 * np.pi * found.length_m[path])) ** 2 * found.share[path] ** 2
+        means.append(10 * np.log10(mean.prod() * free / power[path]))
+    assert len(means) >= 8
+    assert max(means) > 2.0
+    assert min(means) < -0.5
+
+
+def test_a_chain_reflects_as_much_backwards() -> None:
+    stops, normal, cosine = reflected_ways(40, 3, seed=0)
+    log_excess = np.random.default_rng(1).uniform(-1.0, 4.0, cosine.shape)
+    met = np.ones(cosine.shape, bool)
+    there = chain_reflection(log_excess, cosine, turns(stops, normal), met)[0]
+    back = chain_reflection(
+        log_excess[:, ::-1], cosine[:, ::-1], turns(stops[:, ::-1], normal[:, ::-1]), met
+    )[0]
+    np.testing.assert_allclose(there, back, rtol=1e-12)
+
+
+def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_nothing() -> None:
+    log_excess, cosine = np.linspace(-2.0, 4.0, 20), np.linspace(0.05, 1.0, 20)
+    rest = np.zeros((20, 2))
+    share, slope = chain_reflection(
+        np.column_stack([log_excess, rest]), np.column_stack([cosine, rest]), np.zeros((20, 3)),
+        np.tile([True, False, False], (20, 1)),
+    )  # fmt: skip
+    value, rise = fresnel_curves().value(log_excess, cosine)
+    np.testing.assert_allclose(share, value, rtol=5e-3)  # a table over permittivity and cosine
+    assert (slope[:, 1:] == 0).all()
+    steps = np.abs(slope[:, 0] - rise / value)
+    assert np.median(steps) < 0.02  # the table's derivative is that of a chord
+
+
+def test_derivatives_of_a_chain_are_those_of_differences() -> None:
+    stops, normal, cosine = reflected_ways(30, 3, seed=2)
+    turn, met = turns(stops, normal), np.ones(cosine.shape, bool)
+    met[::3, 2] = False
+    log_excess = np.random.default_rng(3).uniform(-1.0, 4.0, cosine.shape)
+    slope = chain_reflection(log_excess, cosine, turn, met)[1]
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        up, down = (chain_reflection(log_excess + s, cosine, turn, met)[0] for s in (step, -step))
+        np.testing.assert_allclose(slope[:, k], np.log(up / down) / 2e-6, atol=1e-7)
+
+
+def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
+    """A wave that goes to a wall and back keeps its polarisation, whichever plane stands in for the missing one."""
+    stops = np.array([[[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 4.0], [0.0, 0.0, 1.0]]])
+    normal = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+    share = chain_reflection(
+        np.log([[3.0, 3.0]]), np.ones((1, 2)), turns(stops, normal), np.ones((1, 2), bool)
+    )
+    np.testing.assert_allclose(share[0], (1.0 / 3.0) ** 4, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("edge_m", "least", "most"), [(-0.2, 1.0, 1.0), (-0.012, 0.4, 0.75), (0.01, 0.0, 0.0)]
+)
+def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: float, most: float) -> None:
+    """Floor, then a wall: a screen across the leg between them leaves all, about half, or nothing of the path.
+
+    The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a skin above a mirror,
+    which moves them by a centimetre.
+    """
+    mesh, _ = joined(box_mesh([0, 0, 0], [5, 4, 3], inward=True))
+    alone = specular_paths(_surface(mesh), TX, RX[None], 1e-3, order=2)
+    order = np.flatnonzero(alone.order == 2)
+    over = alone.point[order]
+    pick = order[np.flatnonzero((np.abs(over[:, 0, 2]) < 1e-9) & (np.abs(over[:, 1, 0] - 5.0) < 1e-9))[0]]
+    floor, wall = alone.point[pick, 0], alone.point[pick, 1]
+    middle, toward = 0.5 * (floor + wall), wall - floor
+    across = np.cross(toward, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    up = np.cross(across, toward / np.linalg.norm(toward))
+    corner = middle + edge_m * across
+    plate = np.array(
+        [corner - 0.3 * up, corner + 0.3 * up, corner - across + 0.3 * up, corner - across - 0.3 * up]
+    )
+    both, _ = joined((mesh.vertices, mesh.faces), (plate, np.array([[0, 1, 2], [0, 2, 3]])))
+    found = specular_paths(_surface(both), TX, RX[None], 1e-3, order=2)
+    same = (found.order == 2) & (np.abs(found.length_m - alone.length_m[pick]) < 1e-9)
+    same &= found.arrival @ alone.arrival[pick] > 1 - 1e-12
+    assert alone.share[pick] == 1.0
+    assert same.sum() == (most > 0)
+    assert all(least <= share <= most for share in found.share[same])
+
+
+def _surface(mesh: Mesh) -> Surface:
+    """A surface that is as wrong as one from photos: its skin widens the zones."""
+    return replace(Surface.of(mesh), skin_m=SKIN_M)
+
+
+@pytest.mark.parametrize("mirrors", [1, 2, 3])
+def test_any_chain_reflects_as_fields_in_space_do(mirrors: int) -> None:
+    """Two field vectors across the first leg, reflected one mirror after the other in room coordinates.
+
+    With three mirrors the sense of each turn counts: of two, only its size.
+    """
+    stops, normal, cosine = reflected_ways(200, mirrors, 11)
+    log_excess = np.log(np.random.default_rng(4).uniform(0.5, 12.0, (200, mirrors)))
+    share, _ = chain_reflection(log_excess, cosine, turns(stops, normal), np.ones(cosine.shape, bool))
+    leg = np.diff(stops, axis=1)
+    leg /= np.linalg.norm(leg, axis=2, keepdims=True)
+    for path in range(200):
+        u = np.linalg.svd(leg[path, :1])[2][1:]  # two unit vectors across the first leg
+        for k in range(mirrors):
+            s = np.cross(leg[path, k], normal[path, k])
+            s /= np.linalg.norm(s)
+            before, after = np.cross(s, leg[path, k]), np.cross(s, leg[path, k + 1])
+            c, permittivity = cosine[path, k], 1.0 + np.exp(log_excess[path, k])
+            root = np.sqrt(permittivity - 1.0 + c**2)
+            te, tm = (c - root) / (c + root), (permittivity * c - root) / (permittivity * c + root)
+            u = te * np.outer(u @ s, s) + tm * np.outer(u @ before, after)
+        assert share[path] == pytest.approx(0.5 * (u**2).sum(), rel=1e-9)

@@ -1,0 +1,404 @@
+"""The bistatic field: laws it must obey, a fit to deterministic spectra of a furnished room, and hard cases."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+
+from warprrf.geometry import o3d
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic import fit as fitting
+from warprrf.rf.fields.bistatic.bounces import BounceTracer
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.specular import specular_paths
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.lookups import nearest
+from warprrf.rf.spectra.metrics import evaluate
+from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
+
+F = 300e9
+WAVELENGTH = SPEED_OF_LIGHT / F
+SHAPE = (24, 48)
+SIGMA = np.radians(5.0)
+TX = np.array([0.8, 0.9, 2.2])
+MATERIALS = [
+    SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4),
+    SlabMaterial("box", 6.0, 0.5, np.inf, 0.8),
+]
+RECEIVERS = np.array(
+    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
+     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0], [1.8, 1.1, 1.1], [2.6, 3.5, 1.4]]
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene() -> RadioScene:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+    )
+    return RadioScene(mesh, part, MATERIALS)
+
+
+def spectra(scene: RadioScene, receivers: np.ndarray, transmitter: np.ndarray = TX) -> SpectrumDataset:
+    return exact_spectra(scene, receivers, transmitter=transmitter, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+
+
+@pytest.fixture(scope="module")
+def data(scene: RadioScene) -> SpectrumDataset:
+    return spectra(scene, RECEIVERS)
+
+
+@pytest.fixture(scope="module")
+def field(scene: RadioScene, data: SpectrumDataset) -> BistaticField:
+    return RadioField.fit(scene, data.subset(np.arange(6)))
+
+
+def psnr(field: RadioField, ds: SpectrumDataset, transmitter: np.ndarray | None = None) -> float:
+    return evaluate(ds, lambda rx: field.spectrum(rx, transmitter))["psnr_db"]
+
+
+def test_ten_times_better_than_the_nearest_measurement(field: BistaticField, data: SpectrumDataset) -> None:
+    test = data.subset(np.arange(6, 10))
+    ours = evaluate(test, field.spectrum)
+    copied = evaluate(test, nearest(data.subset(np.arange(6))))
+    assert ours["psnr_db"] > copied["psnr_db"] + 10
+    assert ours["psnr_db"] > 36
+    assert ours["direction_within_3deg"] == 1.0
+    assert ours["tof_error_median_ns"] < 0.1
+
+
+def test_a_transmitter_never_seen_is_as_good(
+    scene: RadioScene, field: BistaticField, data: SpectrumDataset
+) -> None:
+    other = np.array([4.3, 3.2, 2.4])
+    moved = spectra(scene, RECEIVERS[[2, 4, 6, 8]], other)
+    assert psnr(field, moved, other) > psnr(field, data.subset(np.arange(6, 10))) - 4
+    assert psnr(field, moved, other) > psnr(field, moved) + 8  # and it does depend on the transmitter
+
+
+def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field: BistaticField) -> None:
+    paths, spectrum = field.paths(RECEIVERS[3]), field.spectrum(RECEIVERS[3])
+    assert paths.power.sum() == pytest.approx(spectrum.total_path_gain, rel=1e-5)
+    los = paths.kind == "los"
+    distance = np.linalg.norm(RECEIVERS[3] - TX)
+    assert los.sum() == 1
+    assert paths.tau[los][0] == pytest.approx(distance / SPEED_OF_LIGHT, rel=1e-12)
+    assert paths.power[los][0] == pytest.approx((WAVELENGTH / (4 * np.pi * distance)) ** 2, rel=1e-9)
+    assert set(paths.kind) == {"los", "mirror", "diffuse"}
+    several = field.paths(RECEIVERS[:2], max_paths=5)
+    assert several.gain.shape == (2, 5)
+
+
+def test_a_saved_field_answers_the_same(field: BistaticField, tmp_path: Path) -> None:
+    file = tmp_path / "field.safetensors"
+    field.save(file)
+    again = RadioField.load(file)
+    assert isinstance(again, BistaticField)
+    before, after = (f.spectrum(RECEIVERS[7], uncertainty=True) for f in (field, again))
+    assert np.array_equal(before.path_gain, after.path_gain)
+    assert np.array_equal(before.std_db, after.std_db)
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="corrupt"):
+        RadioField.load(file)
+
+
+def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, data: SpectrumDataset) -> None:
+    prior = BistaticField.prior(scene, data)
+    unfitted = BistaticField.fit(scene, data.subset([0]), iterations=0)
+    image = prior.spectrum(RECEIVERS[4]).path_gain
+    assert np.allclose(image, unfitted.spectrum(RECEIVERS[4]).path_gain, rtol=1e-6)
+    dark = replace(data, path_gain=np.zeros_like(data.path_gain))
+    assert np.array_equal(image, BistaticField.prior(scene, dark).spectrum(RECEIVERS[4]).path_gain)
+    bare = BistaticField.prior(scene, data, terms=Terms(line_of_sight=False, mirror_order=0, diffuse=False))
+    assert bare.spectrum(RECEIVERS[4]).path_gain.max() == 0
+
+
+def test_fitting_twice_gives_the_same_numbers(scene: RadioScene, data: SpectrumDataset) -> None:
+    train = data.subset(np.arange(3))
+    a, b = (RadioField.fit(scene, train) for _ in range(2))
+    assert np.array_equal(a.parameters.log_weight, b.parameters.log_weight)
+
+
+def test_jacobian_against_differences(scene: RadioScene, data: SpectrumDataset) -> None:
+    seen = trace(scene, data.subset([0]))
+    blank = BistaticField.fit(scene, data.subset([0]), transport=seen, iterations=0)
+    view = blank.view(seen.sights[0], np.arange(0, SHAPE[0] * SHAPE[1], 7))
+    layout = fitting.Layout(2, len(blank.terms.lobes), indirect=True, gain=True)
+    rng = np.random.default_rng(0)
+    p = layout.unpack(rng.normal(-1.0, 0.2, layout.size))
+    power, slopes, index = fitting.jacobian(view, p, layout)
+    dense = np.zeros((len(power), layout.size))
+    np.add.at(dense.T, index, slopes.T)
+    assert np.allclose(power, fitting.predict(view, p), rtol=1e-4)
+    for k in range(layout.size):
+        step = np.zeros(layout.size)
+        step[k] = 0.02
+        up, down = (fitting.predict(view, layout.unpack(layout.pack(p) + s * step)) for s in (1, -1))
+        numeric = (up - down) / 0.04
+        scale = np.abs(numeric).max() + 1e-3 * power.max()
+        # The permittivity's table is linear between its nodes, which a difference may straddle.
+        allowed = 0.1 if k % layout.stride == layout.lobes else 0.02
+        assert np.abs(dense[:, k] - numeric).max() < allowed * scale, k
+    planted = dense[:, 0] * 1.2
+    up, down = (
+        fitting.predict(view, layout.unpack(layout.pack(p) + s * np.eye(layout.size)[0] * 0.02))
+        for s in (1, -1)
+    )
+    assert np.abs(planted - (up - down) / 0.04).max() > 0.1 * np.abs(dense[:, 0]).max()
+
+
+def test_gauss_newton_ends_no_higher_than_adam(scene: RadioScene, data: SpectrumDataset) -> None:
+    seen = trace(scene, data.subset(np.arange(3)))
+    blank = BistaticField.fit(scene, data.subset(np.arange(3)), transport=seen, iterations=0)
+    target = to_db(data.path_gain, data.floor) - 10 * np.log10(data.floor)
+    views = [blank.view(s, np.arange(0, target[0].size, 2), target[r]) for r, s in enumerate(seen.sights)]
+    start = fitting.Parameters.prior(2, len(blank.terms.lobes))
+    newton = fitting.fit_groups(views, start, np.ones(2))
+    adam = fitting.fit_groups_adam(views, start, np.ones(2), steps=150)
+    assert newton.losses[-1] < adam.losses[-1] * 1.05
+    assert newton.losses[-1] < 0.2 * adam.losses[0]
+
+
+def test_an_uncalibrated_gain_is_found(scene: RadioScene, data: SpectrumDataset) -> None:
+    from dataclasses import replace
+
+    few = data.subset(np.arange(4))
+    off = replace(few, path_gain=few.path_gain * np.float32(10**0.35), floor=few.floor * 10**0.35)
+    found = RadioField.fit(scene, off, gain_offset=True)
+    assert found.report["gain_offset_db"] == pytest.approx(3.5, abs=0.5)
+    assert 0 < found.report["gain_offset_std_db"] < 0.5
+
+
+def test_uncertainty_covers_the_error(field: BistaticField, data: SpectrumDataset) -> None:
+    errors, sigma = [], []
+    for k in range(6, 10):
+        found = field.spectrum(data.receivers[k], uncertainty=True)
+        errors.append(found.path_gain_db - data[k].path_gain_db)
+        sigma.append(found.std_db)
+    ratio = np.abs(np.concatenate(errors) / np.concatenate(sigma))
+    assert 0.45 < (ratio <= 1).mean() < 0.9
+    assert (ratio <= 2).mean() > 0.75
+
+
+def test_the_beam_keeps_power_and_its_adjoint_is_one() -> None:
+    beam = BeamOperator(SHAPE, SIGMA)
+    rng = np.random.default_rng(1)
+    x, y = rng.random((*SHAPE, 2)), rng.random((*SHAPE, 2))
+    assert beam(x).sum() == pytest.approx(x.sum(), rel=1e-9)
+    assert (beam(x) * y).sum() == pytest.approx((x * beam.adjoint(y.astype(np.float32))).sum(), rel=1e-5)
+
+
+def test_fresnel_family_contains_the_half_space() -> None:
+    curves = fresnel_curves()
+    value, slope = curves.value(np.log([2.0]), [1.0])
+    n = np.sqrt(3.0)
+    assert value[0] == pytest.approx(((n - 1) / (n + 1)) ** 2, rel=2e-3)
+    up, down = (curves.value(np.log([2.0]) + s, [1.0])[0][0] for s in (0.05, -0.05))
+    assert slope[0] == pytest.approx((up - down) / 0.1, rel=0.05)
+
+
+# ---------------------------------------------------------------------------------------------- hard cases
+
+
+def test_grazing_scatter_stays_finite(scene: RadioScene, field: BistaticField) -> None:
+    found = field.spectrum([2.0, 0.002, 1.0]).path_gain  # every ray along the wall leaves at grazing
+    assert np.isfinite(found).all()
+    assert found.sum() < 1.0
+
+
+def test_element_at_the_transmitter_is_bounded(field: BistaticField) -> None:
+    near = field.spectrum([1.5, 1.0, 1.5], transmitter=[2.5, 2.0, 2.401]).path_gain  # 1 mm over the box
+    assert np.isfinite(near).all()
+    assert near.sum() < 1e-3  # not more than the source sends: (lambda / 4 pi d)^2 is 6e-9 at 1 m
+
+
+def test_transmitter_in_a_patchs_plane_has_no_mirror_there(scene: RadioScene) -> None:
+    surface = Surface.of(scene)
+    found = specular_paths(surface, np.array([0.5, 0.5, 2.4]), np.array([[4.0, 3.0, 2.0]]), WAVELENGTH)
+    top = np.flatnonzero((np.abs(surface.plane_offset - 2.4) < 1e-6) & (surface.plane_normal[:, 2] > 0.9))
+    assert len(top) == 1
+    assert not np.isin(found.patch[:, 0], top).any()
+
+
+def test_a_receiver_one_millimetre_from_a_wall(scene: RadioScene, field: BistaticField) -> None:
+    point = np.array([4.999, 2.0, 1.0])
+    found = field.spectrum(point)
+    truth = spectra(scene, point[None]).path_gain[0]
+    assert np.isfinite(found.path_gain).all()
+    error = to_db(found.path_gain, field.floor) - to_db(truth, field.floor)
+    assert np.sqrt(np.mean(error**2)) < 3.0
+    with pytest.raises(ValueError, match="surface"):
+        field.spectrum([5.0, 2.0, 1.0])
+    with pytest.raises(ValueError, match="transmitter"):
+        field.spectrum(TX)
+
+
+def test_a_receiver_in_full_shadow_gets_nothing_but_what_bounces(scene: RadioScene) -> None:
+    # A closed shell around the receiver: nothing arrives.
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True),
+        box_mesh([2.9, 1.9, 0.9], [4.1, 3.1, 2.1]),
+        box_mesh([3.0, 2.0, 1.0], [4.0, 3.0, 2.0], inward=True),
+    )
+    part = np.minimum(part, 1)
+    closed = RadioScene(mesh, part, MATERIALS)
+    field = RadioField.fit(closed, spectra(closed, RECEIVERS[1:3]))
+    dark = field.spectrum([3.5, 2.5, 1.5])
+    assert dark.total_path_gain == 0.0
+    assert np.isnan(dark.delay_s).all()
+    assert len(field.paths([3.5, 2.5, 1.5]).gain) == 0
+
+
+def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
+    scene: RadioScene, data: SpectrumDataset
+) -> None:
+    from dataclasses import replace
+
+    nothing = replace(data.subset([0, 1]), path_gain=np.zeros((2, *SHAPE), np.float32))
+    with pytest.raises(ValueError, match="no pixel above the floor"):
+        RadioField.fit(scene, nothing)
+    gain = data.subset([0, 1, 2]).path_gain.copy()
+    gain[1] = 0
+    assert np.isfinite(
+        RadioField.fit(scene, replace(data.subset([0, 1, 2]), path_gain=gain))
+        .spectrum(RECEIVERS[5])
+        .path_gain
+    ).all()
+
+
+def test_one_training_receiver_is_enough_for_a_field(scene: RadioScene, data: SpectrumDataset) -> None:
+    single = RadioField.fit(scene, data.subset([0]))
+    assert psnr(single, data.subset(np.arange(6, 10))) > 30
+    with pytest.raises(ValueError, match="too few"):
+        single.spectrum(RECEIVERS[5], uncertainty=True)
+
+
+def test_duplicate_receivers_change_little(scene: RadioScene, data: SpectrumDataset) -> None:
+    once = RadioField.fit(scene, data.subset([0, 1]))
+    twice = RadioField.fit(scene, data.subset([0, 1, 0, 1][:3]))
+    a, b = (to_db(f.spectrum(RECEIVERS[8]).path_gain, data.floor) for f in (once, twice))
+    assert np.sqrt(np.mean((a - b) ** 2)) < 0.5
+
+
+def test_bad_options_are_refused(scene: RadioScene, data: SpectrumDataset) -> None:
+    few = data.subset([0])
+    with pytest.raises(ValueError, match=r"bistatic, rf3dgs\+, rf3dgs"):
+        RadioField.fit(scene, few, model="magic")
+    for options, name in (({"mirror_order": 4}, "mirror_order"), ({"diffuse_order": 0}, "diffuse_order"),
+                          ({"lobes": ()}, "lobes"), ({"iterations": -1}, "iterations")):  # fmt: skip
+        with pytest.raises(ValueError, match=name):
+            RadioField.fit(scene, few, **options)
+    with pytest.raises(TypeError, match="geometry"):
+        RadioField.fit(SimpleNamespace(), few)
+    with pytest.raises(ValueError, match="transport"):
+        RadioField.fit(scene, data.subset([1]), transport=trace(scene, few))
+
+
+def test_a_tracer_on_true_materials_matches_the_exact_engine(scene: RadioScene) -> None:
+    surface = Surface.of(scene)
+    tracer = BounceTracer(surface, SHAPE, lobes=(0, 4))
+    met = tracer.meet(RECEIVERS[0])
+    lit = tracer.light(met, TX)
+    weight = np.array([[0.0, 0.25], [0.64, 0.0]])
+    power = tracer.scatter(met, lit, weight, np.log([2.0, 5.0]), WAVELENGTH)
+    engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
+    assert power.sum() == pytest.approx(engine.diffuse(RECEIVERS[0]).power.sum(), rel=0.02)
+
+
+@pytest.mark.skipif(not o3d.installed(), reason="Open3D is not installed: there is one way to search")
+@pytest.mark.parametrize("count", [1, 3])
+def test_rays_by_embree_and_inside_kernels_see_the_same(
+    scene: RadioScene, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface = Surface.of(scene)
+    found = []
+    for installed in (True, False):
+        monkeypatch.setattr(o3d, "installed", lambda installed=installed: installed)
+        tracer = BounceTracer(surface, SHAPE)
+        met = tracer.meet(RECEIVERS[:count])
+        found.append(
+            (met, tracer.light(met, TX), tracer.light(met, surface.images(TX)[0][0], real=TX, patch=0))
+        )
+    (ours, lit, mirrored), (other, lit_2, mirrored_2) = found
+    assert (ours.face.numpy() >= 0).all() and len(ours.face) == count * SHAPE[0] * SHAPE[1] * 9
+    same = ours.face.numpy() == other.face.numpy()
+    assert same.mean() > 0.999  # on an edge either face may be named
+    np.testing.assert_allclose(ours.range_m.numpy()[same], other.range_m.numpy()[same], rtol=1e-6)
+    for a, b in ((lit, lit_2), (mirrored, mirrored_2)):
+        a, b = a.strength.numpy(), b.strength.numpy()
+        assert 0.02 < (a > 0).mean() < 0.98
+        assert ((a > 0) == (b > 0))[same].mean() > 0.998  # the border of a shadow
+        both = same & (a > 0) & (b > 0)
+        np.testing.assert_allclose(a[both], b[both], rtol=1e-5)
+
+
+def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:
+    beam = BeamOperator(SHAPE, SIGMA)
+    rng = np.random.default_rng(6)
+    directions = sub_pixel_directions(SHAPE, 4)[0].reshape(*SHAPE, -1, 3)[:, 0]
+    images = 10.0 ** rng.uniform(-12, -4, (*SHAPE, 2))
+    images[:3] = 0.0
+    expected = np.zeros_like(images)
+    for i in range(SHAPE[0]):
+        one = spread(directions[i], np.full(16, 1.0 / 16.0), SHAPE, SIGMA)  # of the row's first pixel
+        for j in range(SHAPE[1]):
+            expected += np.roll(one, j, axis=1)[..., None] * images[i, j]
+    found = beam(images)
+    np.testing.assert_allclose(found, expected, atol=1e-13 * expected.max())
+    pixels = np.array([5, 400, 777])
+    np.testing.assert_allclose(
+        beam.at(pixels, images.reshape(-1, 2)), expected.reshape(-1, 2)[pixels], rtol=1e-5
+    )
+
+
+def test_a_quick_fit_tries_nothing_and_is_near(scene: RadioScene, data: SpectrumDataset) -> None:
+    few, test = data.subset(np.arange(6)), data.subset(np.arange(6, 10))
+    quick = RadioField.fit(scene, few, quick=True)
+    assert quick.terms == Terms(mirror_order=1, indirect=True, residual=True, sub_pixels=1)
+    tried = {choice["term"] for choice in quick.report["choices"]}
+    assert tried <= {"single bounces", "2 materials as 2", "residual"}
+    assert psnr(quick, test) > evaluate(test, nearest(few))["psnr_db"] + 8
+    finer = RadioField.fit(scene, few, quick=True, sub_pixels=2, mirror_order=2)
+    assert (finer.terms.sub_pixels, finer.terms.mirror_order) == (2, 2)
+    with pytest.raises(ValueError, match="sub_pixels"):
+        RadioField.fit(scene, few, sub_pixels=0)
+
+
+def test_terms_state_what_they_allow() -> None:
+    assert not Terms().further
+    assert Terms(diffuse_order=2).further
+
+
+def test_a_fit_goes_on_after_steps_that_were_cut_short() -> None:
+    """One weight has 9 nepers to go, 1.5 a step, while pixels that nothing explains hide how much each step gains."""
+    from dataclasses import replace
+
+    lit, hopeless = 20, 4000
+    none = np.zeros((lit + hopeless, 0), np.float32)
+    basis = np.zeros((lit + hopeless, 1, 1, 3), np.float32)
+    true = fitting.Parameters.prior(1, 1)
+    basis[:lit, 0, 0] = 200.0 * fresnel_curves().at(fresnel_curves().coordinates, true.log_excess)[0][0]
+    view = fitting.View(
+        groups=np.array([0]), basis=basis, seen=np.zeros(0, int), dark=none, gain=np.zeros(0),
+        path_group=np.zeros((0, 3), int), cosine=np.zeros((0, 3)), turn=np.zeros((0, 3)), beam=none.T,
+        extra=np.zeros(lit + hopeless, np.float32), again_group=np.zeros(0, int), again=none,
+        target_db=np.full(lit + hopeless, 40.0),
+    )  # fmt: skip
+    target = fitting.NEPER * np.log1p(fitting.predict(view, true)[0])
+    view.target_db[:lit] = target
+    start = replace(true, log_weight=true.log_weight - 9.0)
+    loose = fitting.Deviations(weight=1e3, excess=1e-3, mirror=1e3, energy=1e6)
+    found = fitting.fit_groups([view], start, np.ones(1), deviations=loose)
+    now = fitting.NEPER * np.log1p(fitting.predict(view, found.parameters)[:lit])
+    assert found.steps > 5
+    assert np.abs(now - target).max() < 0.1

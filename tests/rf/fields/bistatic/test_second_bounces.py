@@ -1,0 +1,269 @@
+"""What follows a first bounce: mirrors of mirrors, surfaces lit by mirrors; and materials that spectra tell apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.fit import Layout, Parameters, View, fit_groups, jacobian, predict
+from warprrf.rf.fields.bistatic.grouping import regroup
+from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.fields.bistatic.specular import specular_paths
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import to_db
+
+F = 300e9
+WAVELENGTH = SPEED_OF_LIGHT / F
+SHAPE = (24, 48)
+TX = np.array([0.8, 0.9, 2.2])
+ROOM = np.array([5.0, 4.0, 3.0])
+
+
+def test_a_room_shows_as_many_images_as_its_lattice_has() -> None:
+    mesh, part = joined(box_mesh([0, 0, 0], ROOM, inward=True))
+    surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
+    receivers = np.array([[4.1, 3.2, 1.3], [2.2, 0.7, 0.6]])
+    found = specular_paths(surface, TX, receivers, WAVELENGTH, order=3)
+    for r, receiver in enumerate(receivers):
+        for order, count in ((0, 1), (1, 6), (2, 18), (3, 38)):  # |i| + |j| + |k| = n has 4 n^2 + 2 solutions
+            own = found.subset(np.flatnonzero((found.receiver == r) & (found.order == order)))
+            lattice = [
+                np.linalg.norm(image - receiver)
+                for i in range(-order, order + 1) for j in range(-order, order + 1) for k in range(-order, order + 1)
+                if abs(i) + abs(j) + abs(k) == order
+                for image in [np.where(np.array([i, j, k]) % 2 == 0, TX, ROOM - TX) + np.array([i, j, k]) * ROOM]
+            ]  # fmt: skip
+            assert len(own) == count
+            assert np.allclose(np.sort(own.length_m), np.sort(lattice), rtol=1e-12)
+
+
+def test_mirror_points_lie_on_their_patches_and_obey_the_law_of_reflection() -> None:
+    mesh, part = joined(box_mesh([0, 0, 0], ROOM, inward=True))
+    surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
+    found = specular_paths(surface, TX, np.array([[4.1, 3.2, 1.3]]), WAVELENGTH, order=3)
+    for k in np.flatnonzero(found.order == 3):
+        stops = np.vstack([TX, found.point[k], [4.1, 3.2, 1.3]])
+        legs = np.diff(stops, axis=0)
+        legs /= np.linalg.norm(legs, axis=1, keepdims=True)
+        for b in range(3):
+            normal = surface.plane_normal[found.patch[k, b]]
+            assert normal @ stops[b + 1] == pytest.approx(surface.plane_offset[found.patch[k, b]], abs=1e-12)
+            turned = legs[b] - 2 * (legs[b] @ normal) * normal
+            assert np.allclose(turned, legs[b + 1], atol=1e-12)
+            assert found.cosine[k, b] == pytest.approx(abs(legs[b] @ normal), rel=1e-12)
+
+
+def test_a_tree_of_no_patches_is_empty() -> None:
+    vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    mesh, part = joined((vertices, np.array([[0, 1, 2]])))
+    surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
+    assert len(surface.plane_offset) == 0  # too small for a mirror
+    assert MirrorTree(surface, TX, 3).order == 0
+    assert len(specular_paths(surface, TX, np.array([[1.0, 1, 1]]), WAVELENGTH, order=3)) == 1
+
+
+def plane(z: float, up: bool) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.array([[-4.0, -4, z], [4, -4, z], [4, 4, z], [-4, 4, z]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return corners, faces if up else faces[:, ::-1]
+
+
+def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
+    """A rough floor under a mirror: besides the transmitter's own light, that of its image behind the mirror."""
+    mesh, part = joined(plane(0.0, True), plane(3.0, False))
+    both = Surface.of(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("mirror")]))
+    mesh, part = joined(
+        plane(0.0, True), plane(6.0, False)
+    )  # a black lid far above, to have room for the image
+    alone = Surface.of(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]))
+    receiver, transmitter = np.array([1.0, -0.5, 1.2]), np.array([-0.7, 0.4, 1.6])
+    image = np.array([-0.7, 0.4, 4.4])
+    nothing = -60.0
+    lobes = (0, 5)
+    weight = np.array([[np.log(0.2), np.log(0.3)], [nothing, nothing]])
+
+    def field(surface: Surface, source: np.ndarray, **terms: object) -> BistaticField:
+        return BistaticField(
+            surface=surface, transmitter=source, frequency_hz=F, shape=SHAPE, floor=1e-20, range_db=(-200.0, -80.0),
+            beam_sigma_rad=np.radians(5.0), terms=Terms(mirror_order=0, line_of_sight=False, lobes=lobes, **terms),
+            parameters=Parameters(
+                weight, np.array([np.log(4.0), np.log(199.0)]), np.array([nothing, 0.0]), np.full(2, -np.inf)
+            ),
+            material=np.arange(2), residual=np.zeros((2, surface.texels)),
+        )  # fmt: skip
+
+    lit = field(both, transmitter, mirror_scatter=True)
+    dark = field(both, transmitter)
+    seen = lit.see(receiver)
+    extra = lit.compose(seen).image - dark.compose(seen).image
+    wanted = field(alone, image).spectrum(receiver).path_gain
+    # The mirror keeps what its Fresnel curve says, which hardly depends on the angle up to 60 degrees.
+    reflected = fresnel_curves().value(np.full(2, np.log(199.0)), np.array([0.5, 1.0]))[0]
+    below = slice(17, None)  # rows that look down steeply: their pixels' four rays meet the floor well inside
+    ratio = extra[below] / wanted[below]
+    assert 0.97 * reflected.min() < np.median(ratio) < 1.03 * reflected.max()
+    assert 0.9 * reflected.min() < ratio.min() and ratio.max() < 1.1 * reflected.max()
+    assert 0.97 * reflected.min() < extra.sum() / wanted.sum() < 1.03 * reflected.max()
+    assert lit.further(seen).sum() == pytest.approx(extra.sum(), rel=1e-6)
+
+
+@pytest.mark.on_cuda_too
+def test_what_groups_send_on_adds_up(scene: RadioScene) -> None:
+    surface = Surface.of(scene)
+    ds = spectra(scene, RECEIVERS[:1])
+    terms = Terms(mirror_scatter=True, diffuse_order=3)
+    field = BistaticField.prior(surface, ds, terms=terms)
+    sight = field.see(RECEIVERS[0])
+    pixels = np.arange(SHAPE[0] * SHAPE[1])
+    groups, images, shown = field.further_by_group(sight, pixels)
+    assert len(groups) == images.shape[1]
+    assert not shown.any()
+    whole = field.beam(field.further(sight)).ravel()
+    assert np.allclose(images.sum(axis=1), whole, rtol=1e-4, atol=1e-7 * whole.max())
+
+
+MATERIALS = [
+    SlabMaterial("walls", 3.0, 0.5, np.inf, 0.4, "directive", 5),
+    SlabMaterial("one", 6.0, 0.5, np.inf, 0.8),
+    SlabMaterial("two", 6.0, 0.5, np.inf, 0.8),
+]
+RECEIVERS = np.array(
+    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1]]
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> RadioScene:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], ROOM, inward=True),
+        box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.4]),
+        box_mesh([3.4, 0.8, 0.0], [4.0, 1.4, 1.0]),
+    )
+    return RadioScene(mesh, part, MATERIALS)
+
+
+def spectra(scene: RadioScene, receivers: np.ndarray) -> SpectrumDataset:
+    return exact_spectra(scene, receivers, transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=np.radians(5.0))
+
+
+@pytest.fixture(scope="module")
+def views(scene: RadioScene) -> list[View]:
+    ds = spectra(scene, RECEIVERS)
+    seen = trace(scene, ds)
+    blank = BistaticField.prior(seen.surface, ds)
+    target = to_db(ds.path_gain, ds.floor) - 10 * np.log10(ds.floor)
+    pixels = np.arange(SHAPE[0] * SHAPE[1])
+    return [blank.view(s, pixels, t) for s, t in zip(seen.sights, target, strict=True)]
+
+
+def test_spectra_join_groups_of_one_material_and_no_others(views: list[View], scene: RadioScene) -> None:
+    area = np.bincount(scene.face_material, scene.mesh.areas)
+    separate = fit_groups(views, Parameters.prior(3, 5), area)
+    alike = np.zeros((3, 4))  # all look the same
+    material, parameters = regroup(views, separate.parameters, np.arange(3), alike, area)
+    assert material[1] == material[2] != material[0]
+    assert len(parameters.log_excess) == 2
+    # and a group that was put with the wrong material goes over
+    mixed = np.array([0, 1, 0])
+    again = fit_groups([v.tied(mixed) for v in views], parameters, np.bincount(mixed, area))
+    moved, _ = regroup(views, again.parameters, mixed, alike, area)
+    assert moved[2] == moved[1] != moved[0]
+
+
+def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(views: list[View], scene: RadioScene) -> None:
+    dark = [replace(v, target_db=np.zeros_like(v.target_db), basis=0 * v.basis) for v in views]
+    area = np.bincount(scene.face_material, scene.mesh.areas)
+    look = np.array([[0.0, 0, 0, 0], [0.1, 0, 0, 0], [9.0, 0, 0, 0]])
+    material, _ = regroup(dark, Parameters.prior(3, 5), np.arange(3), look, area)
+    assert material[0] == material[1]  # nothing speaks against it
+
+
+def test_tied_views_predict_the_same(views: list[View]) -> None:
+    rng = np.random.default_rng(0)
+    owner = np.array([0, 1, 1])
+    p = Parameters(
+        rng.normal(-2, 0.5, (2, 5)), rng.normal(1, 0.3, 2), rng.normal(-1, 0.3, 2), rng.normal(-3, 0.2, 2)
+    )
+    for view in views:
+        view = with_light(view, rng)
+        assert np.allclose(predict(view, p.take(owner)), predict(view.tied(owner), p), rtol=1e-5)
+
+
+def with_light(view: View, rng: np.random.Generator) -> View:
+    light = rng.uniform(0, 5, (len(view.target_db), 2)).astype(np.float32)
+    return replace(view, again_group=np.array([0, 2]), again=light)
+
+
+def test_derivatives_follow_light_that_is_sent_on(views: list[View]) -> None:
+    rng = np.random.default_rng(1)
+    view = with_light(views[0], rng)
+    # beams of single paths would drown the rest in single precision
+    view = replace(
+        view,
+        gain=view.gain[:0],
+        beam=view.beam[:0],
+        path_group=view.path_group[:0],
+        cosine=view.cosine[:0],
+        turn=view.turn[:0],
+    )
+    layout = Layout(3, 5, indirect=True, gain=True)
+    p = Parameters(
+        rng.normal(-1.5, 0.3, (3, 5)),
+        rng.normal(1, 0.1, 3),
+        rng.normal(-1, 0.3, 3),
+        rng.normal(-2, 0.2, 3),
+        0.2,
+    )
+    x = layout.pack(p)
+    power, table, index = jacobian(view, layout.unpack(x), layout)
+    assert np.allclose(power, predict(view, layout.unpack(x)), rtol=1e-5)
+    dense = np.zeros((len(power), layout.size))
+    np.add.at(dense.T, index, table.T)
+    for k in range(layout.size):
+        step = np.zeros(layout.size)
+        step[k] = 1e-3
+        slope = (predict(view, layout.unpack(x + step)) - predict(view, layout.unpack(x - step))) / 2e-3
+        # single precision, and curves that are linear piece by piece
+        gap = np.abs(dense[:, k] - slope)
+        assert np.quantile(gap, 0.99) <= 0.02 * np.abs(slope).max() + 3e-5 * power.max()
+
+
+def test_the_beam_at_some_pixels_is_that_of_the_whole_image() -> None:
+    beam = BeamOperator(SHAPE, np.radians(5.0))
+    images = np.random.default_rng(2).random((SHAPE[0] * SHAPE[1], 3))
+    pixels = np.array([0, 7, 500, 1151])
+    whole = beam(images.reshape(*SHAPE, 3)).reshape(-1, 3)
+    assert np.allclose(beam.at(pixels, images), whole[pixels], rtol=1e-5)
+    assert np.allclose(whole.sum(axis=0), images.sum(axis=0), rtol=1e-12)
+    quick = beam(images.reshape(*SHAPE, 3), quick=True).reshape(-1, 3)
+    assert 0 < np.abs(quick - whole).max() < 3e-6 * whole.max()
+    back = beam.adjoint(images.reshape(*SHAPE, 3), quick=True).reshape(-1, 3)
+    assert np.abs(back - beam.adjoint(images.reshape(*SHAPE, 3)).reshape(-1, 3)).max() < 3e-6 * back.max()
+
+
+def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
+    """In a closed room whose surfaces send L evenly, the sum over pixels is (lambda / 4 pi)^2 4 pi L."""
+    import trimesh
+
+    from warprrf.geometry.mesh import Mesh
+    from warprrf.rf.fields.bistatic.bounces import BounceTracer
+    from warprrf.rf.fields.bistatic.second_bounce import SeenSurface
+    from warprrf.rf.fields.bistatic.surface import Surface
+
+    box = trimesh.creation.box((6.0, 4.0, 3.0))
+    surface = Surface.of(Mesh(box.vertices, box.faces[:, ::-1]))
+    tracer = BounceTracer(surface, (12, 24))
+    seen = SeenSurface.of(tracer, tracer.meet(np.array([0.5, -0.3, 0.2])))
+    assert seen.solid_angle.sum() == pytest.approx(4.0 * np.pi, rel=1e-6)
+    radiance, wavelength = 0.7, 1e-3
+    power = seen.power(np.full(len(seen.face), radiance), wavelength)
+    assert power.sum() == pytest.approx((wavelength / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6)
+    assert np.array_equal(np.unique(seen.pixel), np.arange(12 * 24))

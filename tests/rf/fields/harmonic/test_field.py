@@ -1,0 +1,447 @@
+"""Radio fields: the paper's equations by brute force, their scaling laws, paths, files, and resumed fits."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.rf.fields.harmonic.field import HarmonicField
+from warprrf.rf.fields.harmonic.interaction import interaction_points
+from warprrf.rf.fields.harmonic.paths import BEAM_REACH
+from warprrf.rf.fields.harmonic.single_bounce import FieldOptions
+from warprrf.rf.fields.harmonic.transport import transport
+from warprrf.rf.spectra.metrics import psnr, unit_image
+from warprrf.rf.spectra.spectrum import angles_from_directions, pixel_directions, pixel_solid_angles
+
+LIGHT = 299_792_458.0
+FREQUENCY = 300e9
+WAVELENGTH = LIGHT / FREQUENCY
+SHAPE = (16, 32)
+SIGMA = np.radians(6.0)
+TRANSMITTER = np.array([0.9, 1.0, 2.3])
+FLOOR, RANGE_DB = 1e-16, (-160.0, -80.0)
+
+
+def box(low: list[float], high: list[float], inward: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a closed box."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    return np.asarray(low) + corners * np.subtract(high, low), faces[:, ::-1] if inward else faces
+
+
+@pytest.fixture(scope="module")
+def room() -> SimpleNamespace:
+    """A closed room with a block that hides the transmitter from behind it, covered with discs."""
+    (v1, f1), (v2, f2) = box([0, 0, 0], [5, 4, 3], inward=True), box([2, 0.2, 0.1], [2.4, 2.9, 2.9])
+    mesh = Mesh(np.concatenate([v1, v2]), np.concatenate([f1, f2 + len(v1)]))
+    return SimpleNamespace(mesh=mesh, gaussians=discs_on_mesh(mesh, 1500, seed=1))
+
+
+RECEIVERS = np.random.default_rng(3).uniform([0.5, 0.5, 0.8], [4.5, 3.5, 2.2], (60, 3))
+RECEIVERS = RECEIVERS[(RECEIVERS[:, 0] < 1.7) | (RECEIVERS[:, 0] > 2.7)][:16]
+VISIBLE, BLOCKED = np.array([1.5, 2.4, 1.2]), np.array([3.6, 1.2, 1.3])
+
+
+def field_with(room: SimpleNamespace, layers: dict[str, np.ndarray], **options) -> HarmonicField:
+    return HarmonicField(
+        gaussians=room.gaussians, mesh=room.mesh, transmitter=TRANSMITTER, frequency_hz=FREQUENCY, shape=SHAPE,
+        floor=FLOOR, range_db=RANGE_DB, beam_sigma_rad=SIGMA, options=FieldOptions(**options), layers=layers,
+        gain_unit=0.1, delay_unit=1e-8,
+    )  # fmt: skip
+
+
+def smooth_layers(gaussians: Gaussians, seed: int = 0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    table = np.zeros((len(gaussians), 16), np.float32)
+    table[:, 0] = 3.0 * np.sin(gaussians.means @ rng.normal(0, 0.7, 3))
+    table[:, 1:4] = 0.5 * np.cos(gaussians.means @ rng.normal(0, 0.5, (3, 3)))
+    return {"gain": table}
+
+
+def dataset(field: HarmonicField, receivers: np.ndarray) -> SimpleNamespace:
+    spectra = [field.spectrum(r) for r in receivers]
+    gain = np.stack([s.path_gain for s in spectra])
+    return SimpleNamespace(
+        receivers=receivers, transmitter=field.transmitter, frequency_hz=field.frequency_hz, path_gain=gain,
+        delay_s=np.stack([s.delay_s for s in spectra]), aod=np.stack([s.aod for s in spectra]), floor=FLOOR,
+        range_db=(10 * np.log10(FLOOR), 10 * np.log10(gain.max() + FLOOR)), beam_sigma_rad=SIGMA,
+        line_of_sight=np.array([True] * len(receivers)),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def truth(room: SimpleNamespace) -> HarmonicField:
+    return field_with(room, smooth_layers(room.gaussians))
+
+
+@pytest.fixture(scope="module")
+def spectra(truth: HarmonicField) -> SimpleNamespace:
+    return dataset(truth, RECEIVERS)
+
+
+# --- the model's equations
+
+
+@pytest.mark.on_cuda_too
+@pytest.mark.parametrize("rule", ["product", "exp"])
+@pytest.mark.parametrize("gain", ["exp", "linear"])
+def test_a_pixel_is_the_papers_equations(rule: str, gain: str) -> None:
+    """Eq. (2)-(4) by hand: discs across one ray, harmonics of degree 0 and 1 written out."""
+    row, column = 7, 20
+    d = pixel_directions(SHAPE)[row, column]
+    receiver, transmitter = np.array([0.2, -0.1, 0.3]), np.array([1.0, 2.0, 0.5])
+    depth, opacity = np.array([2.0, 3.0, 4.5]), np.array([0.3, 0.8, 0.5])
+    scale = 0.4
+    table = np.zeros((3, 16), np.float32)
+    table[:, :4] = np.random.default_rng(5).uniform(0.2, 1.5, (3, 4))
+    balls = Gaussians(
+        receiver + depth[:, None] * d, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), scale), opacity,
+        np.zeros((3, 1, 3)),
+    )  # fmt: skip
+    field = HarmonicField(
+        gaussians=balls, mesh=None, transmitter=transmitter, frequency_hz=FREQUENCY, shape=SHAPE, floor=FLOOR,
+        range_db=RANGE_DB, beam_sigma_rad=SIGMA, options=FieldOptions(transmittance=rule, gain=gain),
+        layers={"gain": table}, gain_unit=0.25, delay_unit=1.0,
+    )  # fmt: skip
+    alpha = opacity  # the ray passes through all three centres
+    passed = (
+        np.cumprod(np.r_[1.0, 1 - alpha[:-1]])
+        if rule == "product"
+        else np.exp(-np.cumsum(np.r_[0.0, alpha[:-1]]))
+    )
+    weight = alpha * passed
+    c0, c1 = 0.5 / np.sqrt(np.pi), np.sqrt(3 / (4 * np.pi))
+    harmonic = np.array([c0, -c1 * d[1], c1 * d[2], -c1 * d[0]])
+    exponent = table[:, :4] @ harmonic
+    amplitude = 0.25 * (np.exp(exponent) if gain == "exp" else np.maximum(exponent, 0.0))
+    centre = balls.means[np.argmax(weight)].astype(float)
+    length = np.linalg.norm(centre - transmitter) + np.linalg.norm(centre - receiver)
+    solid_angle = pixel_solid_angles(SHAPE)[row]
+    expected = solid_angle * (weight @ amplitude) * (WAVELENGTH / (4 * np.pi * length)) ** 2
+    spectrum = field.spectrum(receiver)
+    assert spectrum.path_gain[row, column] == pytest.approx(expected, rel=2e-4)
+    assert spectrum.delay_s[row, column] == pytest.approx(length / LIGHT, rel=1e-9)
+
+
+def test_the_exp_rule_can_blend_to_more_than_one_and_the_product_rule_cannot(room: SimpleNamespace) -> None:
+    sums = {
+        rule: transport(room.gaussians, VISIBLE[None], SHAPE, rule=rule).pixel_weight
+        for rule in ("product", "exp")
+    }
+    assert sums["product"].max() <= 1 + 1e-4
+    assert sums["exp"].max() > 1.1
+
+
+@pytest.mark.parametrize(("model", "power_ratio"), [("rf3dgs+", 0.25), ("rf3dgs", 1.0)])
+def test_doubling_every_distance_quarters_the_power_only_with_lengths(
+    room: SimpleNamespace, model: str, power_ratio: float
+) -> None:
+    layers = smooth_layers(room.gaussians)
+    small = field_with(room, layers, model=model)
+    g = room.gaussians
+    large = HarmonicField(
+        gaussians=Gaussians(2 * g.means, g.quaternions, 2 * g.scales, g.opacities, g.sh),
+        mesh=Mesh(2 * room.mesh.vertices, room.mesh.faces), transmitter=2 * TRANSMITTER, frequency_hz=FREQUENCY,
+        shape=SHAPE, floor=FLOOR, range_db=RANGE_DB, beam_sigma_rad=SIGMA, options=small.options, layers=layers,
+        gain_unit=0.1, delay_unit=1e-8,
+    )  # fmt: skip
+    a, b = small.spectrum(VISIBLE), large.spectrum(2 * VISIBLE)
+    assert b.path_gain == pytest.approx(power_ratio * a.path_gain, rel=1e-3)
+    if model == "rf3dgs+":
+        assert b.delay_s == pytest.approx(2 * a.delay_s, rel=1e-9)
+
+
+def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(truth: HarmonicField) -> None:
+    elsewhere = np.array([1.4, 3.2, 0.9])
+    here, there = truth.spectrum(BLOCKED), truth.spectrum(BLOCKED, transmitter=elsewhere)
+    paths = [truth.paths(BLOCKED), truth.paths(BLOCKED, transmitter=elsewhere)]
+    assert all((p.kind == "diffuse").all() for p in paths)
+    ratio = (here.delay_s / there.delay_s) ** 2
+    assert there.path_gain == pytest.approx(ratio * here.path_gain, rel=1e-4)
+    moved = angles_from_directions(paths[1].vertices[:, 0] - elsewhere)
+    assert paths[1].theta_t == pytest.approx(moved[0])
+    assert paths[1].phi_t == pytest.approx(moved[1])
+
+
+def test_mesh_interaction_points_give_exact_lengths(room: SimpleNamespace) -> None:
+    """Rays to the walls of an axis-aligned box, by the slab formula in float64."""
+    mesh = Mesh(*box([0.0, 0.0, 0.0], [5.0, 4.0, 3.0], inward=True))
+    field = HarmonicField(
+        gaussians=room.gaussians, mesh=mesh, transmitter=TRANSMITTER, frequency_hz=FREQUENCY, shape=SHAPE,
+        floor=FLOOR, range_db=RANGE_DB, beam_sigma_rad=1e-3, options=FieldOptions(interaction_point="mesh"),
+        layers=smooth_layers(room.gaussians), gain_unit=1.0, delay_unit=1.0,
+    )  # fmt: skip
+    d = pixel_directions(SHAPE)
+    walls = np.where(d > 0, np.array([5.0, 4.0, 3.0]) - VISIBLE, -VISIBLE)
+    distance = (walls / d).min(axis=-1)
+    point = VISIBLE + distance[..., None] * d
+    expected = (distance + np.linalg.norm(point - TRANSMITTER, axis=-1)) / LIGHT
+    delay = field.spectrum(VISIBLE).delay_s
+    surface = delay != np.linalg.norm(VISIBLE - TRANSMITTER) / LIGHT  # the line of sight's pixels apart
+    assert surface.sum() > 0.98 * surface.size
+    assert delay[surface] == pytest.approx(expected[surface], rel=1e-9)
+
+
+def test_interaction_points_lie_where_they_say(room: SimpleNamespace) -> None:
+    seen = transport(room.gaussians, VISIBLE[None], SHAPE)
+    centre = interaction_points(seen, room.gaussians, "centre")
+    assert np.array_equal(centre, room.gaussians.means[seen.dominant].astype(np.float64))
+    d = pixel_directions(SHAPE)
+    for kind in ("peak", "expected", "mesh"):
+        ray = interaction_points(seen, room.gaussians, kind, mesh=room.mesh)[0] - VISIBLE
+        assert np.linalg.norm(np.cross(ray, d), axis=-1).max() < 1e-6
+        assert np.median(room.mesh.distance(ray.reshape(-1, 3) + VISIBLE)) < 0.005
+
+
+# --- fitting
+
+
+def test_a_field_is_recovered_from_spectra_of_its_own_kind(
+    room: SimpleNamespace, spectra: SimpleNamespace
+) -> None:
+    train = SimpleNamespace(**{**vars(spectra)})
+    for name in ("receivers", "path_gain", "delay_s", "aod", "line_of_sight"):
+        setattr(train, name, getattr(spectra, name)[:13])
+    found = HarmonicField.fit(room, train, iterations=150, seed=0)
+    untrained = HarmonicField.fit(room, train, iterations=0, seed=0)
+
+    def score(field: HarmonicField, index: int) -> float:
+        image = unit_image(field.spectrum(spectra.receivers[index]).path_gain, FLOOR, spectra.range_db)
+        return psnr(image, unit_image(spectra.path_gain[index], FLOOR, spectra.range_db))
+
+    assert np.mean([score(found, i) for i in range(13)]) > 45
+    held_out = [score(found, i) for i in (13, 14, 15)]
+    assert np.mean(held_out) > 35
+    assert np.mean(held_out) > np.mean([score(untrained, i) for i in (13, 14, 15)]) + 5
+    assert found.report["losses"]["gain"][-1] < 0.3 * found.report["losses"]["gain"][0]
+
+
+def test_rf3dgs_learns_delay_and_departure_of_its_training_spectra(
+    room: SimpleNamespace, spectra: SimpleNamespace
+) -> None:
+    found = HarmonicField.fit(room, spectra, "rf3dgs", iterations=100)
+    blocked = [i for i, r in enumerate(spectra.receivers) if r[0] > 2.7]
+    delay = np.stack([found.spectrum(spectra.receivers[i]).delay_s for i in blocked])
+    spread_s = np.std(spectra.delay_s[blocked])
+    assert np.median(np.abs(delay - spectra.delay_s[blocked])) < 0.05 * spread_s
+    zenith = np.stack([found.spectrum(spectra.receivers[i]).aod[..., 0] for i in blocked])
+    assert np.median(np.abs(zenith - spectra.aod[blocked][..., 0])) < np.radians(3)
+
+
+def test_gaussians_that_nobody_saw_keep_the_median_gain(
+    room: SimpleNamespace, spectra: SimpleNamespace
+) -> None:
+    g = room.gaussians
+    outside = Gaussians(
+        np.concatenate([g.means, [[50.0, 50, 50]]]), np.concatenate([g.quaternions, g.quaternions[:1]]),
+        np.concatenate([g.scales, g.scales[:1]]), np.concatenate([g.opacities, [0.0]]),
+        np.concatenate([g.sh, g.sh[:1]]),
+    )  # fmt: skip
+    found = HarmonicField.fit(SimpleNamespace(gaussians=outside, mesh=room.mesh), spectra, iterations=3)
+    assert not found.layers["gain"][-1].any()
+    seen = found.layers["gain"][:-1].any(axis=1)
+    assert seen.mean() > 0.9
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_seed_others(
+    room: SimpleNamespace, spectra: SimpleNamespace
+) -> None:
+    fits = [HarmonicField.fit(room, spectra, iterations=6, batch=4, seed=s).layers["gain"] for s in (1, 1, 2)]
+    assert np.array_equal(fits[0], fits[1])
+    assert not np.array_equal(fits[0], fits[2])
+
+
+def test_a_killed_fit_goes_on_and_ends_with_the_same_bits(
+    room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
+) -> None:
+    class Killed(Exception):
+        pass
+
+    def killer(stage: str, done: int, total: int) -> None:
+        if stage == "fit" and done == 70:
+            raise Killed
+
+    file = tmp_path / "fit.safetensors"
+    whole = HarmonicField.fit(room, spectra, iterations=80, batch=4)
+    with pytest.raises(Killed):
+        HarmonicField.fit(room, spectra, iterations=80, batch=4, checkpoint=file, progress=killer)
+    assert file.exists()
+    steps = []
+    resumed = HarmonicField.fit(
+        room, spectra, iterations=80, batch=4, checkpoint=file, progress=lambda s, d, t: steps.append((s, d))
+    )
+    assert min(d for s, d in steps if s == "fit") == 51
+    assert np.array_equal(whole.layers["gain"], resumed.layers["gain"])
+    assert whole.report["losses"] == resumed.report["losses"]
+    assert not file.exists()
+
+
+def test_a_checkpoint_of_another_fit_is_refused(
+    room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
+) -> None:
+    file = tmp_path / "fit.safetensors"
+    HarmonicField.fit(room, spectra, iterations=1, checkpoint=file)
+
+    def killer(stage: str, done: int, total: int) -> None:
+        if stage == "fit" and done == 60:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        HarmonicField.fit(room, spectra, iterations=70, checkpoint=file, progress=killer)
+    with pytest.raises(ValueError, match="another fit|other data"):
+        HarmonicField.fit(room, spectra, iterations=70, checkpoint=file, gain="linear")
+    assert file.exists()
+
+
+# --- line of sight and paths
+
+
+def test_explicit_line_of_sight_adds_friis_gain_where_the_transmitter_is_seen(
+    room: SimpleNamespace, truth: HarmonicField
+) -> None:
+    explicit = field_with(room, truth.layers, line_of_sight="explicit")
+    for receiver, seen in ((VISIBLE, 1.0), (BLOCKED, 0.0)):
+        friis = (WAVELENGTH / (4 * np.pi * np.linalg.norm(receiver - TRANSMITTER))) ** 2
+        more = explicit.spectrum(receiver).total_path_gain - truth.spectrum(receiver).total_path_gain
+        assert more == pytest.approx(seen * friis, rel=1e-5, abs=1e-6 * friis)
+
+
+@pytest.mark.parametrize("line_of_sight", [None, "explicit"])
+@pytest.mark.parametrize("floor", [1e-16, 1e-9, 1e-3])
+def test_paths_sum_to_the_spectrum_whatever_the_floor(
+    room: SimpleNamespace, truth: HarmonicField, line_of_sight: str | None, floor: float
+) -> None:
+    field = field_with(room, truth.layers, line_of_sight=line_of_sight)
+    object.__setattr__(field, "floor", floor)
+    for receiver in (VISIBLE, BLOCKED):
+        paths = field.paths(receiver)
+        total = np.sum(field.spectrum(receiver).path_gain, dtype=np.float64)
+        assert (np.abs(paths.gain) ** 2).sum() == pytest.approx(total, rel=1e-12)
+
+
+def test_line_of_sight_path_is_exact(room: SimpleNamespace, truth: HarmonicField) -> None:
+    outward = VISIBLE - TRANSMITTER
+    distance = np.linalg.norm(outward)
+    for option in (None, "explicit"):
+        paths = field_with(room, truth.layers, line_of_sight=option).paths(VISIBLE)
+        i = np.flatnonzero(paths.kind == "los")
+        assert len(i) == 1
+        assert paths.tau[i[0]] == pytest.approx(distance / LIGHT, rel=1e-12)
+        assert paths.departure[i[0]] == pytest.approx(outward / distance, abs=1e-12)
+        assert paths.arrival[i[0]] == pytest.approx(-outward / distance, abs=1e-12)
+        if option == "explicit":
+            assert paths.power[i[0]] == pytest.approx((WAVELENGTH / (4 * np.pi * distance)) ** 2)
+        else:
+            near = pixel_directions(SHAPE) @ (-outward / distance) >= np.cos(BEAM_REACH * SIGMA)
+            image = truth.spectrum(VISIBLE).path_gain.astype(np.float64)
+            assert paths.power[i[0]] == pytest.approx(image[near].sum(), rel=1e-6)
+    assert not (truth.paths(BLOCKED).kind == "los").any()
+
+
+def test_phase_and_delay_of_a_path_follow_from_its_vertices(truth: HarmonicField) -> None:
+    paths = truth.paths(BLOCKED)
+    point = paths.vertices[:, 0]
+    length = np.linalg.norm(point - TRANSMITTER, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
+    assert paths.tau == pytest.approx(length / LIGHT, rel=1e-12)
+    turned = paths.gain * np.exp(2j * np.pi * np.mod(FREQUENCY * paths.tau, 1.0))
+    assert np.abs(np.angle(turned)).max() < 1e-6
+
+
+def test_max_paths_keeps_the_strongest_and_several_receivers_are_padded(truth: HarmonicField) -> None:
+    everything, few = truth.paths(VISIBLE), truth.paths(VISIBLE, max_paths=5)
+    assert few.gain == pytest.approx(everything.gain[np.argsort(-everything.power)[:5]])
+    both = truth.paths(np.stack([VISIBLE, BLOCKED]))
+    assert both.gain.shape == both.valid.shape and both.gain.shape[0] == 2
+    assert (both.gain[~both.valid] == 0).all() and both.valid.sum() == len(everything.gain) + len(
+        truth.paths(BLOCKED).gain
+    )
+
+
+# --- files
+
+
+def test_a_saved_field_predicts_the_same_bits(
+    room: SimpleNamespace, spectra: SimpleNamespace, tmp_path: Path
+) -> None:
+    for model in ("rf3dgs+", "rf3dgs"):
+        field = HarmonicField.fit(room, spectra, model, iterations=2)
+        field.save(tmp_path / "field.safetensors")
+        again = HarmonicField.load(tmp_path / "field.safetensors")
+        a, b = field.spectrum(VISIBLE), again.spectrum(VISIBLE)
+        assert np.array_equal(a.path_gain, b.path_gain)
+        assert np.array_equal(a.delay_s, b.delay_s) and np.array_equal(a.aod, b.aod)
+        assert again.options == field.options and again.report == field.report
+    assert [f.name for f in tmp_path.iterdir()] == ["field.safetensors"]
+
+
+def test_a_corrupt_file_is_a_clear_error(truth: HarmonicField, tmp_path: Path) -> None:
+    file = tmp_path / "field.safetensors"
+    truth.save(file)
+    data = file.read_bytes()
+    for broken in (b"", b"not a field", data[: len(data) // 2], data[:7]):
+        file.write_bytes(broken)
+        with pytest.raises(ValueError, match="corrupt"):
+            HarmonicField.load(file)
+    with pytest.raises(FileNotFoundError, match="nothing.safetensors"):
+        HarmonicField.load(tmp_path / "nothing.safetensors")
+
+
+# --- errors
+
+
+@pytest.mark.parametrize(
+    ("position", "message"),
+    [
+        ([np.nan, 1.0, 1.0], "NaN"),
+        ([9.0, 1.0, 1.0], "outside"),
+        ([5.0, 1.0, 1.0], "surface"),
+        ([1.0, 1.0], "shape"),
+    ],
+)
+def test_positions_where_nothing_can_be_received_are_refused(
+    truth: HarmonicField, position: list[float], message: str
+) -> None:
+    for ask in (truth.spectrum, truth.paths):
+        with pytest.raises(ValueError, match=message):
+            ask(position)
+
+
+def test_a_millimetre_from_a_wall_is_still_inside(truth: HarmonicField) -> None:
+    assert np.isfinite(truth.spectrum([4.999, 1.0, 1.0]).path_gain).all()
+
+
+def test_options_that_do_not_exist_are_refused(room: SimpleNamespace, spectra: SimpleNamespace) -> None:
+    with pytest.raises(ValueError, match=r"bistatic.*rf3dgs\+, rf3dgs"):
+        HarmonicField.fit(room, spectra, model="bistatic")
+    for name in ("transmittance", "interaction_point", "gain", "line_of_sight", "sh_degree"):
+        with pytest.raises(ValueError, match=name):
+            HarmonicField.fit(room, spectra, **{name: 7})
+    with pytest.raises(TypeError, match="geometry"):
+        HarmonicField.fit(object(), spectra)
+    with pytest.raises(ValueError, match="mesh"):
+        HarmonicField.fit(room.gaussians, spectra, line_of_sight="explicit")
+
+
+def test_rf3dgs_refuses_a_transmitter_that_it_does_not_know(
+    room: SimpleNamespace, truth: HarmonicField
+) -> None:
+    fixed = field_with(room, truth.layers, model="rf3dgs")
+    assert np.array_equal(
+        fixed.spectrum(VISIBLE, transmitter=TRANSMITTER).path_gain, fixed.spectrum(VISIBLE).path_gain
+    )
+    with pytest.raises(ValueError, match="rf3dgs"):
+        fixed.spectrum(VISIBLE, transmitter=[1.0, 3.0, 1.0])
+
+
+def test_transport_of_other_receivers_is_refused(room: SimpleNamespace, truth: HarmonicField) -> None:
+    other = transport(room.gaussians, BLOCKED[None], SHAPE, range_db=RANGE_DB)
+    with pytest.raises(ValueError, match="transport"):
+        truth.spectrum(VISIBLE, transport=other)
+    assert np.array_equal(
+        truth.spectrum(BLOCKED, transport=other).path_gain, truth.spectrum(BLOCKED).path_gain
+    )

@@ -1,0 +1,212 @@
+"""Loss and adjoint of the field fit against NumPy and finite differences, in float64."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warprrf.kernels.ssim import RADIUS, WINDOW
+from warprrf.rf.fields.harmonic.batches import Problem
+from warprrf.rf.fields.harmonic.fitting import Layer, Rates, Target, fit_layer
+from warprrf.rf.fields.harmonic.targets import weighted_means
+from warprrf.rf.fields.harmonic.transport import Transport
+from warprrf.rf.spectra.spectrum import pixel_directions
+
+SHAPE = (12, 24)
+GAUSSIANS = 9
+
+
+def synthetic_transport(receivers: int = 3, seed: int = 0) -> Transport:
+    """Random sparse weights: zero to four Gaussians a pixel, indices with gaps."""
+    rng = np.random.default_rng(seed)
+    pixels = receivers * SHAPE[0] * SHAPE[1]
+    counts = rng.integers(0, 5, pixels)
+    gaussian = np.concatenate([rng.choice(GAUSSIANS, n, replace=False) * 3 for n in counts]).astype(np.int32)
+    return Transport(
+        shape=SHAPE,
+        receivers=rng.random((receivers, 3)),
+        start=np.concatenate([[0], np.cumsum(counts)]),
+        gaussian=gaussian,
+        weight=rng.uniform(0.1, 0.9, len(gaussian)).astype(np.float32),
+        dominant=np.where(counts > 0, 0, -1).reshape(receivers, *SHAPE).astype(np.int32),
+        expected_range=np.ones((receivers, *SHAPE), np.float32),
+        rule="product",
+        dropped=(0.0, 0.0),
+    )
+
+
+def gain_target(problem: Problem, seed: int = 1, unit: np.ndarray | None = None) -> Target:
+    rng = np.random.default_rng(seed)
+    shape = (len(problem.transport.receivers), *SHAPE)
+    return Target(
+        image=rng.uniform(0.1, 0.9, shape),
+        initial=np.zeros(len(problem.seen)),
+        unit=unit,
+        factor=rng.uniform(5.0, 50.0, shape),
+        extra=np.where(rng.random(shape) < 0.1, 20.0, 0.0),
+        floor=1.0,
+        low=0.0,
+        high=40.0,
+    )
+
+
+def coefficients_for(problem: Problem, kind: str, seed: int = 2) -> np.ndarray:
+    table = np.random.default_rng(seed).normal(0, 0.3, (len(problem.seen), 16))
+    table[:, 0] += 6.0 if kind == "linear" else 1.0  # clamped sums stay off their kink
+    return table
+
+
+def harmonics_by_hand(d: np.ndarray) -> np.ndarray:
+    """Real harmonics of degree 0 to 3 from Legendre functions, in the INRIA order and signs, shape (..., 16)."""
+    x, y, z = np.moveaxis(d, -1, 0)
+    azimuth, sine = np.arctan2(y, x), np.sqrt(x * x + y * y)
+    # Associated Legendre without the Condon-Shortley phase.
+    legendre = {
+        (0, 0): 1 + 0 * z, (1, 0): z, (1, 1): sine, (2, 0): (3 * z**2 - 1) / 2, (2, 1): 3 * z * sine,
+        (2, 2): 3 * sine**2, (3, 0): (5 * z**3 - 3 * z) / 2, (3, 1): 1.5 * (5 * z**2 - 1) * sine,
+        (3, 2): 15 * z * sine**2, (3, 3): 15 * sine**3,
+    }  # fmt: skip
+    factorial = [1, 1, 2, 6, 24, 120, 720]
+    out = []
+    for degree in range(4):
+        for order in range(-degree, degree + 1):
+            m = abs(order)
+            norm = np.sqrt((2 * degree + 1) / (4 * np.pi) * factorial[degree - m] / factorial[degree + m])
+            turn = 1.0 if m == 0 else np.sqrt(2) * (np.cos(m * azimuth) if order > 0 else np.sin(m * azimuth))
+            out.append((-1) ** m * norm * turn * legendre[degree, m])
+    return np.stack(out, axis=-1)
+
+
+def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray) -> float:
+    """The documented loss in NumPy: dense loops, no kernels."""
+    t = problem.transport
+    basis = harmonics_by_hand(pixel_directions(SHAPE).reshape(-1, 3))
+    local = np.searchsorted(problem.seen, t.gaussian)
+    pixel = np.repeat(np.arange(len(t.start) - 1), np.diff(t.start))
+    x = np.einsum("ek,ek->e", table[local], basis[pixel % (SHAPE[0] * SHAPE[1])])
+    gain = {"exp": np.exp, "linear": lambda v: np.maximum(v, 0), "signed": lambda v: v}[kind](x)
+    if target.unit is not None:
+        gain = gain * target.unit[local]
+    total = np.bincount(pixel, weights=t.weight.astype(np.float64) * gain, minlength=len(t.start) - 1)
+    if target.mask is not None:
+        return float((target.mask.ravel() * np.abs(total - target.image.ravel())).sum() / target.mask.sum())
+    power = target.factor.ravel() * total + target.extra.ravel()
+    u = (10 * np.log10(power + target.floor) - target.low) / (target.high - target.low)
+    u = u.reshape(target.image.shape)
+    a, b = u, target.image
+
+    def smooth(image: np.ndarray) -> np.ndarray:
+        padded = np.pad(image, ((0, 0), (RADIUS, RADIUS), (0, 0)))
+        rows = sum(w * padded[:, k : k + image.shape[1]] for k, w in enumerate(WINDOW))
+        return sum(w * np.roll(rows, RADIUS - k, axis=2) for k, w in enumerate(WINDOW))
+
+    ma, mb = smooth(a), smooth(b)
+    va, vb, cov = smooth(a * a) - ma**2, smooth(b * b) - mb**2, smooth(a * b) - ma * mb
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * ma * mb + c1) * (2 * cov + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2))
+    return float(0.8 * np.abs(a - b).mean() + 0.2 * (1 - similarity.mean()))
+
+
+@pytest.mark.on_cuda_too
+@pytest.mark.parametrize("kind", ["exp", "linear", "signed"])
+@pytest.mark.parametrize("with_unit", [False, True])
+def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_unit: bool) -> None:
+    problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
+    unit = np.random.default_rng(7).uniform(0.5, 2.0, len(problem.seen)) if with_unit else None
+    target = gain_target(problem, unit=unit)
+    if kind == "signed":
+        mask = (np.random.default_rng(8).random(target.image.shape) < 0.7).astype(float)
+        target = Target(image=target.image, initial=target.initial, unit=unit, mask=mask)
+    table = coefficients_for(problem, kind)
+    layer = Layer(problem, target, kind)
+
+    def loss(values: np.ndarray) -> float:
+        return layer.step(0, problem.upload(values, problem.kernels.vec16))
+
+    assert loss(table) == pytest.approx(loss_by_hand(problem, target, kind, table), rel=1e-12)
+    gradient = layer.gradient.numpy().copy()
+    assert np.abs(gradient).max() > 1e-4
+    step = 1e-6
+    rng = np.random.default_rng(9)
+    for _ in range(6):  # directions mix all coefficients, so each of them is tested
+        direction = rng.normal(size=table.shape)
+        numeric = (loss(table + step * direction) - loss(table - step * direction)) / (2 * step)
+        assert (gradient * direction).sum() == pytest.approx(numeric, rel=2e-5, abs=1e-9)
+    for gaussian, k in ((0, 0), (4, 7), (8, 15)):
+        nudge = np.zeros_like(table)
+        nudge[gaussian, k] = step
+        numeric = (loss(table + nudge) - loss(table - nudge)) / (2 * step)
+        assert gradient[gaussian, k] == pytest.approx(numeric, rel=1e-4, abs=1e-9)
+
+
+def test_batches_split_the_receivers_and_each_epoch_uses_all_of_them() -> None:
+    problem = Problem(synthetic_transport(receivers=7), batch=2, seed=3)
+    assert sorted(np.concatenate([b.receivers for b in problem.batches])) == list(range(7))
+    count = len(problem.batches)
+    for epoch in range(3):
+        assert sorted(problem.batch_at(epoch * count + i) for i in range(count)) == list(range(count))
+
+
+def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    import warprrf.device as device
+
+    problem = Problem(synthetic_transport(receivers=4), batch=4)
+    layer = Layer(problem, gain_target(problem), "exp")
+    table = problem.upload(coefficients_for(problem, "exp"), problem.kernels.vec16)
+    results = []
+    for smallest in (1, 10**9):
+        monkeypatch.setattr(device, "MIN_SPLIT", smallest)
+        results.append((layer.step(0, table), layer.gradient.numpy().copy()))
+    assert results[0][0] == results[1][0]
+    assert np.array_equal(results[0][1], results[1][1])
+
+
+@pytest.mark.on_cuda_too
+def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign() -> None:
+    """Kingma and Ba 2015: after bias correction the first update is rate * g / |g|."""
+    problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
+    target = gain_target(problem)
+    layer = Layer(problem, target, "exp")
+    start = np.zeros((len(problem.seen), 16))
+    layer.step(0, problem.upload(start, problem.kernels.vec16))
+    gradient = layer.gradient.numpy()
+    state = fit_layer(problem, target, "exp", steps=1, rates=Rates(0.3, 0.01, 0.0, 0.0))
+    assert state.coefficients[:, 0] == pytest.approx(-0.3 * np.sign(gradient[:, 0]), rel=1e-6)
+    assert state.coefficients[:, 1:] == pytest.approx(-0.01 * np.sign(gradient[:, 1:]), rel=1e-6)
+
+
+@pytest.mark.parametrize(("degree", "count"), [(0, 1), (1, 4), (2, 9), (3, 16)])
+def test_coefficients_above_the_degree_stay_zero(degree: int, count: int) -> None:
+    problem = Problem(synthetic_transport(), batch=3)
+    state = fit_layer(problem, gain_target(problem), "exp", steps=4, degree=degree)
+    assert state.coefficients[:, :count].all()
+    assert not state.coefficients[:, count:].any()
+
+
+def test_the_ridge_holds_a_gaussian_at_its_start() -> None:
+    problem = Problem(synthetic_transport(), batch=3)
+    target = gain_target(problem)
+    free, held = (
+        fit_layer(problem, target, "exp", steps=60, rates=Rates(0.05, 0.05, ridge, ridge)).coefficients
+        for ridge in (0.0, 1e6)
+    )
+    assert np.abs(free).max() > 0.5
+    assert np.abs(held).max() < 0.1 * np.abs(free).max()
+
+
+def test_weighted_means_are_those_of_the_pixels_that_see_a_gaussian() -> None:
+    t = synthetic_transport(receivers=2)
+    rng = np.random.default_rng(4)
+    values, where = rng.random((2, *SHAPE)), rng.random((2, *SHAPE)) < 0.5
+    seen, mean = weighted_means(t, values, where)
+    pixel = np.repeat(np.arange(len(t.start) - 1), np.diff(t.start))
+    for g, m in zip(seen, mean, strict=True):
+        mine = (t.gaussian == g) & where.ravel()[pixel]
+        assert m == pytest.approx(np.average(values.ravel()[pixel[mine]], weights=t.weight[mine]))
+
+
+@pytest.mark.on_cuda_too
+def test_harmonics_on_the_device_are_the_textbooks() -> None:
+    problem = Problem(synthetic_transport(), precision=np.float64)
+    expected = harmonics_by_hand(pixel_directions(SHAPE).reshape(-1, 3))
+    assert problem.basis.numpy() == pytest.approx(expected, abs=1e-12)
+    assert problem.basis.dtype is wp.types.vector(16, wp.float64)

@@ -1,0 +1,140 @@
+"""Scenario folders, loaded by the DeepMIMO package itself."""
+
+import json
+
+import numpy as np
+import pytest
+from path_makers import random_paths
+from radio_scenes import box_mesh
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.materials import Material
+from warprrf.rf.interop.deepmimo import write_deepmimo
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.scene import Scene
+
+F = 300e9
+WALLS = Material.custom("stone", relative_permittivity=5.0, conductivity=5.0, thickness_m=0.1)
+
+
+@pytest.fixture
+def deepmimo():
+    return pytest.importorskip(
+        "deepmimo",
+        reason="DeepMIMO is no dependency: its wheel asks for an older NumPy (pip install --no-deps deepmimo)",
+    )
+
+
+def room():
+    mesh = Mesh(*box_mesh([-7.0, -6, 0], [8.0, 6, 4], inward=True))
+    return Scene(mesh, [WALLS], np.zeros(len(mesh.faces), np.int32), object_names=("room",))
+
+
+def traced():
+    points = np.random.default_rng(0).uniform([-6, -5, 0.5], [7, 5, 3], (5, 3))
+    return trace_paths(room(), transmitter=[-5.0, 3, 2.5], receivers=points, frequency_hz=F, mirror_order=2)
+
+
+@pytest.fixture
+def loaded(deepmimo, tmp_path, monkeypatch):
+    paths = traced()
+    write_deepmimo(paths, tmp_path / "deepmimo_scenarios" / "room_1", scene=room())
+    monkeypatch.chdir(tmp_path)
+    return paths, deepmimo.load("room_1", max_paths=100)
+
+
+def test_package_reads_what_was_written(loaded):
+    paths, data = loaded
+    np.testing.assert_allclose(data.rx_pos, paths.receiver, rtol=1e-6)
+    np.testing.assert_allclose(data.tx_pos[0], paths.transmitter, rtol=1e-6)
+    assert (np.asarray(data.num_paths) == paths.valid.sum(axis=1)).all()
+    assert (np.asarray(data.los) == 1).all()
+    for r in range(len(paths.gain)):
+        p = paths[r]
+        p = p.select(np.argsort(-p.power, kind="stable"))
+        n = len(p.gain)
+        np.testing.assert_allclose(data.power[r, :n], 10 * np.log10(p.power), atol=1e-4)
+        np.testing.assert_allclose(data.delay[r, :n], p.tau, rtol=1e-6)
+        np.testing.assert_allclose(
+            np.exp(1j * np.deg2rad(data.phase[r, :n])), p.gain / np.abs(p.gain), atol=1e-5
+        )
+        for name, angle in (
+            ("aoa_az", p.phi_r),
+            ("aoa_el", p.theta_r),
+            ("aod_az", p.phi_t),
+            ("aod_el", p.theta_t),
+        ):
+            np.testing.assert_allclose(data[name][r, :n], np.rad2deg(angle), atol=1e-4)
+        assert [len(str(int(c))) if c else 0 for c in data.inter[r, :n]] == np.isfinite(
+            p.vertices[..., 0]
+        ).sum(1).tolist()
+        np.testing.assert_allclose(data.inter_pos[r, :n], p.vertices, atol=1e-5)
+    assert data.rt_params["frequency"] == F
+    assert [o.name for o in data.scene.objects] == ["room"]
+    assert list(data.materials.name) == ["stone"]
+
+
+def test_package_makes_our_channels(loaded, deepmimo):
+    """DeepMIMO counts array phases from an array's first element (lowest row, first column), we from its centre."""
+    paths, data = loaded
+    wide, count = 1e9, 1024
+    chosen = np.arange(0, 64, 4)
+    parameters = deepmimo.ChannelParameters(
+        bs_antenna={"shape": [2, 3], "spacing": 0.5},
+        ue_antenna={"shape": [2, 1], "spacing": 0.5},
+        num_paths=100,
+        freq_domain=1,
+        ofdm={"subcarriers": count, "selected_subcarriers": chosen, "bandwidth": wide, "rx_filter": 0},
+    )
+    theirs = data.compute_channels(parameters) * np.sqrt(count)
+    lam = SPEED_OF_LIGHT / F
+
+    def phases(shape, directions):
+        y, z = np.tile(np.arange(shape[0]), shape[1]), np.repeat(np.arange(shape[1]), shape[0])
+        place = 0.5 * lam * np.stack([0 * y, y, z], axis=1)
+        return np.exp(2j * np.pi / lam * place @ directions.T)
+
+    for r in range(len(paths.gain)):
+        p = paths[r]
+        waves = np.exp(-2j * np.pi * np.outer(p.tau, chosen * wide / count))
+        ours = np.einsum(
+            "mp,np,p,pf->mnf", phases((2, 1), p.arrival), phases((2, 3), p.departure), p.gain, waves
+        )
+        np.testing.assert_allclose(theirs[r], ours, atol=1e-4 * np.abs(ours).max())
+    single = deepmimo.ChannelParameters(
+        bs_antenna={"shape": [1, 1]},
+        num_paths=100,
+        ofdm={"subcarriers": count, "selected_subcarriers": chosen, "bandwidth": wide, "rx_filter": 0},
+    )
+    theirs = data.compute_channels(single) * np.sqrt(count)
+    ours = paths.cfr(F + chosen * wide / count)
+    np.testing.assert_allclose(theirs, ours, atol=1e-4 * np.abs(ours).max())
+
+
+def test_folder_without_the_package(tmp_path):
+    """What DeepMIMO relies on: names of files, NaN where there is no path, codes of interactions."""
+    parts = [
+        Paths.concatenate([random_paths(3), random_paths(2, seed=1, kind="diffuse")]),
+        random_paths(1, seed=2),
+    ]
+    for k, p in enumerate(parts):
+        p.vertices[:] = k
+    paths = Paths.stack(parts)
+    with pytest.raises(ValueError, match="diffuse"):
+        write_deepmimo(paths, tmp_path / "a")
+    folder = write_deepmimo(paths, tmp_path / "a", diffuse="random_phase", max_paths=4)
+    power = np.load(folder / "power_t000_tx000_r001.npz")["power"]
+    assert power.shape == (2, 4) and np.isnan(power[1, 1:]).all() and (np.diff(power[0]) <= 0).all()
+    codes = np.load(folder / "inter_t000_tx000_r001.npz")["inter"]
+    assert set(codes[0]) == {1.0, 3.0}
+    assert json.loads((folder / "params.json").read_text())["txrx_sets"]["txrx_set_1"]["num_points"] == 2
+    assert not [f for f in folder.iterdir() if f.name.startswith(".")]
+
+
+def test_bad_input_is_named(tmp_path):
+    with pytest.raises(ValueError, match="folder"):
+        write_deepmimo(random_paths(2), tmp_path / "Room")
+    with pytest.raises(ValueError, match="max_paths"):
+        write_deepmimo(random_paths(2), tmp_path / "room", max_paths=0)

@@ -1,0 +1,138 @@
+"""Sionna RT and our own evaluation check each other on a room with a solid in it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sionna_room import sionna_or_skip, write_scene
+
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.interop import llvm
+from warprrf.rf.interop.sionna_paths import repeated
+from warprrf.rf.scene import Scene
+from warprrf.rf.simulate import simulate
+from warprrf.rf.spectra.spectrum import pixel_of
+
+F, SHAPE = 300e9, (30, 60)
+TX, SEES, BLOCKED = np.array([-5.0, 3.5, 2.7]), np.array([3.0, 4.0, 1.4]), np.array([3.0, -2.0, 1.2])
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("scene"))
+
+
+@pytest.fixture(scope="module")
+def engines(scene):
+    sionna = sionna_or_skip()
+    common = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
+    return ExactEngine(scene, **common), sionna(scene, depth=1, **common)
+
+
+@pytest.mark.parametrize("rx", [SEES, BLOCKED])
+def test_total_diffuse_power_agrees_within_half_a_percent(engines, rx):
+    ours, theirs = engines
+    found = theirs.solve(rx, specular=False)
+    assert ours.diffuse(rx).power.sum() == pytest.approx(found["power"][found["diffuse"]].sum(), rel=5e-3)
+
+
+@pytest.mark.parametrize("rx", [SEES, BLOCKED])
+def test_line_of_sight_and_mirrors_agree_in_power_delay_and_direction(engines, rx):
+    ours, theirs = engines
+    found = theirs.solve(rx)
+    sharp = ~found["diffuse"]
+    paths = ours.tracer.trace(rx, 1)
+    # Delays agree to float32 and two may be that close: pair by arrival instead.
+    theirs_at = found["arrival"][sharp]
+    assert len(paths.tau) == len(theirs_at)
+    pair = (paths.arrival @ theirs_at.T).argmax(axis=1)
+    np.testing.assert_allclose(paths.tau, found["tau"][sharp][pair], rtol=1e-6)
+    np.testing.assert_allclose(paths.power, found["power"][sharp][pair], rtol=1e-3)
+    np.testing.assert_allclose(paths.arrival, theirs_at[pair], atol=2e-5)
+    np.testing.assert_allclose(
+        np.column_stack([paths.theta_t, paths.phi_t]), found["aod"][sharp][pair], atol=2e-5
+    )
+
+
+def test_one_seed_gives_the_same_paths_in_the_same_order(scene):
+    """Sionna itself stores them in whatever order its threads end."""
+    sionna = sionna_or_skip()
+    engine = sionna(scene, depth=2, samples=20_000, transmitter=TX, frequency_hz=F, shape=SHAPE)
+    first = engine.solve(SEES)
+    assert len(first["tau"]) > 5000 and (np.diff(first["tau"]) >= 0).all()
+    for _ in range(4):
+        again = engine.solve(SEES)
+        for name, values in first.items():
+            np.testing.assert_array_equal(again[name], values, err_msg=name)
+
+
+def test_two_mirror_reflections_agree_in_power(scene):
+    sionna = sionna_or_skip()
+    common = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
+    found = sionna(scene, depth=2, samples=200_000, **common).solve(SEES)
+    sharp = ~found["diffuse"]
+    paths = ExactEngine(scene, **common).tracer.trace(SEES, 2)
+    a, b = np.argsort(paths.tau), np.argsort(found["tau"][sharp])
+    assert len(a) == len(b) > 10
+    np.testing.assert_allclose(paths.tau[a], found["tau"][sharp][b], rtol=1e-6)
+    # Two of the delays agree to float32, so powers are put in order by themselves.
+    np.testing.assert_allclose(np.sort(paths.power), np.sort(found["power"][sharp]), rtol=1e-3)
+
+
+def test_spectra_have_the_same_shape_and_the_same_strongest_pixel(engines):
+    ours, theirs = (engine.receive(SEES) for engine in engines)
+    pixel = pixel_of(TX - SEES, SHAPE)
+    distance = np.linalg.norm(TX - SEES)
+    for got in (ours, theirs):
+        assert np.unravel_index(got.path_gain.argmax(), SHAPE) == pixel
+        assert got.delay_s[pixel] == pytest.approx(distance / SPEED_OF_LIGHT, rel=1e-6)
+        assert got.path_gain.sum() == pytest.approx(sum(got.totals.values()), rel=1e-9)
+    assert ours.line_of_sight and theirs.line_of_sight
+
+
+def test_more_bounces_bring_more_power_and_simulate_says_how(scene):
+    sionna_or_skip()
+    options = {
+        "transmitter": TX,
+        "receivers": [BLOCKED],
+        "frequency_hz": F,
+        "shape": SHAPE,
+        "engine": "sionna",
+    }
+    one, three = (simulate(scene, depth=n, samples=100_000, **options) for n in (1, 3))
+    assert 1.05 < three.path_gain.sum() / one.path_gain.sum() < 10
+    assert (three.attributes["depth"], three.attributes["samples"]) == (3, 100_000)
+    assert three.attributes["version_sionna_rt"] and not three.line_of_sight[0]
+
+
+def test_a_mirror_found_twice_counts_once():
+    tau = np.array([30e-9, 40e-9, 40.001e-9, 40e-9, 40e-9, 40.1e-9])  # 0.3 mm and 30 mm apart
+    arrival = np.array([[1, 0, 0], [0, 1, 0], [1e-5, 1, 0], [0, 0, 1], [0, 1, 0], [0, 1, 0]], float)
+    aod = np.tile([1.0, 0.5], (6, 1))
+    bounces = np.array([1, 1, 1, 1, 2, 1])
+    assert repeated(tau, arrival, aod, bounces).tolist() == [False, False, True, False, False, False]
+    aod[2, 1] += 0.01  # leaves in another direction
+    assert not repeated(tau, arrival, aod, bounces).any()
+    assert repeated(tau[:0], arrival[:0], aod[:0], bounces[:0]).shape == (0,)
+
+
+def test_a_scene_without_a_file_is_refused(scene):
+    sionna = sionna_or_skip()
+    bare = Scene(scene.mesh, scene.materials, scene.face_material)
+    with pytest.raises(ValueError, match="xml|XML"):
+        sionna(bare, transmitter=TX, frequency_hz=F, shape=SHAPE)
+
+
+def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.setattr(
+        llvm, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
+    )
+    assert llvm.select_llvm() == Path("c")
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH")
+    monkeypatch.setattr(llvm, "installed_llvm", lambda: {15: Path("b")})
+    with pytest.raises(ImportError, match="15.*libllvm19"):
+        llvm.select_llvm()
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/mine.so")
+    assert llvm.select_llvm() == Path("/mine.so")

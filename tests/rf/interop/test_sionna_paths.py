@@ -1,0 +1,171 @@
+"""Sionna RT's own paths, channels and link-level functions beside ours."""
+
+import numpy as np
+import pytest
+from path_makers import CARRIER, random_paths
+from places import LOBBY
+
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.interop import llvm
+from warprrf.rf.interop.sionna_engine import load_sionna_scene
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.scene import Scene
+
+TX = np.array([13.6, 11.2, 2.5])
+RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
+
+
+@pytest.fixture(scope="module")
+def rt():
+    try:
+        llvm.select_llvm()
+    except ImportError as error:
+        pytest.skip(str(error))
+    pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
+    from warprrf.rf.interop.sionna_engine import sionna_rt
+
+    return sionna_rt()
+
+
+def solve(rt, scene, tx_array, rx_array, depth=2, diffuse=False):
+    loaded = load_sionna_scene(scene, frequency_hz=CARRIER)
+    loaded.tx_array, loaded.rx_array = tx_array, rx_array
+    loaded.add(rt.Transmitter("tx", position=TX.tolist()))
+    for k, point in enumerate(RECEIVERS):
+        loaded.add(rt.Receiver(f"rx{k}", position=point.tolist()))
+    return rt.PathSolver(deterministic=True)(
+        loaded, max_depth=depth, samples_per_src=200_000, synthetic_array=True, diffuse_reflection=diffuse,
+        refraction=False, seed=1,
+    )  # fmt: skip
+
+
+def element(rt, polarisation="VH"):
+    return rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarisation)
+
+
+@pytest.fixture(scope="module")
+def solved(rt):
+    return solve(rt, LOBBY / "scene.xml", element(rt), element(rt))
+
+
+@pytest.fixture(scope="module")
+def traced():
+    scene = Scene.load(LOBBY / "scene.xml")
+    return trace_paths(scene, transmitter=TX, receivers=RECEIVERS, frequency_hz=CARRIER, mirror_order=2)
+
+
+def test_lobby_paths_agree(solved, traced):
+    """Every specular path, its delay, angles and all four complex coefficients; Sionna reckons in float32."""
+    theirs = Paths.from_sionna(solved, frequency_hz=CARRIER, drop_repeated=True)
+    for r in range(len(RECEIVERS)):
+        s, o = theirs[r], traced[r]
+        assert len(s.gain) == len(o.gain) > 4
+        gap = np.abs(s.tau[:, None] - o.tau) * 3e8 + np.linalg.norm(s.arrival[:, None] - o.arrival, axis=2)
+        match = gap.argmin(axis=1)
+        assert len(set(match)) == len(match)
+        o = o.select(match)
+        assert np.abs(s.tau - o.tau).max() < 1e-12
+        for a, b in ((s.arrival, o.arrival), (s.departure, o.departure)):
+            assert np.linalg.norm(a - b, axis=1).max() < 1e-4
+        assert np.abs(10 * np.log10(s.power / o.power)).max() < 0.05
+        assert (s.kind == o.kind).all()
+        # Without the carrier's turns, which float32 delays cannot carry.
+        js, jo = (p.jones * np.exp(2j * np.pi * CARRIER * p.tau)[:, None, None] for p in (s, o))
+        error = np.abs(js - jo).max(axis=(1, 2)) / np.abs(js).max(axis=(1, 2))
+        assert error.max() < 0.01
+
+
+@pytest.mark.parametrize(
+    "pattern", [("iso", "isotropic"), ("hw_dipole", "half_wave_dipole"), ("tr38901", "tr38901")]
+)
+@pytest.mark.parametrize("polarisation", ["V", "cross"])
+def test_arrays_and_patterns_are_theirs(rt, traced, pattern, polarisation):
+    shape = {"num_rows": 2, "num_cols": 3, "pattern": pattern[0], "polarization": polarisation}
+    theirs = solve(rt, LOBBY / "scene.xml", rt.PlanarArray(**shape), rt.PlanarArray(**shape), depth=0)
+    a = PlanarArray(2, 3, pattern=pattern[1], polarisation=polarisation)
+    ours = traced.to_sionna(a, a)
+    for r in range(len(RECEIVERS)):
+        seen = np.flatnonzero(theirs.valid.numpy()[r, 0])
+        direct = np.flatnonzero(traced.kind[r] == "los")
+        assert len(seen) == len(direct)
+        if len(direct):
+            # Angles near an element's null or 2.8 rad off boresight: float32 errs by 1e-3 of the strongest.
+            b = theirs.a[0].numpy()[r, :, 0, :, seen[0]] + 1j * theirs.a[1].numpy()[r, :, 0, :, seen[0]]
+            np.testing.assert_allclose(ours.a[r, :, 0, :, direct[0]], b, atol=2e-3 * np.abs(b).max())
+
+
+def test_round_trip_changes_nothing(solved):
+    both = PlanarArray(1, 1, polarisation="VH")
+    back = Paths.from_sionna(solved, frequency_hz=CARRIER)
+    again = back.to_sionna(both, both)
+    a = solved.a[0].numpy() + 1j * solved.a[1].numpy()
+    tau, valid = solved.tau.numpy(), solved.valid.numpy()
+    for r in range(len(RECEIVERS)):
+        order = np.argsort(-np.abs(back.gain[r][back.valid[r]]), kind="stable")
+        there = np.flatnonzero(valid[r, 0])
+        strongest = there[np.argsort(-(np.abs(a[r][..., there]) ** 2).sum(axis=(0, 1, 2)), kind="stable")]
+        assert len(order) == len(strongest)
+        np.testing.assert_allclose(
+            again.a[r, :, 0][..., : len(order)], a[r, :, 0][..., strongest], rtol=1e-5, atol=1e-12
+        )
+        np.testing.assert_allclose(again.tau[r, 0, : len(order)], tau[r, 0, strongest], rtol=1e-6)
+        assert (again.tau[r, 0, len(order) :] == -1).all()
+        for name in ("theta_t", "phi_t", "theta_r", "phi_r"):
+            np.testing.assert_allclose(
+                getattr(again, name)[r, 0, : len(order)],
+                getattr(solved, name).numpy()[r, 0, strongest],
+                atol=1e-6,
+            )
+        kinds = solved.interactions.numpy()[:, r, 0][:, strongest]
+        np.testing.assert_array_equal(again.interactions[: len(kinds), r, 0, : len(order)], kinds)
+
+
+def test_channels_are_theirs(rt, solved):
+    """``cir``, ``cfr`` and ``taps`` of the same paths; float32 delays limit the agreement."""
+    back = Paths.from_sionna(solved, frequency_hz=CARRIER)
+    both = PlanarArray(1, 1, polarisation="VH")
+    ours = back.to_sionna(both, both)
+    f = np.linspace(-2e9, 2e9, 33)
+    h, g = ours.cfr(f), solved.cfr(f.astype(np.float32), out_type="numpy")
+    assert h.shape == g.shape
+    # Delays counted from the first path are exact to 1e-15 s, or 1e-3 rad at the carrier; so the whole to some 1e-3.
+    np.testing.assert_allclose(h, g, atol=2e-2 * np.abs(g).max())
+    t, u = ours.taps(1e9, -2, 20), solved.taps(1e9, -2, 20, out_type="numpy")
+    assert t.shape == u.shape
+    # Sionna's taps are NaN for receivers with padded paths, whose delay is -1 s.
+    whole = solved.valid.numpy().all(axis=(1, 2))
+    assert whole.any() and np.isfinite(t).all()
+    np.testing.assert_allclose(t[whole], u[whole], atol=2e-2 * np.abs(u[whole]).max())
+    a, tau = ours.cir(num_time_steps=3)
+    b, other = solved.cir(num_time_steps=3, out_type="numpy")
+    assert a.shape == b.shape and tau.shape == other.shape
+    normal = ours.cfr(f, normalize=True)
+    np.testing.assert_allclose((np.abs(normal) ** 2).mean(axis=(1, 3, 4, 5)), 1.0)
+
+
+def test_link_level_functions_take_them():
+    """Sionna PHY's ``cir_to_ofdm_channel`` on our impulse response."""
+    channel = pytest.importorskip(
+        "sionna.phy.channel", reason="Sionna PHY is a package of its own", exc_type=ImportError
+    )
+    s = Paths.stack([random_paths(5), random_paths(8, seed=1)]).to_sionna(
+        PlanarArray(2, 2), PlanarArray(1, 2)
+    )
+    f = channel.subcarrier_frequencies(32, 1e7)
+    h = channel.cir_to_ofdm_channel(f, *(x[None] for x in s.cir(out_type="torch")))
+    ours = s.cfr(np.asarray(f))
+    np.testing.assert_allclose(h[0].numpy(), ours, atol=1e-4 * np.abs(ours).max())
+
+
+def test_shapes_of_paths_with_and_without_diffuse_power():
+    p = Paths.stack(
+        [random_paths(3), Paths.concatenate([random_paths(2), random_paths(2, seed=3, kind="diffuse")])]
+    )
+    with pytest.raises(ValueError, match="diffuse"):
+        p.to_sionna()
+    s = p.to_sionna(PlanarArray(2, 2), PlanarArray(1, 3), diffuse="power")
+    assert s.a.shape == (2, 3, 1, 4, 4) and s.tau.shape == (2, 1, 4) and s.interactions.shape == (1, 2, 1, 4)
+    assert s.valid[1, 0].tolist() == [True, True, False, False] and (s.tau[1, 0, 2:] == -1).all()
+    with pytest.raises(ValueError, match="out_type"):
+        s.cir(out_type="jax")

@@ -1,0 +1,300 @@
+"""The digital twin: exact where a material can say what the field learned, errors stated where it cannot."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import ROOT
+from sionna_room import sionna_or_skip
+from twin_fields import BLOCKED, LOBES, MATERIALS, SEES, SHAPE, SIGMA, TX, F, known_field, room
+
+import warprrf as wr
+from warprrf import cli
+from warprrf.rf.em.fresnel import lobe, slab_reflection
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.interop import twin as twins
+from warprrf.rf.spectra.spectrum import to_db
+
+
+@pytest.fixture(scope="module")
+def field():
+    return known_field()
+
+
+@pytest.fixture(scope="module")
+def twin(field, tmp_path_factory):
+    return wr.write_twin(field, tmp_path_factory.mktemp("twin") / "twin")
+
+
+def spectra(twin, receivers, **options):
+    return wr.simulate(
+        wr.Scene.load(twin.xml), transmitter=TX, receivers=receivers, frequency_hz=F, shape=SHAPE,
+        beam_sigma_rad=SIGMA, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("receiver", [SEES, BLOCKED])
+def test_the_twin_answers_as_the_room_that_the_field_knows(twin, field, receiver):
+    ours = spectra(twin, [receiver]).path_gain[0]
+    engine = ExactEngine(room(), transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
+    truth = engine.receive(receiver).path_gain
+    # The projection errs by 0.02 dB, as losses bend the curve; the mesh file is float32.
+    np.testing.assert_allclose(ours, truth, rtol=0.01, atol=1e-4 * truth.max())
+    # The field itself casts fewer rays and softens blocking: the twin is as near to it as the room is.
+    known = to_db(field.spectrum(receiver).path_gain, field.floor)
+    near, nearest = (np.sqrt(np.mean((to_db(p, field.floor) - known) ** 2)) for p in (ours, truth))
+    assert nearest < 1.0
+    assert near < nearest + 0.05
+
+
+def test_materials_are_the_fields_own(twin):
+    assert [group.name for group in twin.groups] == [
+        "walls",
+        "block/top <1>",
+    ]  # by area; no face, no material
+    for group, given, weight in zip(twin.groups, MATERIALS, (0.25, 0.64), strict=False):
+        assert group.permittivity.real == pytest.approx(given.relative_permittivity, rel=2e-3)
+        assert group.scattering**2 == pytest.approx(weight, rel=2e-3)
+        assert max(group.scattering_error_db, group.mirror_error_db) < 0.03
+        assert group.lobe_error_db < 1e-6
+    assert [group.alpha_r for group in twin.groups] == [4, 0]
+    area = room().mesh.areas.sum()
+    assert sum(group.area_m2 for group in twin.groups) == pytest.approx(area, rel=1e-6)
+    assert sorted(path.name for path in (twin.xml.parent / "meshes").iterdir()) == [
+        "block_top__1_.ply",
+        "walls.ply",
+    ]
+    with pytest.raises(ValueError, match="140 GHz"):  # fitted at one frequency, known near it alone
+        twin.groups[0].material.permittivity(140e9)
+
+
+def test_sionna_opens_the_scene_as_it_is(twin):
+    sionna_or_skip()
+    import sionna.rt as rt
+
+    loaded = rt.load_scene(str(twin.xml), merge_shapes=False)
+    assert set(loaded.objects) == {"surface_walls", "surface_block_top__1_"}
+    for group in twin.groups:
+        radio = loaded.radio_materials[group.material.name]
+        assert radio.relative_permittivity.numpy()[0] == pytest.approx(group.permittivity.real, rel=1e-6)
+        assert radio.conductivity.numpy()[0] == pytest.approx(group.material.conductivity(F), rel=1e-6)
+        assert radio.scattering_coefficient.numpy()[0] == pytest.approx(group.scattering, rel=1e-6)
+        assert isinstance(radio.scattering_pattern, rt.LambertianPattern)
+    assert len(rt.load_scene(str(twin.xml)).objects) == 2
+
+
+def test_our_loader_sets_the_scattering_patterns_too(twin):
+    sionna_or_skip()
+    import sionna.rt as rt
+
+    loaded = wr.load_sionna_scene(twin.xml, frequency_hz=F)
+    assert isinstance(loaded, rt.Scene)
+    assert loaded.frequency.numpy()[0] == pytest.approx(F)
+    walls, block = (loaded.objects[f"surface_{name}"].radio_material for name in ("walls", "block_top__1_"))
+    assert isinstance(walls.scattering_pattern, rt.DirectivePattern)
+    assert walls.scattering_pattern.alpha_r == 4
+    assert isinstance(block.scattering_pattern, rt.LambertianPattern)
+    assert walls.scattering_coefficient.numpy()[0] == pytest.approx(0.5, rel=2e-3)
+    with pytest.raises(ValueError, match="140 GHz"):
+        wr.load_sionna_scene(twin.xml, frequency_hz=140e9)
+
+
+def test_our_loader_opens_a_scene_of_itu_materials_with_our_table():
+    sionna_or_skip()
+    import sionna.rt as rt
+
+    lobby = ROOT / "data" / "lobby" / "scene.xml"
+    loaded, ours = wr.load_sionna_scene(str(lobby), frequency_hz=F), wr.Scene.load(lobby)
+    assert len(loaded.objects) == len(ours.object_names)
+    metal = loaded.objects["elevator"].radio_material
+    assert metal.conductivity.numpy()[0] == pytest.approx(1e7)
+    assert isinstance(metal.scattering_pattern, rt.DirectivePattern)
+    assert metal.scattering_pattern.alpha_r == 10
+    assert len(loaded.radio_materials) == len(ours.materials)
+
+
+def test_sionna_scatters_and_mirrors_as_the_field(twin, field):
+    sionna_or_skip()
+    found = spectra(twin, [SEES], engine="sionna", depth=1, samples=400_000).path_gain[0]
+    ours = field.spectrum(SEES).path_gain
+    assert found.sum() == pytest.approx(ours.sum(), rel=0.01)
+    gap = to_db(found, 1e-12) - to_db(ours, 1e-12)  # what sampling leaves dark lies below
+    assert np.sqrt(np.mean(gap**2)) < 1.0
+
+
+# ------------------------------------------------------------------------------------------------ projection
+
+
+@pytest.mark.parametrize("exponent", [0, 1, 5, 12, 30, 75])
+def test_one_lobe_stays_as_it_is(exponent):
+    found, error = twins.project_lobes((0, exponent), np.array([0.0, 0.3]))
+    assert found == exponent
+    assert error < 1e-9
+
+
+def test_the_error_of_a_mix_is_that_of_random_directions():
+    exponents, weight = (0, 12), np.array([0.3, 0.5])
+    best, error = twins.project_lobes(exponents, weight)
+    rng = np.random.default_rng(0)
+    ci, cs, turn = rng.random(200_000), np.sqrt(rng.random(200_000)), 2 * np.pi * rng.random(200_000)
+    psi = ci * cs + np.sqrt((1 - ci**2) * (1 - cs**2)) * np.cos(turn)
+    mix = sum(w * lobe(n, ci, cs, psi) for n, w in zip(exponents, weight, strict=True)) / weight.sum()
+
+    def miss(n):
+        lost = twins.LOST_IN_NOISE
+        return np.sqrt(np.mean((10 * np.log10((lobe(n, ci, cs, psi) + lost) / (mix + lost))) ** 2))
+
+    assert error == pytest.approx(miss(best), rel=0.01)
+    assert error > 1.0
+    assert all(miss(best) <= miss(n) for n in range(61))
+
+
+@pytest.mark.parametrize(("permittivity", "scattered"), [(1.2, 0.5), (3.0, 0.02), (6.0, 0.98), (80.0, 0.3)])
+def test_shares_that_sum_to_one_are_kept(permittivity, scattered):
+    found = twins.project_reflection(np.log(permittivity - 1), scattered, 1 - scattered)
+    assert found.relative_permittivity - 1 == pytest.approx(permittivity - 1, rel=0.01)
+    assert found.scattering**2 == pytest.approx(scattered, rel=0.01)
+    assert max(found.scattering_error_db, found.mirror_error_db) < 0.06
+
+
+def test_where_shares_do_not_sum_to_one_the_mirror_gives_way():
+    lost = twins.project_reflection(np.log(4.0), 0.04, 0.001)
+    assert lost.scattering_error_db < 1.0
+    assert lost.mirror_error_db > 20.0
+    # The stated error, by other means: S^2 |Gamma|^2 against W F over the cosine, weighted by it.
+    c = (np.arange(4000) + 0.5) / 4000
+    curve = [
+        np.mean([np.abs(r) ** 2 for r in slab_reflection(c, eps, np.inf, 1.0)], axis=0)
+        for eps in (lost.relative_permittivity * (1 - 1j * twins.LOSS_TANGENT), 5.0)
+    ]
+    gap = 10 * np.log10(lost.scattering**2 * curve[0] / (0.04 * curve[1]))
+    assert lost.scattering_error_db == pytest.approx(np.sqrt(np.average(gap**2, weights=c)), abs=0.02)
+
+
+def test_more_than_metal_reflects_is_stated_as_error():
+    found = twins.project_reflection(np.log(1e9), 1.0, 2.0)  # the family ends at 201: 0.75 of the power
+    assert found.relative_permittivity > 1e5
+    assert found.scattering_error_db + found.mirror_error_db > 1.0
+    assert 0 <= found.scattering <= 1
+
+
+def test_all_scattered_and_all_mirrored():
+    assert twins.project_reflection(np.log(2.0), 0.7, 0.0).scattering == 1.0
+    assert twins.project_reflection(np.log(2.0), 0.0, 0.7).scattering < 1e-6
+
+
+@pytest.mark.parametrize("permittivity", [1.05, 1.5, 4.0, 30.0, 1e5])
+def test_the_slab_reflects_like_a_half_space_in_single_precision_too(permittivity):
+    eta, cosine = permittivity * (1 - 1j * twins.LOSS_TANGENT), np.linspace(0.02, 1.0, 500)
+    front = slab_reflection(cosine, eta, np.inf, 1.0)
+    slab = slab_reflection(cosine, eta, twins.THICKNESS_WAVELENGTHS, 1.0)
+    for a, b in zip(slab, front, strict=True):
+        assert np.abs(np.abs(a) - np.abs(b)).max() < 1e-6
+    sionna_or_skip()
+    import mitsuba as mi
+    from sionna.rt.utils import itu_coefficients_single_layer_slab
+
+    theirs = itu_coefficients_single_layer_slab(
+        mi.Float(cosine),
+        mi.Complex2f(eta.real, eta.imag),
+        mi.Float(twins.THICKNESS_WAVELENGTHS),
+        mi.Float(1.0),
+    )
+    for a, b in zip(theirs[:2], front, strict=True):
+        assert np.abs(np.hypot(a.real.numpy(), a.imag.numpy()) - np.abs(b)).max() < 1e-3
+
+
+def test_what_no_material_can_hold_is_said(field, tmp_path):
+    assert wr.write_twin(field, tmp_path / "plain").left_out == ()
+    parameters = replace(
+        field.parameters, log_gain=np.log(10**0.35), log_indirect=np.array([-9.0, -9.0, -9.0])
+    )
+    residual = np.full((2, field.surface.texels), np.log(10**0.1))
+    rich = replace(
+        field,
+        parameters=parameters,
+        residual=residual,
+        terms=Terms(lobes=LOBES, residual=True, indirect=True),
+    )
+    found = wr.write_twin(rich, tmp_path / "rich")
+    gain, elements, indirect = found.left_out
+    assert "3.50 dB" in gain
+    assert "1.00 dB" in elements
+    assert "indirect" in indirect
+    about = json.loads((tmp_path / "rich" / "materials.json").read_text())["about"]
+    assert gain in about
+
+
+# ------------------------------------------------------------------------------------------------ files
+
+
+def test_an_earlier_twin_is_replaced_and_nothing_else(field, tmp_path):
+    folder = tmp_path / "twin"
+    folder.mkdir()
+    wr.write_twin(field, folder)
+    darker = replace(field.parameters, log_excess=field.parameters.log_excess - 1.0)
+    wr.write_twin(replace(field, parameters=darker), folder)
+    again = wr.Scene.load(folder / "scene.xml")
+    assert again.materials[0].permittivity(F).real == pytest.approx(1 + 2 / np.e, rel=2e-3)
+    assert [path.name for path in tmp_path.iterdir()] == ["twin"]
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"folder.*notes\.txt"):
+        wr.write_twin(field, folder)
+    (folder / "notes.txt").unlink()
+    (folder / "materials.json").write_text("{")
+    with pytest.raises(ValueError, match="no earlier twin"):
+        wr.write_twin(field, folder)
+    with pytest.raises(ValueError, match=r"file .*materials\.json"):
+        wr.write_twin(field, folder / "materials.json")
+
+
+def test_a_failed_write_leaves_the_earlier_twin(field, tmp_path, monkeypatch):
+    folder = tmp_path / "twin"
+    wr.write_twin(field, folder)
+    before = (folder / "scene.xml").read_bytes()
+
+    def full(*_args, **_options):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(twins, "write_mesh", full)
+    with pytest.raises(OSError, match="disk full"):
+        wr.write_twin(field, folder)
+    assert (folder / "scene.xml").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["twin"]
+    monkeypatch.undo()
+    rename = Path.rename
+
+    def stuck(self, target):
+        if Path(target) == folder and not self.name.endswith(".earlier"):
+            raise OSError("stale handle")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", stuck)
+    with pytest.raises(OSError, match="stale handle"):
+        wr.write_twin(field, folder)
+    assert (folder / "scene.xml").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["twin"]
+
+
+def test_fields_without_materials_are_refused(field, tmp_path):
+    with pytest.raises(TypeError, match="field.*bistatic"):
+        wr.write_twin(object(), tmp_path / "twin")
+    with pytest.raises(ValueError, match="line of sight alone"):
+        wr.write_twin(replace(field, terms=Terms(lobes=LOBES, diffuse=False, mirror_order=0)), tmp_path / "x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_command_writes_a_saved_fields_twin(field, tmp_path, capsys):
+    field.save(tmp_path / "field.safetensors")
+    assert cli.main(["twin", str(tmp_path / "field.safetensors"), "-o", str(tmp_path / "twin")]) == 0
+    said = capsys.readouterr().out
+    assert "walls" in said
+    assert "2 materials" in said
+    assert len(wr.Scene.load(tmp_path / "twin" / "scene.xml").materials) == 2
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    assert cli.main(["twin", str(tmp_path / "field.safetensors"), "-o", str(tmp_path / "other")]) == 2
+    assert "notes.txt" in capsys.readouterr().err

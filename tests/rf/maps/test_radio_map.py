@@ -1,0 +1,283 @@
+"""Radio maps and links without spectra: closed forms, the field's own spectra, walls and air, files, bad input."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.maps.links import BeamSearch, directivity, links_of
+from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, in_the_air
+from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles
+
+F = 300e9
+WAVELENGTH = SPEED_OF_LIGHT / F
+SHAPE = (24, 48)
+SIGMA = np.radians(5.0)
+TX = np.array([0.8, 0.9, 2.2])
+MATERIALS = [
+    SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4),
+    SlabMaterial("box", 6.0, 0.5, np.inf, 0.8),
+]
+EVERYTHING = Terms(mirror_order=2, mirror_scatter=True, scatter_mirror=True, diffuse_order=2, indirect=True)
+PLACES = np.array([[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [4.4, 1.3, 1.9], [3.6, 3.3, 2.1], [2.6, 3.5, 1.4]])
+
+
+@pytest.fixture(scope="module")
+def scene() -> RadioScene:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+    )
+    return RadioScene(mesh, part, MATERIALS)
+
+
+def prior(scene: object, terms: Terms) -> BistaticField:
+    known = SimpleNamespace(
+        transmitter=TX, frequency_hz=F, path_gain=np.zeros((1, *SHAPE)), floor=1e-16, range_db=(-150.0, -90.0),
+        beam_sigma_rad=SIGMA,
+    )  # fmt: skip
+    return BistaticField.prior(scene, known, terms=terms)
+
+
+@pytest.fixture(scope="module")
+def whole(scene: RadioScene) -> BistaticField:
+    return prior(scene, EVERYTHING)
+
+
+@pytest.fixture(scope="module")
+def found(whole: BistaticField) -> RadioMap:
+    return whole.radio_map(1.2, 0.5, beam_sigma_rad=SIGMA)
+
+
+def db(ratio: np.ndarray) -> np.ndarray:
+    return np.abs(10.0 * np.log10(ratio))
+
+
+def test_an_empty_room_of_line_of_sight_alone_is_friis() -> None:
+    room = Mesh(*box_mesh([0, 0, 0], [5, 4, 3], inward=True))
+    m = prior(room, Terms(diffuse=False, mirror_order=0)).radio_map(1.5, 0.4, transmit_power_dbm=10.0)
+    length = np.linalg.norm(m.positions - TX, axis=-1)
+    friis = (WAVELENGTH / (4.0 * np.pi * length)) ** 2
+    assert m.free.sum() == 12 * 10  # the thirteenth column's centre is at the wall
+    assert db(m.total_path_gain[m.free] / friis[m.free]).max() < 1e-6
+    np.testing.assert_array_equal(m.best_path_gain, m.total_path_gain)
+    assert np.nanmax(m.delay_spread_s) < 1e-15
+    # a beam of kappa has directivity 2 kappa, where kappa is large
+    snr = 10.0 + 10.0 * np.log10(friis * 2.0 / m.beam_sigma_rad**2) - m.noise_power_dbm
+    assert np.abs(m.best_beam_snr_db - snr)[m.free].max() < 1e-6
+    assert m.noise_power_dbm == pytest.approx(-173.975 + 10.0 * np.log10(2.16e9) + 10.0, abs=1e-3)
+
+
+def test_directivity_has_mean_one_over_the_sphere() -> None:
+    shape = (400, 800)
+    cosine = pixel_directions(shape) @ np.array([0.36, 0.48, 0.8])
+    for sigma in (0.05, 0.3, 2.0):
+        mean = (directivity(sigma, cosine) * pixel_solid_angles(shape)[:, None]).sum() / (4.0 * np.pi)
+        assert mean == pytest.approx(1.0, rel=2e-3)
+
+
+def test_two_paths_within_a_beam_add_up_and_apart_do_not() -> None:
+    search = BeamSearch((20, 40), np.radians(5.0))
+    a, b = np.array([1.0, 0.0, 0.0]), np.array([np.cos(0.02), np.sin(0.02), 0.0])
+    dark = np.zeros((1, 20, 40))
+    peak = directivity(np.radians(5.0))
+    both = search(dark, np.zeros(2, int), np.stack([a, b]), np.array([1.0, 1.0]))[0]
+    assert both == pytest.approx(peak * (1.0 + np.exp(-0.5 * (0.02 / np.radians(5.0)) ** 2)), rel=1e-3)
+    apart = search(dark, np.zeros(2, int), np.stack([a, -a]), np.array([1.0, 0.7]))[0]
+    assert apart == pytest.approx(peak, rel=1e-9)
+
+
+def test_even_light_gives_any_beam_the_isotropic_gain() -> None:
+    even = np.broadcast_to(pixel_solid_angles((20, 40))[:, None] / (4.0 * np.pi), (1, 20, 40)).copy()
+    none = np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
+    assert BeamSearch((20, 40), 0.1)(even, *none)[0] == pytest.approx(1.0, rel=0.02)
+
+
+def test_map_is_what_the_spectra_sum_to(whole: BistaticField, found: RadioMap) -> None:
+    rows, columns = np.nonzero(found.free)
+    search = BeamSearch(SHAPE, SIGMA)
+    for k in range(0, len(rows), 11):
+        cell = rows[k], columns[k]
+        place = found.positions[cell]
+        paths = whole.paths(place)
+        truth = links_of([paths], search)
+        total = float(whole.spectrum(place).total_path_gain)
+        # 3200 rays a cell instead of 18,432: a mean over rays errs by a few per cent of what is diffuse
+        assert db(found.total_path_gain[cell] / total) < 0.15
+        assert db(found.best_path_gain[cell] / truth.best_path_gain[0]) < 0.5
+        assert db(found.best_beam_gain[cell] / truth.best_beam_gain[0]) < 0.5
+        # a diffuse path of `paths` stands for a pixel of 7.5 degrees, with one delay
+        assert found.delay_spread_s[cell] == pytest.approx(truth.delay_spread_s[0], abs=0.2e-9)
+
+
+def test_links_do_not_depend_on_their_company(whole: BistaticField) -> None:
+    together = whole.links(PLACES)
+    for k, place in enumerate(PLACES):
+        alone = whole.links(place[None])
+        for name, value in vars(together).items():
+            assert value[k] == pytest.approx(getattr(alone, name)[0], rel=1e-5), name
+
+
+def test_more_rays_come_closer(whole: BistaticField) -> None:
+    truth = np.array([whole.spectrum(p).total_path_gain for p in PLACES])
+    error = [
+        np.sqrt(np.mean(db(whole.links(PLACES, shape=shape).total_path_gain / truth) ** 2))
+        for shape in ((4, 8), (40, 80))
+    ]
+    assert error[1] < 0.5 * error[0]
+    assert error[1] < 0.05
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_fewer_mirrors_are_those_of_a_field_with_fewer(whole: BistaticField, order: int) -> None:
+    fewer = replace(whole, terms=replace(whole.terms, mirror_order=order))
+    expected, found = fewer.links(PLACES), whole.links(PLACES, mirror_order=order)
+    for name, value in vars(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
+    lost = whole.links(PLACES).total_path_gain - found.total_path_gain
+    assert (lost > 0).any() if order < 2 else (lost == 0).all()
+    # more than the field has stay what it has
+    np.testing.assert_array_equal(
+        fewer.links(PLACES, mirror_order=3).total_path_gain, expected.total_path_gain
+    )
+
+
+def test_another_transmitter_moves_the_map(whole: BistaticField) -> None:
+    other = np.array([4.3, 3.2, 2.0])
+    m = whole.radio_map(1.2, 0.5, transmitter=other)
+    peak = m.positions.reshape(-1, 3)[np.nanargmax(m.total_path_gain)]
+    assert np.abs(peak[:2] - other[:2]).max() <= 0.5
+    np.testing.assert_array_equal(m.transmitter, other)
+
+
+def test_a_harmonic_field_has_maps_too(scene: RadioScene) -> None:
+    ds = exact_spectra(
+        scene, PLACES, transmitter=TX, frequency_hz=F, shape=(12, 24), sigma=np.radians(10.0), sub_pixels=2
+    )
+    field = RadioField.fit(scene, ds, model="rf3dgs+", iterations=3)
+    with pytest.raises(
+        ValueError, match=r"mirror_order: got 1, but a field of model 'rf3dgs\+' has no mirrors"
+    ):
+        field.links(PLACES, mirror_order=1)
+    m = field.radio_map(1.2, 1.5)
+    assert 3 <= m.free.sum() <= 12
+    for row, column in np.argwhere(m.free):
+        sum_ = field.spectrum(m.positions[row, column]).total_path_gain
+        assert m.total_path_gain[row, column] == pytest.approx(sum_, rel=1e-5)
+
+
+def test_solids_are_no_cells_even_of_a_torn_mesh(scene: RadioScene) -> None:
+    rng = np.random.default_rng(0)
+    surface = Surface.of(scene).mesh  # faces of a tenth of a metre
+    torn = Mesh(surface.vertices, surface.faces[rng.random(len(surface.faces)) > 0.1])
+    assert not torn.is_closed
+    points = rng.uniform([-0.5, -0.5, 0.05], [5.5, 4.5, 2.95], (2000, 3))
+    room = ((points > 0) & (points < [5, 4, 3])).all(axis=1)
+    box = ((points > [2.2, 1.6, 0]) & (points < [3.0, 2.4, 2.4])).all(axis=1)
+    clear = scene.mesh.distance(points) > 0.1  # nearer to a wall one missing face fills half the view
+    for mesh in (scene.mesh, torn, Mesh(torn.vertices, torn.faces[:, ::-1])):
+        np.testing.assert_array_equal(in_the_air(mesh, points, TX)[clear], (room & ~box)[clear])
+
+
+def test_map_of_a_furnished_room_has_a_hole(found: RadioMap) -> None:
+    inside = (np.abs(found.x - 2.6) < 0.4)[None, :] & (np.abs(found.y - 2.0) < 0.4)[:, None]
+    for name in ("total_path_gain", "best_path_gain", "delay_spread_s", "best_beam_gain"):
+        np.testing.assert_array_equal(np.isnan(getattr(found, name)), inside)
+    assert (found.total_path_gain[found.free] >= 0.999999 * found.best_path_gain[found.free]).all()
+
+
+@pytest.mark.on_cuda_too
+def test_all_chains_of_mirrors_are_tried(scene: RadioScene) -> None:
+    tree = MirrorTree(Surface.of(scene), TX, 3)
+    for order in (1, 2, 3):
+        rows, chains, points = tree.candidates(PLACES, order)
+        found = {(int(r), int(c)): p for r, c, p in zip(rows, chains, points, strict=True)}
+        expected = {}
+        for r, place in enumerate(PLACES):
+            for c in range(len(tree.levels[order - 1].depth)):
+                here, link, way = place, c, []
+                for level in reversed(tree.levels[:order]):
+                    p = level.patch[link, -1]
+                    side = tree.normal[p] @ here - tree.offset[p]
+                    here = here + side / (side + level.depth[link]) * (level.image[link] - here)
+                    if side <= 1e-9 or (here < tree.low[p] - 0.1).any() or (here > tree.high[p] + 0.1).any():
+                        break
+                    way.insert(0, here)
+                    link = level.parent[link]
+                else:
+                    expected[r, c] = np.array(way)
+        assert len(expected) > 0
+        assert list(found) == sorted(expected)
+        for pair, way in expected.items():
+            np.testing.assert_allclose(found[pair], way, atol=1e-9)
+        wanted = {"rows": rows[::2], "chains": chains[::2]}
+        np.testing.assert_array_equal(tree.candidates(PLACES, order, **wanted)[2], points[::2])
+
+
+def test_file_round_trip(found: RadioMap, tmp_path: Path) -> None:
+    file = tmp_path / "map.nc"
+    found.save(file)
+    again = RadioMap.load(file)
+    for name, value in vars(found).items():
+        np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
+    assert [p.name for p in tmp_path.iterdir()] == ["map.nc"]
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="corrupt or no radio map"):
+        RadioMap.load(file)
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        RadioMap.load(tmp_path / "none.nc")
+
+
+def test_pictures_show_every_quantity(found: RadioMap, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    found.picture(tmp_path / "map.png")
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    for quantity in QUANTITIES:
+        ax = found.plot(quantity)
+        shown = np.asarray(ax.images[0].get_array().filled(np.nan))
+        np.testing.assert_allclose(shown, found.shown(quantity), equal_nan=True)
+    with pytest.raises(ValueError, match="quantity: got 'snr'"):
+        found.plot("snr")
+
+
+def test_progress_counts_cells(whole: BistaticField) -> None:
+    said: list[tuple[str, int, int]] = []
+    m = whole.radio_map(1.2, 1.0, progress=lambda *step: said.append(step))
+    assert said[0] == ("links", 0, m.free.sum())
+    assert said[-1] == ("links", m.free.sum(), m.free.sum())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"height": 3.5}, "height: got 3.5 m, expected one inside"),
+        ({"height": np.nan}, "height: got nan"),
+        ({"cell": 0.0}, "cell: got 0.0, expected a positive number"),
+        ({"cell": 1e-4}, "makes 2000000000 cells"),
+        ({"bounds": [3, 0, 1, 1]}, "bounds: got"),
+        ({"cell": 0.2, "bounds": [2.3, 1.7, 2.9, 2.3]}, "bounds: no cell of the"),
+        ({"beam_sigma_rad": -1.0}, "beam_sigma_rad: got -1.0"),
+        ({"bandwidth_hz": 0}, "bandwidth_hz: got 0"),
+        ({"transmitter": [1.0, 2.0]}, "transmitter: got shape"),
+        ({"shape": (0, 4)}, "shape: got"),
+        ({"mirror_order": 4}, "mirror_order: got 4, expected 0 to 3"),
+    ],
+)
+def test_bad_input_is_named(whole: BistaticField, change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        whole.radio_map(**({"height": 1.2, "cell": 0.5} | change))
+
+
+def test_links_refuse_places_without_a_channel(whole: BistaticField) -> None:
+    for place, message in (([9.0, 1.0, 1.0], "outside"), (TX, "own position"), ([1.0, 1.0], "got shape")):
+        with pytest.raises(ValueError, match=message):
+            whole.links([place])

@@ -1,0 +1,266 @@
+"""Line of sight and mirror paths against float64 geometry and the Fresnel limits."""
+
+import itertools
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import ROOT
+from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection
+from warprrf.rf.paths.trace import planar_patches, trace_paths
+
+F = 300e9
+WAVELENGTH = SPEED_OF_LIGHT / F
+LOW, HIGH = np.array([-7.0, -6, 0]), np.array([8.0, 6, 4])
+TX = np.array([-5.123, 3.456, 2.789])
+
+
+def room():
+    return Mesh(*box_mesh(LOW, HIGH, inward=True))
+
+
+def receivers(n, seed=0):
+    return np.random.default_rng(seed).uniform(LOW + 0.3, HIGH - 0.3, (n, 3))
+
+
+def box_images(order):
+    """Images of the transmitter in an empty box with exactly ``order`` reflections: each wall sequence that differs."""
+    images = []
+    for n in itertools.product(range(-order, order + 1), repeat=3):
+        if np.abs(n).sum() == order:
+            even = np.array(n) % 2 == 0
+            # |n| reflections in one axis: shift by whole double rooms, flip when odd.
+            size = HIGH - LOW
+            local = np.where(even, TX - LOW, HIGH - TX)
+            images.append(LOW + np.array(n) * size + local)
+    return np.array(images)
+
+
+def test_friis():
+    p = trace_paths(room(), transmitter=TX, receivers=[1.0, -2, 1.5], frequency_hz=F, mirror_order=0)
+    d = np.linalg.norm(TX - [1.0, -2, 1.5])
+    assert p.kind.tolist() == ["los"]
+    np.testing.assert_allclose(p.power, (WAVELENGTH / (4 * np.pi * d)) ** 2, rtol=1e-13)
+    np.testing.assert_allclose(
+        np.angle(p.gain), np.angle(np.exp(-2j * np.pi * F * d / SPEED_OF_LIGHT)), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_box_paths_are_the_image_lattice_to_1e_9(order):
+    points = receivers(20)
+    paths = trace_paths(room(), transmitter=TX, receivers=points, frequency_hz=F, mirror_order=order)
+    for k, point in enumerate(points):
+        expected = [np.linalg.norm(box_images(m) - point, axis=1) for m in range(order + 1)]
+        found = np.sort(paths.length_m[k][paths.valid[k]])
+        np.testing.assert_allclose(found, np.sort(np.concatenate(expected)), rtol=1e-12)
+
+
+def test_angles_and_vertices_describe_the_same_polyline():
+    paths = trace_paths(room(), transmitter=TX, receivers=receivers(5), frequency_hz=F, mirror_order=2)
+    for r, point in enumerate(receivers(5)):
+        for k in np.flatnonzero(paths.valid[r]):
+            v = paths.vertices[r, k]
+            v = v[np.isfinite(v[:, 0])]
+            chain = np.concatenate([[TX], v, [point]])
+            steps = np.diff(chain, axis=0)
+            lengths = np.linalg.norm(steps, axis=1)
+            assert lengths.sum() == pytest.approx(paths.length_m[r, k], rel=1e-13)
+            np.testing.assert_allclose(paths.departure[r, k], steps[0] / lengths[0], atol=1e-12)
+            np.testing.assert_allclose(paths.arrival[r, k], -steps[-1] / lengths[-1], atol=1e-12)
+            for a, b in itertools.pairwise(steps / lengths[:, None]):
+                assert (
+                    np.abs(np.abs(a) - np.abs(b)) < 1e-9
+                ).all()  # an axis-aligned mirror only flips a sign
+
+
+def test_swapping_the_ends_keeps_gain_and_delay():
+    blocker = box_mesh([-1, -1, 0], [0.5, 1.5, 2.2])
+    mesh, part = joined(box_mesh(LOW, HIGH, inward=True), blocker)
+    scene = RadioScene(mesh, part, [SlabMaterial(scattering=0.3), SlabMaterial(relative_permittivity=2.0)])
+    for point in receivers(8, 3):
+        if mesh.distance(point[None])[0] < 0.01 or np.all((point > [-1, -1, 0]) & (point < [0.5, 1.5, 2.2])):
+            continue
+        there = trace_paths(scene, transmitter=TX, receivers=point, frequency_hz=F, mirror_order=2)
+        back = trace_paths(scene, transmitter=point, receivers=TX, frequency_hz=F, mirror_order=2)
+        assert len(there.tau) == len(back.tau)
+        a, b = np.argsort(there.tau), np.argsort(back.tau)
+        np.testing.assert_allclose(there.tau[a], back.tau[b], rtol=1e-12)
+        np.testing.assert_allclose(there.power[a], back.power[b], rtol=1e-9)
+        np.testing.assert_allclose(there.theta_r[a], back.theta_t[b], atol=1e-9)
+
+
+@pytest.mark.on_cuda_too
+def test_a_screen_takes_away_what_it_hides():
+    floor, screen = (
+        square(50.0),
+        (np.array([[0, -3, 0.0], [0, 3, 0], [0, 3, 2], [0, -3, 2]]), np.array([[0, 1, 2], [0, 2, 3]])),
+    )
+    mesh, _ = joined(floor, screen)
+    hidden = trace_paths(mesh, transmitter=[-2, 0, 1], receivers=[2, 0, 1.2], frequency_hz=F)
+    assert len(hidden.gain) == 0
+    over = trace_paths(mesh, transmitter=[-2, 0, 3], receivers=[2, 0, 3.4], frequency_hz=F)
+    assert over.kind.tolist() == ["los"]
+    beside = trace_paths(mesh, transmitter=[-2, 5, 1], receivers=[2, 5, 1.2], frequency_hz=F)
+    assert beside.kind.tolist() == ["los", "mirror"]
+
+
+def test_a_path_over_the_seam_of_two_faces_counts_once():
+    mesh = Mesh(*square(1.0))
+    p = trace_paths(mesh, transmitter=[-0.5, -0.5, 1], receivers=[0.5, 0.5, 1], frequency_hz=F)
+    assert p.kind.tolist() == ["los", "mirror"]
+
+
+def test_a_bare_mesh_reflects_perfectly_and_metal_does_almost():
+    mesh = Mesh(*square(10.0))
+    ends = dict(transmitter=[-1, 0, 2.0], receivers=[2, 1, 1.0], frequency_hz=F)
+    bare = trace_paths(mesh, **ends)
+    d = np.linalg.norm([3, 1, 3])
+    np.testing.assert_allclose(
+        bare.gain[1], WAVELENGTH / (4 * np.pi * d) * np.exp(-2j * np.pi * F * bare.tau[1]), rtol=1e-9
+    )
+    metal = trace_paths(RadioScene(mesh, np.zeros(2, int), [METAL]), **ends)
+    np.testing.assert_allclose(metal.gain[1], -bare.gain[1], rtol=5e-3)
+    rough = trace_paths(
+        RadioScene(mesh, np.zeros(2, int), [SlabMaterial(conductivity=1e7, scattering=0.6)]), **ends
+    )
+    np.testing.assert_allclose(rough.power[1] / metal.power[1], 1 - 0.36, rtol=1e-3)
+
+
+def test_two_bounces_in_one_plane_of_incidence_multiply_te_and_tm():
+    # Floor and ceiling, ends above one another in x: both reflections share the plane of incidence.
+    mesh, part = joined(square(30.0), square(30.0, 3.0))
+    glass = SlabMaterial(relative_permittivity=6.0, conductivity=1.0)
+    scene = RadioScene(mesh, part, [glass, glass])
+    p = trace_paths(scene, transmitter=[-2, 0, 1.0], receivers=[2, 0, 2.0], frequency_hz=F, mirror_order=2)
+    for k in np.flatnonzero(np.isfinite(p.vertices[:, 1, 0])):
+        cos = np.abs(p.arrival[k, 2])
+        te, tm = slab_reflection(cos, glass.permittivity(F), glass.thickness_m, WAVELENGTH)
+        power = 0.5 * (np.abs(te) ** 4 + np.abs(tm) ** 4) * (WAVELENGTH / (4 * np.pi * p.length_m[k])) ** 2
+        assert p.power[k] == pytest.approx(power, rel=1e-9)
+
+
+def test_slab_limits():
+    te, tm = slab_reflection(np.linspace(0.1, 1, 9), 1 - 1e9j, 0.1, WAVELENGTH)
+    np.testing.assert_allclose(te, -1, atol=1e-3)
+    np.testing.assert_allclose(tm, 1, atol=1e-3)
+    brewster = np.cos(np.arctan(np.sqrt(4.0)))
+    assert abs(slab_reflection(brewster, 4.0 - 0j, 0.1, WAVELENGTH)[1]) < 1e-12
+    te, tm = slab_reflection(1e-9, 4.0 - 0.1j, 0.1, WAVELENGTH)
+    np.testing.assert_allclose(np.abs([te, tm]), 1.0, atol=1e-7)
+    half_wave = WAVELENGTH / 2 / 2.0  # a lossless half-wave slab of index 2 is invisible
+    assert abs(slab_reflection(1.0, 4.0 - 0j, half_wave, WAVELENGTH)[0]) < 1e-12
+    # No thickness: nothing there. Passive everywhere.
+    assert abs(slab_reflection(0.5, 4.0 - 0.1j, 0.0, WAVELENGTH)[0]) < 1e-12
+
+
+@pytest.mark.parametrize("alpha_r", [0, 1, 2, 5, 10, 30])
+@pytest.mark.parametrize("cos_incidence", [0.02, 0.5, 1.0])
+def test_lobes_integrate_to_one_over_the_hemisphere(alpha_r, cos_incidence):
+    x, weight = np.polynomial.legendre.leggauss(200)
+    cos, weight = 0.5 * (x + 1), 0.5 * weight
+    phi = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    sin_i = np.sqrt(1 - cos_incidence**2)
+    to_mirror = np.sqrt(1 - cos**2)[:, None] * sin_i * np.cos(phi) + cos[:, None] * cos_incidence
+    value = lobe(alpha_r, cos_incidence, cos[:, None] + 0 * phi, to_mirror)
+    assert (value.mean(axis=1) * 2 * np.pi) @ weight == pytest.approx(1.0, rel=1e-6)
+
+
+def test_patches_of_a_box_are_its_six_sides():
+    patches = planar_patches(room())
+    assert len(patches) == 6
+    np.testing.assert_allclose(np.sort(patches.area), np.sort([180, 180, 60, 60, 48, 48]))
+    split = planar_patches(room(), np.arange(12) % 2)
+    assert len(split) == 12
+
+
+def test_padding_is_marked():
+    mesh, _ = joined(square(1.0))
+    p = trace_paths(
+        mesh, transmitter=[0, 0, 1.0], receivers=[[0.2, 0, 1.5], [0, 9, 1.0]], frequency_hz=F, mirror_order=1
+    )
+    assert p.valid.tolist() == [[True, True], [True, False]]
+    assert p.gain[1, 1] == 0 and np.isnan(p.tau[1, 1]) and p.kind[1, 1] == ""
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(ValueError, match="receivers.*NaN"):
+        trace_paths(room(), transmitter=TX, receivers=[np.nan, 0, 0], frequency_hz=F)
+    with pytest.raises(ValueError, match="mirror_order"):
+        trace_paths(room(), transmitter=TX, receivers=[0, 0, 1], frequency_hz=F, mirror_order=3)
+    with pytest.raises(ValueError, match="frequency_hz"):
+        trace_paths(room(), transmitter=TX, receivers=[0, 0, 1], frequency_hz=-1)
+    with pytest.raises(TypeError, match="mesh_or_scene"):
+        trace_paths("room", transmitter=TX, receivers=[0, 0, 1], frequency_hz=F)
+
+
+def external(name):
+    root = os.environ.get("WARPRRF_EXTERNAL", ROOT.parent / "shared" / "external")
+    path = Path(root) / "newrf" / name
+    if not path.exists():
+        pytest.skip(
+            f"no {path}: set WARPRRF_EXTERNAL to the folder that holds newrf/ to run this outside check"
+        )
+    return path
+
+
+def read_stl(path):
+    data = np.fromfile(path, dtype=np.uint8)
+    count = int(data[80:84].view("<u4")[0])
+    records = data[84 : 84 + 50 * count].reshape(count, 50)[:, :48].copy().view("<f4").reshape(count, 4, 3)
+    return Mesh(records[:, 1:].reshape(-1, 3).astype(float), np.arange(3 * count).reshape(-1, 3))
+
+
+def test_paths_in_a_conference_room_agree_with_matlabs_image_method():
+    # NeWRF (LuHaofan/NeWRF, MIT): MATLAB's image method, perfect reflectors, up to two reflections.
+    data = np.load(external("newrf_conference.npz"))
+    mesh = read_stl(external("conferenceroom.stl"))
+    chosen = np.arange(0, len(data["receivers"]), 30)
+    ends = dict(transmitter=data["transmitter"], frequency_hz=float(data["frequency_hz"]))
+    paths = trace_paths(mesh, receivers=data["receivers"][chosen], **ends)
+    matched = theirs_once = 0
+    for k, row in enumerate(chosen):
+        rays = int(data["rays"][row])
+        theirs, gain = data["last_point"][row, :rays], data["gain"][row, :rays]
+        assert (paths.kind[k] == "los").any() == data["line_of_sight"][row]
+        ours = np.flatnonzero(paths.valid[k])
+        last = np.where(paths.kind[k] == "los", 0, 1)
+        point = np.where(last[:, None] == 0, data["transmitter"], np.nan_to_num(paths.vertices[k, :, 0]))
+        for n in ours:
+            gap = np.linalg.norm(theirs - point[n], axis=1)
+            if gap.min() < 1e-4:
+                matched += 1
+                assert gain[gap.argmin()] == pytest.approx(paths.gain[k, n], rel=2e-4)
+        # A ray of theirs reflected once: its gain says that its length is that of transmitter - last point - receiver.
+        once = np.linalg.norm(theirs - data["transmitter"], axis=1) + np.linalg.norm(
+            theirs - data["receivers"][row], axis=1
+        )
+        theirs_once += int(
+            np.isclose(
+                np.abs(gain), SPEED_OF_LIGHT / ends["frequency_hz"] / (4 * np.pi * once), rtol=1e-5
+            ).sum()
+        )
+    assert matched == theirs_once == int(paths.valid.sum())
+
+
+def test_a_scene_of_a_kilometre_keeps_the_phase_at_a_millimetre_wavelength():
+    """Two rays over a plane: lengths sqrt(D^2 + (h1 -+ h2)^2), phases to a thousandth of a radian."""
+    ground = Mesh(*square(1024.0))
+    transmitter = np.array([-500.0, 3.0, 12.3456789])
+    points = np.stack([np.linspace(400, 500, 7), np.full(7, -2.0), np.linspace(1.5, 30, 7)], axis=1)
+    paths = trace_paths(ground, transmitter=transmitter, receivers=points, frequency_hz=F, mirror_order=1)
+    span = np.hypot(points[:, 0] - transmitter[0], points[:, 1] - transmitter[1])
+    for column, height in ((0, transmitter[2] - points[:, 2]), (1, transmitter[2] + points[:, 2])):
+        length = np.sqrt(span.astype(np.longdouble) ** 2 + height.astype(np.longdouble) ** 2)
+        assert paths.valid[:, column].all()
+        assert np.abs(paths.tau[:, column] * SPEED_OF_LIGHT - length).max() < 1e-9 * 1000
+        cycles = length / np.longdouble(WAVELENGTH)
+        phase = -2 * np.pi * (cycles - np.round(cycles))
+        error = paths.gain[:, column] * np.exp(-1j * phase.astype(float))
+        assert np.abs(np.angle(error)).max() < 1e-3
+        expected = WAVELENGTH / (4 * np.pi * length.astype(float))
+        assert np.abs(paths.gain[:, column]) == pytest.approx(expected, rel=1e-9)

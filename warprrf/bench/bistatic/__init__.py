@@ -1,6 +1,0 @@
-"""The bistatic field beside other systems: one resumable command that makes the whole table of its evaluation."""
-
-from warprrf.bench.bistatic.report import summary_text, write
-from warprrf.bench.bistatic.table import run
-
-__all__ = ["run", "summary_text", "write"]

@@ -1,0 +1,377 @@
+"""Structure from motion: camera poses and a sparse point cloud from photo files.
+
+Wraps pycolmap (COLMAP: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT on the image
+files, matching, incremental mapping with one shared pinhole camera whose focal length is estimated. Photos must be
+free of lens distortion. The model comes out in units and axes of its own; :mod:`warprrf.geometry.photos.sparse` brings it to
+metres. Everything runs on the CPU and repeats itself for a given seed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import Progress, require
+from warprrf.files import write_text
+from warprrf.geometry.photos.photo_files import MIN_PHOTOS, check_photos, find_photos, some
+from warprrf.geometry.photos.sparse import SparseModel
+from warprrf.geometry.splats.camera import Camera
+from warprrf.marks import code_mark, log_other_code
+
+CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+
+# Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
+MAX_EXHAUSTIVE_PAIRS = 2000
+COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
+COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
+PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
+EXTRACT_BATCH = 12
+MATCH_BATCH = 400
+
+
+def structure_from_motion(
+    photos: Any,
+    *,
+    workspace: str | os.PathLike[str],
+    max_features: int = 2400,
+    camera_model: str = "SIMPLE_PINHOLE",
+    pairs: str = "auto",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> SparseModel:
+    """Camera poses and sparse points of ``photos``, in the model's own units (see :mod:`~warprrf.geometry.photos.sparse`).
+
+    Finished steps are kept in ``workspace`` and reused as long as photos, options, pycolmap and this code stay the
+    same, so that a stopped run goes on where it was.
+
+    Args:
+        photos: a folder, or a sequence of image files, all of one size and from one undistorted camera.
+        workspace: folder for the feature database and the model; made if it is not there.
+        max_features: SIFT features kept per photo (the largest ones).
+        camera_model: COLMAP camera model, ``"SIMPLE_PINHOLE"`` (one focal length) or ``"PINHOLE"`` (two).
+        pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
+            largest features finds promising, once there are more than 2000 pairs.
+        seed: seed of every random draw.
+        progress: called as ``progress("features" | "comparing" | "matching" | "mapping", done, total)``.
+
+    Raises:
+        ValueError: for photos that are missing, unreadable, of different sizes or too few, an unknown camera model,
+            or when the photos overlap too little to be posed; the message names the files.
+        ImportError: if pycolmap is not installed.
+    """
+    if camera_model not in CAMERA_MODELS:
+        raise ValueError(
+            f"camera_model: got {camera_model!r}, expected one of {CAMERA_MODELS}; photos with lens distortion have "
+            "to be undistorted first (for instance with COLMAP's image_undistorter)"
+        )
+    if pairs not in ("auto", "exhaustive"):
+        raise ValueError(f'pairs: got {pairs!r}, expected "auto" or "exhaustive"')
+    if max_features < 100:
+        raise ValueError(f"max_features: got {max_features}, expected at least 100")
+    colmap = require("pycolmap", extra="photos")
+    named = find_photos(photos)
+    check_photos(named)
+    folder = Path(workspace) / "sfm"
+    options = {"max_features": max_features, "camera_model": camera_model, "pairs": pairs, "seed": seed}
+    _open_workspace(folder, named, options, code_mark(__name__, packages=("pycolmap",)))
+    report = progress or (lambda stage, done, total: None)
+    with _quiet(colmap):
+        colmap.set_random_seed(seed)
+        if not (folder / "model" / "points3D.bin").is_file():
+            _extract(colmap, folder, list(named), max_features, camera_model, report)
+            _match(colmap, folder, list(named), pairs, seed, report)
+            _map(colmap, folder, named, seed, report)
+        model = colmap.Reconstruction(str(folder / "model"))
+        others = json.loads((folder / "model" / "others.json").read_text())
+        return replace(_sparse_model(model, list(named)), other_models=tuple(others))
+
+
+def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
+    """A COLMAP model folder (``cameras``, ``images``, ``points3D``; ``.bin`` or ``.txt``) as a :class:`SparseModel`.
+
+    Lengths are taken as metres.
+
+    Raises:
+        ValueError: if the folder holds no readable model, or a camera is not a pinhole.
+        ImportError: if pycolmap is not installed.
+    """
+    colmap = require("pycolmap", extra="photos")
+    root = Path(folder)
+    if not any(
+        all((root / f"{n}{ext}").is_file() for n in ("cameras", "images")) for ext in (".bin", ".txt")
+    ):
+        raise ValueError(
+            f"colmap: {root} holds no COLMAP model; expected cameras, images and points3D (.bin or .txt)"
+        )
+    with _quiet(colmap):
+        try:
+            model = colmap.Reconstruction(str(root))
+        except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
+            raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
+        return replace(_sparse_model(model, sorted(i.name for i in model.images.values())), metric=True)
+
+
+@contextmanager
+def _quiet(colmap: ModuleType) -> Iterator[None]:
+    """COLMAP logs to stderr; keep only its fatal messages, and put the level back afterwards."""
+    before = colmap.logging.minloglevel
+    colmap.logging.minloglevel = int(colmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        colmap.logging.minloglevel = before
+
+
+def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any], code: str) -> None:
+    """Make ``folder`` hold the work of this code on these photos, with these options: what others left there goes."""
+    state = {
+        "options": options,
+        "photos": {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in named.items()},
+        "code": code,
+    }
+    stamp = folder / "photos.json"
+    if stamp.is_file():
+        before = json.loads(stamp.read_text())
+        if before == state:
+            return
+        if before | {"code": code} == state:
+            log_other_code(folder)
+    if folder.is_dir():
+        for part in ("photos.json", "features.db", "matches.db", "working.db", "pairs.txt"):
+            (folder / part).unlink(missing_ok=True)
+        for part in ("model", "mapping", "images"):
+            shutil.rmtree(folder / part, ignore_errors=True)
+    images = folder / "images"
+    for name, path in named.items():
+        link = images / name
+        link.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            link.symlink_to(path)
+        except OSError:  # a file system without links
+            shutil.copyfile(path, link)
+    write_text(stamp, json.dumps(state))
+
+
+def _fresh_copy(source: Path | None, target: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        Path(f"{target}{suffix}").unlink(missing_ok=True)
+    if source is not None:
+        shutil.copyfile(source, target)
+
+
+def _settle(working: Path, final: Path) -> None:
+    """Move a finished database into place, with nothing left in SQLite's write-ahead log."""
+    with closing(sqlite3.connect(working)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        connection.execute("PRAGMA journal_mode=DELETE")
+    os.replace(working, final)
+
+
+def _extract(
+    colmap: ModuleType, folder: Path, names: list[str], max_features: int, camera_model: str, report: Progress
+) -> None:
+    if (folder / "features.db").is_file():
+        return
+    working, images = folder / "working.db", folder / "images"
+    _fresh_copy(None, working)
+    colmap.Database.open(str(working)).close()
+    reader = colmap.ImageReaderOptions(camera_model=camera_model)
+    # Importing first numbers the images by name; extraction alone numbers them as threads finish.
+    colmap.import_images(working, images, colmap.CameraMode.SINGLE, image_names=names, options=reader)
+    reader.existing_camera_id = 1
+    extraction = colmap.FeatureExtractionOptions(use_gpu=False)
+    extraction.sift.max_num_features = max_features
+    extraction.sift.peak_threshold = PEAK_THRESHOLD
+    for start in range(0, len(names), EXTRACT_BATCH):
+        report("features", start, len(names))
+        colmap.extract_features(
+            working,
+            images,
+            image_names=names[start : start + EXTRACT_BATCH],
+            camera_mode=colmap.CameraMode.SINGLE,
+            reader_options=reader,
+            extraction_options=extraction,
+            device=colmap.Device.cpu,
+        )
+    report("features", len(names), len(names))
+    _settle(working, folder / "features.db")
+
+
+def _match(
+    colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, report: Progress
+) -> None:
+    if (folder / "matches.db").is_file():
+        return
+    working, listing = folder / "working.db", folder / "pairs.txt"
+    _fresh_copy(folder / "features.db", working)
+    with colmap.Database.open(str(working)) as database:
+        counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
+        blank = [n for n in names if counts[n] < 8]
+        if len(names) - len(blank) < MIN_PHOTOS:
+            raise ValueError(
+                f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), "
+                f"too few remain to work with: {some(blank)}"
+            )
+        chosen = list(itertools.combinations(names, 2))
+        if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
+            chosen = _promising_pairs(database, names, report)
+    matching = colmap.FeatureMatchingOptions(use_gpu=False)
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    for start in range(0, len(chosen), MATCH_BATCH):
+        report("matching", start, len(chosen))
+        listing.write_text("".join(f"{a} {b}\n" for a, b in chosen[start : start + MATCH_BATCH]))
+        colmap.match_image_pairs(
+            working,
+            matching_options=matching,
+            pairing_options=colmap.ImportedPairingOptions(match_list_path=listing),
+            verification_options=verification,
+            device=colmap.Device.cpu,
+        )
+    listing.unlink(missing_ok=True)
+    report("matching", len(chosen), len(chosen))
+    _settle(working, folder / "matches.db")
+
+
+def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[tuple[str, str]]:
+    """Pairs worth matching: each photo with those that share the most of its largest features.
+
+    The largest features of two photos are compared by brute force, one matrix product a pair; a mutual nearest
+    neighbour that passes the ratio test is a vote. Consecutive photos are always kept.
+    """
+    ids = {i.name: i.image_id for i in database.read_all_images()}
+    descriptors = []
+    for name in names:
+        d = np.asarray(database.read_descriptors(ids[name]).data, dtype=np.float32)
+        k = database.read_keypoints(ids[name])  # x, y and the 2x2 shape
+        area = np.abs(k[:, 2] * k[:, 5] - k[:, 3] * k[:, 4])
+        d = d[np.argsort(-area, kind="stable")[:COARSE_FEATURES]]
+        descriptors.append(d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-9))
+    votes = np.zeros((len(names), len(names)))
+    fewest = min(len(d) for d in descriptors)
+    if fewest < COARSE_FEATURES:  # pad, so that all photos go through one product; zeros match nothing
+        descriptors = [np.pad(d, ((0, COARSE_FEATURES - len(d)), (0, 0))) for d in descriptors]
+    stack = np.stack(descriptors)
+    for i in range(len(names) - 1):
+        report("comparing", i, len(names))
+        # One product of photo i with all later ones, shape (features of i, photos, features of j).
+        cosine = (stack[i] @ stack[i + 1 :].reshape(-1, stack.shape[2]).T).reshape(
+            COARSE_FEATURES, -1, COARSE_FEATURES
+        )
+        back = cosine.argmax(axis=0)
+        first = cosine.argmax(axis=2)[..., None]
+        top = np.take_along_axis(cosine, first, axis=2)[..., 0]
+        np.put_along_axis(cosine, first, -1.0, axis=2)
+        distinct = (1 - top) < 0.64 * (1 - cosine.max(axis=2))  # Lowe's ratio 0.8, on squared distances
+        first = first[..., 0]
+        mutual = np.take_along_axis(back, first.T, axis=1).T == np.arange(COARSE_FEATURES)[:, None]
+        votes[i, i + 1 :] = (distinct & mutual & (top > 0.5)).sum(axis=0)
+    votes += votes.T
+    report("comparing", len(names), len(names))
+    keep = np.zeros(votes.shape, dtype=bool)
+    order = np.argsort(-votes, axis=1, kind="stable")[:, :COARSE_NEIGHBOURS]
+    np.put_along_axis(keep, order, True, axis=1)
+    keep &= votes >= 4
+    step = np.arange(len(names) - 1)
+    keep[step, step + 1] = True
+    keep |= keep.T
+    return [(names[i], names[j]) for i, j in itertools.combinations(range(len(names)), 2) if keep[i, j]]
+
+
+def _map(colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int, report: Progress) -> None:
+    working, output = folder / "working.db", folder / "mapping"
+    _fresh_copy(folder / "matches.db", working)
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir()
+    options = colmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.num_threads = 1  # sums in a fixed order: the same poses every time
+    options.min_model_size = MIN_PHOTOS
+    models: dict[int, Any] = {}
+    for relaxed in (False, True):
+        # Few photos, or all from nearly one direction: a weaker first pair, when COLMAP's own limits find none.
+        if relaxed:
+            options.mapper.init_min_num_inliers = 40
+            options.mapper.init_min_tri_angle = 4.0
+            options.mapper.abs_pose_min_num_inliers = 20
+        posed = itertools.count(2)
+        report("mapping", 0, len(named))
+        models = colmap.incremental_mapping(
+            working,
+            folder / "images",
+            output,
+            options,
+            next_image_callback=lambda posed=posed: report(
+                "mapping", min(next(posed), len(named)), len(named)
+            ),
+        )
+        models = {k: m for k, m in models.items() if m.num_reg_images() >= MIN_PHOTOS}
+        if models:
+            break
+    if not models:
+        with colmap.Database.open(str(working)) as database:
+            linked = int(
+                (np.array(database.read_two_view_geometry_num_inliers()[1]) >= options.min_num_matches).sum()
+            )
+        raise ValueError(
+            f"photos: too few matches between the {len(named)} photos to pose any ({linked} pairs of photos match); "
+            f"expected photos of one textured place that overlap by half or more: {some(list(named))}"
+        )
+    largest, *others = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    partial = folder / "model.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir()
+    largest.write_binary(str(partial))
+    (partial / "others.json").write_text(json.dumps([m.num_reg_images() for m in others]))
+    os.replace(partial, folder / "model")
+    shutil.rmtree(output, ignore_errors=True)
+    _fresh_copy(None, working)
+    report("mapping", len(named), len(named))
+
+
+def _sparse_model(model: Any, names: Sequence[str]) -> SparseModel:
+    images = {i.name: i for i in model.images.values() if i.has_pose}
+    cameras = {}
+    for name in sorted(images):
+        image = images[name]
+        lens = model.cameras[image.camera_id]
+        kind = lens.model.name
+        if kind not in CAMERA_MODELS:
+            raise ValueError(
+                f"colmap: camera {image.camera_id} is a {kind}, expected one of {CAMERA_MODELS}; undistort the photos "
+                "first (COLMAP's image_undistorter writes a pinhole model)"
+            )
+        k = lens.calibration_matrix()
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().matrix()
+        u, _, vt = np.linalg.svd(pose[:3, :3])
+        pose[:3, :3] = u @ vt
+        cameras[name] = Camera.pinhole(
+            lens.width, lens.height, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2], world_to_camera=pose
+        )
+    position = {images[n].image_id: i for i, n in enumerate(cameras)}
+    points = [model.points3D[i] for i in sorted(model.points3D)]
+    tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
+    length = np.array([len(t) for t in tracks], dtype=np.int64)
+    return SparseModel(
+        cameras=cameras,
+        points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
+        colors=np.array([p.color for p in points], dtype=np.float64).reshape(-1, 3) / 255,
+        reprojection_error=np.array([p.error for p in points], dtype=np.float64),
+        track_length=length,
+        track_start=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
+        track_camera=np.array([c for t in tracks for c in t], dtype=np.int64),
+        unposed=tuple(n for n in names if n not in cameras),
+    )

@@ -1,0 +1,160 @@
+"""Posed cameras with a sparse point cloud, and the similarity that brings them to metres.
+
+Structure from motion leaves units and axes of its own. A similarity fitted to surveyed camera positions brings both to
+the world; without a survey a plausible one is assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import check_array
+from warprrf.geometry.photos.photo_files import match_names, some
+from warprrf.geometry.splats.camera import Camera
+
+# Without surveyed positions the scale is unknown: the median distance from a camera to a point it sees becomes this.
+ASSUMED_DISTANCE_M = 3.0
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """Posed cameras and a sparse point cloud.
+
+    Attributes:
+        cameras: photo name to :class:`Camera`, for the photos that were posed.
+        points: 3D points, shape ``(P, 3)`` float64; metres once aligned, arbitrary units before.
+        colors: colour of each point in [0, 1], shape ``(P, 3)``.
+        reprojection_error: mean reprojection error of each point [pixels], shape ``(P,)``.
+        track_length: number of photos that see each point, shape ``(P,)`` int64.
+        track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
+        track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
+        unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
+        other_models: number of photos in each smaller model that was left out.
+        metric: True once :func:`align_to_known` has brought the model to metres.
+        scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
+    """
+
+    cameras: dict[str, Camera]
+    points: np.ndarray
+    colors: np.ndarray
+    reprojection_error: np.ndarray
+    track_length: np.ndarray
+    track_start: np.ndarray
+    track_camera: np.ndarray
+    unposed: tuple[str, ...] = ()
+    other_models: tuple[int, ...] = ()
+    metric: bool = False
+    scale_rms_m: float = float("nan")
+
+    def viewpoints(self) -> np.ndarray:
+        """Mean position of the cameras that see each point, shape ``(P, 3)``: normals are turned towards it."""
+        positions = np.array([camera.position for camera in self.cameras.values()])
+        total = np.add.reduceat(positions[self.track_camera], self.track_start[:-1], axis=0)
+        return total / self.track_length[:, None]
+
+    def subset(self, keep: np.ndarray) -> SparseModel:
+        """The model with only the points where ``keep`` (boolean, shape ``(P,)``) is True."""
+        seen = np.repeat(keep, self.track_length)
+        length = self.track_length[keep]
+        return replace(
+            self,
+            points=self.points[keep],
+            colors=self.colors[keep],
+            reprojection_error=self.reprojection_error[keep],
+            track_length=length,
+            track_start=np.concatenate([[0], np.cumsum(length)]),
+            track_camera=self.track_camera[seen],
+        )
+
+
+def align_to_known(sparse: SparseModel, known_positions: Mapping[str, Any]) -> SparseModel:
+    """``sparse`` in metres and world axes, by the similarity that best meets surveyed camera positions.
+
+    Args:
+        known_positions: photo name (or its file name, where that is unique) to camera position (3,) [m].
+
+    Returns:
+        The transformed model; its ``scale_rms_m`` is the rms distance left at the surveyed cameras [m].
+
+    Raises:
+        ValueError: for fewer than three positions, positions on one line, a name that is no photo, or a surveyed
+            photo that could not be posed.
+    """
+    if len(known_positions) < 3:
+        raise ValueError(
+            f"known_positions: got {len(known_positions)}, expected at least 3 camera positions that are not on a line"
+        )
+    names = match_names("known_positions", known_positions, (*sparse.cameras, *sparse.unposed))
+    lost = [n for n in names if n not in sparse.cameras]
+    usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in sparse.cameras}
+    if len(usable) < 3:
+        raise ValueError(
+            f"known_positions: only {len(usable)} of the surveyed photos were posed, expected at least 3; "
+            f"without pose: {some(lost)}"
+        )
+    source = np.array([sparse.cameras[n].position for n in usable])
+    target = np.array([check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in usable.items()])
+    try:
+        scale, rotation, shift = fit_similarity(source, target)
+    except ValueError as error:
+        raise ValueError(f"known_positions: {error}") from error
+    rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
+    return replace(transformed(sparse, scale, rotation, shift), metric=True, scale_rms_m=rms)
+
+
+def assume_scale(sparse: SparseModel) -> SparseModel:
+    """``sparse`` with z up and a plausible size, where nobody measured either."""
+    poses = list(sparse.cameras.values())
+    up = -np.mean([c.rotation[1] for c in poses], axis=0)
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
+    ahead = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
+    ahead /= np.linalg.norm(ahead)
+    rotation = np.stack([ahead, np.cross(up, ahead), up])
+    positions = np.array([c.position for c in poses])
+    gap = np.linalg.norm(
+        np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1
+    )
+    scale = ASSUMED_DISTANCE_M / float(np.median(gap)) if len(gap) else 1.0
+    return transformed(sparse, scale, rotation, -scale * rotation @ positions.mean(axis=0))
+
+
+def fit_similarity(source: Any, target: Any) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale ``s``, rotation ``R`` (3, 3) and shift ``t`` (3,) that minimise ``sum |s R source + t - target|^2``.
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
+    1991, eqs. (40) to (43). Float64 throughout.
+
+    Raises:
+        ValueError: for fewer than three points, or points on one line.
+    """
+    source = check_array("source", source, (None, 3))
+    target = check_array("target", target, (len(source), 3))
+    if len(source) < 3:
+        raise ValueError(f"source: got {len(source)} points, expected at least 3")
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    for name, centred in (("source", a), ("target", b)):
+        spread = np.linalg.svd(centred, compute_uv=False)
+        if spread[1] <= 1e-6 * spread[0] or spread[0] == 0:
+            raise ValueError(
+                f"{name}: the points lie on one line (or coincide), so that the rotation is not fixed"
+            )
+    u, d, vt = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / (a**2).sum())
+    return scale, rotation, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+
+
+def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
+    """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
+    cameras = {}
+    for name, camera in sparse.cameras.items():
+        pose = np.eye(4)
+        pose[:3, :3] = camera.rotation @ rotation.T
+        pose[:3, 3] = -pose[:3, :3] @ (scale * rotation @ camera.position + shift)
+        cameras[name] = replace(camera, world_to_camera=pose)
+    return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)

@@ -1,0 +1,93 @@
+"""What refinement starts from: the sparse points cleaned, their planes found, completed and covered with Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf.device import Progress
+from warprrf.geometry.photos import surface, sweep
+from warprrf.geometry.photos.edges import meeting
+from warprrf.geometry.photos.initial_gaussians import initial_gaussians, seen_cells
+from warprrf.geometry.photos.planes import Plane, aligned, occupancy
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from warprrf.geometry.photos.config import ReconstructionConfig
+    from warprrf.geometry.photos.sparse import SparseModel
+
+
+def start_of(
+    sparse: SparseModel,
+    cameras: Mapping[str, Camera],
+    images: Sequence[np.ndarray],
+    *,
+    config: ReconstructionConfig,
+    seed: int = 0,
+    progress: Progress | None = None,
+    device: Any = None,
+) -> tuple[list[Plane], Gaussians]:
+    """Planes of the sparse points, and the Gaussians that refinement starts from.
+
+    Args:
+        sparse: posed cameras and points [m], those of held-out photos among them.
+        cameras: of the photos that the Gaussians are fitted to.
+        images: these photos, shape ``(H, W, 3)`` each, in [0, 1].
+        config: settings.
+        seed: of the plane detection.
+        progress: called with ``"planes"``.
+        device: Warp device of the sweeps.
+
+    Raises:
+        ValueError: for fewer than three points.
+    """
+    report = progress or (lambda stage, done, total: None)
+    report("planes", 0, 5)
+    if len(sparse.points) < 3:
+        raise ValueError(
+            f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
+        )
+    keep = surface.clean_points(
+        sparse.points,
+        reprojection_error=sparse.reprojection_error,
+        track_length=sparse.track_length,
+        max_reprojection_error=config.max_reprojection_error,
+    )
+    if keep.sum() < 3:  # a handful of photos: few points are seen three times
+        keep[:] = True
+    sparse = sparse.subset(keep)
+    normals = surface.estimate_normals(sparse.points, sparse.viewpoints())
+    planes = surface.detect_room_planes(
+        sparse.points,
+        normals,
+        sparse.viewpoints(),
+        distance_m=config.plane_distance_m,
+        min_points=config.plane_points,
+        seed=seed,
+    )
+    planes = aligned(planes, sparse.points) if sparse.metric else planes
+    eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
+    targets = np.repeat(sparse.points, sparse.track_length, axis=0)
+    planes = occupancy(planes, sparse.points, eyes, targets, cell_m=config.cell_m)
+    report("planes", 1, 5)
+    if config.sweep and len(cameras) > 2 and planes:
+        photos = sweep.Photos.upload(list(cameras.values()), images, device)
+        planes = sweep.proven_cells(planes, sparse.points, photos)
+        report("planes", 2, 5)
+        if sparse.metric:  # else z is not up
+            levels = []
+            for k, up in enumerate((True, False)):
+                levels += sweep.level_planes(
+                    planes, sparse.points, photos, eyes, targets, cell_m=config.cell_m, up=up
+                )
+                report("planes", 3 + k, 5)
+            planes = sweep.joined(planes, levels)
+    planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
+    start = initial_gaussians(
+        sparse.points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
+    )
+    report("planes", 5, 5)
+    return planes, start

@@ -1,0 +1,1 @@
+"""Gaussians and cameras: what they are, how they are rendered, and rays through them."""

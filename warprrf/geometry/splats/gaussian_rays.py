@@ -1,0 +1,293 @@
+"""Rays through Gaussians: ordered hits along any ray, and transmittance between two points, in metres.
+
+The rasteriser blends what one point sees; here every ray has its own origin. A Gaussian's response is evaluated
+exactly on the ray, as there (:mod:`warprrf.kernels.rays.gaussians`), in float64, and it counts where its peak lies
+within the ray or segment and its alpha exceeds ``alpha_min``. Transmittance is a product over layers, so it needs no
+order: the hierarchy's candidates are multiplied as they come.
+
+:meth:`GaussianRays.hits` and :meth:`GaussianRays.transmittance` are the NumPy face. :meth:`GaussianRays.trace` and
+:meth:`GaussianRays.transmit` return Warp arrays and record their adjoints on an active ``wp.Tape``;
+:mod:`warprrf.geometry.splats.torch_functions` offers both to torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf.device import check_array, is_cuda, launch, resolve
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import RADIO, RULES, Blending
+from warprrf.geometry.splats.tape import active_tape, gradient, with_gradients
+from warprrf.kernels.rays import gaussians as kernels
+
+CPU_PIECES = 4  # gradient sums on a CPU, one writer each: the result does not depend on the thread count
+LARGEST = 1e15
+"""Of coordinates and directions: squares and products of them stay finite, also in float32."""
+
+ORDERS = {"peak": kernels.BY_PEAK, "range": kernels.BY_RANGE}
+"""Of hits: by the peak's distance along the ray, or by the mean's from the origin, as the rasteriser blends."""
+
+
+@dataclass(frozen=True)
+class RayHits:
+    """The first K Gaussians along each ray, in order.
+
+    Attributes:
+        index: Gaussian, shape ``(N, K)`` int32, -1 where fewer than K.
+        t: distance of its peak along the unit direction [m], shape ``(N, K)`` float64, inf where none.
+        alpha: opacity times response at the peak, clamped, shape ``(N, K)`` float64.
+        weight: alpha times the transmittance in front, shape ``(N, K)`` float64.
+        left: transmittance behind the last hit listed, shape ``(N,)`` float64. Where all K places are taken, more
+            Gaussians may follow.
+    """
+
+    index: np.ndarray = field(repr=False)
+    t: np.ndarray = field(repr=False)
+    alpha: np.ndarray = field(repr=False)
+    weight: np.ndarray = field(repr=False)
+    left: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Traced:
+    """:class:`RayHits` on the device; all but ``index`` carry gradients under a tape."""
+
+    index: wp.array
+    t: wp.array
+    alpha: wp.array
+    weight: wp.array
+    left: wp.array
+
+    @property
+    def outputs(self) -> tuple[wp.array, ...]:
+        """The arrays that a loss may use."""
+        return self.t, self.alpha, self.weight, self.left
+
+
+class GaussianRays:
+    """Gaussians in a hierarchy, asked along arbitrary rays.
+
+    Args:
+        gaussians: the Gaussians; or their means, quaternions, scales and opacities as four Warp arrays of one
+            precision, whose ``.grad`` the adjoints add to. The hierarchy holds them as they are now: after a change
+            of parameters build another.
+        blending: alpha cutoff, clamp and transmittance rule; default: those of radio. ``transmittance_min`` ends the
+            hits of a ray; it does not apply to :meth:`transmittance`.
+        device: where the hierarchy is searched; default: that of the arrays, else Warp's preferred one.
+
+    Raises:
+        TypeError: if ``gaussians`` is neither.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians | tuple[wp.array, wp.array, wp.array, wp.array],
+        *,
+        blending: Blending | None = None,
+        device: Any = None,
+    ) -> None:
+        self.blending = blending or RADIO
+        if isinstance(gaussians, Gaussians):
+            self.device = resolve(device)
+            self.inputs: tuple[wp.array, ...] = (
+                wp.array(gaussians.means, dtype=wp.vec3, device=self.device),
+                wp.array(gaussians.quaternions, dtype=wp.vec4, device=self.device),
+                wp.array(gaussians.scales, dtype=wp.vec3, device=self.device),
+                wp.array(gaussians.opacities, dtype=wp.float32, device=self.device),
+            )
+        elif len(gaussians) == 4 and all(isinstance(a, wp.array) for a in gaussians):
+            self.device = gaussians[0].device if device is None else resolve(device)
+            self.inputs = tuple(gaussians)
+        else:
+            raise TypeError(
+                f"gaussians: got {type(gaussians).__name__}, expected warprrf.Gaussians or four Warp arrays"
+            )
+        self._kernels = kernels.build(self.inputs[3].dtype)
+        self._rules = kernels.Rules()
+        self._rules.alpha_min = self.blending.alpha_min
+        self._rules.alpha_max = self.blending.alpha_max
+        self._rules.transmittance_min = self.blending.transmittance_min
+        self._rules.rule = RULES[self.blending.rule]
+        self._build()
+
+    def __len__(self) -> int:
+        return len(self.inputs[0])
+
+    def _build(self) -> None:
+        n, on = len(self), self.device
+        scene = kernels.Scene()
+        scene.means = wp.empty(n, dtype=wp.vec3d, device=on)
+        scene.whitening = wp.empty(n, dtype=wp.mat33d, device=on)
+        scene.opacities = wp.empty(n, dtype=wp.float64, device=on)
+        scene.cuts = wp.empty(n, dtype=wp.float64, device=on)
+        half = wp.empty(n, dtype=wp.vec3d, device=on)
+        out = [scene.means, scene.whitening, scene.opacities, scene.cuts, half]
+        launch(self._kernels.whiten, n, [*self.inputs, self._rules, *out], device=on)
+        ids = np.flatnonzero(scene.cuts.numpy() > 0).astype(np.int32)
+        scene.ids = wp.array(ids, dtype=int, device=on)
+        if len(ids):
+            middle, size = scene.means.numpy()[ids], half.numpy()[ids]
+            low, high = (middle - size).min(axis=0), (middle + size).max(axis=0)
+            center, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+            pad = kernels.ROUNDING * 4 * radius
+            scene.center, scene.radius = wp.vec3d(center), radius + 2 * pad
+            self._bvh = wp.Bvh(
+                wp.array(middle - size - center - pad, dtype=wp.vec3, device=on),
+                wp.array(middle + size - center + pad, dtype=wp.vec3, device=on),
+            )
+            scene.bvh = self._bvh.id
+        self._scene = scene
+
+    def hits(self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak") -> RayHits:
+        """The first ``k`` Gaussians along each ray.
+
+        Args:
+            origins: ray starts [m], shape ``(N, 3)`` or ``(3,)`` for all.
+            directions: of any length but zero, shape ``(N, 3)`` or ``(3,)`` for all.
+            k: places for each ray.
+            order: ``"peak"``: by distance of the peak along the ray; ``"range"``: by distance of the mean from the
+                origin, in float32 as the rasteriser blends. Ties by index.
+
+        Raises:
+            TypeError, ValueError: naming the argument: wrong shape, NaN, a direction of length zero, ``k`` below 1.
+        """
+        found = self._trace(origins, directions, k, order, requires_grad=False)[0]
+        return RayHits(found.index.numpy(), *(array.numpy() for array in found.outputs))
+
+    def transmittance(self, a: Any, b: Any) -> np.ndarray:
+        """Share of light that passes from ``a`` to ``b``, (N, 3) or (3,) each [m]; shape ``(N,)`` float64.
+
+        A Gaussian counts whose response peaks strictly between the points; between two equal points nothing does.
+
+        Raises:
+            TypeError, ValueError: naming the argument that does not fit.
+        """
+        values: np.ndarray = self._transmit(a, b, requires_grad=False)[0].numpy()
+        return values
+
+    def trace(self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak") -> Traced:
+        """:meth:`hits` as Warp arrays, differentiable on an active tape in the parameters (not in the rays)."""
+        tape = active_tape()
+        found, adjoint = self._trace(origins, directions, k, order, requires_grad=tape is not None)
+        if tape is not None:
+            self._record(tape, adjoint, found.outputs)
+        return found
+
+    def transmit(self, a: Any, b: Any) -> wp.array:
+        """:meth:`transmittance` as a Warp array, differentiable on an active tape in the parameters."""
+        tape = active_tape()
+        values, adjoint = self._transmit(a, b, requires_grad=tape is not None)
+        if tape is not None:
+            self._record(tape, adjoint, (values,))
+        return values
+
+    def trace_with_adjoint(
+        self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak"
+    ) -> tuple[Traced, Callable[[], None]]:
+        """:meth:`trace` without a tape: the hits, and the function that adds the parameters' gradients."""
+        return self._trace(origins, directions, k, order, requires_grad=True)
+
+    def transmit_with_adjoint(self, a: Any, b: Any) -> tuple[wp.array, Callable[[], None]]:
+        """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients."""
+        return self._transmit(a, b, requires_grad=True)
+
+    def _record(self, tape: wp.Tape, adjoint: Callable[[], None], outputs: tuple[wp.array, ...]) -> None:
+        def backward() -> None:
+            adjoint()
+            for array in outputs:  # as Warp's own adjoints do: a second backward adds the same again
+                if not array.retain_grad:
+                    array.grad.zero_()
+
+        tape.record_func(backward, with_gradients(*self.inputs, *outputs))
+
+    def _trace(
+        self, origins: Any, directions: Any, k: int, order: str, *, requires_grad: bool
+    ) -> tuple[Traced, Callable[[], None]]:
+        start, toward = _pairs("origins", origins, "directions", directions)
+        if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
+            raise ValueError(f"k: got {k!r}, expected a whole number of at least 1")
+        if order not in ORDERS:
+            raise ValueError(f"order: got {order!r}, expected one of {', '.join(ORDERS)}")
+        still = int(np.count_nonzero(np.linalg.norm(toward, axis=1) == 0))
+        if still:
+            raise ValueError(f"directions: got {still} of length zero, expected directions")
+        count, on = _rows(start, toward), self.device
+        shape = (count, int(k))
+        real = {"dtype": wp.float64, "device": on}
+        found = Traced(
+            wp.full(shape, -1, dtype=int, device=on),
+            wp.full(shape, np.inf, requires_grad=requires_grad, **real),
+            wp.zeros(shape, requires_grad=requires_grad, **real),
+            wp.zeros(shape, requires_grad=requires_grad, **real),
+            wp.empty(count, requires_grad=requires_grad, **real),
+        )
+        rays = [wp.array(start, dtype=wp.vec3d, device=on), wp.array(toward, dtype=wp.vec3d, device=on)]
+        launch(
+            kernels.collect,
+            count,
+            [self._scene, self._rules, ORDERS[order], *rays, found.index, wp.empty(shape, **real),
+             found.t, found.alpha, found.weight, found.left],
+            device=on,
+        )  # fmt: skip
+
+        def adjoint() -> None:
+            gradients = [array.grad for array in found.outputs]
+            inputs = [self._scene, self._rules, *rays, found.index, found.alpha, found.weight, *gradients]
+            self._chain(kernels.collect_adjoint, count, inputs)
+
+        return found, adjoint
+
+    def _transmit(self, a: Any, b: Any, *, requires_grad: bool) -> tuple[wp.array, Callable[[], None]]:
+        start, end = _pairs("a", a, "b", b)
+        count, on = _rows(start, end), self.device
+        values = wp.empty(count, dtype=wp.float64, device=on, requires_grad=requires_grad)
+        parts = [wp.empty(count, dtype=wp.float64, device=on), wp.empty(count, dtype=int, device=on)]
+        ends = [wp.array(start, dtype=wp.vec3d, device=on), wp.array(end, dtype=wp.vec3d, device=on)]
+        launch(kernels.transmit, count, [self._scene, self._rules, *ends, values, *parts], device=on)
+
+        def adjoint() -> None:
+            inputs = [self._scene, self._rules, *ends, *parts, values.grad]
+            self._chain(kernels.transmit_adjoint, count, inputs)
+
+        return values, adjoint
+
+    def _chain(self, kernel: Any, count: int, inputs: list[Any]) -> None:
+        """Run a hit-wise adjoint, then add its sums to the gradients of the parameters."""
+        if count == 0 or len(self) == 0:
+            return
+        pieces = 1 if is_cuda(self.device) else min(CPU_PIECES, count)
+        sums = wp.zeros((pieces, len(self), kernels.SUMS), dtype=wp.float64, device=self.device)
+        launch(kernel, count, [count, pieces, *inputs, sums], device=self.device, pieces=pieces)
+        _, quaternions, scales, _ = self.inputs
+        gradients = [gradient(array) for array in self.inputs]
+        launch(
+            self._kernels.chain, len(self), [quaternions, scales, self._scene.whitening, sums, *gradients],
+            device=self.device,
+        )  # fmt: skip
+
+
+def _pairs(first_name: str, first: Any, second_name: str, second: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Two arrays of float64 rows, one or N of each."""
+    one, other = (
+        np.atleast_2d(check_array(name, value))
+        for name, value in ((first_name, first), (second_name, second))
+    )
+    for name, array in ((first_name, one), (second_name, other)):
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
+        if np.abs(array).max(initial=0.0) > LARGEST:
+            raise ValueError(f"{name}: got numbers above {LARGEST:g}, expected metres")
+    if len(one) != len(other) and 1 not in (len(one), len(other)):
+        raise ValueError(
+            f"{second_name}: got {len(other)} for {len(one)} {first_name}, expected as many, or one of either"
+        )
+    return one, other
+
+
+def _rows(one: np.ndarray, other: np.ndarray) -> int:
+    return max(len(one), len(other)) if min(len(one), len(other)) else 0

@@ -1,0 +1,242 @@
+"""Gaussians: the frozen geometry's primitive, and the INRIA splat PLY layout that other viewers open.
+
+Scales in metres, opacities in [0, 1], quaternions wxyz (normalised on entry), colour = max(0, SH + 0.5).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import check_array
+from warprrf.files import write_atomically
+from warprrf.kernels.raster.sh import COEFFICIENTS
+
+# The file holds the logit; beyond this an opacity is as good as 0 or 1 and its logit stays finite in float32.
+OPACITY_MARGIN = 1e-7
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N anisotropic Gaussians.
+
+    Attributes:
+        means: centres [m], shape ``(N, 3)`` float32.
+        quaternions: rotations wxyz, unit, shape ``(N, 4)`` float32.
+        scales: standard deviations along the rotated axes [m], shape ``(N, 3)`` float32.
+        opacities: in [0, 1], shape ``(N,)`` float32.
+        sh: spherical-harmonic coefficients, shape ``(N, K, C)`` float32, K of 1, 4, 9, 16.
+
+    Raises:
+        ValueError: for shapes that do not fit, values that are not finite, zero quaternions, scales that are not
+            positive, opacities outside [0, 1].
+    """
+
+    means: np.ndarray = field(repr=False)
+    quaternions: np.ndarray = field(repr=False)
+    scales: np.ndarray = field(repr=False)
+    opacities: np.ndarray = field(repr=False)
+    sh: np.ndarray = field(repr=False)
+
+    def __post_init__(self) -> None:
+        means = check_array("means", self.means, (None, 3), np.float32)
+        n = len(means)
+        quaternions = check_array("quaternions", self.quaternions, (n, 4), np.float64)
+        scales = check_array("scales", self.scales, (n, 3), np.float32)
+        opacities = check_array("opacities", self.opacities, (n,), np.float32)
+        sh = check_array("sh", self.sh, (n, None, None), np.float32)
+        if sh.shape[1] not in COEFFICIENTS.values():
+            raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
+        norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
+        if (norm < 1e-12).any():
+            raise ValueError(
+                f"quaternions: {int((norm < 1e-12).sum())} are zero, expected wxyz rotations; (1, 0, 0, 0) is none"
+            )
+        norm = np.where(
+            np.abs(norm - 1) < 1e-6, 1.0, norm
+        )  # unit up to float32: saving and loading changes nothing
+        smallest = float(np.finfo(np.float32).tiny)
+        if (scales < smallest).any():
+            raise ValueError(
+                f"scales: {int((scales < smallest).any(axis=1).sum())} have a scale that is zero, negative or "
+                "denormal, expected positive metres; a flat Gaussian needs a small scale such as 1e-4"
+            )
+        if ((opacities < 0) | (opacities > 1)).any():
+            raise ValueError(
+                f"opacities: got values from {opacities.min()} to {opacities.max()}, expected [0, 1] (not logits)"
+            )
+        for name, value in (
+            ("means", means), ("quaternions", (quaternions / norm).astype(np.float32)), ("scales", scales),
+            ("opacities", opacities), ("sh", sh),
+        ):  # fmt: skip
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __getitem__(self, chosen: Any) -> Gaussians:
+        """The Gaussians that an index array, mask or slice selects."""
+        return Gaussians(
+            self.means[chosen],
+            self.quaternions[chosen],
+            self.scales[chosen],
+            self.opacities[chosen],
+            self.sh[chosen],
+        )
+
+    @property
+    def rotations(self) -> np.ndarray:
+        """Rotation matrices, columns are the axes of the scales, shape ``(N, 3, 3)`` float64."""
+        return rotations_of(self.quaternions)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Axis of the smallest scale, up to sign, shape ``(N, 3)`` float64."""
+        return self.rotations[np.arange(len(self)), :, np.argmin(self.scales, axis=1)]
+
+    def save_ply(self, path: str | os.PathLike[str]) -> None:
+        """Write the INRIA splat layout (binary little endian): x y z, normals (zero), f_dc, f_rest channel by channel,
+        opacity as logit, scales as logarithm, rotation wxyz.
+
+        Raises:
+            ValueError: unless there are three colour channels, as the layout demands.
+        """
+        n, k, channels = self.sh.shape
+        if channels != 3:
+            raise ValueError(f"sh: got {channels} channels, the INRIA PLY layout holds exactly 3")
+        names = [
+            *("x", "y", "z", "nx", "ny", "nz"), *(f"f_dc_{c}" for c in range(3)),
+            *(f"f_rest_{j}" for j in range(3 * (k - 1))), "opacity", *(f"scale_{c}" for c in range(3)),
+            *(f"rot_{c}" for c in range(4)),
+        ]  # fmt: skip
+        opacity = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+        columns = np.concatenate(
+            [
+                self.means, np.zeros((n, 3)), self.sh[:, 0], self.sh[:, 1:].transpose(0, 2, 1).reshape(n, -1),
+                np.log(opacity / (1 - opacity))[:, None], np.log(self.scales.astype(np.float64)), self.quaternions,
+            ],
+            axis=1,
+        ).astype("<f4")  # fmt: skip
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+        header += [f"property float {name}" for name in names] + ["end_header", ""]
+        data = "\n".join(header).encode("ascii") + columns.tobytes()
+        write_atomically(path, lambda file: file.write_bytes(data))
+
+    @classmethod
+    def load_ply(cls, path: str | os.PathLike[str]) -> Gaussians:
+        """Read splats in the INRIA layout, ASCII or binary, properties in any order.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is no PLY, is cut short, or lacks a property of the layout.
+        """
+        table = _read_ply(Path(path))
+
+        def columns(*names: str) -> np.ndarray:
+            missing = [name for name in names if name not in table]
+            if missing:
+                raise ValueError(
+                    f"{path}: lacks the vertex properties {missing}; expected a splat in the INRIA layout "
+                    "(x y z f_dc_* f_rest_* opacity scale_* rot_*), not a mesh or a plain point cloud"
+                )
+            return np.stack([table[name].astype(np.float64) for name in names], axis=1)
+
+        dc = columns(*(f"f_dc_{c}" for c in range(3)))
+        rest = sum(name.startswith("f_rest_") for name in table)
+        if 1 + rest / 3 not in COEFFICIENTS.values():
+            raise ValueError(f"{path}: got {rest} f_rest properties, expected 0, 9, 24 or 45")
+        higher = columns(*(f"f_rest_{j}" for j in range(rest))) if rest else np.zeros((len(dc), 0))
+        sh = np.concatenate([dc[:, None], higher.reshape(len(dc), 3, -1).transpose(0, 2, 1)], axis=1)
+        logit = columns("opacity")[:, 0]
+        try:
+            return cls(
+                columns("x", "y", "z"),
+                columns(*(f"rot_{c}" for c in range(4))),
+                np.exp(columns(*(f"scale_{c}" for c in range(3)))),
+                0.5 * (1 + np.tanh(0.5 * logit)),  # the sigmoid, without overflow
+                sh,
+            )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+
+def rotations_of(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices ``(N, 3, 3)`` of quaternions wxyz ``(N, 4)``, normalised here."""
+    q = np.asarray(quaternions, dtype=np.float64)
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
+        ],
+        axis=1,
+    )
+
+
+def quaternions_of(rotations: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz ``(N, 4)`` of rotation matrices ``(N, 3, 3)``, by the largest component."""
+    r = np.asarray(rotations, dtype=np.float64)
+    d = np.stack([r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]], axis=1)
+    four = 1 + np.stack(
+        [d.sum(1), d[:, 0] - d[:, 1] - d[:, 2], d[:, 1] - d[:, 0] - d[:, 2], d[:, 2] - d[:, 0] - d[:, 1]],
+        axis=1,
+    )
+    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    e, f, g = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
+    candidates = np.stack(
+        [
+            np.stack([four[:, 0], a, b, c], axis=1),
+            np.stack([a, four[:, 1], e, f], axis=1),
+            np.stack([b, e, four[:, 2], g], axis=1),
+            np.stack([c, f, g, four[:, 3]], axis=1),
+        ],
+        axis=1,
+    )
+    best = candidates[np.arange(len(r)), np.argmax(four, axis=1)]
+    return best / np.linalg.norm(best, axis=1, keepdims=True)
+
+
+def _read_ply(path: Path) -> dict[str, np.ndarray]:
+    """Vertex properties of a PLY file whose first element is ``vertex``."""
+    data = path.read_bytes()
+    end = data.find(b"end_header\n")
+    if not data.startswith(b"ply") or end < 0:
+        raise ValueError(f"{path}: not a PLY file (no 'ply' ... 'end_header')")
+    body = data[end + len(b"end_header\n") :]
+    order, count, fields, element = "", -1, [], ""
+    for line in data[:end].decode("ascii", "replace").split("\n"):
+        words = line.split()
+        if words[:1] == ["format"] and len(words) > 1:
+            order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}.get(words[1], "")
+        elif words[:1] == ["element"] and len(words) == 3:
+            element = words[1]
+            if element == "vertex" and words[2].isdigit():
+                count = int(words[2])
+            elif count < 0:
+                raise ValueError(f"{path}: its first element is {element!r}, expected 'vertex'")
+        elif words[:1] == ["property"] and element == "vertex":
+            if len(words) != 3 or words[1] not in _PLY_TYPES:
+                raise ValueError(f"{path}: cannot read the vertex property {line!r}")
+            fields.append((words[2], _PLY_TYPES[words[1]]))
+    if not order or count < 0 or not fields:
+        raise ValueError(f"{path}: the PLY header names no known format or no vertices")
+    if order == "=":
+        values = np.array(body.split()[: count * len(fields)], dtype=np.float64)
+        if len(values) < count * len(fields):
+            raise ValueError(f"{path}: cut short: {len(values)} of {count * len(fields)} values")
+        return {name: values.reshape(count, -1)[:, k] for k, (name, _) in enumerate(fields)}
+    dtype = np.dtype([(name, order + kind) for name, kind in fields])
+    if len(body) < count * dtype.itemsize:
+        raise ValueError(f"{path}: cut short: {len(body)} of {count * dtype.itemsize} bytes of vertices")
+    table = np.frombuffer(body, dtype, count)
+    return {name: table[name] for name, _ in fields}

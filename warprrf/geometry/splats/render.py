@@ -1,0 +1,155 @@
+"""Splat Gaussians into photos and panoramas: arrays in, arrays out; :mod:`warprrf.geometry.splats.rasterizer` does it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf.device import check_array, launch, resolve
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import RADIO, RULES, TILE_GRAIN, Blending, Rasterizer
+from warprrf.kernels.raster import pixel_weights
+from warprrf.kernels.raster import weights as weight_kernels
+from warprrf.kernels.raster.project import LANES
+from warprrf.kernels.raster.warps import PIXELS
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What :func:`render` returns.
+
+    Attributes:
+        features: blended features, shape ``(H, W, C)`` float32.
+        alpha: sum of blending weights, shape ``(H, W)``.
+        depth: Euclidean range [m], the blended mean of each Gaussian's peak on the ray; inf where alpha is 0.
+        dominant: Gaussian of largest weight, int32, -1 where none.
+        peak: range of the dominant Gaussian's peak [m]; inf where none.
+    """
+
+    features: np.ndarray = field(repr=False)
+    alpha: np.ndarray = field(repr=False)
+    depth: np.ndarray = field(repr=False)
+    dominant: np.ndarray = field(repr=False)
+    peak: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class BlendWeights:
+    """The ``K`` largest blending weights of every pixel, front to back.
+
+    Attributes:
+        index: Gaussian, shape ``(H, W, K)`` int32, -1 where fewer than K.
+        weight: alpha times transmittance, same shape, float32.
+        range: distance of the Gaussian's peak on the ray [m], same shape.
+        dominant: Gaussian of largest weight, shape ``(H, W)`` int32, -1 where none.
+        alpha: sum of all weights, shape ``(H, W)``.
+        dropped: sum of the weights left out by the limit K, shape ``(H, W)``.
+    """
+
+    index: np.ndarray = field(repr=False)
+    weight: np.ndarray = field(repr=False)
+    range: np.ndarray = field(repr=False)
+    dominant: np.ndarray = field(repr=False)
+    alpha: np.ndarray = field(repr=False)
+    dropped: np.ndarray = field(repr=False)
+
+
+def render(
+    g: Gaussians,
+    cam: Camera,
+    features: Any = None,
+    background: Any = 0.0,
+    device: Any = None,
+    *,
+    blending: Blending | None = None,
+) -> Rendering:
+    """Blend Gaussians front to back along every pixel's ray.
+
+    Args:
+        features: per Gaussian, shape ``(N, C)``; default: the colour that ``g.sh`` shows towards the camera.
+        background: scalar or shape ``(C,)``, seen through what transmittance is left.
+        blending: cutoffs and transmittance rule; default: those of photos.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    _check(g, cam)
+    device = resolve(device)
+    raster = Rasterizer(device=device, blending=blending)
+    scene = raster.upload(g)
+    if features is None:
+        feature_array = raster.colors(scene[0], wp.array(g.sh, dtype=wp.float32, device=device), cam)
+    else:
+        feature_array = wp.array(
+            check_array("features", features, (len(g), None), np.float32), dtype=wp.float32, device=device
+        )
+    back = check_array("background", background, None, np.float32)
+    if back.ndim > 1 or (back.ndim == 1 and len(back) != feature_array.shape[1]):
+        raise ValueError(
+            f"background: got shape {back.shape}, expected a scalar or ({feature_array.shape[1]},)"
+        )
+    view = raster.prepare(*scene, cam)
+    image = raster.blend(view, feature_array, np.broadcast_to(back, (feature_array.shape[1],)))
+    alpha = image.alpha.numpy()
+    dominant = image.dominant.numpy()
+    depth = np.where(alpha > 0, image.depth.numpy(), np.inf).astype(np.float32)
+    peak = np.where(dominant >= 0, image.peak.numpy(), np.inf).astype(np.float32)
+    return Rendering(image.features.numpy(), alpha, depth, dominant, peak)
+
+
+def blend_weights(
+    g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: Any = None
+) -> BlendWeights:
+    """Blending weights of every pixel as a sparse matrix; geometry that is frozen needs them only once.
+
+    Raises:
+        TypeError, ValueError: naming the argument that does not fit.
+    """
+    _check(g, cam)
+    if not isinstance(top_k, int | np.integer) or top_k < 1:
+        raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    raster = Rasterizer(device=device, blending=blending)
+    view = raster.prepare(*raster.upload(g), cam)
+    shape = (cam.height, cam.width, int(top_k))
+    index = wp.full(shape, -1, dtype=int, device=raster.device)
+    weight = wp.zeros(shape, dtype=wp.float32, device=raster.device)
+    range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
+    total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
+    rule = RULES[blending.rule]
+    out = [a.flatten() for a in (index, weight, range_, total)]
+    if raster.on_gpu:
+        nothing = wp.empty(0, dtype=wp.float32, device=raster.device)
+        launch(
+            pixel_weights.build(wp.float32, rule),
+            (len(view.starts) - 1) * PIXELS,
+            [view.rows, nothing, view.ids, view.masks, view.starts, view.rays, view.view, raster.rules, shape[2],
+             *out],
+            device=raster.device,
+        )  # fmt: skip
+    else:
+        launch(
+            weight_kernels.build(wp.float32, rule).strongest,
+            len(view.blocks.starts) - 1,
+            [view.rows, view.blocks.ids, view.blocks.starts, view.rays, view.view, raster.rules, shape[2], LANES,
+             *out],
+            device=raster.device,
+            grain=TILE_GRAIN,
+        )  # fmt: skip
+    weights, indices, alpha = weight.numpy(), index.numpy(), total.numpy()
+    best = np.argmax(weights, axis=2)
+    dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]
+    dropped = np.maximum(alpha - weights.sum(axis=2), 0)
+    return BlendWeights(indices, weights, range_.numpy(), dominant, alpha, dropped)
+
+
+def _check(g: Any, cam: Any) -> None:
+    if not isinstance(g, Gaussians):
+        raise TypeError(f"g: got {type(g).__name__}, expected warprrf.Gaussians")
+    if not isinstance(cam, Camera):
+        raise TypeError(
+            f"cam: got {type(cam).__name__}, expected warprrf.Camera (Camera.pinhole or Camera.spherical)"
+        )

@@ -1,0 +1,1 @@
+"""Radio: beams, mirrors, scattering, and fitting what Gaussians send."""

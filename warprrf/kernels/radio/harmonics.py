@@ -1,0 +1,243 @@
+"""Fitting spherical harmonics to spectra on cached blending weights: forward, loss, hand-written adjoint, Adam.
+
+A pair is one Gaussian seen in one pixel of one receiver, with its blending weight ``w``. Pairs are stored Gaussian by
+Gaussian; a row is one Gaussian's stretch of them. Every sum has one owner, so that a launch split over threads gives
+the same bits as one thread: rows own their contributions and gradients, pixels own their power and loss.
+
+    row:    c_e = w_e A(b_p . a_g)               A = exp, max(0, .), or the identity (delay and angle channels)
+    pixel:  P_p = F_p sum_e c_e + X_p            F: solid angle and spreading loss, X: explicit line of sight
+            u_p = (10 log10(P_p + N0) - lo) / (hi - lo)
+    loss:   0.8 mean |u - t| + 0.2 (1 - mean SSIM(u, t))
+    adjoint, row:  dL/da_g = sum_e (dL/dP_p F_p) w_e A'(b_p . a_g) b_p
+
+``b_p`` are the 16 real harmonics of the pixel's ray direction, shared by all its Gaussians and by all receivers.
+SSIM is that of :mod:`warprrf.kernels.ssim`, zero beyond the poles, periodic in azimuth.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf.kernels import ssim as _ssim
+from warprrf.kernels.raster import sh as _sh
+
+EXPONENTIAL, CLAMPED, SIGNED = 0, 1, 2  # what a gain is of its harmonics' sum
+COEFFICIENTS = 16
+EXPONENT_LIMIT = 60.0  # nepers: keeps a runaway gain finite in float32; 260 dB off the median gain
+
+
+@cache
+def build(real: Any) -> SimpleNamespace:
+    """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
+    vec3 = wp.types.vector(3, real)
+    vec16 = wp.types.vector(COEFFICIENTS, real)
+    limit = wp.constant(real(EXPONENT_LIMIT))
+    per_neper = wp.constant(real(10.0 / np.log(10.0)))  # dB per unit of natural logarithm of power
+
+    harmonics = _sh.build(real).basis
+    slope_of = _ssim.build(real).slope
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def evaluate_basis(offset: int, directions: wp.array(dtype=vec3), out: wp.array(dtype=vec16)):
+        """The 16 harmonics of each direction."""
+        i = offset + wp.tid()
+        out[i] = harmonics(directions[i])
+
+    @wp.func
+    def gain(x: real, kind: int):
+        if kind == EXPONENTIAL:
+            return wp.exp(wp.clamp(x, -limit, limit))
+        if kind == CLAMPED:
+            return wp.max(x, real(0.0))
+        return x
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def contributions(
+        offset: int,
+        kind: int,
+        row_gaussian: wp.array(dtype=int),
+        row_start: wp.array(dtype=int),
+        pair_direction: wp.array(dtype=int),
+        pair_weight: wp.array(dtype=real),
+        basis: wp.array(dtype=vec16),
+        coefficients: wp.array(dtype=vec16),
+        contribution: wp.array(dtype=real),
+    ):
+        """``w_e A(b_p . a_g)`` of every pair of a row."""
+        row = offset + wp.tid()
+        a = coefficients[row_gaussian[row]]
+        for e in range(row_start[row], row_start[row + 1]):
+            contribution[e] = pair_weight[e] * gain(wp.dot(a, basis[pair_direction[e]]), kind)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pixel_sums(
+        offset: int,
+        pixel_start: wp.array(dtype=int),
+        pair_of_pixel: wp.array(dtype=int),
+        contribution: wp.array(dtype=real),
+        out: wp.array(dtype=real),
+    ):
+        """Sum of the contributions to a pixel."""
+        p = offset + wp.tid()
+        total = real(0.0)
+        for j in range(pixel_start[p], pixel_start[p + 1]):
+            total += contribution[pair_of_pixel[j]]
+        out[p] = total
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def to_image(
+        offset: int,
+        factor: wp.array(dtype=real),
+        extra: wp.array(dtype=real),
+        floor: real,
+        low: real,
+        high: real,
+        target: wp.array(dtype=real),
+        total: wp.array(dtype=real),
+        image: wp.array(dtype=real),
+        moments: wp.array(dtype=vec3),
+    ):
+        """The dB image in units of the range, and the products (u, u^2, u t) that SSIM averages."""
+        p = offset + wp.tid()
+        power = wp.max(factor[p] * total[p] + extra[p], real(0.0))
+        u = (per_neper * wp.log(power + floor) - low) / (high - low)
+        image[p] = u
+        moments[p] = vec3(u, u * u, u * target[p])
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def loss_adjoint(
+        offset: int,
+        factor: wp.array(dtype=real),
+        extra: wp.array(dtype=real),
+        floor: real,
+        low: real,
+        high: real,
+        absolute_share: real,
+        ssim_share: real,
+        target: wp.array(dtype=real),
+        total: wp.array(dtype=real),
+        image: wp.array(dtype=real),
+        slopes: wp.array(dtype=vec3),
+        absolute: wp.array(dtype=real),
+        pixel_adjoint: wp.array(dtype=real),
+    ):
+        """``|u - t|`` and ``dL/d(sum of contributions)``; the shares already hold the division by the pixel count."""
+        p = offset + wp.tid()
+        u = image[p]
+        absolute[p] = wp.abs(u - target[p])
+        slope = slope_of(u, target[p], slopes[p], absolute_share, ssim_share)
+        power = factor[p] * total[p] + extra[p]
+        if power < real(0.0):
+            slope = real(0.0)
+        pixel_adjoint[p] = slope * per_neper / ((wp.max(power, real(0.0)) + floor) * (high - low)) * factor[p]
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def absolute_adjoint(
+        offset: int,
+        share: real,
+        mask: wp.array(dtype=real),
+        target: wp.array(dtype=real),
+        total: wp.array(dtype=real),
+        absolute: wp.array(dtype=real),
+        pixel_adjoint: wp.array(dtype=real),
+    ):
+        """Masked absolute error of a plainly blended channel (delay, angle of departure) and its adjoint."""
+        p = offset + wp.tid()
+        difference = total[p] - target[p]
+        absolute[p] = mask[p] * wp.abs(difference)
+        slope = real(0.0)
+        if difference != real(0.0):
+            slope = share * mask[p] * wp.sign(difference)
+        pixel_adjoint[p] = slope
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def coefficient_adjoint(
+        offset: int,
+        kind: int,
+        row_gaussian: wp.array(dtype=int),
+        row_start: wp.array(dtype=int),
+        pair_pixel: wp.array(dtype=int),
+        pair_direction: wp.array(dtype=int),
+        pair_weight: wp.array(dtype=real),
+        basis: wp.array(dtype=vec16),
+        contribution: wp.array(dtype=real),
+        pixel_adjoint: wp.array(dtype=real),
+        gradient: wp.array(dtype=vec16),
+    ):
+        """``dL/da_g`` of the row's Gaussian: no other row of the batch has the same one."""
+        row = offset + wp.tid()
+        total = vec16(real(0.0))
+        for e in range(row_start[row], row_start[row + 1]):
+            slope = pair_weight[e]
+            if kind == EXPONENTIAL:
+                slope = contribution[e]
+            elif kind == CLAMPED and contribution[e] <= real(0.0):
+                slope = real(0.0)
+            total += (pixel_adjoint[pair_pixel[e]] * slope) * basis[pair_direction[e]]
+        gradient[row_gaussian[row]] = total
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def adam(
+        offset: int,
+        rate: vec16,
+        ridge: vec16,
+        first_decay: real,
+        second_decay: real,
+        first_correction: real,
+        second_correction: real,
+        epsilon: real,
+        initial: wp.array(dtype=real),
+        gradient: wp.array(dtype=vec16),
+        first: wp.array(dtype=vec16),
+        second: wp.array(dtype=vec16),
+        coefficients: wp.array(dtype=vec16),
+    ):
+        """One step of Adam (Kingma and Ba 2015) on a Gaussian, with a pull ``ridge`` towards the initial constant."""
+        i = offset + wp.tid()
+        a = coefficients[i]
+        away = a
+        away[0] -= initial[i]
+        g = gradient[i] + wp.cw_mul(ridge, away)
+        m = first_decay * first[i] + (real(1.0) - first_decay) * g
+        v = second_decay * second[i] + (real(1.0) - second_decay) * wp.cw_mul(g, g)
+        first[i] = m
+        second[i] = v
+        for k in range(COEFFICIENTS):
+            a[k] -= rate[k] * first_correction * m[k] / (wp.sqrt(second_correction * v[k]) + epsilon)
+        coefficients[i] = a
+        gradient[i] = vec16(real(0.0))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def predict(
+        offset: int,
+        kind: int,
+        start: wp.array(dtype=int),
+        gaussian: wp.array(dtype=int),
+        weight: wp.array(dtype=real),
+        basis: wp.array(dtype=vec16),
+        coefficients: wp.array(dtype=vec16),
+        out: wp.array(dtype=real),
+    ):
+        """Blended gain of one receiver's pixel from its pairs."""
+        p = offset + wp.tid()
+        total = real(0.0)
+        for e in range(start[p], start[p + 1]):
+            total += weight[e] * gain(wp.dot(coefficients[gaussian[e]], basis[p]), kind)
+        out[p] = total
+
+    return SimpleNamespace(
+        absolute_adjoint=absolute_adjoint,
+        adam=adam,
+        coefficient_adjoint=coefficient_adjoint,
+        contributions=contributions,
+        evaluate_basis=evaluate_basis,
+        loss_adjoint=loss_adjoint,
+        pixel_sums=pixel_sums,
+        predict=predict,
+        to_image=to_image,
+        vec16=vec16,
+        vec3=vec3,
+    )

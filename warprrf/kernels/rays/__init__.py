@@ -1,0 +1,1 @@
+"""Rays: through triangle meshes and through Gaussians."""

@@ -1,0 +1,1 @@
+"""Radio fields: one way to fit, ask, save and load, whatever the model."""

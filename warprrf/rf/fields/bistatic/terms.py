@@ -1,0 +1,49 @@
+"""What a bistatic field models, and how finely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from warprrf.rf.fields.bistatic.bounces import LOBES, SUB_PIXELS
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What a bistatic field models; see :meth:`BistaticField.fit`.
+
+    Attributes:
+        line_of_sight, diffuse: whether there are such paths.
+        mirror_order: most mirror reflections on a path, 0 to 3.
+        lobes: exponents of the scattering lobes, 0 for Lambertian.
+        mirror_scatter: whether mirrors light surfaces.
+        scatter_mirror: whether mirrors show the lit scene.
+        diffuse_order: diffuse bounces on a path, 1 to 3.
+        indirect: whether groups have an indirect radiance.
+        residual: whether surfaces differ within their group.
+        sub_pixels: square root of the rays per pixel, 1 to 16.
+    """
+
+    line_of_sight: bool = True
+    diffuse: bool = True
+    mirror_order: int = 1
+    lobes: tuple[int, ...] = LOBES
+    mirror_scatter: bool = False
+    scatter_mirror: bool = False
+    diffuse_order: int = 1
+    indirect: bool = False
+    residual: bool = False
+    sub_pixels: int = SUB_PIXELS
+
+    def __post_init__(self) -> None:
+        whole = {"mirror_order": (0, 1, 2, 3), "diffuse_order": (1, 2, 3), "sub_pixels": range(1, 17)}
+        for name, allowed in whole.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {tuple(allowed)}")
+        if not self.lobes or any(n != int(n) or n < 0 for n in self.lobes):
+            raise ValueError(f"lobes: got {self.lobes!r}, expected exponents, whole numbers of at least 0")
+        object.__setattr__(self, "lobes", tuple(int(n) for n in self.lobes))
+
+    @property
+    def further(self) -> bool:
+        """Whether elements send on what other surfaces scattered to them."""
+        return self.diffuse and self.diffuse_order > 1

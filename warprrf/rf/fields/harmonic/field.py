@@ -1,0 +1,490 @@
+"""Radio fields on frozen Gaussians: RF-3DGS+ and RF-3DGS, fitted to spectra and queried at any receiver.
+
+``rf3dgs+`` follows Song et al., "Terahertz Spatial Wireless Channel Modeling with Radio Radiance Field", eq. (2)-(4),
+single bounce: a pixel holds
+
+    P = Omega sum_k alpha_k T_k A_k(d) (lambda / (4 pi (l_prev + l_vd)))^2
+
+with Omega the pixel's solid angle, d the ray's direction, l_prev and l_vd the distances of the ray's interaction point
+from transmitter and receiver. ``rf3dgs`` has no lengths; its delay and angle of departure are channels of their own,
+blended plainly and trained on delay and AoD spectra. The paper leaves the gain's domain open; ours: A = exp(SH), or
+max(0, SH) with ``gain="linear"``, SH of degree 3; loss 0.8 L1 + 0.2 (1 - SSIM) on the dB image. Delay and AoD are
+those of the single bounce, in float64; for ``rf3dgs+`` the pixels around a transmitter that the mesh lets be seen carry
+those of the line of sight, although the paper's surfaces must carry its power.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.device import Progress, check_array
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.kernels.radio import harmonics as _kernels
+from warprrf.rf.em.absorption import Air, air_of
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.fields import files as field_files
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.harmonic import transport as _transport
+from warprrf.rf.fields.harmonic.batches import Problem, harmonics
+from warprrf.rf.fields.harmonic.checkpoint import Checkpoint
+from warprrf.rf.fields.harmonic.fitting import KINDS, Rates, fit_layer
+from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
+from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
+from warprrf.rf.fields.harmonic.single_bounce import FieldOptions, SingleBounce
+from warprrf.rf.fields.harmonic.targets import targets
+from warprrf.rf.fields.harmonic.transport import Transport
+from warprrf.rf.fields.receivers import check_receiver
+from warprrf.rf.paths.trace import Paths
+from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
+
+if TYPE_CHECKING:
+    from warprrf.rf.fields.harmonic.store import StoredTransport
+    from warprrf.rf.spectra.dataset import SpectrumDataset
+
+STEPS = 300  # optimiser steps; twice as many change the test PSNR by less than 0.1 dB
+CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that are nearly right
+CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
+
+
+@dataclass(frozen=True, eq=False)
+class HarmonicField(RadioField):
+    """A radio field of spherical harmonics per Gaussian; build it with :meth:`fit` or :meth:`load`.
+
+    Attributes:
+        gaussians: frozen geometry.
+        mesh: surface for line of sight; None if the geometry has none.
+        transmitter: position it was fitted for [m], shape ``(3,)``.
+        frequency_hz: carrier [Hz].
+        shape: rows and columns of its spectra.
+        floor, range_db, beam_sigma_rad: of the data set it was fitted to.
+        options: what it computes.
+        layers: coefficients per Gaussian, shape ``(N, 16)`` float32: ``gain``, and for ``rf3dgs`` ``delay`` and
+            ``aod_x``, ``aod_y``, ``aod_z``.
+        gain_unit: linear factor of the gain layer.
+        delay_unit: seconds per unit of the delay layer.
+        air: absorption over every path's length, that of the data set it was fitted to; None for none. ``rf3dgs`` has
+            lengths for an explicit line of sight alone and learns it with the gain.
+        report: how the fit went: seconds, pairs, losses, Gaussians seen.
+    """
+
+    gaussians: Gaussians = field(repr=False)
+    mesh: Mesh | None = field(repr=False)
+    transmitter: np.ndarray
+    frequency_hz: float
+    shape: tuple[int, int]
+    floor: float
+    range_db: tuple[float, float]
+    beam_sigma_rad: float
+    options: FieldOptions
+    layers: dict[str, np.ndarray] = field(repr=False)
+    gain_unit: float
+    delay_unit: float
+    air: Air | None = None
+    report: dict[str, Any] = field(default_factory=dict, repr=False)
+    device: Any = field(default=None, repr=False)
+    _uploaded: dict[str, wp.array] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+        return self.options.model
+
+    @classmethod
+    def fit(  # type: ignore[override]
+        cls,
+        geometry: Any,
+        ds: SpectrumDataset,
+        model: str = "rf3dgs+",
+        *,
+        transmittance: str = "product",
+        interaction_point: str = "centre",
+        gain: str = "exp",
+        sh_degree: int = 3,
+        top_k: int = _transport.TOP_K,
+        line_of_sight: str | None = None,
+        iterations: int = STEPS,
+        batch: int = 10,
+        rates: Rates | None = None,
+        transport: Transport | StoredTransport | None = None,
+        train_opacity: bool = False,
+        checkpoint: str | os.PathLike[str] | None = None,
+        seed: int = 0,
+        device: Any = None,
+        progress: Progress | None = None,
+    ) -> HarmonicField:
+        """Fit a radio field to the spectra of ``ds``.
+
+        Args:
+            geometry: anything with ``.gaussians`` and ``.mesh`` (a Reconstruction); a Scene or Mesh is covered with
+                discs first.
+            ds: training set.
+            model: ``"rf3dgs+"`` or ``"rf3dgs"``.
+            transmittance: ``"product"`` of (1 - alpha), or the paper's ``"exp"`` of minus the sum of alphas.
+            interaction_point: ``"centre"`` of the dominant Gaussian (the paper),
+                ``"peak"``, ``"expected"``, ``"mesh"``.
+            gain: ``"exp"`` of the harmonics or ``"linear"``, clamped at zero.
+            sh_degree: 0 to 3.
+            top_k: Gaussians kept per pixel.
+            line_of_sight: None (the paper: surfaces must carry it), or ``"explicit"``: Friis gain where the mesh lets
+                the transmitter be seen, spread by the data set's beam.
+            iterations: optimiser steps of the gain layer, ``batch`` receivers each.
+            batch: receivers per step.
+            rates: learning rates and ridge.
+            transport: blending weights of ``ds.receivers``, if they were computed before; stored ones are fitted from
+                disk (:func:`warprrf.rf.fields.harmonic.store.store_transport`).
+            train_opacity: also train the opacities with the gain, as RF-3DGS does; the field then has Gaussians of its
+                own opacities. Needs the ``product`` transmittance.
+            checkpoint: file to save progress to and go on from; removed when the fit is done.
+            seed: of the batches.
+            device: where to compute.
+            progress: called with the stages ``"transport"`` and ``"fit"``.
+
+        Raises:
+            TypeError: if ``geometry`` has no Gaussians and is no mesh.
+            ValueError: for an unknown option, receivers that are not inside the scene, spectra without power, or a
+                checkpoint of another fit.
+        """
+        options = FieldOptions(
+            model, transmittance, interaction_point, gain, int(sh_degree), int(top_k), line_of_sight
+        )
+        if not isinstance(iterations, int | np.integer) or iterations < 0:
+            raise ValueError(f"iterations: got {iterations!r}, expected a whole number of steps, 0 or more")
+        started = time.perf_counter()
+        gaussians, mesh = _geometry(geometry)
+        check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), mesh)
+        if mesh is None and (line_of_sight == "explicit" or interaction_point == "mesh"):
+            raise ValueError(
+                'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
+            )
+        images = check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float64)
+        shape = (images.shape[1], images.shape[2])
+        seen = transport
+        if seen is None:
+            seen = _transport.transport(
+                gaussians, ds.receivers, shape, range_db=ds.range_db, rule=transmittance, top_k=top_k,
+                device=device, progress=progress,
+            )  # fmt: skip
+        _check_transport(seen, np.asarray(ds.receivers, np.float64), shape, transmittance)
+        blank = cls(
+            gaussians=gaussians,
+            mesh=mesh,
+            transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
+            frequency_hz=float(ds.frequency_hz),
+            shape=shape,
+            floor=float(ds.floor),
+            range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
+            beam_sigma_rad=float(ds.beam_sigma_rad),
+            options=options,
+            layers={},
+            gain_unit=1.0,
+            delay_unit=1.0,
+            air=getattr(ds, "air", None),
+            device=device,
+        )
+        listed = None
+        if train_opacity:
+            if not isinstance(seen, Transport):
+                raise ValueError(
+                    "transport: got weights stored on disk together with train_opacity=True, which makes weights anew; "
+                    "expected weights in memory, or None"
+                )
+            listed = list_responses(gaussians, seen, ds.range_db, device=device, progress=progress)
+            seen = listed.transport
+        ready = time.perf_counter()
+        plan = targets(blank.law, ds, images, seen)
+        problem = Problem(seen, batch=batch, seed=seed, device=device)
+        steps = {
+            n: int(iterations) if n == "gain" else min(CHANNEL_STEPS, int(iterations)) for n in plan.layers
+        }
+        learned = Rates() if rates is None else rates
+        identity = field_files.fingerprint(
+            options, learned, seed, batch, steps, seen, train_opacity, *plan.layers.values()
+        )
+        saver = Checkpoint(checkpoint, identity)
+        layers, losses, done = {}, {}, 0
+        for name, target in plan.layers.items():
+            kept, opacity = saver.state(name), None
+            if listed is not None and name == "gain":
+                before = None if kept is None else kept.opacity
+                opacity = OpacityTraining(problem, listed, gaussians.opacities, target.unit, before)
+            state = fit_layer(
+                problem, target, options.gain if name == "gain" else "signed", steps=steps[name],
+                degree=options.sh_degree, rates=learned if name == "gain" else CHANNEL_RATES,
+                state=kept, each=saver.saving(name), opacity=opacity,
+                progress=_shifted(progress, done, sum(steps.values())),
+            )  # fmt: skip
+            done += steps[name]
+            everyone = np.zeros((len(gaussians), _kernels.COEFFICIENTS), np.float32)
+            everyone[:, 0] = plan.unseen[name]
+            unit = 1.0 if target.unit is None else target.unit[:, None]
+            everyone[problem.seen] = state.coefficients * unit
+            layers[name], losses[name] = everyone, [float(loss) for loss in state.losses]
+            if listed is not None and opacity is not None:
+                trained = np.array(gaussians.opacities, np.float32)
+                trained[problem.seen] = opacity.opacities
+                gaussians = replace(gaussians, opacities=trained)
+                # Channels are blended with the opacities that the gain has found.
+                problem = Problem(listed.with_opacities(trained), batch=batch, seed=seed, device=device)
+        saver.remove()
+        return replace(
+            blank,
+            gaussians=gaussians,
+            layers=layers,
+            gain_unit=plan.gain_unit,
+            delay_unit=plan.delay_unit,
+            report={
+                "receivers": len(images),
+                "transport_time_s": 0.0 if transport is not None else ready - started,
+                "fit_time_s": time.perf_counter() - ready,
+                "pairs_per_pixel": seen.pairs / (len(images) * shape[0] * shape[1]),
+                "weight_dropped_mean": seen.dropped[1],
+                "gaussians": len(gaussians),
+                "gaussians_seen": len(problem.seen),
+                "iterations": int(iterations),
+                "seed": int(seed),
+                "train_opacity": bool(train_opacity),
+                "losses": losses,
+            },
+        )
+
+    def with_gas(self, gas: Any = True) -> HarmonicField:
+        """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
+        air = air_of(gas, self.frequency_hz)
+        if air != self.air and self.options.model == "rf3dgs":
+            raise ValueError(
+                f"gas: got {gas!r}, but an rf3dgs field knows no lengths and holds what absorption its spectra had; "
+                'fit model="rf3dgs+", or fit again'
+            )
+        return replace(self, air=air)
+
+    def spectrum(self, rx: Any, transmitter: Any = None, *, transport: Transport | None = None) -> Spectrum:
+        """The spatial spectrum at ``rx`` (3,) [m].
+
+        Args:
+            rx: receiver position.
+            transmitter: position (3,) [m] if another than the fitted one: lengths are recomputed, gains are kept.
+            transport: blending weights of exactly this receiver, if they were computed before.
+
+        Raises:
+            ValueError: for a position that is not finite, outside the scene or on a surface; or another transmitter
+                with ``rf3dgs``, whose delays and gains hold only for the one it was fitted for.
+        """
+        return self._look(rx, transmitter, transport).spectrum
+
+    def paths(self, rx: Any, transmitter: Any = None, max_paths: int | None = None) -> Paths:
+        """Propagation paths at ``rx``: line of sight where the mesh lets the transmitter be seen, and one diffuse path
+        per pixel above the floor.
+
+        The sum of ``|gain|^2`` equals the spectrum's sum: what pixels below the floor hold is spread over the diffuse
+        paths in proportion to their power (at least one is kept to carry it). With ``line_of_sight="explicit"`` the
+        ``los`` path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's
+        direction, merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre.
+
+        Args:
+            rx: receiver position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded.
+            transmitter: as for :meth:`spectrum`.
+            max_paths: keep the strongest only (the sum is then what they carry).
+
+        Raises:
+            ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
+        """
+        if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
+            raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
+        positions = check_receiver("rx", rx, self.mesh)
+        found = [
+            replace(
+                paths_of(
+                    self._look(position, transmitter, None),
+                    beam_sigma_rad=self.beam_sigma_rad,
+                    frequency_hz=self.frequency_hz,
+                    max_paths=max_paths,
+                ),
+                air=self.air,
+            )
+            for position in np.atleast_2d(positions)
+        ]
+        return found[0] if positions.ndim == 1 else Paths.stack(found)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything to one safetensors file, in one go: geometry, coefficients, options, report."""
+        tensors = {f"layer/{name}": table for name, table in self.layers.items()}
+        for name in ("means", "quaternions", "scales", "opacities", "sh"):
+            tensors[f"gaussians/{name}"] = getattr(self.gaussians, name)
+        if self.mesh is not None:
+            tensors["mesh/vertices"], tensors["mesh/faces"] = self.mesh.vertices, self.mesh.faces
+        tensors["transmitter"] = self.transmitter
+        header = {name: getattr(self, name) for name in _PLAIN}
+        header |= {} if self.air is None else self.air.attributes
+        field_files.write(path, tensors, {**header, "options": asdict(self.options), "report": self.report})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> HarmonicField:
+        """Read a field that :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is corrupt, or no radio field.
+        """
+        tensors, header = field_files.read(path)
+        try:
+            parts = {
+                n: tensors[f"gaussians/{n}"] for n in ("means", "quaternions", "scales", "opacities", "sh")
+            }
+            mesh = Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]) if "mesh/faces" in tensors else None
+            layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
+            if "gain" not in layers or any(t.shape != (len(parts["means"]), 16) for t in layers.values()):
+                raise ValueError("its coefficients do not fit its Gaussians")
+            plain = {name: header[name] for name in _PLAIN}
+            return cls(
+                **{**plain, "shape": tuple(plain["shape"]), "range_db": tuple(plain["range_db"])},
+                gaussians=Gaussians(**parts),
+                mesh=mesh,
+                transmitter=tensors["transmitter"],
+                options=FieldOptions(**header["options"]),
+                layers=layers,
+                air=Air.from_attributes(header),
+                report=header["report"],
+                device=device,
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{os.fspath(path)}: corrupt or no radio field of this version: {error}"
+            ) from error
+
+    @property
+    def law(self) -> SingleBounce:
+        """Path lengths, spreading loss and line of sight of this field."""
+        return SingleBounce(
+            self.gaussians,
+            self.mesh,
+            self.options,
+            self.shape,
+            self.frequency_hz,
+            self.beam_sigma_rad,
+            self.device,
+            self.air,
+        )
+
+    def _blend(self, name: str, seen: Transport) -> np.ndarray:
+        """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
+        device = _device.resolve(self.device)
+        kernels = _kernels.build(wp.float32)
+        if name not in self._uploaded:
+            self._uploaded[name] = wp.array(self.layers[name], dtype=kernels.vec16, device=device)
+        if "basis" not in self._uploaded:
+            self._uploaded["basis"] = harmonics(self.shape, wp.float32, device)
+        kind = KINDS[self.options.gain] if name == "gain" else KINDS["signed"]
+        out = wp.zeros(self.shape[0] * self.shape[1], dtype=float, device=device)
+        inputs = [
+            kind,
+            wp.array(seen.start.astype(np.int32), dtype=int, device=device),
+            wp.array(seen.gaussian, dtype=int, device=device),
+            wp.array(seen.weight, dtype=float, device=device),
+            self._uploaded["basis"],
+            self._uploaded[name],
+            out,
+        ]
+        _device.launch(kernels.predict, len(out), inputs, device=device)
+        return out.numpy().reshape(self.shape).astype(np.float64)
+
+    def _look(self, rx: Any, transmitter: Any, seen: Transport | None) -> View:
+        """Spectrum at one receiver and what it was made of."""
+        receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
+        source = self._transmitter(transmitter)
+        if seen is None:
+            seen = _transport.transport(
+                self.gaussians, receiver[None], self.shape, range_db=self.range_db,
+                rule=self.options.transmittance, top_k=self.options.top_k, device=self.device,
+            )  # fmt: skip
+        _check_transport(seen, receiver[None], self.shape, self.options.transmittance)
+        law = self.law
+        visible, friis = law.line_of_sight(receiver, source)
+        lengths = law.lengths(seen, source)
+        power = law.factor(lengths)[0] * self.gain_unit * self._blend("gain", seen)
+        point, delay, departure = lengths.point[0], lengths.delay_s[0], lengths.departure[0]
+        if self.options.model == "rf3dgs":
+            point = np.full_like(point, np.nan)
+            delay, departure = self._channels(seen)
+        angles = np.stack(angles_from_directions(departure), axis=-1)
+        beam = law.beam(receiver, source)
+        direct = np.zeros(self.shape, dtype=bool)
+        if beam is not None:
+            direct, power = beam > power, power + beam
+        elif visible and self.options.model == "rf3dgs+":
+            direct = near_line_of_sight(receiver, source, self.shape, self.beam_sigma_rad)
+        toward = receiver - source
+        delay = np.where(direct, np.linalg.norm(toward) / SPEED_OF_LIGHT, delay)
+        angles = np.where(direct[..., None], np.stack(angles_from_directions(toward)), angles)
+        spectrum = Spectrum(
+            path_gain=power.astype(np.float32),
+            delay_s=delay,
+            aod=angles,
+            floor=self.floor,
+            range_db=self.range_db,
+        )
+        return View(spectrum, receiver, source, point, visible, friis, beam)
+
+    def _channels(self, seen: Transport) -> tuple[np.ndarray, np.ndarray]:
+        """Learned delay [s] and vector of departure; NaN where a ray meets nothing or nothing was learned."""
+        if "delay" not in self.layers:
+            return np.full(self.shape, np.nan), np.full((*self.shape, 3), np.nan)
+        empty = seen.dominant[0] < 0
+        delay = np.maximum(self._blend("delay", seen), 0.0) * self.delay_unit
+        departure = np.stack([self._blend(f"aod_{axis}", seen) for axis in "xyz"], axis=-1)
+        return np.where(empty, np.nan, delay), np.where(empty[..., None], np.nan, departure)
+
+    def _transmitter(self, transmitter: Any) -> np.ndarray:
+        if transmitter is None:
+            return self.transmitter
+        position = check_array("transmitter", transmitter, (3,))
+        if self.options.model == "rf3dgs" and not np.array_equal(position, self.transmitter):
+            raise ValueError(
+                f"transmitter: got {position.tolist()}, but an rf3dgs field holds only for the one it was fitted for, "
+                f'{self.transmitter.tolist()}; fit model="rf3dgs+", which recomputes lengths, or fit again'
+            )
+        return position
+
+
+_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad", "gain_unit", "delay_unit")
+
+
+def _geometry(geometry: Any) -> tuple[Gaussians, Mesh | None]:
+    if isinstance(geometry, Gaussians):
+        return geometry, None
+    gaussians = getattr(geometry, "gaussians", None)
+    mesh = geometry if isinstance(geometry, Mesh) else getattr(geometry, "mesh", None)
+    if gaussians is None and mesh is not None:
+        gaussians = discs_on_mesh(mesh)
+    if not isinstance(gaussians, Gaussians):
+        raise TypeError(
+            f"geometry: got {type(geometry).__name__}, expected a Reconstruction (or anything with .gaussians and "
+            ".mesh), a Scene or a Mesh"
+        )
+    if len(gaussians) == 0:
+        raise ValueError("geometry: got no Gaussians, expected at least one")
+    return gaussians, mesh
+
+
+def _check_transport(
+    seen: Transport | StoredTransport, receivers: np.ndarray, shape: tuple[int, int], rule: str
+) -> None:
+    if seen.shape != shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
+        raise ValueError(
+            f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
+            f"expected those of exactly the {len(receivers)} receivers asked for, shape {shape}, rule {rule!r}"
+        )
+
+
+def _shifted(progress: Progress | None, done: int, total: int) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda stage, step, _: progress(stage, done + step, total)

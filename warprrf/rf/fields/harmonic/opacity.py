@@ -1,0 +1,202 @@
+"""Training opacities with the rest frozen, as RF-3DGS does: cached responses and order in the place of weights.
+
+A Gaussian's response on a pixel's ray and the order along the ray do not depend on opacities; only the blending weights
+do, and those are cheap to make anew. So that Gaussians behind a wall are listed too, and can show when the wall turns
+transparent, the lists are made with all opacities thinned: a pixel's list goes down to where the thinned transmittance
+is 1e-4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf.device import Progress
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import Blending
+from warprrf.geometry.splats.render import blend_weights
+from warprrf.kernels.radio import opacity as _kernels
+from warprrf.rf.fields.harmonic.batches import Problem
+from warprrf.rf.fields.harmonic.transport import Transport, cutoffs
+
+THINNED = 0.5  # of each opacity, while lists are made
+LISTED = 32  # Gaussians kept per pixel
+THINNED_LEFT = 1e-4  # transmittance at which a thinned list ends: float32 weights give alpha to 0.1 % there
+RATE = 0.05  # Adam rate of the logits, as RF-3DGS publishes it
+DECAYS = (0.9, 0.999, 1e-15)
+LEAST, MOST = 1e-4, 1 - 1e-6  # opacities that logits are made of
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Responses along the rays of some receivers, in the order of a :class:`Transport` of theirs.
+
+    Attributes:
+        transport: its weights are those of the Gaussians' own opacities.
+        response: of each pair, in [0, 1], shape ``(E,)`` float32.
+        alpha_max: clamp of alpha.
+    """
+
+    transport: Transport
+    response: np.ndarray
+    alpha_max: float
+
+    def with_opacities(self, opacities: np.ndarray) -> Transport:
+        """The weights that other opacities (N,) give."""
+        start, gaussian = self.transport.start, self.transport.gaussian
+        alpha = np.minimum(opacities[gaussian] * self.response.astype(np.float64), self.alpha_max)
+        cumulated = np.concatenate([[0.0], np.cumsum(np.log1p(-alpha))])
+        pixel = np.repeat(np.arange(len(start) - 1), np.diff(start))
+        left = np.exp(cumulated[:-1] - cumulated[start[pixel]])
+        return replace(self.transport, weight=(alpha * left).astype(np.float32))
+
+
+def list_responses(
+    gaussians: Gaussians,
+    seen: Transport,
+    range_db: Any,
+    *,
+    top_k: int = LISTED,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> Listed:
+    """Responses and order along the rays of the receivers of ``seen``.
+
+    Args:
+        gaussians: the frozen geometry.
+        seen: weights of the receivers, whose interaction points are kept; made with the ``product`` rule.
+        range_db: range of the data set's dB images.
+        top_k: Gaussians kept per pixel, those of largest thinned weight.
+
+    Raises:
+        ValueError: for weights of another rule.
+    """
+    if seen.rule != "product":
+        raise ValueError(f"train_opacity: got transmittance {seen.rule!r}, expected 'product'")
+    rules = cutoffs(range_db)
+    thin = replace(gaussians, opacities=(THINNED * gaussians.opacities).astype(np.float32))
+    blending = Blending(THINNED * rules.alpha_min, rules.alpha_max, THINNED_LEFT, "product")
+    counts, indices, responses = [], [], []
+    rows, columns = seen.shape
+    for k, receiver in enumerate(seen.receivers):
+        view = blend_weights(
+            thin,
+            Camera.spherical(columns, rows, position=receiver),
+            top_k=top_k,
+            blending=blending,
+            device=device,
+        )
+        weight = np.asarray(view.weight, np.float64)
+        listed = (np.asarray(view.index) >= 0) & (weight > 0)
+        weight = np.where(listed, weight, 0.0)
+        left = 1.0 - (np.cumsum(weight, axis=-1) - weight)
+        alpha = weight / np.maximum(left, 1e-12)
+        index = np.asarray(view.index)[listed]
+        counts.append(np.count_nonzero(listed, axis=-1).ravel())
+        indices.append(index)
+        responses.append(np.minimum(alpha[listed] / thin.opacities[index], 1.0).astype(np.float32))
+        if progress is not None:
+            progress("transport", k + 1, len(seen.receivers))
+    start = np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64)
+    gaussian = np.concatenate(indices).astype(np.int32)
+    response = np.concatenate(responses)
+    blank = replace(seen, start=start, gaussian=gaussian, weight=np.zeros(len(gaussian), np.float32))
+    found = Listed(blank, response, rules.alpha_max)
+    own = found.with_opacities(np.asarray(gaussians.opacities, np.float64))
+    return replace(found, transport=own)
+
+
+class OpacityTraining:
+    """Logits of the opacities of the Gaussians that a problem sees, and their Adam.
+
+    Args:
+        problem: of the transport of ``listed``.
+        listed: responses.
+        opacities: to start from, of all Gaussians, shape ``(N,)``.
+        unit: what each Gaussian's blended value is multiplied by, shape ``(G,)``; None for one.
+        state: logits and Adam's moments to go on from, shape ``(3, G)``.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        listed: Listed,
+        opacities: np.ndarray,
+        unit: np.ndarray | None = None,
+        state: np.ndarray | None = None,
+    ) -> None:
+        self.problem, self.kernels = problem, _kernels.build(problem.real)
+        self.alpha_max = problem.real(listed.alpha_max)
+        first = np.clip(np.asarray(opacities, np.float64)[problem.seen], LEAST, MOST)
+        self.state = np.stack([np.log(first / (1 - first)), np.zeros_like(first), np.zeros_like(first)])
+        if state is not None:
+            self.state = np.array(state, np.float64)
+        everyone = replace(listed.transport, weight=listed.response)
+        self.pairs = []
+        for batch in problem.batches:
+            owner = batch.pair_owner()
+            response = np.empty(len(owner), np.float32)
+            response[batch.pair_of_pixel.numpy()] = everyone.subset(batch.receivers).weight
+            own = np.ones(len(owner)) if unit is None else unit[owner]
+            self.pairs.append(
+                (
+                    wp.array(owner.astype(np.int32), dtype=int, device=problem.device),
+                    problem.upload(response),
+                    problem.upload(own),
+                )
+            )
+        self._pair_adjoint = wp.zeros(
+            max(len(b.pair_pixel) for b in problem.batches), dtype=problem.real, device=problem.device
+        )
+        self.refresh()
+
+    @property
+    def opacities(self) -> np.ndarray:
+        """Opacities of the Gaussians seen, shape ``(G,)``."""
+        return np.asarray(1.0 / (1.0 + np.exp(-self.state[0])))
+
+    def refresh(self) -> None:
+        """Put the opacities on the device."""
+        self._opacity = self.problem.upload(self.opacities)
+
+    def weights(self, index: int, out: wp.array) -> None:
+        """Blending weights of batch ``index`` into ``out``, pair by pair."""
+        p, batch = self.problem, self.problem.batches[index]
+        owner, response, unit = self.pairs[index]
+        p.launch(
+            self.kernels.blend, len(batch.pixel_start) - 1, self.alpha_max, batch.pixel_start, batch.pair_of_pixel,
+            owner, response, unit, self._opacity, out,
+        )  # fmt: skip
+
+    def gradient(self, index: int, contribution: wp.array, total: wp.array, adjoint: wp.array) -> np.ndarray:
+        """Derivative of the loss by each opacity of batch ``index``, shape ``(G,)``."""
+        p, batch = self.problem, self.problem.batches[index]
+        owner, response, _ = self.pairs[index]
+        p.launch(
+            self.kernels.blend_adjoint, len(batch.pixel_start) - 1, self.alpha_max, batch.pixel_start,
+            batch.pair_of_pixel, owner, response, self._opacity, contribution, total, adjoint, self._pair_adjoint,
+        )  # fmt: skip
+        out = wp.zeros(len(p.seen), dtype=p.real, device=p.device)
+        p.launch(
+            self.kernels.row_sums, batch.rows, batch.row_gaussian, batch.row_start, self._pair_adjoint, out
+        )
+        return np.asarray(out.numpy(), np.float64)
+
+    def step(self, gradient: np.ndarray, count: int, rate: float) -> None:
+        """Adam's step ``count`` (from 1) along the derivative by the opacities."""
+        opacity = self.opacities
+        slope = gradient * opacity * (1.0 - opacity)
+        decay1, decay2, epsilon = DECAYS
+        logits, first, second = self.state
+        first = decay1 * first + (1 - decay1) * slope
+        second = decay2 * second + (1 - decay2) * slope**2
+        logits = logits - rate * (first / (1 - decay1**count)) / (
+            np.sqrt(second / (1 - decay2**count)) + epsilon
+        )
+        low, high = np.log(LEAST / (1 - LEAST)), np.log(MOST / (1 - MOST))
+        self.state = np.stack([np.clip(logits, low, high), first, second])
+        self.refresh()

@@ -1,0 +1,114 @@
+"""A predicted spectrum as propagation paths: line of sight merged out of its beam, one diffuse path per pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.paths.trace import Paths
+from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, pixel_directions, pixel_of
+
+BEAM_REACH = 3.0  # pixels within so many beam sigmas of a visible transmitter are its line of sight
+
+
+@dataclass(frozen=True)
+class View:
+    """A spectrum with what it was made of.
+
+    Attributes:
+        spectrum: the spectrum at ``receiver``.
+        receiver, transmitter: positions [m], shape ``(3,)``.
+        points: interaction points [m], shape ``(H, W, 3)``; NaN where unknown.
+        visible: whether the mesh lets the two see each other.
+        line_of_sight_gain: its Friis gain.
+        beam: power of the explicit line of sight per pixel, shape ``(H, W)``; None if the model has none.
+    """
+
+    spectrum: Spectrum
+    receiver: np.ndarray
+    transmitter: np.ndarray
+    points: np.ndarray
+    visible: bool
+    line_of_sight_gain: float
+    beam: np.ndarray | None
+
+
+def paths_of(view: View, *, beam_sigma_rad: float, frequency_hz: float, max_paths: int | None) -> Paths:
+    """Paths of ``view``, strongest first; see :meth:`RadioField.paths`."""
+    spectrum, shape = view.spectrum, view.spectrum.shape
+    power = np.asarray(spectrum.path_gain, np.float64)
+    total = float(power.sum())
+    toward = pixel_directions(shape)
+    outward = view.receiver - view.transmitter
+    distance = float(np.linalg.norm(outward))
+    line_of_sight = 0.0
+    if view.beam is not None:
+        line_of_sight, power = min(view.line_of_sight_gain, total), np.maximum(power - view.beam, 0.0)
+    elif view.visible:
+        near = near_line_of_sight(view.receiver, view.transmitter, shape, beam_sigma_rad)
+        line_of_sight, power = float(power[near].sum()), np.where(near, 0.0, power)
+    rest = total - line_of_sight
+    kept = power > spectrum.floor
+    if not kept.any() and rest > 0 and power.max() > 0:
+        kept = power == power.max()
+    row, column = np.nonzero(kept)
+    diffuse = power[row, column]
+    if len(diffuse):
+        diffuse = diffuse * (max(rest, 0.0) / diffuse.sum())
+    else:
+        line_of_sight = total  # nothing else has power
+    delay = np.full(len(diffuse), np.nan) if spectrum.delay_s is None else spectrum.delay_s[row, column]
+    aod = np.full((len(diffuse), 2), np.nan) if spectrum.aod is None else spectrum.aod[row, column]
+    parts = [
+        _single(diffuse, delay, toward[row, column], aod, view.points[row, column], "diffuse", frequency_hz)
+    ]
+    if line_of_sight > 0:
+        departure = np.stack(angles_from_directions(outward[None]), axis=-1)
+        flight = np.array([distance / SPEED_OF_LIGHT])
+        nowhere = np.full((1, 3), np.nan)
+        parts.append(
+            _single(
+                np.array([line_of_sight]), flight, -outward[None], departure, nowhere, "los", frequency_hz
+            )
+        )
+    everything = Paths.concatenate(parts)
+    order = np.argsort(-np.abs(everything.gain), kind="stable")[:max_paths]
+    return replace(everything.select(order), transmitter=view.transmitter, receiver=view.receiver)
+
+
+def near_line_of_sight(
+    receiver: np.ndarray, transmitter: np.ndarray, shape: tuple[int, int], beam_sigma_rad: float
+) -> np.ndarray:
+    """Pixels ``(H, W)`` within :data:`BEAM_REACH` beam sigmas of the transmitter's direction, at least one."""
+    direction = (transmitter - receiver) / np.linalg.norm(transmitter - receiver)
+    near = pixel_directions(shape) @ direction >= np.cos(BEAM_REACH * beam_sigma_rad)
+    near[pixel_of(direction, shape)] = True
+    return near
+
+
+def _single(
+    power: np.ndarray,
+    delay: np.ndarray,
+    arrival: np.ndarray,
+    departure: np.ndarray,
+    points: np.ndarray,
+    kind: str,
+    frequency_hz: float,
+) -> Paths:
+    """Paths of at most one interaction, at ``points`` (L, 3), NaN for none. Without a delay the phase is zero."""
+    turns = np.mod(frequency_hz * np.where(np.isfinite(delay), delay, 0.0), 1.0)
+    zenith, azimuth = angles_from_directions(arrival)
+    return Paths(
+        gain=np.sqrt(power) * np.exp(-2j * np.pi * turns),
+        tau=np.asarray(delay, np.float64),
+        theta_r=zenith,
+        phi_r=azimuth,
+        theta_t=departure[:, 0],
+        phi_t=departure[:, 1],
+        vertices=points[:, None, :],
+        kind=np.full(len(power), kind, dtype="<U7"),
+        valid=np.ones(len(power), dtype=bool),
+        frequency_hz=float(frequency_hz),
+    )

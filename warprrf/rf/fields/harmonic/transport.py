@@ -1,0 +1,266 @@
+"""What a receiver sees of the frozen geometry: blending weights.
+
+Geometry does not change while the radio part is learned, so the weights of a view are computed once, as a sparse
+pixels-by-Gaussians matrix, and every fit and every model reuses them. Radio needs other cutoffs than photos: an image
+60 dB deep shows what an opacity clamp of 0.99 leaks through a wall (-20 dB), so :func:`cutoffs` derives them from the
+data set's range.
+
+:func:`transport` keeps the weights in memory; :mod:`warprrf.rf.fields.harmonic.store` keeps them on disk, a file a receiver,
+for as many receivers as the disk holds. Whoever fits takes either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import Progress, check_array
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import Blending
+from warprrf.geometry.splats.render import blend_weights
+from warprrf.rf.spectra.spectrum import check_shape
+
+TRANSMITTANCE = ("product", "exp")
+TOP_K = 16  # Gaussians kept per pixel
+ALPHA_MIN = 1e-3  # a fainter layer changes what lies behind it by less than 0.005 dB
+MIN_WEIGHT = 1e-4  # smaller shares of a pixel's weight are given to the others: 0.0004 dB
+
+
+@dataclass(frozen=True)
+class Transport:
+    """Blending weights of the frozen geometry for some receivers, as sparse rows: one row a pixel.
+
+    Attributes:
+        shape: rows and columns of a spectrum.
+        receivers: positions [m], shape ``(R, 3)``.
+        start: where each pixel's pairs begin, shape ``(R * H * W + 1,)`` int64.
+        gaussian: Gaussian of each pair, front to back within a pixel, shape ``(E,)`` int32.
+        weight: blending weight alpha T of each pair, shape ``(E,)`` float32; what top-K left out is shared among the
+            pairs that stayed, so that a pixel's sum is that of all its Gaussians.
+        dominant: Gaussian with the largest weight, shape ``(R, H, W)`` int32, -1 where there is none.
+        expected_range: blended mean of the peak ranges [m], shape ``(R, H, W)`` float32, NaN where there is none.
+        rule: transmittance rule, ``"product"`` or ``"exp"``.
+        dropped: largest and mean weight per pixel that top-K left out.
+    """
+
+    shape: tuple[int, int]
+    receivers: np.ndarray
+    start: np.ndarray
+    gaussian: np.ndarray
+    weight: np.ndarray
+    dominant: np.ndarray
+    expected_range: np.ndarray
+    rule: str
+    dropped: tuple[float, float]
+
+    def subset(self, indices: Sequence[int] | np.ndarray) -> Transport:
+        """The receivers at ``indices``, in that order."""
+        chosen = np.asarray(indices, dtype=np.int64)
+        pixels = self.shape[0] * self.shape[1]
+        pieces = [slice(self.start[r * pixels], self.start[(r + 1) * pixels]) for r in chosen]
+        counts = np.diff(self.start).reshape(len(self.receivers), pixels)[chosen].ravel()
+        return Transport(
+            shape=self.shape,
+            receivers=self.receivers[chosen],
+            start=np.concatenate([[0], np.cumsum(counts)]),
+            gaussian=np.concatenate([self.gaussian[p] for p in pieces]),
+            weight=np.concatenate([self.weight[p] for p in pieces]),
+            dominant=self.dominant[chosen],
+            expected_range=self.expected_range[chosen],
+            rule=self.rule,
+            dropped=self.dropped,
+        )
+
+    def at(self, receiver: Any) -> Transport:
+        """The part of one receiver (3,) [m].
+
+        Raises:
+            ValueError: if it is none of these receivers.
+        """
+        return self.subset([index_of(self.receivers, receiver)])
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of pixel and Gaussian in all."""
+        return len(self.gaussian)
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Gaussians that any receiver sees, ascending."""
+        return np.unique(self.gaussian)
+
+    def parts(self) -> Iterator[tuple[np.ndarray, Transport]]:
+        """The receivers in portions that fit into memory, with their indices: here all at once."""
+        yield np.arange(len(self.receivers)), self
+
+    @property
+    def pixel_weight(self) -> np.ndarray:
+        """Sum of the weights per pixel, shape ``(R, H, W)`` float64; with the ``exp`` rule it can exceed one."""
+        cumulated = np.concatenate([[0.0], np.cumsum(self.weight, dtype=np.float64)])
+        return np.diff(cumulated[self.start]).reshape(len(self.receivers), *self.shape)
+
+
+def cutoffs(range_db: Any, rule: str = "product") -> Blending:
+    """How to blend for images that span ``range_db`` (lowest, highest) [dB].
+
+    A wall may leak no more than the floor of the range, and blending stops when no more than that is left. An alpha
+    below :data:`ALPHA_MIN` is left out.
+    """
+    depth = 10 ** (-(float(range_db[1]) - float(range_db[0])) / 10)
+    leak = min(max(depth, 1e-6), 1e-2)
+    return Blending(alpha_min=ALPHA_MIN, alpha_max=1.0 - leak, transmittance_min=leak, rule=rule)
+
+
+def transport(
+    gaussians: Gaussians,
+    receivers: Any,
+    shape: tuple[int, int],
+    *,
+    range_db: Any = (-60.0, 0.0),
+    rule: str = "product",
+    top_k: int = TOP_K,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> Transport:
+    """Blending weights of ``gaussians`` for every pixel of every receiver.
+
+    Args:
+        gaussians: the frozen geometry.
+        receivers: positions [m], shape ``(R, 3)``.
+        shape: rows and columns of a spectrum.
+        range_db: lowest and highest value of the data set's dB images: sets :func:`cutoffs`.
+        rule: transmittance: ``"product"`` of (1 - alpha), or the paper's ``"exp"`` of minus the sum of alphas.
+        top_k: Gaussians kept per pixel.
+        device: where blending runs.
+        progress: called once a receiver with the stage ``"transport"``.
+
+    Raises:
+        ValueError: for positions that are not finite, an unknown rule, or a ``top_k`` below 1.
+    """
+    view, positions = viewing(gaussians, receivers, shape, range_db, rule, top_k, device)
+    pieces = []
+    for i in range(len(positions)):
+        pieces.append(view(i))
+        if progress is not None:
+            progress("transport", i + 1, len(positions))
+    return joined(positions, view.shape, rule, pieces)
+
+
+@dataclass(frozen=True)
+class View:
+    """What one receiver sees: the arrays of :class:`Transport` for it alone.
+
+    Attributes:
+        counts: pairs of each pixel, shape ``(H * W,)``.
+        gaussian, weight: of each pair, shape ``(E,)`` int32 and float32.
+        dominant, expected_range: shape ``(H, W)`` int32 and float32.
+        dropped: weight that top-K left out, shape ``(H, W)`` float32.
+    """
+
+    counts: np.ndarray
+    gaussian: np.ndarray
+    weight: np.ndarray
+    dominant: np.ndarray
+    expected_range: np.ndarray
+    dropped: np.ndarray
+
+
+@dataclass(frozen=True)
+class Viewing:
+    """Computes the :class:`View` of each of some receivers; see :func:`transport` for what goes in."""
+
+    gaussians: Gaussians
+    positions: np.ndarray
+    shape: tuple[int, int]
+    blending: Blending
+    top_k: int
+    device: Any
+
+    def __call__(self, receiver: int) -> View:
+        """The view of receiver number ``receiver``."""
+        rows, columns = self.shape
+        seen = blend_weights(
+            self.gaussians,
+            Camera.spherical(columns, rows, position=self.positions[receiver]),
+            top_k=self.top_k,
+            blending=self.blending,
+            device=self.device,
+        )
+        weight = np.asarray(seen.weight, dtype=np.float64)
+        index = np.asarray(seen.index)
+        listed = (index >= 0) & (weight > 0)
+        total = np.sum(weight, axis=-1, where=listed, initial=0.0)
+        dropped = np.asarray(seen.dropped, dtype=np.float64)
+        keep = listed & (weight > MIN_WEIGHT * total[..., None])
+        kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
+        scale = np.divide(total + dropped, kept, out=np.zeros_like(kept), where=kept > 0)
+        expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
+        return View(
+            counts=np.count_nonzero(keep, axis=-1).ravel(),
+            gaussian=index[keep].astype(np.int32),
+            weight=(weight * scale[..., None])[keep].astype(np.float32),
+            dominant=np.where(kept > 0, np.asarray(seen.dominant), -1).astype(np.int32),
+            expected_range=np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0).astype(
+                np.float32
+            ),
+            dropped=dropped.astype(np.float32),
+        )
+
+
+def viewing(
+    gaussians: Gaussians,
+    receivers: Any,
+    shape: tuple[int, int],
+    range_db: Any,
+    rule: str,
+    top_k: int,
+    device: Any,
+) -> tuple[Viewing, np.ndarray]:
+    """The checked arguments of :func:`transport`, and the receivers' positions.
+
+    Raises:
+        ValueError: naming the argument that does not fit.
+    """
+    positions = check_array("receivers", receivers, (None, 3))
+    if len(positions) == 0:
+        raise ValueError("receivers: got none, expected at least one position")
+    if rule not in TRANSMITTANCE:
+        raise ValueError(f"rule: got {rule!r}, expected one of {', '.join(TRANSMITTANCE)}")
+    if not isinstance(top_k, int | np.integer) or top_k < 1:
+        raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    blending = cutoffs(range_db, rule)
+    return Viewing(gaussians, positions, check_shape(shape), blending, int(top_k), device), positions
+
+
+def joined(receivers: np.ndarray, shape: tuple[int, int], rule: str, views: Sequence[View]) -> Transport:
+    """The views of ``receivers`` (R, 3) as one :class:`Transport`."""
+    dropped = [(float(v.dropped.max()), float(v.dropped.mean(dtype=np.float64))) for v in views]
+    return Transport(
+        shape=shape,
+        receivers=receivers,
+        start=np.concatenate([[0], np.cumsum(np.concatenate([v.counts for v in views]))]).astype(np.int64),
+        gaussian=np.concatenate([v.gaussian for v in views]),
+        weight=np.concatenate([v.weight for v in views]),
+        dominant=np.stack([v.dominant for v in views]),
+        expected_range=np.stack([v.expected_range for v in views]),
+        rule=rule,
+        dropped=(max(d[0] for d in dropped), float(np.mean([d[1] for d in dropped]))),
+    )
+
+
+def index_of(receivers: np.ndarray, receiver: Any) -> int:
+    """Which of ``receivers`` (R, 3) lies at ``receiver`` (3,) [m].
+
+    Raises:
+        ValueError: if none does.
+    """
+    position = check_array("receiver", receiver, (3,))
+    found = np.flatnonzero((receivers == position).all(axis=1))
+    if len(found) == 0:
+        raise ValueError(f"receiver: got {position.tolist()}, which is none of the {len(receivers)} here")
+    return int(found[0])

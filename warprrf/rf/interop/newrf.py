@@ -1,0 +1,298 @@
+"""NeWRF's published conference room: MATLAB's rays to read, and our image method beside them, ray by ray.
+
+NeWRF (Lu, Vattheuer, Mirzasoleiman, Abari, ICML 2024; github.com/LuHaofan/NeWRF, MIT licence) traces its rooms with
+MATLAB's image method: perfect reflectors without a sign change, up to two reflections, isotropic antennas. Here that
+data is an outside check: nothing in it was computed by this package.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.paths.mirror_chains import mirror_chains
+from warprrf.rf.paths.trace import MirrorTracer
+
+RAYS_FILE = "newrf_conference.npz"
+MESH_FILE = "conferenceroom.stl"
+
+# A gain of theirs states the ray's length to 1e-7 m; lengths over their last point either agree with it to that or
+# miss by millimetres and more, so anything between separates single from double reflections.
+_ONCE_M = 1e-5
+_AT_TRANSMITTER_M = 1e-6
+MATCH_M = 1e-3
+"""Rays of one order are the same if last points and lengths together differ by less [m]."""
+
+
+@dataclass(frozen=True)
+class NewrfRays:
+    """Rays of one transmitter to R receivers, at most L each.
+
+    Attributes:
+        transmitter: Position [m], shape ``(3,)``.
+        receivers: Positions [m], shape ``(R, 3)``, in NeWRF's order.
+        frequency_hz: Carrier frequency [Hz].
+        last_point: What the receiver sees last [m], shape ``(R, L, 3)``: the transmitter for line of sight, else the
+            last reflection; NaN where not valid.
+        gain: Complex gain between isotropic antennas, exp(-j 2 pi f tau) included, shape ``(R, L)``; 0 where not valid.
+        valid: Whether there is a ray, shape ``(R, L)``, bool.
+        line_of_sight: Whether the receiver sees the transmitter, shape ``(R,)``, bool.
+        csi: Complex channel, the sum of the gains, shape ``(R,)``.
+        mesh: The room.
+    """
+
+    transmitter: np.ndarray
+    receivers: np.ndarray
+    frequency_hz: float
+    last_point: np.ndarray
+    gain: np.ndarray
+    valid: np.ndarray
+    line_of_sight: np.ndarray
+    csi: np.ndarray
+    mesh: Mesh
+
+    @property
+    def wavelength_m(self) -> float:
+        """Wavelength [m]."""
+        return SPEED_OF_LIGHT / self.frequency_hz
+
+    @property
+    def length_m(self) -> np.ndarray:
+        """Unfolded length that the gain's modulus states (Friis) [m], shape ``(R, L)``; NaN where not valid."""
+        size = np.where(self.valid, np.abs(self.gain), np.nan)
+        return self.wavelength_m / (4.0 * np.pi * size)
+
+    @property
+    def order(self) -> np.ndarray:
+        """Reflections of each ray, shape ``(R, L)``, int: 0, 1, 2 (two or more); -1 where not valid.
+
+        A ray is reflected once if the way from the transmitter over its last point is as long as its gain says.
+        """
+        first = np.linalg.norm(self.last_point - self.transmitter, axis=2)
+        over = first + np.linalg.norm(self.last_point - self.receivers[:, None], axis=2)
+        order = np.where(np.abs(over - self.length_m) < _ONCE_M, 1, 2)
+        order[first < _AT_TRANSMITTER_M] = 0
+        return np.where(self.valid, order, -1)
+
+    def split(self, n_train: int | None = None, share: float = 0.8) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of training and held-out receivers after NeWRF's ``loaders.py``.
+
+        Held out are the last 20 %, the same whatever the training; training are the first ``share``, of which the
+        first ``n_train`` are taken.
+
+        Raises:
+            ValueError: if there are fewer training receivers.
+        """
+        count = len(self.receivers)
+        most = int(count * share)
+        chosen = most if n_train is None else n_train
+        if not 0 <= chosen <= most:
+            raise ValueError(
+                f"n_train: got {n_train}, expected 0 to {most}, the training receivers there are"
+            )
+        return np.arange(chosen), np.arange(count - int(count * 0.2), count)
+
+
+def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
+    """Read ``newrf_conference.npz`` and ``conferenceroom.stl`` from ``folder``.
+
+    Raises:
+        FileNotFoundError: if one of the files is missing.
+        ValueError: if one does not read, lacks an array, or an array has the wrong shape.
+    """
+    base = Path(folder)
+    for name in (RAYS_FILE, MESH_FILE):
+        if not (base / name).is_file():
+            raise FileNotFoundError(
+                f"folder: there is no {base / name}, expected {RAYS_FILE} and {MESH_FILE}"
+            )
+    data = _read_npz(base / RAYS_FILE)
+    count, most = _shape(data, base / RAYS_FILE)
+    last = _array(data, "last_point", (count, most, 3), float)
+    gain = _array(data, "gain", (count, most), complex)
+    rays = _array(data, "rays", (count,), np.int64)
+    if (rays < 0).any() or (rays > most).any():
+        raise ValueError(
+            f"rays: got {rays.min()} to {rays.max()}, expected 0 to {most}, the columns there are"
+        )
+    valid = np.arange(most) < rays[:, None]
+    for name, array in (("last_point", last), ("gain", gain)):
+        if not np.isfinite(array[valid]).all():
+            raise ValueError(f"{name}: got NaN or infinite values among the rays that are there")
+    if (gain[valid] == 0).any():
+        raise ValueError("gain: got rays with a gain of zero, expected them left out")
+    return NewrfRays(
+        transmitter=_device.check_array("transmitter", data["transmitter"], (3,)),
+        receivers=_device.check_array("receivers", data["receivers"], (count, 3)),
+        frequency_hz=check_frequency(data["frequency_hz"]),
+        last_point=np.where(valid[..., None], last, np.nan),
+        gain=np.where(valid, gain, 0.0),
+        valid=valid,
+        line_of_sight=_array(data, "line_of_sight", (count,), bool),
+        csi=_device.check_array("csi", _array(data, "csi", (count,), complex), (count,), dtype=complex),
+        mesh=read_stl(base / MESH_FILE),
+    )
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    names = ("transmitter", "receivers", "frequency_hz", "last_point", "gain", "rays", "line_of_sight", "csi")
+    try:
+        with np.load(path, allow_pickle=False) as opened:
+            data = {name: opened[name] for name in names if name in opened}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+        raise ValueError(f"folder: {path} does not read as an npz file ({error}); is it whole?") from error
+    missing = [name for name in names if name not in data]
+    if missing:
+        raise ValueError(f"folder: {path} lacks {', '.join(missing)}")
+    return data
+
+
+def _shape(data: dict[str, np.ndarray], path: Path) -> tuple[int, int]:
+    shape = data["last_point"].shape
+    if len(shape) != 3 or shape[2] != 3:
+        raise ValueError(f"last_point: got shape {shape} in {path}, expected (receivers, rays, 3)")
+    return shape[0], shape[1]
+
+
+def _array(data: dict[str, np.ndarray], name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    return _device.check_array(name, data[name], shape, dtype=dtype, finite=False)
+
+
+def read_stl(path: str | os.PathLike[str]) -> Mesh:
+    """A binary STL file as a mesh with three vertices a face.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not a whole binary STL file.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"path: there is no {file}")
+    content = np.fromfile(file, dtype=np.uint8)
+    count = int(content[80:84].view("<u4")[0]) if len(content) >= 84 else -1
+    if count < 1 or len(content) != 84 + 50 * count:
+        raise ValueError(
+            f"path: {file} has {len(content)} bytes, expected a binary STL file: 84 bytes and 50 a triangle"
+        )
+    floats = content[84:].reshape(count, 50)[:, :48].copy().view("<f4").reshape(count, 4, 3)
+    if not np.isfinite(floats[:, 1:]).all():
+        raise ValueError(f"path: {file} holds vertices that are NaN or infinite")
+    return Mesh(floats[:, 1:].reshape(-1, 3).astype(np.float64), np.arange(3 * count).reshape(-1, 3))
+
+
+@dataclass(frozen=True)
+class RayMatch:
+    """NeWRF's rays beside ours; arrays over their N rays, NaN where ours has none.
+
+    Attributes:
+        receiver: Index of the receiver, shape ``(N,)``.
+        order: Reflections: 0, 1 or 2, shape ``(N,)``.
+        found: Whether a ray of ours is the same, shape ``(N,)``, bool.
+        length_error_m: Absolute difference of unfolded lengths [m].
+        point_error_m: Distance between the last points [m].
+        phase_error_rad: Absolute difference of the gains' phases [rad].
+        gain_error: Relative difference of the complex gains, ``|ours - theirs| / |theirs|``.
+        extra_receiver: Receivers of the rays that only we have, shape ``(E,)``.
+        extra_order: Their orders, shape ``(E,)``.
+        extra_point: Their last points [m], shape ``(E, 3)``.
+        missing_point: Last points of the rays that only they have [m], shape ``(N - found, 3)``.
+    """
+
+    receiver: np.ndarray
+    order: np.ndarray
+    found: np.ndarray
+    length_error_m: np.ndarray
+    point_error_m: np.ndarray
+    phase_error_rad: np.ndarray
+    gain_error: np.ndarray
+    extra_receiver: np.ndarray
+    extra_order: np.ndarray
+    extra_point: np.ndarray
+    missing_point: np.ndarray
+
+    def summary(self) -> dict[str, dict[str, float | int | None]]:
+        """Figures per kind of ray ("line_of_sight", "once", "twice"): counts, share found, median and worst errors."""
+        rows: dict[str, dict[str, float | int | None]] = {}
+        for order, name in enumerate(("line_of_sight", "once", "twice")):
+            mine = self.order == order
+            if not mine.any():
+                continue
+            row: dict[str, float | int | None] = {
+                "rays": int(mine.sum()),
+                "found": int(self.found[mine].sum()),
+                "share": float(self.found[mine].mean()),
+                "only_ours": int((self.extra_order == order).sum()),
+            }
+            for error in ("length_error_m", "point_error_m", "phase_error_rad", "gain_error"):
+                values = getattr(self, error)[mine & self.found]
+                row[f"{error}_median"] = float(np.median(values)) if len(values) else None
+                row[f"{error}_worst"] = float(values.max()) if len(values) else None
+            rows[name] = row
+        return rows
+
+
+def match_rays(
+    rays: NewrfRays, *, order: int = 1, tolerance_m: float = MATCH_M, device: Any = None
+) -> RayMatch:
+    """Trace the same room by our image method and pair the rays, one to one, by order, last point and length.
+
+    Args:
+        rays: What :func:`load_newrf` read.
+        order: Most reflections to compare: 0, 1 or 2.
+        tolerance_m: Distance of last points plus difference of lengths below which rays are the same [m].
+
+    Raises:
+        ValueError: on another order or a tolerance that is not positive.
+    """
+    if not tolerance_m > 0:
+        raise ValueError(f"tolerance_m: got {tolerance_m!r}, expected a positive distance in metres")
+    tracer = MirrorTracer(
+        rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=device
+    )
+    ours = mirror_chains(tracer, rays.receivers, order)
+    our_gain = ours.gain(rays.wavelength_m)
+    their_order, their_length = rays.order, rays.length_m
+    receiver, column = np.nonzero((their_order >= 0) & (their_order <= order))
+    partner = np.full(len(receiver), -1)
+    taken = np.zeros(len(ours.receiver), dtype=bool)
+    bounces = ours.order
+    for k in range(len(rays.receivers)):
+        theirs, mine = np.flatnonzero(receiver == k), np.flatnonzero(ours.receiver == k)
+        c = column[theirs]
+        gap = np.linalg.norm(rays.last_point[k, c][:, None] - ours.last_point[mine][None], axis=2)
+        gap = gap + np.abs(their_length[k, c][:, None] - ours.length_m[mine][None])
+        gap[their_order[k, c][:, None] != bounces[mine][None]] = np.inf
+        while gap.size and gap.min() < tolerance_m:
+            i, j = np.unravel_index(gap.argmin(), gap.shape)
+            partner[theirs[i]] = mine[j]
+            taken[mine[j]] = True
+            gap[i], gap[:, j] = np.inf, np.inf
+    found = partner >= 0
+    gain, mirror = rays.gain[receiver, column], our_gain[partner]
+    last = rays.last_point[receiver, column]
+
+    def where_found(values: np.ndarray) -> np.ndarray:
+        return np.where(found, values, np.nan)
+
+    return RayMatch(
+        receiver=receiver,
+        order=their_order[receiver, column],
+        found=found,
+        length_error_m=where_found(np.abs(their_length[receiver, column] - ours.length_m[partner])),
+        point_error_m=where_found(np.linalg.norm(last - ours.last_point[partner], axis=1)),
+        phase_error_rad=where_found(np.abs(np.angle(gain / mirror))),
+        gain_error=where_found(np.abs(mirror - gain) / np.abs(gain)),
+        extra_receiver=ours.receiver[~taken],
+        extra_order=bounces[~taken],
+        extra_point=ours.last_point[~taken],
+        missing_point=last[~found],
+    )

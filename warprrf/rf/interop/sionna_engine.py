@@ -1,0 +1,339 @@
+"""Spectra from Sionna RT's PathSolver: line of sight, specular and diffuse paths of any depth, by ray sampling.
+
+The scene's own material table is set in Python (an XML can't carry scattering patterns, and Sionna has no metal at
+300 GHz). Both transmit and both receive polarisations are solved at once: path gain is the mean over the former and
+the sum over the latter. One solve per receiver, because Sionna shares its cap on paths between all of them. Sionna has
+no absorption by the air; where asked for, every path is given that of its own length.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.em.absorption import air_of
+from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.exact import ReceivedPaths
+from warprrf.rf.interop.llvm import select_llvm
+from warprrf.rf.interop.sionna_paths import repeated
+from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
+
+# Sionna's default cap of 1e6 paths truncates silently; each sample can give one path a bounce.
+_PATHS_PER_SAMPLE_AND_BOUNCE = 1
+# Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
+_RECEIVERS_PER_FLUSH = 20
+_DIFFUSE = 2  # sionna.rt.InteractionType.DIFFUSE
+_VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
+
+
+def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
+    """Open a scene in Sionna RT with its table of materials, scattering patterns included.
+
+    Sionna's own ``load_scene`` knows no patterns (every material is Lambertian) and takes what it can from the XML.
+
+    Args:
+        scene: Path of an XML with ``materials.json`` beside it (a digital twin, the lobby), or a loaded :class:`Scene`.
+        frequency_hz: Carrier frequency [Hz]; materials are those of this frequency.
+
+    Returns:
+        The ``sionna.rt.Scene``, objects kept apart and named as in the XML. Materials that the XML gives by their ITU
+        name alone are replaced by ``warprrf-<name>``.
+
+    Raises:
+        ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
+        FileNotFoundError: if the XML, a mesh or the table is missing.
+        ValueError: if the scene was not loaded from a file, a material is not known at this frequency or is infinitely
+            thick, or an object has more than one.
+    """
+    if isinstance(scene, str | os.PathLike):
+        scene = Scene.load(scene)
+    frequency = check_frequency(frequency_hz)
+    if getattr(scene, "xml_path", None) is None:
+        raise ValueError(
+            "scene: got one without an XML file, which Sionna needs; use Scene.load or engine='exact'"
+        )
+    rt = sionna_rt()
+    loaded = rt.load_scene(str(scene.xml_path), merge_shapes=False)
+    before = list(loaded.radio_materials)
+    materials = [_radio_material(loaded, rt, material, frequency) for material in scene.materials]
+    objects = dict(loaded.objects)
+    for index, name in enumerate(scene.object_names):
+        if name not in objects:
+            raise ValueError(f"scene: object {name!r} is not in {scene.xml_path} as Sionna reads it")
+        used = np.unique(np.asarray(scene.face_material)[np.asarray(scene.face_object) == index])
+        if len(used) != 1:
+            raise ValueError(f"scene: object {name!r} has {len(used)} materials, Sionna allows one an object")
+        objects[name].radio_material = materials[int(used[0])]
+    for name in before:
+        if not loaded.radio_materials[name].is_used:
+            loaded.remove(name)
+    loaded.frequency = frequency
+    return loaded
+
+
+def _radio_material(loaded: Any, rt: Any, material: Any, frequency: float) -> Any:
+    """The material of this name in Sionna's scene, added if it has none that can be set, with our values."""
+    if not np.isfinite(material.thickness_m):
+        raise ValueError(
+            f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
+        )
+    radio = loaded.radio_materials.get(material.name)
+    if type(radio) is not rt.RadioMaterial:  # an ITU material keeps its own permittivity
+        radio = rt.RadioMaterial(f"warprrf-{material.name}")  # objects and materials share one set of names
+        loaded.add(radio)
+    eta = complex(material.permittivity(frequency))
+    radio.relative_permittivity = eta.real
+    radio.conductivity = -eta.imag * 2.0 * np.pi * frequency * _VACUUM_PERMITTIVITY
+    radio.thickness = float(material.thickness_m)
+    radio.scattering_coefficient = float(material.scattering_coefficient(frequency))
+    radio.xpd_coefficient = 0.0
+    directive = material.pattern == "directive"
+    radio.scattering_pattern = (
+        rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
+    )
+    return radio
+
+
+def sionna_rt() -> Any:
+    """Sionna RT, on a variant of Mitsuba and an LLVM that it can use."""
+    select_llvm()
+    _select_variant()
+    return _device.require("sionna.rt", extra="sionna")
+
+
+def _select_variant() -> Any:
+    """Mitsuba, on a variant for radio: it may be on another, for photos, and Sionna needs the one of its import."""
+    mitsuba = _device.require("mitsuba", extra="sionna")
+    if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
+        mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
+    return mitsuba
+
+
+class SionnaEngine:
+    """Sionna RT for one transmitter.
+
+    Args:
+        scene: Scene loaded from an XML file.
+        transmitter: Position [m], shape ``(3,)``.
+        frequency_hz: Carrier frequency [Hz].
+        shape: Rows and columns of the spectrum.
+        beam_sigma_rad: Receiver beam width [rad].
+        depth: Most bounces on a path.
+        samples: Rays from the transmitter.
+        refraction: Whether paths go through slabs.
+        seed: Seed of the ray directions.
+        gas: Absorption of the air: see :meth:`Paths.with_gas`.
+        device: Where beams are spread (Sionna takes its own: CUDA where there is a GPU).
+
+    Raises:
+        ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
+        ValueError: if the scene was not loaded from a file.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        *,
+        transmitter: Any,
+        frequency_hz: float,
+        shape: tuple[int, int],
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        depth: int = 3,
+        samples: int = 1_000_000,
+        refraction: bool = False,
+        seed: int = 0,
+        gas: Any = False,
+        device: Any = None,
+    ) -> None:
+        self.shape = check_shape(shape)
+        self.beam_sigma_rad = beam_sigma_rad
+        self.transmitter = _device.check_array("transmitter", transmitter, (3,))
+        self.frequency_hz = check_frequency(frequency_hz)
+        self.depth, self.samples, self.refraction, self.seed = depth, samples, refraction, seed
+        self.air = air_of(gas)
+        self.device = device
+        self._rt = sionna_rt()
+        self._scene = load_sionna_scene(scene, frequency_hz=self.frequency_hz)
+        both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
+        self._scene.tx_array = self._rt.PlanarArray(**both)
+        self._scene.rx_array = self._rt.PlanarArray(**both)
+        self._scene.add(self._rt.Transmitter("tx", position=self.transmitter.tolist()))
+        self._solver = self._rt.PathSolver(deterministic=True)
+        self._solved = 0
+
+    @property
+    def version(self) -> str:
+        """Sionna RT's version."""
+        return str(self._rt.__version__)
+
+    def solve(self, receiver: Any, *, specular: bool = True) -> dict[str, np.ndarray]:
+        """Paths of one receiver (3,): ``power``, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.
+
+        They come by rising delay: one seed gives the same paths to the bit, in the same order, in every run.
+        Without ``specular`` reflections every ray scatters, and at depth 1 Sionna's result hardly depends on chance.
+        """
+        point = _device.check_array("receiver", receiver, (3,))
+        _select_variant()
+        self._scene.add(self._rt.Receiver("rx", position=point.tolist()))
+        try:
+            paths = self._solver(
+                self._scene,
+                max_depth=self.depth,
+                max_num_paths_per_src=self._path_cap,
+                samples_per_src=self.samples,
+                synthetic_array=True,
+                los=True,
+                specular_reflection=specular,
+                diffuse_reflection=True,
+                refraction=self.refraction,
+                seed=self.seed,
+            )
+            found = self._read(paths)
+        finally:
+            self._scene.remove("rx")
+        self._solved += 1
+        if self._solved % _RECEIVERS_PER_FLUSH == 0:
+            self._flush()
+        return found
+
+    @property
+    def _path_cap(self) -> int:
+        return self.samples * max(self.depth, 1) * _PATHS_PER_SAMPLE_AND_BOUNCE + 100_000
+
+    def _read(self, paths: Any) -> dict[str, np.ndarray]:
+        """Sionna's arrays of one receiver and transmitter; both antennas are two polarisations at one place."""
+        real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
+        per_path = (real**2 + imag**2).reshape(-1, real.shape[-1])  # 2 receive x 2 transmit polarisations
+        valid = paths.valid.numpy().reshape(-1)
+        if len(valid) >= self._path_cap:
+            raise RuntimeError(f"Sionna filled its cap of {self._path_cap} paths: power would be missing")
+        kinds = paths.interactions.numpy().reshape(-1, len(valid)) if len(valid) else np.zeros((1, 0), int)
+
+        def field(values: Any) -> np.ndarray:
+            return np.asarray(values.numpy(), dtype=np.float64).reshape(-1)[valid]
+
+        found = {
+            "power": per_path.sum(axis=0)[valid] / 2.0,
+            "tau": field(paths.tau),
+            "arrival": directions_from_angles(field(paths.theta_r), field(paths.phi_r)),
+            "aod": np.column_stack([field(paths.theta_t), field(paths.phi_t)]),
+            "diffuse": (kinds == _DIFFUSE).any(axis=0)[valid],
+            "bounces": (kinds != 0).sum(axis=0)[valid],
+        }
+        # Sionna stores paths in the order in which its threads end; sorted, one seed's numbers are always the same
+        order = np.lexsort([*found["aod"].T, *found["arrival"].T, found["power"], found["tau"]])
+        found = {name: values[order] for name, values in found.items()}
+        if self.air is not None:
+            through = self.air.transmittance(self.frequency_hz, SPEED_OF_LIGHT * found["tau"])
+            found["power"] = found["power"] * through
+        sharp = np.flatnonzero(~found["diffuse"])
+        copies = sharp[repeated(*(found[name][sharp] for name in ("tau", "arrival", "aod", "bounces")))]
+        return {name: np.delete(values, copies, axis=0) for name, values in found.items()}
+
+    def _flush(self) -> None:
+        drjit = _device.require("drjit", extra="sionna")
+        drjit.flush_malloc_cache()
+        drjit.flush_kernel_cache()
+
+    def receive(self, receiver: Any) -> ReceivedPaths:
+        """The spectrum of one receiver (3,)."""
+        found = self.solve(receiver)
+        spread = spread_paths(
+            found["arrival"], found["power"], self.shape, self.beam_sigma_rad, device=self.device
+        )
+        filled = spread.strongest >= 0
+        index = spread.strongest[filled]
+        delay_s, aod = np.full(self.shape, np.nan), np.full((*self.shape, 2), np.nan)
+        delay_s[filled], aod[filled] = found["tau"][index], found["aod"][index]
+        direct, diffuse = found["bounces"] == 0, found["diffuse"]
+        power = found["power"]
+        return ReceivedPaths(
+            path_gain=spread.path_gain,
+            delay_s=delay_s,
+            aod=aod,
+            line_of_sight=bool(direct.any()),
+            totals={
+                "los": float(power[direct].sum()),
+                "mirror": float(power[~direct & ~diffuse].sum()),
+                "diffuse": float(power[diffuse].sum()),
+            },
+        )
+
+
+class SionnaMap:
+    """Sionna RT's RadioMapSolver for one transmitter on a horizontal grid of square cells.
+
+    Path gain is averaged over each cell by Sionna, and over vertical and horizontal transmit polarisation by us; its
+    receiver is isotropic and takes every polarisation.
+
+    Args:
+        scene: Scene loaded from an XML file.
+        transmitter: Position [m], shape ``(3,)``.
+        frequency_hz: Carrier frequency [Hz].
+        x: Centres of the cells [m], evenly spaced, shape ``(X,)``, at least two.
+        y: The same, shape ``(Y,)``, at the same spacing.
+        height_m: Of the plane.
+        depth: Most bounces on a path: specular and diffuse ones, without refraction.
+
+    Raises:
+        ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
+        ValueError: if the scene was not loaded from a file, or the cells are not square.
+    """
+
+    def __init__(
+        self,
+        scene: Any,
+        *,
+        transmitter: Any,
+        frequency_hz: float,
+        x: Any,
+        y: Any,
+        height_m: float,
+        depth: int = 3,
+    ) -> None:
+        columns, rows = _device.check_array("x", x, (None,)), _device.check_array("y", y, (None,))
+        steps = np.concatenate([np.diff(columns), np.diff(rows)])
+        if len(columns) < 2 or not (steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-6)):
+            raise ValueError(
+                f"x, y: got steps of {np.unique(steps.round(6)).tolist()} m, expected square cells"
+            )
+        self.shape, self.depth = (len(rows), len(columns)), depth
+        self._cell = float(steps[0])
+        self._middle = [0.5 * (columns[0] + columns[-1]), 0.5 * (rows[0] + rows[-1]), height_m]
+        self._rt = sionna_rt()
+        self._scene = load_sionna_scene(scene, frequency_hz=check_frequency(frequency_hz))
+        self._solver = self._rt.RadioMapSolver()
+        self._scene.rx_array = self._array("V")
+        place = _device.check_array("transmitter", transmitter, (3,))
+        self._scene.add(self._rt.Transmitter("tx", position=place.tolist()))
+
+    def _array(self, polarisation: str) -> Any:
+        return self._rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarisation)
+
+    def __call__(self, samples: int, *, seed: int) -> np.ndarray:
+        """Mean path gain of every cell [linear], shape ``(Y, X)``; half of ``samples`` in each polarisation."""
+        mitsuba = _select_variant()
+        rows, columns = self.shape
+        total = np.zeros(self.shape)
+        for k, polarisation in enumerate("VH"):
+            self._scene.tx_array = self._array(polarisation)
+            solved = self._solver(
+                self._scene,
+                center=mitsuba.Point3f(*(float(v) for v in self._middle)),
+                orientation=mitsuba.Point3f(0.0),
+                # a little less, since Sionna rounds up to whole cells
+                size=mitsuba.Point2f((columns - 1e-3) * self._cell, (rows - 1e-3) * self._cell),
+                cell_size=mitsuba.Point2f(self._cell, self._cell),
+                samples_per_tx=max(samples // 2, 1),
+                max_depth=self.depth,
+                diffuse_reflection=True,
+                refraction=False,
+                seed=2 * seed + k,
+            )
+            total += 0.5 * np.asarray(solved.path_gain.numpy(), np.float64)[0]
+        return total

@@ -1,0 +1,414 @@
+"""A calibrated digital twin: the reconstructed mesh with what the bistatic field learned, as a scene for ray tracers.
+
+A group of the field scatters as a mix of lobes times the Fresnel curve of a half-space, and mirrors a share of that
+curve. A Sionna radio material has one curve |Gamma|^2, one scattering coefficient S and one lobe: it scatters
+S^2 |Gamma|^2 f_s and mirrors (1 - S^2) |Gamma|^2 (Degli-Esposti et al. 2007). Each group is projected on that:
+
+- permittivity and S are those of the half-space that comes nearest to both powers, in dB over the cosine of incidence,
+  weighted by it (what a surface takes in under even light). Where lobe weights W and mirror strength m sum to one that
+  is the fitted curve and S^2 = W; where they do not, the mirror gives way: it shows in few pixels, scattering in all;
+- the lobe is the one exponent nearest to the mix, in dB over both hemispheres, weighted by the solid angle that a
+  receiver sees and with a floor where scattered power is lost in noise.
+
+What cannot be said is stated: both errors of each group, and what has no place in a material at all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from warprrf.geometry.mesh_files import write_mesh
+from warprrf.rf.em.fresnel import LAMBERTIAN, lobe, slab_reflection
+from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.fit import NEPER
+
+ABOUT = "Digital twin written by warprrf.write_twin."
+"""First line of a twin's ``materials.json``: a folder that says so may be replaced."""
+LOSS_TANGENT = 0.02  # least that single precision, which Sionna computes in, surely turns into a decay
+THICKNESS_WAVELENGTHS = (
+    200.0  # then what the far side sends back has lost 25 nepers: the slab is a half-space
+)
+BAND_SHARE = 0.1  # a material holds this far from the carrier: it was fitted at one frequency
+NARROWEST_LOBE = 60  # largest exponent that is tried
+MIRROR_SHARE = (
+    0.01  # weight of mirrored power: about the share of a spectrum's pixels that a mirror's beam fills
+)
+LOST_IN_NOISE = 1e-2 / np.pi  # [1/sr], 20 dB below a white Lambertian lobe: darker directions hardly count
+_EXCESS = np.geomspace(1e-2, 1e6, 1601)  # of epsilon_r - 1; the last reflects like metal
+CERTAIN = 40.0  # logit of an S^2 of one
+_MATERIAL = "fitted_"  # Sionna keeps names of materials and objects apart, and reserves those of the ITU
+_FILES = {"scene.xml", "materials.json", "meshes"}
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """What a material can say of a group's reflection; see :func:`project_reflection`.
+
+    Attributes:
+        relative_permittivity: of a half-space with losses of :data:`LOSS_TANGENT`.
+        scattering: scattering coefficient S.
+        scattering_error_db: error of S^2 |Gamma|^2, rms over incidence [dB].
+        mirror_error_db: error of (1 - S^2) |Gamma|^2, rms over incidence [dB].
+    """
+
+    relative_permittivity: float
+    scattering: float
+    scattering_error_db: float
+    mirror_error_db: float
+
+
+@dataclass(frozen=True)
+class TwinGroup:
+    """One material of a twin.
+
+    Attributes:
+        name: its largest group's name in the field.
+        area_m2: area of its faces [m^2].
+        material: what it became.
+        permittivity: complex relative permittivity at the carrier.
+        scattering: scattering coefficient S.
+        alpha_r: exponent of its lobe, 0 for Lambertian.
+        scattering_error_db: error of the power that it scatters, rms over incidence [dB].
+        mirror_error_db: error of the power that it mirrors, rms over incidence [dB].
+        lobe_error_db: what one lobe misses of the fitted mix, rms over both directions [dB].
+    """
+
+    name: str
+    area_m2: float
+    material: Material = dataclasses.field(repr=False)
+    permittivity: complex
+    scattering: float
+    alpha_r: int
+    scattering_error_db: float
+    mirror_error_db: float
+    lobe_error_db: float
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A digital twin on disk; see :func:`write_twin`.
+
+    Attributes:
+        xml: its scene file, for :meth:`Scene.load`, :func:`load_sionna_scene` and ``sionna.rt.load_scene``.
+        frequency_hz: carrier that its materials were fitted at [Hz].
+        groups: its materials, largest area first.
+        left_out: what of the field no material can hold, in words with numbers.
+    """
+
+    xml: Path
+    frequency_hz: float
+    groups: tuple[TwinGroup, ...] = dataclasses.field(repr=False)
+    left_out: tuple[str, ...]
+
+    @property
+    def scattering_error_db(self) -> float:
+        """Error of the scattered power over all groups, rms weighted by area [dB]."""
+        return self._rms("scattering_error_db")
+
+    @property
+    def mirror_error_db(self) -> float:
+        """Error of the mirrored power over all groups, rms weighted by area [dB]."""
+        return self._rms("mirror_error_db")
+
+    @property
+    def lobe_error_db(self) -> float:
+        """Error of the lobes over all groups, rms weighted by area [dB]."""
+        return self._rms("lobe_error_db")
+
+    def _rms(self, name: str) -> float:
+        squares = [getattr(group, name) ** 2 for group in self.groups]
+        return float(np.sqrt(np.average(squares, weights=[group.area_m2 for group in self.groups])))
+
+
+def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
+    """Write the reconstructed mesh with a field's materials as ``scene.xml``, ``materials.json`` and ``meshes/``.
+
+    ``sionna.rt.load_scene`` opens the XML as it is, all lobes Lambertian; :func:`load_sionna_scene` sets the scattering
+    patterns too; :meth:`Scene.load` and :func:`simulate` take it as any scene. Each material of the field is an object
+    ``surface_<group>`` of a material ``fitted_<group>``, named by its largest group; it holds within 10 % of the
+    field's carrier.
+
+    No material can hold a common gain (an uncalibrated receiver), residuals of elements or an indirect radiance, and
+    softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former.
+    Sionna may find one mirror in several small triangles and count it as often; :func:`simulate` counts it once.
+
+    Args:
+        field: a fitted bistatic field.
+        folder: a new or empty folder, or an earlier twin's, which is replaced. It is written beside and renamed.
+
+    Raises:
+        TypeError: if the field is of another model.
+        ValueError: if the folder holds anything else, or the field models line of sight alone.
+    """
+    if not isinstance(field, BistaticField):
+        raise TypeError(f"field: got {type(field).__name__}, expected a field of model 'bistatic'")
+    if not field.terms.diffuse and field.terms.mirror_order == 0:
+        raise ValueError("field: it models line of sight alone, expected one with diffuse or mirror paths")
+    folder = Path(folder)
+    _check_replaceable(folder)
+    surface = field.surface
+    face_material = field.material[surface.group]
+    area = np.bincount(face_material, surface.mesh.areas)
+    own = np.bincount(surface.group, surface.mesh.areas, minlength=surface.groups)
+    used = [m for m in np.argsort(-area, kind="stable").tolist() if area[m] > 0]
+    largest = {m: int(np.where(field.material == m, own, -1.0).argmax()) for m in used}  # a material's name
+    names = _identifiers(surface.group_names)
+    groups = [_project(field, largest[m], names[largest[m]], float(area[m])) for m in used]
+    left_out = _left_out(field)
+    table = {
+        "about": [ABOUT, f"Fitted to spectra at {field.frequency_hz / 1e9:g} GHz. Left out:", *left_out],
+        "materials": [table_entry(group.material) for group in groups],
+    }
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    earlier = part.with_name(part.name + ".earlier")
+    try:
+        part.chmod(0o755)
+        for m in used:
+            kept, faces = np.unique(surface.mesh.faces[face_material == m], return_inverse=True)
+            write_mesh(
+                part / "meshes" / f"{names[largest[m]]}.ply",
+                surface.mesh.vertices[kept],
+                faces.reshape(-1, 3),
+            )
+        (part / "materials.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        (part / "scene.xml").write_text(
+            _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
+        )
+        if folder.exists():
+            folder.rename(earlier)  # a folder cannot be renamed over one that holds something
+        part.rename(folder)
+    finally:
+        if earlier.exists() and not folder.exists():
+            earlier.rename(folder)
+        for rest in (part, earlier):
+            shutil.rmtree(rest, ignore_errors=True)
+    return Twin(folder / "scene.xml", field.frequency_hz, tuple(groups), left_out)
+
+
+def project_reflection(log_excess: float, scattered: float, mirrored: float) -> Reflection:
+    """The half-space and the S that come nearest to what a group scatters and mirrors.
+
+    Args:
+        log_excess: ln(epsilon_r - 1) of the group's curve, clipped to the family that fields know.
+        scattered: W, what it scatters of that curve; 0 for nothing.
+        mirrored: m, what it mirrors of that curve; 0 for nothing.
+    """
+    cosine, weight, family = _half_spaces()
+    gap = (
+        family - NEPER * np.log(fresnel_curves().value(np.full(len(cosine), log_excess), cosine)[0])[:, None]
+    )
+    level = weight @ gap
+    shape = weight @ (gap - level) ** 2
+    excess = np.log(_EXCESS)
+    wanted = NEPER * np.log(np.maximum([scattered, mirrored], 1e-30))
+    share = np.where([scattered > 0, mirrored > 0], [1.0 - MIRROR_SHARE, MIRROR_SHARE], 0.0)
+
+    def errors(x: np.ndarray, odds: np.ndarray) -> np.ndarray:
+        """Mean square errors [dB^2] of scattered and mirrored power, ``(2, ...)``; ``odds`` is the logit of S^2."""
+        split = -NEPER * np.logaddexp(0.0, np.stack([-odds, odds]))  # S^2 and 1 - S^2 in dB
+        miss = split - wanted.reshape(2, *np.ones(odds.ndim, int)) + np.interp(x, excess, level)
+        return np.asarray(miss**2 + np.interp(x, excess, shape))
+
+    def best_odds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Logit of the S^2 that suits each ``x`` (N,) best, and what is left of the error."""
+        if mirrored <= 0 or scattered <= 0:
+            odds = np.full(len(x), CERTAIN if mirrored <= 0 else -CERTAIN)
+        else:
+            odds = _refined(
+                lambda trial: np.tensordot(share, errors(x[:, None], trial), axes=1), np.zeros(len(x)), 14.0
+            )
+        return odds, share @ errors(x, odds)
+
+    coarse = best_odds(excess)[1]
+    start = np.array([excess[coarse.argmin()]])
+    x = _refined(
+        lambda trial: best_odds(np.clip(trial[0], *excess[[0, -1]]))[1][None], start, excess[1] - excess[0]
+    )
+    x = np.clip(x, *excess[[0, -1]])
+    odds = best_odds(x)[0]
+    rms = np.sqrt(errors(x, odds)[:, 0])
+    return Reflection(
+        relative_permittivity=1.0 + float(np.exp(x[0])),
+        scattering=float(np.exp(-0.5 * np.logaddexp(0.0, -odds[0]))),
+        scattering_error_db=float(rms[0]) if scattered > 0 else 0.0,
+        mirror_error_db=float(rms[1]) if mirrored > 0 else 0.0,
+    )
+
+
+def _refined(cost: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, reach: float) -> np.ndarray:
+    """Where ``cost``, of trials ``(N, T)``, is least within ``reach`` of each ``centre`` (N,): grids that close in."""
+    for _ in range(9):
+        trial = centre[:, None] + np.linspace(-reach, reach, 29)
+        centre = np.take_along_axis(trial, cost(trial).argmin(axis=1)[:, None], axis=1)[:, 0]
+        reach /= 7.0
+    return centre
+
+
+def project_lobes(exponents: Sequence[int], weight: np.ndarray) -> tuple[int, float]:
+    """The one exponent (0: Lambertian) whose lobe is nearest to a mix, and its error.
+
+    Args:
+        exponents: of the mixed lobes, 0 for Lambertian.
+        weight: of each, shape ``(L,)``; their scale plays no part.
+
+    Returns:
+        The exponent, and the rms difference of the lobes [dB] over cosines of incidence (evenly) and the projected
+        hemisphere of scattering, both raised by :data:`LOST_IN_NOISE`.
+    """
+    most = max(NARROWEST_LOBE, *exponents)
+    lobes, solid_angle = _lobe_table(most)
+    mix = np.asarray(weight, float) @ lobes[list(exponents)] / np.sum(weight)
+    gap = NEPER * np.log((lobes + LOST_IN_NOISE) / (mix + LOST_IN_NOISE))
+    error = np.sqrt(gap**2 @ solid_angle)
+    best = int(error.argmin())
+    return best, float(error[best])
+
+
+def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
+    """What group ``g`` becomes."""
+    p, terms, frequency = field.parameters, field.terms, field.frequency_hz
+    scattered = float(p.weight[g].sum()) if terms.diffuse else 0.0
+    mirrored = float(np.exp(p.log_mirror[g])) if terms.mirror_order > 0 else 0.0
+    reflection = project_reflection(float(p.log_excess[g]), scattered, mirrored)
+    permittivity = reflection.relative_permittivity
+    alpha_r, lobe_error = project_lobes(terms.lobes, p.weight[g]) if scattered > 0 else (LAMBERTIAN, 0.0)
+    conductivity = LOSS_TANGENT * permittivity * 2.0 * np.pi * frequency * VACUUM_PERMITTIVITY
+    low, high = (1.0 - BAND_SHARE) * frequency, (1.0 + BAND_SHARE) * frequency
+    fitted = f"fitted at {frequency / 1e9:g} GHz"
+    row = Band(low, high, permittivity, 0.0, conductivity, 0.0, fitted)
+    material = Material(
+        _MATERIAL + name,
+        (row,),
+        thickness_m=THICKNESS_WAVELENGTHS * field.wavelength_m,
+        scattering=reflection.scattering,
+        pattern="lambertian" if alpha_r == LAMBERTIAN else "directive",
+        alpha_r=max(alpha_r, 1),
+        sources={
+            "thickness_m": "stands for a half-space",
+            "scattering": f"{fitted}; errors {reflection.scattering_error_db:.2f} dB rms scattered, "
+            f"{reflection.mirror_error_db:.2f} dB rms mirrored",
+            "pattern": f"{fitted}; one lobe for the mix: {lobe_error:.2f} dB rms",
+        },
+    )
+    return TwinGroup(
+        name=field.surface.group_names[g],
+        area_m2=area,
+        material=material,
+        permittivity=material.permittivity(frequency),
+        scattering=material.scattering_coefficient(frequency),
+        alpha_r=alpha_r,
+        scattering_error_db=reflection.scattering_error_db,
+        mirror_error_db=reflection.mirror_error_db,
+        lobe_error_db=lobe_error,
+    )
+
+
+def _left_out(field: BistaticField) -> tuple[str, ...]:
+    found, p, s = [], field.parameters, field.surface
+    if p.log_gain != 0.0:
+        found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
+    if field.terms.residual:
+        squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.texel, s.mesh.areas))
+        found.append(f"residuals within groups, {NEPER * np.sqrt(squares):.2f} dB rms over area")
+    if field.terms.indirect:
+        found.append("indirect radiance of each group: further bounces are the ray tracer's")
+    return tuple(found)
+
+
+@lru_cache(maxsize=1)
+def _half_spaces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cosines of incidence ``(C,)``, their weights 2 cos dcos, and the family's |Gamma|^2 there [dB], ``(C, E)``."""
+    node, step = np.polynomial.legendre.leggauss(48)
+    cosine = 0.5 * (1.0 + node)
+    te, tm = slab_reflection(cosine[:, None], (1.0 + _EXCESS) * (1.0 - 1j * LOSS_TANGENT), np.inf, 1.0)
+    return cosine, step * cosine, NEPER * np.log(0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2))
+
+
+@lru_cache(maxsize=2)
+def _lobe_table(most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lobes of exponents 0 to ``most`` at pairs of directions [1/sr], ``(most + 1, N)``, and weights that sum to 1."""
+    incidence, di = np.polynomial.legendre.leggauss(10)
+    scatter, ds = np.polynomial.legendre.leggauss(28)
+    turn = (np.arange(28) + 0.5) * np.pi / 28  # of azimuth; the other half is the same
+    ci, cs, az = np.meshgrid(0.5 * (1.0 + incidence), 0.5 * (1.0 + scatter), turn, indexing="ij")
+    psi = ci * cs + np.sqrt((1.0 - ci**2) * (1.0 - cs**2)) * np.cos(az)
+    weight = di[:, None, None] * ds[None, :, None] * cs
+    lobes = np.stack([lobe(n, ci, cs, psi).ravel() for n in range(most + 1)])
+    return lobes, weight.ravel() / weight.sum()
+
+
+def _identifiers(names: Sequence[str]) -> list[str]:
+    """Names for files and XML: characters other than letters, digits, ``_`` and ``-`` become ``_``; all differ."""
+    found: list[str] = []
+    for k, name in enumerate(names):
+        plain = re.sub(r"[^A-Za-z0-9_-]", "_", name)
+        found.append(plain if plain not in found else f"{plain}_{k}")
+    return found
+
+
+def _scene_xml(materials: Sequence[Material], frequency_hz: float) -> str:
+    """The scene as Sionna RT reads it: a radio material and a mesh for each group."""
+    lines = [
+        '<scene version="3.0.0">',
+        f"  <!-- {ABOUT} Scattering patterns stand in materials.json. -->",
+        "",
+    ]
+    for material in materials:
+        values = {
+            "relative_permittivity": material.relative_permittivity(frequency_hz),
+            "conductivity": material.conductivity(frequency_hz),
+            "thickness": material.thickness_m,
+            "scattering_coefficient": material.scattering_coefficient(frequency_hz),
+            "xpd_coefficient": 0.0,
+        }
+        lines += [
+            f'  <bsdf type="radio-material" id="mat-{material.name}">',
+            *(f'    <float name="{key}" value="{value:.9g}"/>' for key, value in values.items()),
+            "  </bsdf>",
+        ]
+    for material in materials:
+        name = material.name.removeprefix(_MATERIAL)
+        lines += [
+            f'  <shape type="ply" id="surface_{name}">',
+            f'    <string name="filename" value="meshes/{name}.ply"/>',
+            '    <boolean name="face_normals" value="true"/>',
+            f'    <ref id="mat-{material.name}" name="bsdf"/>',
+            "  </shape>",
+        ]
+    return "\n".join([*lines, "</scene>", ""])
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Refuse what is neither new, empty nor an earlier twin."""
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise ValueError(f"folder: got the file {folder}, expected a folder")
+    found = {item.name for item in folder.iterdir()}
+    if not found:
+        return
+    try:
+        table = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
+        twin = found <= _FILES and table["about"][0] == ABOUT
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        twin = False
+    if not twin:
+        raise ValueError(
+            f"folder: {folder} holds {', '.join(sorted(found)[:5])} and is no earlier twin, expected a new or an "
+            "empty folder"
+        )

@@ -1,0 +1,108 @@
+"""What a link gets, without its whole spectrum: total and best path gain, delay spread, the gain of the best beam.
+
+The beam is the receiver's: von Mises-Fisher, kappa = 1 / sigma^2, of directivity D(psi) = 2 kappa exp(kappa (cos(psi) -
+1)) / (1 - exp(-2 kappa)), its mean over the sphere one. Steered somewhere, it brings the sum over paths of path gain
+times D at the angle between. The best direction is sought at the line of sight and mirror paths, exactly, and at the
+pixels of a grid for what is diffuse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf.rf.channel.dispersion import delay_spread
+from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_of, pixel_solid_angles
+
+if TYPE_CHECKING:
+    from warprrf.rf.paths.path_set import Paths
+
+
+@dataclass(frozen=True)
+class Links:
+    """Links of several receivers to one transmitter, arrays ``(R,)``.
+
+    Attributes:
+        total_path_gain: sum over all paths [linear]; the sum of the spectrum.
+        best_path_gain: that of the strongest path [linear]. A diffuse path is what one pixel of the field's spectrum
+            holds, as in :meth:`RadioField.paths`.
+        delay_spread_s: root mean square over all paths, weighted by power [s]; NaN without power.
+        best_beam_gain: of the receiver's beam in its best direction: path gain times array gain [linear].
+    """
+
+    total_path_gain: np.ndarray
+    best_path_gain: np.ndarray
+    delay_spread_s: np.ndarray
+    best_beam_gain: np.ndarray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Links]) -> Links:
+        """One after another."""
+        return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__})
+
+
+def directivity(sigma: float, cosine: Any = 1.0) -> np.ndarray:
+    """Directivity [linear] of the beam of width ``sigma`` [rad] at the cosine of the angle from its axis."""
+    kappa = 1.0 / sigma**2
+    cosine = np.asarray(cosine, float)
+    return np.asarray(2.0 * kappa * np.exp(kappa * (cosine - 1.0)) / -np.expm1(-2.0 * kappa))
+
+
+class BeamSearch:
+    """Looks for the best direction of a receiver's beam.
+
+    Args:
+        shape: rows and columns of the grid that diffuse power is given on.
+        sigma: beam width [rad].
+
+    Raises:
+        ValueError: for a width that is not positive.
+    """
+
+    def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
+        self.shape, self.sigma = shape, sigma
+        self._beam = BeamOperator(shape, sigma, device=device)
+        self._density = 4.0 * np.pi / pixel_solid_angles(shape)[:, None]
+
+    def __call__(
+        self, diffuse: np.ndarray, receiver: np.ndarray, arrival: np.ndarray, power: np.ndarray
+    ) -> np.ndarray:
+        """Gain of the best beam of each receiver, shape ``(R,)``.
+
+        Args:
+            diffuse: path gain per pixel, before any beam, shape ``(R, H, W)``.
+            receiver, arrival, power: each sharp path's receiver ``(L,)``, unit direction ``(L, 3)`` and gain ``(L,)``.
+        """
+        count = len(diffuse)
+        gain = np.moveaxis(self._beam(np.moveaxis(diffuse, 0, -1)), -1, 0) * self._density
+        best = gain.reshape(count, -1).max(axis=1)
+        order = np.argsort(receiver, kind="stable")
+        first = np.searchsorted(receiver[order], np.arange(count + 1))
+        for r in range(count):
+            own = order[first[r] : first[r + 1]]
+            if len(own):
+                to = arrival[own]
+                sharp = directivity(self.sigma, to @ to.T) @ power[own]
+                best[r] = max(best[r], (sharp + gain[r][pixel_of(to, self.shape)]).max())
+        return best
+
+
+def links_of(paths: Sequence[Paths], search: BeamSearch) -> Links:
+    """Links of receivers whose paths are known, one set each."""
+    found = []
+    for p in paths:
+        own = p.valid
+        power, toward = np.abs(p.gain[own]) ** 2, directions_from_angles(p.theta_r[own], p.phi_r[own])
+        rough = p.kind[own] == "diffuse"
+        image = np.zeros(search.shape)
+        np.add.at(image, pixel_of(toward[rough], search.shape), power[rough])
+        sharp = np.flatnonzero(~rough)
+        beam = search(image[None], np.zeros(len(sharp), int), toward[sharp], power[sharp])
+        timed = np.isfinite(p.tau[own])
+        spread = delay_spread(power[timed], p.tau[own][timed])[1] if timed.any() else np.nan
+        found.append((power.sum(), power.max(initial=0.0), float(spread), beam[0]))
+    return Links(*np.array(found, float).reshape(-1, 4).T)

@@ -1,0 +1,347 @@
+"""Radio maps: what a link gets at every place of a floor plan.
+
+A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room or on
+a surface hold NaN. Which they are is decided by the mesh alone, open and torn as a reconstructed one may be: rays from
+the centre over the whole sphere meet surfaces from their outer side in the air and from behind anywhere else, and three
+in four decide. Which side is the outer one is decided at the transmitter, which stands in the air.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.device import Progress
+from warprrf.files import write_atomically
+from warprrf.geometry.floor_plan import section
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.fields.receivers import ON_A_WALL_M
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD
+
+if TYPE_CHECKING:
+    from warprrf.rf.fields.base import RadioField
+
+BOLTZMANN = 1.380649e-23  # SI [J/K]
+ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
+MOST_CELLS = 2_000_000
+
+_FORMAT = "warprrf radio map 1"
+_SIDE_RAYS = 64  # that decide whether a place is in the air
+_OUTER_SHARE = (
+    0.5  # least excess of rays that meet an outer side over those that meet one from behind: 3 in 4
+)
+_LAYERS = {
+    "total_path_gain": ("1", "total path gain"),
+    "best_path_gain": ("1", "gain of the strongest path"),
+    "delay_spread_s": ("s", "rms delay spread"),
+    "best_beam_gain": ("1", "path gain times array gain of the best receive beam"),
+}
+QUANTITIES = {
+    "total_path_gain": "total path gain [dB]",
+    "best_path_gain": "best path's gain [dB]",
+    "delay_spread_s": "delay spread [ns]",
+    "best_beam_snr_db": "best beam's SNR [dB]",
+}
+"""What :meth:`RadioMap.plot` draws, and how the picture calls it."""
+
+
+@dataclass(frozen=True)
+class RadioMap:
+    """What receivers at the centres of cells get; rows go along y, columns along x, NaN outside the air.
+
+    Attributes:
+        x, y: centres of the cells [m], shapes ``(X,)`` and ``(Y,)``.
+        height_m: of all of them.
+        cell_m: width of a cell.
+        transmitter: position [m], shape ``(3,)``.
+        frequency_hz: carrier [Hz].
+        total_path_gain: sum over all paths between isotropic antennas [linear], shape ``(Y, X)``.
+        best_path_gain: of the strongest path [linear], shape ``(Y, X)``.
+        delay_spread_s: root mean square, weighted by power [s], shape ``(Y, X)``.
+        best_beam_gain: path gain times array gain of the receiver's beam in its best direction [linear], shape
+            ``(Y, X)``; the transmitter is isotropic.
+        beam_sigma_rad: width of that beam [rad].
+        transmit_power_dbm: of the transmitter, equally strong in all directions [dBm].
+        noise_power_dbm: of the receiver, k T B F [dBm].
+        outline: floor plan, line segments where the mesh meets this height [m], shape ``(S, 2, 2)``.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    height_m: float
+    cell_m: float
+    transmitter: np.ndarray
+    frequency_hz: float
+    total_path_gain: np.ndarray = field(repr=False)
+    best_path_gain: np.ndarray = field(repr=False)
+    delay_spread_s: np.ndarray = field(repr=False)
+    best_beam_gain: np.ndarray = field(repr=False)
+    beam_sigma_rad: float
+    transmit_power_dbm: float
+    noise_power_dbm: float
+    outline: np.ndarray = field(repr=False)
+
+    @property
+    def free(self) -> np.ndarray:
+        """Whether a cell's centre lies in the air, shape ``(Y, X)``."""
+        return np.isfinite(self.total_path_gain)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Centres of the cells [m], shape ``(Y, X, 3)``."""
+        x, y = np.meshgrid(self.x, self.y)
+        return np.stack([x, y, np.full_like(x, self.height_m)], axis=-1)
+
+    @property
+    def best_beam_snr_db(self) -> np.ndarray:
+        """Signal-to-noise ratio of the best beam [dB], shape ``(Y, X)``; another budget shifts it by a constant."""
+        with np.errstate(divide="ignore"):
+            gain = 10.0 * np.log10(self.best_beam_gain)
+        return self.transmit_power_dbm + gain - self.noise_power_dbm
+
+    def shown(self, quantity: str) -> np.ndarray:
+        """``quantity`` as it is drawn: gains in dB, delay spread in ns, shape ``(Y, X)``.
+
+        Raises:
+            ValueError: for a quantity that is not one of :data:`QUANTITIES`.
+        """
+        if quantity not in QUANTITIES:
+            raise ValueError(f"quantity: got {quantity!r}, expected one of {', '.join(QUANTITIES)}")
+        value = np.asarray(getattr(self, quantity))
+        if quantity == "delay_spread_s":
+            return value * 1e9
+        if quantity.endswith("_db"):
+            return value
+        with np.errstate(divide="ignore"):
+            return np.asarray(10.0 * np.log10(value))
+
+    def plot(self, quantity: str = "total_path_gain", ax: Any = None, **options: Any) -> Any:
+        """Draw one quantity over the floor plan into ``ax`` (a new one by default); returns the axes.
+
+        Args:
+            quantity: one of :data:`QUANTITIES`.
+            options: for matplotlib's ``imshow``.
+
+        Raises:
+            ImportError: if matplotlib is missing.
+            ValueError: for an unknown quantity.
+        """
+        value = self.shown(quantity)
+        if ax is None:
+            _, ax = _device.require("matplotlib.pyplot", extra="plots").subplots(
+                figsize=(8.0, 6.0), layout="constrained"
+            )
+        half = 0.5 * self.cell_m
+        box = (self.x[0] - half, self.x[-1] + half, self.y[0] - half, self.y[-1] + half)
+        drawing: dict[str, Any] = {"cmap": "viridis", "origin": "lower", "interpolation": "nearest"} | options
+        image = ax.imshow(value, extent=box, **drawing)
+        if len(self.outline):
+            ax.plot(*self.outline.transpose(2, 1, 0), color="#222222", linewidth=1.0)
+        ax.plot(*self.transmitter[:2], marker="*", markersize=14, color="#d7263d", markeredgecolor="white")
+        ax.set_aspect("equal")
+        ax.set_xlabel("x [m]")
+        ax.set_ylabel("y [m]")
+        ax.figure.colorbar(image, ax=ax, label=QUANTITIES[quantity], shrink=0.8)
+        return ax
+
+    def picture(self, path: str | os.PathLike[str]) -> None:
+        """Write a PNG of all four quantities, whole or not at all.
+
+        Raises:
+            ImportError: if matplotlib is missing.
+        """
+        figure = _device.require("matplotlib.figure", extra="plots").Figure(
+            figsize=(13.0, 9.0), layout="constrained"
+        )
+        for ax, (quantity, name) in zip(figure.subplots(2, 2).flat, QUANTITIES.items(), strict=True):
+            self.plot(quantity, ax=ax)
+            ax.set_title(name, fontsize=11)
+        budget = f"{self.transmit_power_dbm:g} dBm sent, noise {self.noise_power_dbm:.1f} dBm"
+        figure.suptitle(
+            f"{self.frequency_hz / 1e9:g} GHz at {self.height_m:g} m, cells of {self.cell_m:g} m; receive beam of "
+            f"{np.rad2deg(self.beam_sigma_rad):.3g} degrees, {budget}",
+            fontsize=11,
+        )
+        write_atomically(path, lambda file: figure.savefig(file, dpi=110, format="png"))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a NetCDF-4 file, whole or not at all: the four quantities over ``y`` and ``x``, and the outline."""
+        xarray = _device.require("xarray", extra="all")
+        variables: dict[str, Any] = {
+            name: (("y", "x"), getattr(self, name), {"units": unit, "long_name": text})
+            for name, (unit, text) in _LAYERS.items()
+        }
+        variables["outline"] = (("segment", "end", "xy"), self.outline, {"units": "m"})
+        variables["transmitter"] = (("xyz",), self.transmitter, {"units": "m"})
+        coordinates = {
+            name: ((name,), getattr(self, name), {"units": "m", "long_name": "centre of the cell"})
+            for name in ("x", "y")
+        }
+        attributes = {name: float(getattr(self, name)) for name in _PLAIN} | {"format": _FORMAT}
+        data = xarray.Dataset(variables, coords=coordinates, attrs=attributes)
+        write_atomically(path, lambda file: data.to_netcdf(file, engine="h5netcdf"))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> RadioMap:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is corrupt, or holds something else.
+        """
+        xarray = _device.require("xarray", extra="all")
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"path: there is no file {path}")
+        try:
+            with xarray.open_dataset(path, engine="h5netcdf") as data:
+                if data.attrs.get("format") != _FORMAT:
+                    raise ValueError(f"it holds {data.attrs.get('format')!r}, expected {_FORMAT!r}")
+                held: dict[str, Any] = {n: np.asarray(data[n].values) for n in (*_LAYERS, *_ARRAYS)}
+                return cls(**held | {name: float(data.attrs[name]) for name in _PLAIN})
+        except (OSError, KeyError, ValueError) as error:
+            raise ValueError(f"path: {os.fspath(path)} is corrupt or no radio map: {error}") from error
+
+
+_PLAIN = ("height_m", "cell_m", "frequency_hz", "beam_sigma_rad", "transmit_power_dbm", "noise_power_dbm")
+_ARRAYS = ("x", "y", "transmitter", "outline")
+
+
+def radio_map(
+    field: RadioField,
+    height: float,
+    cell: float = 0.25,
+    transmitter: Any = None,
+    *,
+    bounds: Any = None,
+    beam_sigma_rad: float = BEAM_SIGMA_RAD,
+    transmit_power_dbm: float = 20.0,
+    bandwidth_hz: float = 2.16e9,
+    noise_figure_db: float = 10.0,
+    shape: tuple[int, int] | None = None,
+    mirror_order: int | None = None,
+    progress: Progress | None = None,
+) -> RadioMap:
+    """Links at the centres of cells over a floor plan.
+
+    Cells are left out that the field's mesh takes for solid; see :func:`in_the_air` for what it cannot know.
+
+    Args:
+        field: a fitted field with a mesh.
+        height: of the receivers [m].
+        cell: width of a cell [m].
+        transmitter: position (3,) [m] if another than the fitted one.
+        bounds: lowest x and y, highest x and y [m]; the mesh's by default. The grid starts at the lowest.
+        beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
+            array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
+        transmit_power_dbm: of the isotropic transmitter.
+        bandwidth_hz: of the noise, k T B at 290 K; one channel of IEEE 802.15.3d by default.
+        noise_figure_db: of the receiver.
+        shape: rows and columns of the grid of rays; see :meth:`RadioField.links`.
+        mirror_order: most reflections on a mirror path; see there.
+        progress: called as ``progress("links", done, total)``, cells in the air.
+
+    Raises:
+        ValueError: for a height outside the mesh, a cell that is not positive or makes more than two million, a field
+            without a mesh, bounds without a cell in the air, a beam, power or bandwidth out of range, or a transmitter
+            that is outside the scene or on a surface.
+    """
+    mesh = field.mesh
+    if not isinstance(mesh, Mesh):
+        raise ValueError("field: got one without a mesh, expected one that knows walls from air")
+    source = field.transmitter if transmitter is None else transmitter
+    source = _device.check_array("transmitter", source, (3,))
+    for name, value, positive in (
+        ("height", height, False),
+        ("cell", cell, True),
+        ("bandwidth_hz", bandwidth_hz, True),
+        ("beam_sigma_rad", beam_sigma_rad, True),
+        ("transmit_power_dbm", transmit_power_dbm, False),
+        ("noise_figure_db", noise_figure_db, False),
+    ):
+        if not np.isfinite(value) or (positive and value <= 0):
+            wanted = "a positive number" if positive else "a finite number"
+            raise ValueError(f"{name}: got {value!r}, expected {wanted}")
+    low, high = mesh.bounds
+    if not low[2] < height < high[2]:
+        raise ValueError(
+            f"height: got {height!r} m, expected one inside the scene, {low[2]:.3g} to {high[2]:.3g} m"
+        )
+    x, y = _centres(mesh, cell, bounds)
+    across, along = np.meshgrid(x, y)
+    places = np.stack([across, along, np.full_like(across, float(height))], axis=-1)
+    free = in_the_air(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
+    free &= (places != source).any(axis=-1)
+    if not free.any():
+        raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")
+    links = field.links(
+        places[free],
+        transmitter,
+        beam_sigma_rad=beam_sigma_rad,
+        shape=shape,
+        mirror_order=mirror_order,
+        progress=progress,
+    )
+    layers = {}
+    for name in _LAYERS:
+        layers[name] = np.full(free.shape, np.nan)
+        layers[name][free] = getattr(links, name)
+    noise_w = BOLTZMANN * ROOM_TEMPERATURE_K * bandwidth_hz
+    return RadioMap(
+        x=x,
+        y=y,
+        height_m=float(height),
+        cell_m=float(cell),
+        transmitter=source,
+        frequency_hz=float(field.frequency_hz),
+        beam_sigma_rad=float(beam_sigma_rad),
+        transmit_power_dbm=float(transmit_power_dbm),
+        noise_power_dbm=float(10.0 * np.log10(noise_w) + 30.0 + noise_figure_db),
+        outline=section(mesh.vertices, mesh.faces, float(height)),
+        **layers,
+    )
+
+
+def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any = None) -> np.ndarray:
+    """Whether ``points`` (N, 3) [m] lie in the air like ``known`` (3,) does, shape ``(N,)``.
+
+    Three in four of 64 rays over the sphere must meet a surface from the side that most of those from ``known`` meet.
+    What lies on a surface does not count. This is the mesh's word: a solid whose back no photo shows may be air to it,
+    and air that no photo looked into (above a gallery, behind a desk) solid.
+    """
+    k = np.arange(_SIDE_RAYS) + 0.5  # a Fibonacci lattice: no direction along a wall
+    zenith, azimuth = np.arccos(1.0 - 2.0 * k / _SIDE_RAYS), np.pi * (1.0 + np.sqrt(5.0)) * k
+    rays = np.column_stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
+    )
+    places = np.concatenate([np.reshape(known, (1, 3)), points])
+    directions = np.tile(rays, (len(places), 1))
+    hit = mesh.cast(np.repeat(places, _SIDE_RAYS, axis=0), directions, device=device)
+    meets = hit.face >= 0
+    slope = (mesh.face_normals[np.maximum(hit.face, 0)] * directions).sum(axis=1)
+    outer = np.where(meets, -np.sign(slope), 0.0).reshape(len(places), -1).mean(axis=1)
+    inside = (points >= mesh.bounds[0]).all(axis=1) & (points <= mesh.bounds[1]).all(axis=1)
+    free = inside & (outer[1:] * np.sign(outer[0]) > _OUTER_SHARE)
+    free[free] = mesh.distance(points[free], device=device) > ON_A_WALL_M
+    return free
+
+
+def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Centres of the cells along x and y [m]."""
+    if bounds is None:
+        low, high = mesh.bounds[0][:2], mesh.bounds[1][:2]
+    else:
+        low, high = _device.check_array("bounds", bounds, (4,)).reshape(2, 2)
+    if not (low < high).all():
+        raise ValueError(f"bounds: got {bounds!r}, expected lowest x and y, then higher x and y")
+    counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1.0)
+    if counts.prod() > MOST_CELLS:
+        raise ValueError(
+            f"cell: got {cell!r} m, which makes {counts.prod():.0f} cells; expected at most {MOST_CELLS}"
+        )
+    x, y = (start + cell * (np.arange(int(n)) + 0.5) for start, n in zip(low, counts, strict=True))
+    return x, y

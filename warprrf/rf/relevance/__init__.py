@@ -1,0 +1,1 @@
+"""Which effects a scene needs, in a band and to a tolerance."""

@@ -1,0 +1,363 @@
+"""Which effects a scene needs, in a band and to a tolerance: what each is worth, and the smallest model that is enough.
+
+The full model (:mod:`warprrf.rf.relevance.model`) is evaluated at a handful of receivers with and without each effect.
+What an effect is worth is the larger of two changes that leaving it out makes, both root mean squares over receivers:
+that of the dB image 10 log10(P + N0), over the sphere, and that of the total path gain. The smallest model is found by
+leaving out effects one after another, each time the one whose loss hurts least together with all that went before (the
+costliest of those that hurt alike, to a hundredth of a dB), while the model stays within the tolerance of the full one;
+what is left is then evaluated as a field of its own, to be sure. There the mean squares count with one standard error
+more, because few receivers stand for many.
+The order does not depend on the tolerance, so a larger one never keeps more.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf.device import Progress, check_array
+from warprrf.files import write_text
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.receivers import check_receiver
+from warprrf.rf.relevance.choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
+from warprrf.rf.relevance.model import FullModel, full_field, variant, with_lobes
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
+
+SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds
+TITLES = {
+    "line_of_sight": "line of sight",
+    "mirror_1": "mirrors, order 1",
+    "mirror_2": "mirrors, order 2",
+    "diffuse_1": "diffuse, order 1",
+    "diffuse_2": "diffuse, order 2 and more",
+    "mirror_scatter": "surfaces lit by mirrors",
+    "scatter_mirror": "lit surfaces seen in mirrors",
+    "indirect": "indirect radiance of groups",
+    "residual": "residual of elements",
+    "lobes": "scattering lobes",
+    "gas": "gas absorption (ITU-R P.676)",
+    "diffraction": "diffraction (knife edge, ITU-R P.526)",
+    "transmission": "transmission through walls (ITU-R P.2040)",
+    "unseen": "surface elements that no receiver sees",
+    "gaussians": "Gaussians that no receiver sees",
+}
+OUTSIDE = ("diffraction", "transmission")
+"""Effects that a bistatic field has no term for."""
+ESTIMATED = ("gas", *OUTSIDE)
+"""Effects that are estimated beside the model."""
+MATERIALS = {
+    "scene": "materials of the scene",
+    "fit": "fitted parameters",
+    "assumed": "no materials known: half scattered, half mirrored, permittivity 4 assumed",
+}
+
+
+@dataclass(frozen=True)
+class Relevance:
+    """What a scene needs; made by :func:`relevance`.
+
+    Attributes:
+        materials: ``"scene"``, ``"fit"`` or ``"assumed"``: where they come from.
+        frequency_hz: carrier [Hz].
+        tolerance_db: what leaving effects out may change [dB].
+        floor: N0 of the dB images.
+        receivers, blocked: how many, and how many of them without line of sight.
+        effects: rows of the table.
+        terms: the smallest bistatic model.
+        image_db, total_db: its changes against the full model [dB], rms over receivers, all effects left out at once.
+        full_s, reduced_s: time of a spectrum by the full and by the smallest model [s].
+        unseen: surface elements that no receiver sees, shape ``(E,)``, bool; not written to files.
+    """
+
+    materials: str
+    frequency_hz: float
+    tolerance_db: float
+    floor: float
+    receivers: int
+    blocked: int
+    effects: tuple[Effect, ...]
+    terms: Terms
+    image_db: float
+    total_db: float
+    full_s: float
+    reduced_s: float
+    unseen: np.ndarray | None = field(default=None, repr=False, compare=False)
+
+    def __getitem__(self, name: str) -> Effect:
+        """The effect ``name``; KeyError if there is none."""
+        for effect in self.effects:
+            if effect.name == name:
+                return effect
+        raise KeyError(f"{name!r}: expected one of {', '.join(e.name for e in self.effects)}")
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Names of the effects in the smallest model."""
+        return tuple(e.name for e in self.effects if e.kept)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Effects that the scene needs and a bistatic field has no term for."""
+        return tuple(name for name in self.kept if name in OUTSIDE)
+
+    def options(self, frequency_hz: float) -> dict[str, Any]:
+        """Options of a bistatic fit to spectra at ``frequency_hz``: what is ruled out is off, the rest left to the fit.
+
+        Raises:
+            ValueError: if the carrier is another than the one that this was made for.
+        """
+        if abs(frequency_hz / self.frequency_hz - 1.0) > SAME_BAND:
+            raise ValueError(
+                f"relevance: got one for {self.frequency_hz / 1e9:g} GHz, but the spectra are of "
+                f"{frequency_hz / 1e9:g} GHz; expected the same band, call warprrf.relevance for it"
+            )
+        t, out = self.terms, [e.name for e in self.effects if e.kept is False]
+        off: dict[str, Any] = {
+            name: False for name in ("mirror_scatter", "scatter_mirror", "indirect", "residual")
+        }
+        return {
+            "line_of_sight": t.line_of_sight,
+            "diffuse": t.diffuse,
+            "mirror_order": None if t.mirror_order == 2 else t.mirror_order,
+            "lobes": None if self.materials == "assumed" and t.diffuse else t.lobes,
+            "diffuse_order": None if t.diffuse_order > 1 else 1,
+            **{name: (value if name in out else None) for name, value in off.items()},
+        }
+
+    def reduce(self, full: BistaticField) -> BistaticField:
+        """``full``, a field with the terms that this was made of, cut down to the smallest model."""
+        p, lobes = full.parameters, self.terms.lobes
+        if lobes == full.terms.lobes:
+            return variant(full, terms=self.terms, errors=None)
+        p = with_lobes(p, full.terms.lobes, lobes)
+        p = replace(p, log_weight=p.log_weight[:, [full.terms.lobes.index(n) for n in lobes]])
+        return replace(full, terms=self.terms, parameters=p, errors=None)
+
+    def table(self) -> str:
+        """The effects as a Markdown table, with what was chosen below it."""
+
+        def cell(value: float | None) -> str:
+            return "" if value is None else f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+        lines = [
+            f"{self.frequency_hz / 1e9:g} GHz, tolerance {self.tolerance_db:g} dB, {self.receivers} receivers, "
+            f"{self.blocked} of them blocked; {MATERIALS[self.materials]}.",
+            "",
+            "| effect | image [dB] | total [dB] | blocked: image [dB] | total [dB] | time [ms] | in the model | why |",
+            "|---|---|---|---|---|---|---|---|",
+        ]
+        for e in self.effects:
+            chosen = "left to the fit" if e.kept is None else "yes" if e.kept else "no"
+            if e.name in self.missing:
+                chosen = "needed, no term for it"
+            numbers = [cell(v) for v in (e.image_db, e.total_db, e.image_blocked_db, e.total_blocked_db)]
+            time_ms = "" if e.seconds is None else f"{1e3 * e.seconds:.1f}"
+            lines.append(f"| {title(e.name)} | {' | '.join(numbers)} | {time_ms} | {chosen} | {e.reason} |")
+        lines += [
+            "",
+            f"All that is left out, together: {self.image_db:.3f} dB of the image, {self.total_db:.3f} dB of the "
+            f"total. A spectrum takes {1e3 * self.reduced_s:.0f} ms instead of {1e3 * self.full_s:.0f} ms.",
+        ]
+        if self.missing:
+            lines.append(f"Needed, but no term of the bistatic model: {', '.join(map(title, self.missing))}.")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """All but ``unseen``, in terms of JSON."""
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "unseen"}
+        values["effects"] = [{**asdict(e), "worth_db": e.worth_db} for e in self.effects]
+        return {**values, "terms": asdict(self.terms), "missing": list(self.missing)}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it as JSON, in one go."""
+        text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
+        write_text(path, text)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Relevance:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is something else.
+        """
+        text = Path(path).read_text(encoding="utf-8")
+        try:
+            values = json.loads(text)
+            values.pop("missing")
+            rows = [{k: v for k, v in row.items() if k != "worth_db"} for row in values.pop("effects")]
+            terms = Terms(**values.pop("terms"))
+            return cls(effects=tuple(Effect(**row) for row in rows), terms=terms, **values)
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError(f"{os.fspath(path)}: expected what Relevance.save wrote: {error!r}") from error
+
+
+def title(name: str) -> str:
+    """What an effect is called in tables."""
+    return TITLES.get(name) or f"scattering lobe of exponent {name.removeprefix('lobe_')}"
+
+
+def relevance(
+    geometry: Any,
+    *,
+    receivers: Any,
+    transmitter: Any = None,
+    frequency_hz: float | None = None,
+    tolerance_db: float = 0.1,
+    floor: float | None = None,
+    shape: tuple[int, int] = (60, 120),
+    beam_sigma_rad: float = BEAM_SIGMA_RAD,
+    gas_db_per_m: float | None = None,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> Relevance:
+    """What each effect is worth in a scene and a band, and the smallest model within a tolerance.
+
+    Args:
+        geometry: a Scene (its materials count), a fitted bistatic field (its parameters count, also for terms that its
+            fit left out), or a Reconstruction or Mesh (materials are assumed, and the table says so).
+        receivers: some positions [m], shape ``(R, 3)``, blocked ones among them: a dozen or more, since a mirror may
+            matter much to few.
+        transmitter: position [m], shape ``(3,)``; a field's own by default.
+        frequency_hz: carrier [Hz]; a field's own by default.
+        tolerance_db: what all that is left out may change together [dB].
+        floor: N0 of the dB images; by default a field's own, else 60 dB below the median peak of the full model.
+        shape, beam_sigma_rad: of the spectra; a field's own if it is one.
+        gas_db_per_m: attenuation of the air; None for that of a field's own air, else of standard air
+            (:func:`gas_attenuation_db_per_m`).
+        device: where rays are cast.
+        progress: called with the stage ``"relevance"``.
+
+    Raises:
+        ValueError: for a missing transmitter or carrier, one outside a material's band or another than a field's own,
+            receivers on a surface or outside the scene, or a tolerance that is not positive.
+        TypeError: for a geometry without a mesh, or a field of another model.
+    """
+    return relevances(
+        geometry, (tolerance_db,), receivers=receivers, transmitter=transmitter, frequency_hz=frequency_hz,
+        floor=floor, shape=shape, beam_sigma_rad=beam_sigma_rad, gas_db_per_m=gas_db_per_m, device=device,
+        progress=progress,
+    )[0]  # fmt: skip
+
+
+def relevances(
+    geometry: Any,
+    tolerances_db: Sequence[float],
+    *,
+    receivers: Any,
+    transmitter: Any = None,
+    frequency_hz: float | None = None,
+    floor: float | None = None,
+    shape: tuple[int, int] = (60, 120),
+    beam_sigma_rad: float = BEAM_SIGMA_RAD,
+    gas_db_per_m: float | None = None,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> list[Relevance]:
+    """:func:`relevance` at several tolerances, for little more than the time of one; arguments and errors as there."""
+    fitted = isinstance(geometry, BistaticField)
+    if isinstance(geometry, RadioField) and not fitted:
+        raise TypeError(f"geometry: got a field of model {geometry.model!r}, expected a bistatic one")
+    for tolerance in tolerances_db:
+        if not (np.isfinite(tolerance) and tolerance > 0):
+            raise ValueError(f"tolerance_db: got {tolerance!r}, expected more than 0")
+    if floor is not None and not (np.isfinite(floor) and floor > 0):
+        raise ValueError(f"floor: got {floor!r}, expected a path gain of more than 0")
+    if fitted:
+        own = geometry.frequency_hz
+        if frequency_hz is not None and frequency_hz != own:
+            raise ValueError(f"frequency_hz: got {frequency_hz!r}, but the field was fitted at {own!r}")
+        frequency_hz, shape, beam_sigma_rad = own, geometry.shape, geometry.beam_sigma_rad
+        transmitter = geometry.transmitter if transmitter is None else transmitter
+        floor = geometry.floor if floor is None else floor
+        if gas_db_per_m is None and geometry.air is not None:
+            gas_db_per_m = geometry.air.attenuation_db_per_m(own)
+    for name, value in (("transmitter", transmitter), ("frequency_hz", frequency_hz)):
+        if value is None:
+            raise ValueError(f"{name}: got None, expected it for anything but a fitted field")
+    full, walls, source = full_field(
+        geometry,
+        transmitter=check_array("transmitter", transmitter, (3,)),
+        frequency_hz=check_frequency(frequency_hz),
+        shape=check_shape(shape),
+        beam_sigma_rad=beam_sigma_rad,
+        device=device,
+    )
+    places = np.atleast_2d(check_receiver("receivers", receivers, full.surface.mesh))
+    tick = progress or (lambda stage, done, total: None)
+    model = FullModel(full, walls, places, floor=floor, gas_db_per_m=gas_db_per_m, progress=tick)
+    gaussians = getattr(geometry, "gaussians", None)
+    found = []
+    for tolerance in tolerances_db:
+        one = _choose(model, source, float(tolerance))
+        if isinstance(gaussians, Gaussians):
+            row = gaussians_row(gaussians, places, full.shape, tolerance, device)
+            one = replace(one, effects=(*one.effects, row))
+        found.append(one)
+    tick("relevance", len(places) + 1, len(places) + 1)
+    return found
+
+
+def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
+    full, places = model.field, model.receivers
+    known = model.all if source != "assumed" else model.all - {f"lobe_{n}" for n in full.terms.lobes}
+    order = leave_out(model, known, tolerance_db)
+    # Measured on the reduced field itself, where fewer lobes light other surfaces too: step back if that errs more.
+    while True:
+        kept = model.all - frozenset(order)
+        chosen = Relevance(
+            source, full.frequency_hz, tolerance_db, model.floor, len(places), int(model.blocked.sum()), (),
+            _terms(full.terms, kept), 0.0, 0.0, model.spectrum_s, 0.0, model.unseen,
+        )  # fmt: skip
+        image, seconds = _spectra(chosen.reduce(full if "unseen" in kept else model.seen_only), places)
+        image += model.image(kept) - model.image(kept - set(ESTIMATED))
+        loss = model.difference(np.maximum(image, 0.0))
+        if decisive(loss) <= tolerance_db or not order:
+            break
+        order.pop()
+    effects = [effect_row(model, name, kept) for name in model.effects if name in known]
+    if source == "assumed":
+        effects.append(open_row("lobes", "only known materials or a fit tell which lobes matter"))
+    for name in ("residual", "indirect"):
+        if name not in model.all:
+            effects.append(open_row(name, "only a fit tells"))
+    return replace(
+        chosen, effects=tuple(effects), image_db=rms(loss[0]), total_db=rms(loss[1]), reduced_s=seconds
+    )
+
+
+def _terms(full: Terms, kept: frozenset[str]) -> Terms:
+    diffuse = "diffuse_1" in kept
+    return Terms(
+        line_of_sight="line_of_sight" in kept,
+        diffuse=diffuse,
+        mirror_order=2 if "mirror_2" in kept else int("mirror_1" in kept),
+        lobes=tuple(n for n in full.lobes if f"lobe_{n}" in kept) if diffuse else full.lobes[:1],
+        mirror_scatter="mirror_scatter" in kept,
+        scatter_mirror="scatter_mirror" in kept,
+        diffuse_order=full.diffuse_order if "diffuse_2" in kept else 1,
+        indirect="indirect" in kept,
+        residual="residual" in kept,
+    )
+
+
+def _spectra(field: BistaticField, receivers: np.ndarray) -> tuple[np.ndarray, float]:
+    """Spectra (R, H, W), and the median time of one [s], set-up apart."""
+    field.compose(field.see(receivers[0]))  # tables and, where needed, the light on elements
+    images, seconds = [], []
+    for receiver in receivers:
+        start = time.perf_counter()
+        images.append(field.compose(field.see(receiver)).image)
+        seconds.append(time.perf_counter() - start)
+    return np.stack(images), float(np.median(seconds))

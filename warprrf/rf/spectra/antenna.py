@@ -1,0 +1,325 @@
+"""Taking a receiver's antenna out of measured spectra.
+
+Two ways to measure. *Scanned*: an antenna with a rotationally symmetric pattern G is steered to every pixel centre; the
+value there is y(d) = sum over paths of path gain times G(angle between d and the path), a convolution on the sphere.
+It is undone by Richardson-Lucy steps (Richardson 1972, Lucy 1974), weighted by the pixels' solid angles: estimates stay
+non-negative, a known noise power is part of the model, and each step conserves the total
+``sum_i Omega_i (y_i - noise) / integral of G``, which is the total path gain whatever the horn. *Fixed*: the antenna
+does not turn and directions were told apart by other means; its pattern over absolute directions divides out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.spectra.spectrum import (
+    check_shape,
+    pixel_angles,
+    pixel_directions,
+    pixel_solid_angles,
+    spread_paths,
+)
+
+ITERATIONS = 2000
+"""Most Richardson-Lucy steps."""
+
+TOLERANCE = 1e-3
+"""Relative misfit at which steps stop; paths between pixel centres leave a few percent, so that stalling ends most."""
+
+STALL = 0.01
+"""Steps stop too when the misfit fell by less than this share over the last :data:`STALL_STEPS`."""
+
+STALL_STEPS = 50
+
+LIMIT_DB = 20.0
+"""A fixed antenna that far below its peak tells nothing of a direction [dB]."""
+
+DYNAMIC_RANGE_DB = 60.0
+"""What an estimate holds that far below its strongest direction is dropped [dB]."""
+
+SCANNED = "scanned antenna: Richardson-Lucy on the sphere, then spread by the stated beam"
+FIXED = "fixed antenna: divided by its gain in each direction"
+
+_TOGETHER = 32  # receivers whose estimates are refined at once
+_FLAT_DB = 0.1  # a pattern that varies less cannot tell directions apart
+
+
+class Deembedded(NamedTuple):
+    """Spectra without the antenna.
+
+    Attributes:
+        path_gain: Path gain per pixel [linear], shape ``(R, H, W)``, float64.
+        source: Index ``row * W + column`` of the measured pixel that each pixel's strongest path comes from, shape
+            ``(R, H, W)``, int; -1 where empty.
+        steps: Steps taken, shape ``(R,)``, int; 0 for a fixed antenna.
+        misfit: Relative misfit of the measurement, weighted by solid angle, shape ``(R,)``; 0 for a fixed antenna.
+        covered: Share of the sphere of which something can be told.
+        method: What was done, :data:`SCANNED` or :data:`FIXED`.
+    """
+
+    path_gain: np.ndarray
+    source: np.ndarray
+    steps: np.ndarray
+    misfit: np.ndarray
+    covered: float
+    method: str
+
+
+def deembed(
+    path_gain: np.ndarray,
+    pattern: Any,
+    beam_sigma_rad: float,
+    *,
+    boresight_gain_dbi: float | None = None,
+    noise: float = 0.0,
+    progress: _device.Progress | None = None,
+    **options: Any,
+) -> Deembedded:
+    """``path_gain`` (R, H, W) without the antenna; see :meth:`warprrf.SpectrumDataset.deembed`.
+
+    A pattern ``(H, W)`` is a fixed antenna's, any other a scanned one's; ``options`` go to :func:`deembed_scanned` or
+    :func:`deembed_fixed`.
+
+    Raises:
+        TypeError: for an option of the other kind of antenna.
+        ValueError: for noise with a fixed antenna, or as these two raise it.
+    """
+    fixed = not callable(pattern) and np.ndim(pattern) == 2
+    allowed = {"limit_db"} if fixed else {"snapshots", "iterations", "tolerance", "device"}
+    if wrong := sorted(set(options) - allowed):
+        raise TypeError(
+            f"{wrong[0]}: no option for a {'fixed' if fixed else 'scanned'} antenna, expected "
+            f"{', '.join(sorted(allowed))}"
+        )
+    if fixed:
+        if noise != 0.0:
+            raise ValueError(
+                "noise: a fixed antenna's spectra are divided as they are; take the noise off first"
+            )
+        return deembed_fixed(path_gain, pattern, boresight_gain_dbi=boresight_gain_dbi, **options)
+    return deembed_scanned(
+        path_gain,
+        pattern,
+        beam_sigma_rad,
+        boresight_gain_dbi=boresight_gain_dbi,
+        noise=noise,
+        progress=progress,
+        **options,
+    )
+
+
+def scanned_kernel(
+    pattern: Any, shape: tuple[int, int], boresight_gain_dbi: float | None = None
+) -> np.ndarray:
+    """Azimuth spectrum of the response between rows, shape ``(W // 2 + 1, H, H)``; real, since patterns are even.
+
+    Args:
+        pattern: Power gain [linear] over the angle off boresight: a function of angles (any shape) [rad], or samples
+            ``(N,)`` at equally spaced angles from 0 to pi, both included, interpolated linearly.
+        shape: Rows and columns of the grid.
+        boresight_gain_dbi: Scales the pattern to this gain at its strongest; None takes it as it is.
+
+    Raises:
+        TypeError: if ``pattern`` is neither.
+        ValueError: if gains are negative, NaN, infinite, all zero or the same in all directions.
+    """
+    rows, columns = check_shape(shape)
+    zenith = pixel_angles(shape)[0]
+    azimuth = np.arange(columns) * 2.0 * np.pi / columns
+    # Half the chord, not the cosine: it does not cancel for small angles.
+    half = (
+        np.sin(0.5 * (zenith[:, None] - zenith[None, :]))[..., None] ** 2
+        + np.sin(zenith)[:, None, None] * np.sin(zenith)[None, :, None] * np.sin(0.5 * azimuth) ** 2
+    )
+    angle = 2.0 * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0)))
+    gain = _gains(_sampled(pattern, angle), boresight_gain_dbi)
+    if gain.min() > gain.max() * 10.0 ** (-_FLAT_DB / 10.0):
+        raise ValueError(
+            "pattern: got the same gain in all directions; scanning it tells nothing of directions, expected a "
+            "directive antenna (a fixed isotropic one is an array of ones over the pixels)"
+        )
+    return np.fft.rfft(gain, axis=-1).real.transpose(2, 0, 1).copy()
+
+
+def respond(path_gain: Any, kernel: np.ndarray) -> np.ndarray:
+    """What the scanned antenna measures of ``path_gain`` (..., H, W): power at each pixel it is steered to, same shape.
+
+    ``kernel`` is what :func:`scanned_kernel` returned. Exact on the grid: rows are convolved in azimuth by FFT.
+    """
+    image = np.asarray(path_gain, dtype=np.float64)
+    columns = image.shape[-1]
+    waves = np.moveaxis(np.fft.rfft(image.reshape(-1, *image.shape[-2:]), axis=-1), 0, -1).transpose(1, 0, 2)
+    waves = np.ascontiguousarray(waves)  # (W // 2 + 1, H, R), as pairs of real numbers below
+    turned = (kernel @ waves.view(np.float64)).view(np.complex128)
+    return np.fft.irfft(turned.transpose(2, 1, 0), n=columns, axis=-1).reshape(image.shape)
+
+
+def deembed_scanned(
+    measured: Any,
+    pattern: Any,
+    beam_sigma_rad: float,
+    *,
+    boresight_gain_dbi: float | None = None,
+    noise: float = 0.0,
+    snapshots: int = 1,
+    iterations: int = ITERATIONS,
+    tolerance: float = TOLERANCE,
+    device: Any = None,
+    progress: _device.Progress | None = None,
+) -> Deembedded:
+    """Spectra by this package's conventions from the powers that a steered antenna measured.
+
+    Args:
+        measured: Received over transmitted power [linear] with the antenna steered to each pixel centre, the antenna's
+            gain included in so far as the pattern includes it, shape ``(R, H, W)``.
+        pattern: See :func:`scanned_kernel`.
+        beam_sigma_rad: Width of the beam that spreads the estimate [rad].
+        boresight_gain_dbi: Gain that is in the measurement along boresight: 0 if it was divided out. None takes the
+            pattern as absolute gain over isotropic.
+        noise: Mean noise power in every measured value [linear, over transmitted power].
+        snapshots: Over how many independent ones each value was averaged: noise power scatters by ``noise`` over the
+            root of it.
+        iterations: Most steps for one receiver.
+        tolerance: Steps stop when the misfit is this small against the measurement, both weighted by solid angle,
+            after the first :data:`STALL_STEPS` when it is as small as the noise's scatter, or when it no longer falls
+            (:data:`STALL`).
+
+    Raises:
+        TypeError, ValueError: naming the argument.
+    """
+    power = _spectra("measured", measured)
+    if not (np.isfinite(noise) and noise >= 0):
+        raise ValueError(f"noise: got {noise!r}, expected a linear power of at least 0")
+    if iterations != int(iterations) or iterations < 1:
+        raise ValueError(f"iterations: got {iterations!r}, expected a whole number of at least 1")
+    if snapshots != int(snapshots) or snapshots < 1:
+        raise ValueError(f"snapshots: got {snapshots!r}, expected a whole number of at least 1")
+    if not (np.isfinite(tolerance) and tolerance > 0):
+        raise ValueError(f"tolerance: got {tolerance!r}, expected a positive number")
+    count, shape = len(power), check_shape(power.shape[1:])
+    kernel = scanned_kernel(pattern, shape, boresight_gain_dbi)
+    directions = pixel_directions(shape).reshape(-1, 3)
+    path_gain, source = np.zeros(power.shape), np.full(power.shape, -1)
+    steps, misfit = np.zeros(count, dtype=int), np.zeros(count)
+    for first in range(0, count, _TOGETHER):
+        part = slice(first, min(first + _TOGETHER, count))
+        estimate, steps[part], misfit[part] = _richardson_lucy(
+            power[part], kernel, float(noise), noise / np.sqrt(snapshots), int(iterations), tolerance
+        )
+        for k, one in enumerate(estimate, start=first):
+            kept = np.where(one > one.max() * 10.0 ** (-DYNAMIC_RANGE_DB / 10.0), one, 0.0)
+            if kept.any():
+                kept *= one.sum() / kept.sum()
+                path_gain[k], source[k] = spread_paths(
+                    directions, kept.reshape(-1), shape, beam_sigma_rad, device=device
+                )
+            if progress is not None:
+                progress("deembed", k + 1, count)
+    return Deembedded(path_gain, source, steps, misfit, 1.0, SCANNED)
+
+
+def _richardson_lucy(
+    measured: np.ndarray, kernel: np.ndarray, noise: float, scatter: float, iterations: int, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Path gain per direction ``(R, H, W)``, steps ``(R,)`` and relative misfit ``(R,)``."""
+    weight = np.broadcast_to(pixel_solid_angles(measured.shape[1:])[:, None], measured.shape[1:])
+    back = respond(weight, kernel)  # what a path of unit gain adds to the weighted sum of the measurement
+    signed = (weight * (measured - noise)).sum(axis=(1, 2))
+    # Uniform per solid angle to begin with: a pole's small pixels start with little.
+    estimate = weight / (weight * back).sum() * np.maximum(signed, 0.0)[:, None, None]
+    size = np.sqrt((weight * measured**2).sum(axis=(1, 2)))
+    goal = tolerance * size
+    # The first steps only gather power where it is: they are safe whatever the noise, and never left out.
+    noisy_goal = np.maximum(goal, scatter * np.sqrt(weight.sum()))
+    steps, misfit = np.zeros(len(measured), dtype=int), np.where(size > 0, 1.0, 0.0)
+    before = np.full(len(measured), np.inf)
+    going = np.flatnonzero(signed > 0)
+    for step in range(iterations):
+        expected = np.maximum(respond(estimate[going], kernel), 0.0) + noise
+        error = np.sqrt((weight * (measured[going] - expected) ** 2).sum(axis=(1, 2)))
+        misfit[going] = error / size[going]
+        left = error > (goal if step < STALL_STEPS else noisy_goal)[going]
+        if step % STALL_STEPS == 0:
+            left &= error < (1.0 - STALL) * before[going]
+            before[going] = error
+        going, expected = going[left], expected[left]
+        if len(going) == 0:
+            break
+        ratio = np.divide(measured[going], expected, out=np.zeros(expected.shape), where=expected > 0)
+        estimate[going] *= np.maximum(respond(weight * ratio, kernel), 0.0) / back
+        if noise > 0:  # the noise takes its share of each value only on average: hold the total
+            scale = signed[going] / (estimate[going] * back).sum(axis=(1, 2))
+            estimate[going] *= scale[:, None, None]
+        steps[going] = step + 1
+    return estimate, steps, misfit
+
+
+def deembed_fixed(
+    measured: Any, pattern: Any, *, boresight_gain_dbi: float | None = None, limit_db: float = LIMIT_DB
+) -> Deembedded:
+    """Spectra divided by the gain of an antenna that does not turn.
+
+    Directions in which the antenna is more than ``limit_db`` below its peak come out empty: dividing there would only
+    blow up noise and leakage. The total path gain is then that of the directions that are left.
+
+    Args:
+        measured: Path gain times antenna gain per pixel [linear], shape ``(R, H, W)``.
+        pattern: Power gain [linear] in each pixel's direction, shape ``(H, W)``.
+        boresight_gain_dbi: Scales the pattern to this gain at its strongest; None takes it as it is.
+
+    Raises:
+        TypeError, ValueError: naming the argument.
+    """
+    power = _spectra("measured", measured)
+    if not (np.isfinite(limit_db) and limit_db > 0):
+        raise ValueError(f"limit_db: got {limit_db!r}, expected a positive number of decibels")
+    gain = _gains(_device.check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
+    told = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
+    path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=told)
+    source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)
+    weight = pixel_solid_angles(gain.shape)[:, None]
+    covered = float((weight * told).sum() / (weight * np.ones_like(gain)).sum())
+    none = np.zeros(len(power))
+    return Deembedded(path_gain, source, none.astype(int), none, covered, FIXED)
+
+
+def _spectra(name: str, value: Any) -> np.ndarray:
+    power = _device.check_array(name, value, (None, None, None))
+    if (power < 0).any():
+        raise ValueError(f"{name}: got {int((power < 0).sum())} negative values, expected linear power")
+    return power
+
+
+def _sampled(pattern: Any, angle: np.ndarray) -> np.ndarray:
+    """The pattern at ``angle`` [rad], shape as ``angle``."""
+    if callable(pattern):
+        function: Callable[[np.ndarray], Any] = pattern
+        gain = _device.check_array("pattern", function(angle), finite=False)
+        if gain.shape not in ((), angle.shape):
+            raise ValueError(
+                f"pattern: got shape {gain.shape} for angles {angle.shape}, expected one gain for each angle"
+            )
+        return np.broadcast_to(gain, angle.shape)
+    samples = _device.check_array("pattern", pattern, finite=False)
+    if samples.ndim != 1 or len(samples) < 2:
+        raise ValueError(
+            f"pattern: got shape {samples.shape}, expected a function of the angle, samples (N,) from 0 to pi, or a "
+            "gain for each pixel (H, W)"
+        )
+    return np.interp(angle, np.linspace(0.0, np.pi, len(samples)), samples)
+
+
+def _gains(gain: np.ndarray, boresight_gain_dbi: float | None) -> np.ndarray:
+    if not np.isfinite(gain).all() or (gain < 0).any():
+        raise ValueError("pattern: got negative, NaN or infinite gains, expected linear power gains")
+    if not gain.max() > 0:
+        raise ValueError("pattern: got a gain of zero in all directions, expected linear power gains")
+    if boresight_gain_dbi is None:
+        return gain
+    if not np.isfinite(boresight_gain_dbi):
+        raise ValueError(f"boresight_gain_dbi: got {boresight_gain_dbi!r}, expected decibels over isotropic")
+    return gain / gain.max() * 10.0 ** (boresight_gain_dbi / 10.0)

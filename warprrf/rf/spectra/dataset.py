@@ -1,0 +1,324 @@
+"""A set of spectra of one transmitter: what it holds, how it is split for training, what is measured out of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.em.absorption import Air
+from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.spectra import dataset_files, exr
+from warprrf.rf.spectra.antenna import deembed
+from warprrf.rf.spectra.spectrum import Spectrum, check_shape, default_floor, to_db
+
+POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
+
+_ROLES = ("train", "test")
+
+
+@dataclass(frozen=True)
+class SpectrumDataset:
+    """Spectra at R receivers.
+
+    Attributes:
+        receivers: Positions [m], shape ``(R, 3)``, float64.
+        transmitter: Position [m], shape ``(3,)``, float64.
+        frequency_hz: Carrier frequency [Hz].
+        path_gain: Path gain per pixel [linear], shape ``(R, H, W)``, float32.
+        delay_s: Delay of the pixel's strongest path [s], shape ``(R, H, W)``, float64; NaN where empty.
+        aod: Its zenith and azimuth of departure [rad], shape ``(R, H, W, 2)``, float32; NaN where empty.
+        floor: Noise floor N0 that dB images add [linear].
+        range_db: 10 log10 N0 and the highest value of the dB images [dB].
+        beam_sigma_rad: Width of the receiver beam, kappa = 1 / sigma^2 [rad].
+        engine: "exact" or "sionna".
+        polarisation: What is averaged and summed.
+        seed: Seed of the engine.
+        role: "train" or "test" for each receiver, shape ``(R,)``.
+        line_of_sight: Whether the receiver sees the transmitter, shape ``(R,)``, bool.
+        attributes: Anything else worth keeping: depth, samples, versions; the air (:attr:`air`).
+    """
+
+    receivers: np.ndarray
+    transmitter: np.ndarray
+    frequency_hz: float
+    path_gain: np.ndarray
+    delay_s: np.ndarray
+    aod: np.ndarray
+    floor: float
+    range_db: tuple[float, float]
+    beam_sigma_rad: float
+    engine: str
+    polarisation: str
+    seed: int
+    role: np.ndarray
+    line_of_sight: np.ndarray
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check shapes and values; ValueError or TypeError names the field."""
+        check = _device.check_array
+        receivers = check("receivers", self.receivers, (None, 3))
+        count = len(receivers)
+        gain = check("path_gain", self.path_gain, (count, None, None), dtype=np.float32)
+        if (gain < 0).any():
+            raise ValueError(
+                f"path_gain: got {int((gain < 0).sum())} negative values, expected linear path gain"
+            )
+        shape = check_shape(gain.shape[1:])
+        role = np.asarray(self.role, dtype="<U5")
+        if role.shape != (count,) or not np.isin(role, _ROLES).all():
+            raise ValueError(f"role: got shape {role.shape}, expected ({count},) of 'train' and 'test'")
+        fields: dict[str, Any] = {
+            "receivers": receivers,
+            "transmitter": check("transmitter", self.transmitter, (3,)),
+            "frequency_hz": check_frequency(self.frequency_hz),
+            "path_gain": gain,
+            "delay_s": check("delay_s", self.delay_s, (count, *shape), finite=False),
+            "aod": check("aod", self.aod, (count, *shape, 2), dtype=np.float32, finite=False),
+            "floor": float(check("floor", self.floor, ())),
+            "range_db": (float(self.range_db[0]), float(self.range_db[1])),
+            "beam_sigma_rad": float(check("beam_sigma_rad", self.beam_sigma_rad, ())),
+            "seed": int(self.seed),
+            "role": role,
+            "line_of_sight": check("line_of_sight", self.line_of_sight, (count,), dtype=bool),
+        }
+        if not fields["floor"] > 0:
+            raise ValueError(f"floor: got {self.floor!r}, expected a positive linear noise floor")
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_spectra(
+        cls,
+        *,
+        receivers: Any,
+        transmitter: Any,
+        frequency_hz: float,
+        path_gain: Any,
+        delay_s: Any,
+        aod: Any,
+        line_of_sight: Any,
+        beam_sigma_rad: float,
+        engine: str,
+        seed: int = 0,
+        role: Any = None,
+        floor: float | None = None,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> SpectrumDataset:
+        """A data set with N0, its dB range and, if none are given, roles chosen for it."""
+        gain = np.asarray(path_gain, dtype=np.float32)
+        noise = default_floor(gain) if floor is None else float(floor)
+        return cls(
+            receivers=receivers,
+            transmitter=transmitter,
+            frequency_hz=frequency_hz,
+            path_gain=gain,
+            delay_s=delay_s,
+            aod=aod,
+            floor=noise,
+            range_db=(10.0 * float(np.log10(noise)), float(to_db(gain.max(), noise))),
+            beam_sigma_rad=beam_sigma_rad,
+            engine=engine,
+            polarisation=POLARISATION,
+            seed=seed,
+            role=assign_roles(len(gain), seed=seed) if role is None else role,
+            line_of_sight=line_of_sight,
+            attributes=dict(attributes or {}),
+        )
+
+    def __len__(self) -> int:
+        return len(self.receivers)
+
+    def __getitem__(self, index: int) -> Spectrum:
+        """The spectrum of one receiver."""
+        return Spectrum(
+            path_gain=self.path_gain[index],
+            delay_s=self.delay_s[index],
+            aod=self.aod[index],
+            floor=self.floor,
+            range_db=self.range_db,
+            attributes={
+                "receiver": self.receivers[index],
+                "transmitter": self.transmitter,
+                "frequency_hz": self.frequency_hz,
+                "beam_sigma_rad": self.beam_sigma_rad,
+                "engine": self.engine,
+            },
+        )
+
+    def __iter__(self) -> Any:
+        return (self[k] for k in range(len(self)))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a spectrum."""
+        return self.path_gain.shape[1], self.path_gain.shape[2]
+
+    @property
+    def air(self) -> Air | None:
+        """The air whose absorption is in the path gains, by the attributes ``air_...``; None for none."""
+        return Air.from_attributes(self.attributes)
+
+    @property
+    def path_gain_db(self) -> np.ndarray:
+        """10 log10(P + N0) [dB], shape ``(R, H, W)``, float64."""
+        return to_db(self.path_gain, self.floor)
+
+    def subset(self, indices: Any) -> SpectrumDataset:
+        """The receivers named by ``indices`` (whole numbers or a mask); floor and range stay those of the whole set."""
+        chosen = np.asarray(indices)
+        if chosen.dtype == bool:
+            chosen = np.flatnonzero(chosen)
+        chosen = chosen.astype(np.int64)
+        if chosen.ndim != 1 or (len(chosen) and (chosen.min() < -len(self) or chosen.max() >= len(self))):
+            raise ValueError(
+                f"indices: got {indices!r}, expected a list of receivers from 0 to {len(self) - 1}"
+            )
+        per_receiver = ("receivers", "path_gain", "delay_s", "aod", "role", "line_of_sight")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in per_receiver})
+
+    def split(self, n_train: int, seed: int = 0) -> tuple[SpectrumDataset, SpectrumDataset]:
+        """``n_train`` training receivers and all test receivers.
+
+        Subsets are nested: a larger ``n_train`` holds the smaller one. Seed 0 takes training receivers in the order of
+        the file, which for the lobby is that of the full data set; other seeds take them in another order. The test
+        receivers are always the same.
+
+        Raises:
+            ValueError: if the set has fewer training receivers, or no test receivers.
+        """
+        train, test = np.flatnonzero(self.role == "train"), np.flatnonzero(self.role == "test")
+        if not 1 <= n_train <= len(train):
+            raise ValueError(
+                f"n_train: got {n_train}, expected 1 to {len(train)}, the training receivers there are"
+            )
+        if len(test) == 0:
+            raise ValueError(
+                "role: there are no test receivers; give simulate(..., roles=) or assign_roles some"
+            )
+        if seed != 0:
+            train = np.random.default_rng(seed).permutation(train)
+        return self.subset(train[:n_train]), self.subset(test)
+
+    def deembed(
+        self,
+        pattern: Any,
+        *,
+        boresight_gain_dbi: float | None = None,
+        noise: float = 0.0,
+        progress: _device.Progress | None = None,
+        **options: Any,
+    ) -> SpectrumDataset:
+        """These spectra without the antenna that measured them.
+
+        A *scanned* antenna was steered to every pixel centre, and a pixel holds what it received there over what was
+        transmitted: path gain times antenna gain, summed over all directions. ``pattern`` is then its power gain over
+        the angle off boresight [rad]: a function, or samples ``(N,)`` from 0 to pi, both included. The result is
+        spread by ``beam_sigma_rad``, and its sum is the total path gain between isotropic antennas: that of
+        ``sum over pixels of (value - noise) times solid angle / integral of the pattern over the sphere``; a spectrum
+        of which noise leaves nothing comes out empty.
+
+        A *fixed* antenna did not turn, and directions were told apart otherwise. ``pattern`` is then its gain in each
+        pixel's direction, ``(H, W)``: pixels are divided by it. Where it lies more than ``limit_db`` below its peak
+        nothing can be told: those pixels become empty, and the sum is that of the others.
+
+        Delay and angle of departure are those measured in the direction that gives a pixel most of its power. The
+        floor and range are chosen anew; attributes ``deembedded...`` say what was done.
+
+        Args:
+            pattern: Linear power gain over isotropic; see above.
+            boresight_gain_dbi: Scales the pattern to this gain at its strongest: 0 where measurements had the
+                boresight gain divided out.
+            noise: Mean noise power in every value of a scan [linear, over transmitted power].
+            progress: Called once a receiver with the stage ``"deembed"``.
+            **options: For a scan ``snapshots`` (1, over which each value's noise was averaged), ``iterations`` (2000),
+                ``tolerance`` (1e-3) and ``device``; for a fixed antenna ``limit_db`` (20).
+
+        Raises:
+            TypeError: on a pattern that does not read as numbers, or an option of the other kind of antenna.
+            ValueError: on negative, NaN or infinite gains, a scanned antenna without directivity, another shape.
+        """
+        done = deembed(
+            self.path_gain,
+            pattern,
+            self.beam_sigma_rad,
+            boresight_gain_dbi=boresight_gain_dbi,
+            noise=noise,
+            progress=progress,
+            **options,
+        )
+        count, rows, columns = done.path_gain.shape
+        there = done.source.reshape(count, -1)
+        chosen = np.maximum(there, 0)
+        each = np.arange(count)[:, None]
+        delay = np.where(there >= 0, self.delay_s.reshape(count, -1)[each, chosen], np.nan)
+        aod = np.where(there[..., None] >= 0, self.aod.reshape(count, -1, 2)[each, chosen], np.nan)
+        gain = done.path_gain.astype(np.float32)
+        lit = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
+        floor = default_floor(gain) if lit else self.floor
+        return replace(
+            self,
+            path_gain=gain,
+            delay_s=delay.reshape(count, rows, columns),
+            aod=aod.reshape(count, rows, columns, 2),
+            floor=floor,
+            range_db=(10.0 * float(np.log10(floor)), float(to_db(gain.max(initial=0.0), floor))),
+            attributes={
+                **self.attributes,
+                "deembedded": done.method,
+                "deembedded_boresight_gain_dbi": (
+                    "as the pattern states" if boresight_gain_dbi is None else float(boresight_gain_dbi)
+                ),
+                "deembedded_noise": float(noise),
+                "deembedded_share_of_sphere": done.covered,
+                "deembedded_steps_median": float(np.median(done.steps)) if count else 0.0,
+                "deembedded_misfit_median": float(np.median(done.misfit)) if count else 0.0,
+            },
+        )
+
+    def save(self, path: str | os.PathLike[str], compact: bool = False) -> None:
+        """Write NetCDF-4, whole or not at all.
+
+        Args:
+            path: File to write or replace.
+            compact: Round mantissas first: path gain to 0.4 % or N0 / 128, the larger, delay to 0.91 ps, AoD to
+                4.9e-4 rad. The dB image moves by at most 0.04 dB, and the file says so.
+        """
+        dataset_files.write(path, vars(self), compact=compact)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> SpectrumDataset:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if it is not a readable NetCDF file of spectra.
+        """
+        return cls(**dataset_files.read(path))
+
+    def export_exr(self, path: str | os.PathLike[str], index: int) -> None:
+        """Write one spectrum as OpenEXR: channels path_gain, delay, aod_zenith, aod_azimuth, 32-bit.
+
+        Numbers in the header are text, because EXR headers hold 32-bit floats only.
+        """
+        if not -len(self) <= index < len(self):
+            raise ValueError(f"index: got {index}, expected a receiver from 0 to {len(self) - 1}")
+        spectrum = self[index]
+        exr.export_exr(
+            path, replace(spectrum, attributes={**spectrum.attributes, "polarisation": self.polarisation})
+        )
+
+
+def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.ndarray:
+    """ "train" or "test" for each of ``count`` receivers, ``test`` of them (an eighth by default) drawn at random."""
+    wanted = count // 8 if test is None else test
+    if not 0 <= wanted <= count:
+        raise ValueError(f"test: got {wanted}, expected 0 to {count}, the receivers there are")
+    role = np.full(count, "train", dtype="<U5")
+    role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
+    return role

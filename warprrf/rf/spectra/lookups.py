@@ -1,0 +1,138 @@
+"""Baselines that know no geometry: copy, average or ignore the training spectra.
+
+Every table of results carries them, because published radio fields have been seen to lose to them. Each function takes
+the training set and returns a :class:`Lookup`: a callable from a receiver position to a
+:class:`~warprrf.rf.spectra.spectrum.Spectrum`, the interface that :func:`warprrf.rf.spectra.metrics.evaluate` expects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf.device import check_array
+from warprrf.rf.spectra.metrics import psnr, unit_image
+from warprrf.rf.spectra.spectrum import Spectrum, to_db
+
+if TYPE_CHECKING:
+    from warprrf.rf.spectra.dataset import SpectrumDataset
+
+SAME_PLACE_M = 1e-9  # a receiver nearer than this to a training one is that one
+
+
+@dataclass(frozen=True)
+class Lookup:
+    """A baseline's prediction.
+
+    Attributes:
+        name: ``"nearest"``, ``"idw"``, ``"constant"`` or ``"mean"``.
+        note: what was chosen while building it, in words (empty if nothing was).
+    """
+
+    name: str
+    note: str
+    _predict: Callable[[np.ndarray], Spectrum] = field(repr=False)
+
+    def __call__(self, receiver: Any) -> Spectrum:
+        """The predicted spectrum at ``receiver`` (3,) [m].
+
+        Raises:
+            ValueError: if the position is not three finite numbers.
+        """
+        return self._predict(check_array("receiver", receiver, (3,)))
+
+    spectrum = __call__
+
+
+def nearest(train: SpectrumDataset) -> Lookup:
+    """The spectrum of the nearest training receiver, with its delays and angles of departure."""
+    receivers = _receivers(train)
+
+    def predict(receiver: np.ndarray) -> Spectrum:
+        i = int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))
+        return Spectrum(
+            path_gain=np.array(train.path_gain[i], dtype=np.float32),
+            delay_s=np.array(train.delay_s[i]),
+            aod=np.array(train.aod[i]),
+            floor=float(train.floor),
+            range_db=train.range_db,
+        )
+
+    return Lookup("nearest", "", predict)
+
+
+def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> Lookup:
+    """Inverse-distance weighting of all training spectra.
+
+    Args:
+        train: training set.
+        power: exponent p of the weights ``1 / distance**p``.
+        domain: average the dB images (``"db"``), linear path gain (``"linear"``), or whichever has the higher PSNR
+            when each training receiver in turn is left out (``"auto"``; the choice is in ``.note``).
+
+    Raises:
+        ValueError: for a power that is not positive, or an unknown domain.
+    """
+    if not (np.isfinite(power) and power > 0):
+        raise ValueError(f"power: got {power!r}, expected a positive number")
+    receivers = _receivers(train)
+    floor, range_db = float(train.floor), train.range_db
+    images = np.asarray(train.path_gain, dtype=np.float64)
+    tables = {"db": np.asarray(to_db(images, floor), np.float64), "linear": images}
+
+    def gain(receiver: np.ndarray, keep: np.ndarray, how: str) -> np.ndarray:
+        distance = np.linalg.norm(receivers[keep] - receiver, axis=-1)
+        same = distance < SAME_PLACE_M
+        weight = same.astype(np.float64) if same.any() else distance**-power
+        average = np.tensordot(weight / weight.sum(), tables[how][keep], axes=1)
+        return np.maximum(10 ** (average / 10) - floor, 0.0) if how == "db" else average
+
+    note = f"averaged in {domain}"
+    if domain == "auto":
+        everyone = np.arange(len(receivers))
+        score = {"db": 0.0, "linear": 0.0}
+        for i in everyone if len(everyone) > 1 else []:
+            truth = unit_image(images[i], floor, range_db)
+            for how in score:
+                left_out = gain(receivers[i], everyone != i, how)
+                score[how] += psnr(unit_image(left_out, floor, range_db), truth) / len(everyone)
+        domain = max(score, key=lambda how: score[how])
+        note = (
+            f"averaged in {domain}: leave-one-out PSNR {score['db']:.2f} dB in dB, {score['linear']:.2f} dB in linear "
+            "power"
+        )
+    elif domain not in tables:
+        raise ValueError(f'domain: got {domain!r}, expected "db", "linear" or "auto"')
+    all_of_them = np.ones(len(receivers), dtype=bool)
+    return Lookup("idw", note, lambda receiver: _bare(gain(receiver, all_of_them, domain), train))
+
+
+def constant(train: SpectrumDataset) -> Lookup:
+    """One number for every pixel and receiver: the mean of the training dB images."""
+    _receivers(train)
+    level = float(np.mean(to_db(np.asarray(train.path_gain, np.float64), float(train.floor))))
+    gain = np.full(train.path_gain.shape[1:], max(10 ** (level / 10) - float(train.floor), 0.0))
+    return Lookup("constant", f"{level:.2f} dB", lambda receiver: _bare(gain, train))
+
+
+def mean(train: SpectrumDataset) -> Lookup:
+    """The mean of the training dB images, wherever the receiver is."""
+    _receivers(train)
+    images = to_db(np.asarray(train.path_gain, np.float64), float(train.floor))
+    gain = np.maximum(10 ** (np.mean(images, axis=0) / 10) - float(train.floor), 0.0)
+    return Lookup("mean", "", lambda receiver: _bare(gain, train))
+
+
+def _receivers(train: SpectrumDataset) -> np.ndarray:
+    receivers = np.asarray(train.receivers, dtype=np.float64)
+    if len(receivers) == 0:
+        raise ValueError("train: got no receivers, expected at least one")
+    return receivers
+
+
+def _bare(path_gain: np.ndarray, train: SpectrumDataset) -> Spectrum:
+    """A spectrum without delays or angles of departure."""
+    return Spectrum(path_gain=path_gain.astype(np.float32), floor=float(train.floor), range_db=train.range_db)

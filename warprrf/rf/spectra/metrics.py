@@ -1,0 +1,284 @@
+"""How wrong a predicted spectrum is, in the terms a radio engineer asks for, and how long it took.
+
+PSNR and SSIM are those of the dB image ``y = 10 log10(P + N0)`` mapped to [0, 1] by the data set's stated range; the
+mean of the per-view values is quoted. RMSE is in dB, weighted by solid angle. Directions are compared where a spectrum
+is densest *per solid angle*, so that the answer does not depend on how the grid thins out towards the poles. Beam gain
+loss steers a von Mises-Fisher beam of stated width to the predicted peak and asks what the true spectrum loses against
+the best steering. ToF and AoD errors are weighted by the true power of each pixel.
+
+Figures for receivers without line of sight alone carry the suffix ``_blocked``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warprrf.device import Progress
+from warprrf.rf.spectra.spectrum import (
+    Spectrum,
+    directions_from_angles,
+    pixel_directions,
+    pixel_solid_angles,
+    to_db,
+)
+
+if TYPE_CHECKING:
+    from warprrf.rf.spectra.dataset import SpectrumDataset
+
+SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
+PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
+
+
+def unit_image(path_gain: np.ndarray, floor: float, range_db: Any) -> np.ndarray:
+    """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
+    low, high = (float(v) for v in range_db)
+    if not high > low:
+        raise ValueError(
+            f"range_db: got ({low}, {high}), expected (lowest, highest) with highest above lowest"
+        )
+    return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
+
+
+def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio [dB] of two images in [0, 1]; equal images score :data:`PSNR_CEILING_DB`."""
+    error = float(np.mean((np.asarray(prediction, np.float64) - truth) ** 2))
+    return PSNR_CEILING_DB if error <= 10 ** (-PSNR_CEILING_DB / 10) else -10.0 * np.log10(error)
+
+
+def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity of two images in [0, 1], shape ``(height, width)`` of at least 7 x 7 pixels.
+
+    Wang et al. 2004 with a uniform 7 x 7 window, sample covariance and the border left out: the defaults of
+    ``skimage.metrics.structural_similarity(..., data_range=1)``, without needing scikit-image.
+    """
+    a, b = np.asarray(prediction, np.float64), np.asarray(truth, np.float64)
+    if a.shape != b.shape or a.ndim != 2 or min(a.shape) < SSIM_WINDOW:
+        raise ValueError(
+            f"prediction, truth: got shapes {a.shape} and {b.shape}, expected two equal (height, width) images of at "
+            f"least {SSIM_WINDOW} x {SSIM_WINDOW} pixels"
+        )
+    count = SSIM_WINDOW**2
+    sample = count / (count - 1)
+    mean_a, mean_b = _window_mean(a), _window_mean(b)
+    var_a = sample * (_window_mean(a * a) - mean_a**2)
+    var_b = sample * (_window_mean(b * b) - mean_b**2)
+    covariance = sample * (_window_mean(a * b) - mean_a * mean_b)
+    c1, c2 = 0.01**2, 0.03**2
+    score = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return float(np.mean(score / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
+
+
+def rmse_db(prediction_db: np.ndarray, truth_db: np.ndarray) -> float:
+    """Root mean square difference [dB] of two dB images ``(height, width)``, weighted by solid angle."""
+    weight = pixel_solid_angles(truth_db.shape)[:, None]
+    error = (np.asarray(prediction_db, np.float64) - truth_db) ** 2
+    return float(np.sqrt(np.sum(weight * error) / (np.sum(weight) * truth_db.shape[1])))
+
+
+def strongest_direction(path_gain: np.ndarray) -> np.ndarray:
+    """Unit direction ``(3,)`` of the pixel with the most path gain per solid angle.
+
+    Of equal pixels the first is taken (an empty or constant density has no direction: this is the first row's).
+    """
+    density = np.asarray(path_gain, np.float64) / pixel_solid_angles(path_gain.shape)[:, None]
+    row, column = np.unravel_index(np.argmax(density), density.shape)
+    return pixel_directions(path_gain.shape)[row, column]
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle [degrees] between unit vectors ``(..., 3)``; accurate for small angles too."""
+    return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def beam_kappa(width_rad: float) -> float:
+    """Concentration of the von Mises-Fisher beam whose power falls to half at ``width_rad / 2`` off its axis."""
+    if not 0 < width_rad < 2 * np.pi:
+        raise ValueError(f"width_rad: got {width_rad}, expected a full width at half maximum in (0, 2 pi)")
+    return float(np.log(2.0) / (1.0 - np.cos(width_rad / 2)))
+
+
+def beam_response(path_gain: np.ndarray, width_rad: float) -> np.ndarray:
+    """Power a beam collects when steered to each pixel centre, shape ``(height, width)``.
+
+    The beam's power pattern is ``exp(kappa (cos(angle) - 1))``, one on its axis, with :func:`beam_kappa`. The sum over
+    the sphere is exact on the grid: rows are convolved in azimuth by FFT.
+    """
+    height, width = path_gain.shape
+    kappa = beam_kappa(width_rad)
+    zenith = (np.arange(height) + 0.5) * np.pi / height
+    azimuth = np.arange(width) * 2 * np.pi / width
+    cosine = (
+        np.sin(zenith)[:, None, None] * np.sin(zenith)[None, :, None] * np.cos(azimuth)
+        + np.cos(zenith)[:, None, None] * np.cos(zenith)[None, :, None]
+    )
+    kernel = np.fft.rfft(np.exp(kappa * (cosine - 1.0)), axis=-1)
+    image = np.fft.rfft(np.asarray(path_gain, np.float64), axis=-1)
+    return np.fft.irfft(np.einsum("abm,bm->am", kernel, image), n=width, axis=-1)
+
+
+def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: float) -> float:
+    """Loss [dB] of a beam steered to ``direction`` (3,) on the spectrum ``path_gain`` against its best steering.
+
+    The best is sought over pixel centres, so steering between them can score slightly below zero.
+    """
+    power = np.asarray(path_gain, np.float64)
+    best = float(np.max(beam_response(power, width_rad)))
+    if best <= 0:
+        return 0.0
+    cosine = pixel_directions(path_gain.shape) @ np.asarray(direction, np.float64)
+    got = float(np.sum(power * np.exp(beam_kappa(width_rad) * (cosine - 1.0))))
+    return float(10.0 * np.log10(best / max(got, best * 1e-30)))
+
+
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """Smallest value at which the cumulated weight reaches one half; NaN when no weight is positive."""
+    values, weights = np.ravel(values), np.ravel(weights)
+    if not np.any(weights > 0):
+        return float("nan")
+    order = np.argsort(values, kind="stable")
+    cumulated = np.cumsum(weights[order], dtype=np.float64)
+    return float(values[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
+
+
+def lpips_weights() -> str | None:
+    """Path of LPIPS' AlexNet weights if they are already on this machine, else None; nothing is ever downloaded."""
+    from pathlib import Path
+
+    found = sorted(Path.home().glob(".cache/torch/hub/checkpoints/alexnet-*.pth"))
+    return str(found[0]) if found else None
+
+
+def evaluate(
+    test: SpectrumDataset,
+    predict: Callable[[np.ndarray], Any],
+    *,
+    beam_width_rad: float = np.radians(10.0),
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Score ``predict`` on every receiver of ``test``.
+
+    Args:
+        test: truth: held-out receivers.
+        predict: from a receiver position ``(3,)`` [m] to a :class:`Spectrum`, or to a path gain array
+            ``(height, width)`` alone (then there is no ToF or AoD error).
+        beam_width_rad: full width at half maximum of the beam in ``beam_gain_loss_db``.
+        progress: called once a receiver with the stage ``"evaluate"``.
+
+    Returns:
+        Means over receivers: ``psnr_db``, ``ssim``, ``rmse_db``, ``beam_gain_loss_db``; ``direction_median_deg`` and
+        the shares ``direction_within_1deg``, ``direction_within_3deg``; medians over receivers of each one's
+        power-weighted median over the pixels whose truth is above the floor: ``tof_error_median_ns``,
+        ``aod_error_median_deg`` (None if nothing was predicted, or for most of the power; a pixel without a
+        prediction counts as infinitely wrong); all of them again as ``..._blocked`` for receivers without line of
+        sight (None if there are none); ``lpips`` with ``lpips_reason``; ``seconds_per_spectrum`` (median),
+        ``receivers``, ``receivers_blocked``, ``beam_width_deg``, and ``per_receiver``: the arrays ``(R,)`` behind them.
+
+    Raises:
+        ValueError: if a prediction has another shape than the truth, or holds NaN, infinite or negative path gain.
+    """
+    count = len(test.receivers)
+    if count == 0:
+        raise ValueError("test: got no receivers, expected at least one")
+    floor, range_db = float(test.floor), test.range_db
+    names = (
+        "psnr_db",
+        "ssim",
+        "rmse_db",
+        "direction_error_deg",
+        "beam_gain_loss_db",
+        "tof_error_ns",
+        "aod_error_deg",
+    )
+    rows = {name: np.full(count, np.nan) for name in names}
+    seconds = np.zeros(count)
+    for i, receiver in enumerate(np.asarray(test.receivers, dtype=np.float64)):
+        start = time.perf_counter()
+        prediction = predict(receiver)
+        seconds[i] = time.perf_counter() - start
+        truth = np.asarray(test.path_gain[i], dtype=np.float64)
+        gain = _checked_gain(prediction, truth.shape, i)
+        truth_unit, unit = unit_image(truth, floor, range_db), unit_image(gain, floor, range_db)
+        rows["psnr_db"][i] = psnr(unit, truth_unit)
+        rows["ssim"][i] = ssim(unit, truth_unit) if min(truth.shape) >= SSIM_WINDOW else np.nan
+        rows["rmse_db"][i] = rmse_db(to_db(gain, floor), to_db(truth, floor))
+        if truth.any():
+            peak = strongest_direction(gain)
+            rows["direction_error_deg"][i] = angle_deg(peak, strongest_direction(truth))
+            rows["beam_gain_loss_db"][i] = beam_gain_loss_db(truth, peak, beam_width_rad)
+        if isinstance(prediction, Spectrum):
+            weight = np.where((truth > floor) & np.isfinite(test.delay_s[i]), truth, 0.0)
+            if _predicts(prediction.delay_s):
+                error = np.abs(np.asarray(prediction.delay_s, np.float64) - test.delay_s[i]) * 1e9
+                rows["tof_error_ns"][i] = weighted_median(np.where(np.isnan(error), np.inf, error), weight)
+            if _predicts(prediction.aod):
+                error = angle_deg(_unit(prediction.aod), _unit(test.aod[i]))
+                rows["aod_error_deg"][i] = weighted_median(np.where(np.isnan(error), np.inf, error), weight)
+        if progress is not None:
+            progress("evaluate", i + 1, count)
+    line_of_sight = np.asarray(test.line_of_sight, dtype=bool)
+    report: dict[str, Any] = _summary(rows, np.ones(count, dtype=bool), "")
+    report.update(_summary(rows, ~line_of_sight, "_blocked"))
+    reason = (
+        "needs the lpips package, which is no dependency"
+        if lpips_weights()
+        else "its network weights are not on this machine, and nothing is downloaded"
+    )
+    report.update(
+        lpips=None,
+        lpips_reason=reason,
+        seconds_per_spectrum=float(np.median(seconds)),
+        receivers=count,
+        receivers_blocked=int(np.count_nonzero(~line_of_sight)),
+        beam_width_deg=float(np.degrees(beam_width_rad)),
+        per_receiver={**rows, "line_of_sight": line_of_sight, "seconds": seconds},
+    )
+    return report
+
+
+def _predicts(values: Any) -> bool:
+    return values is not None and bool(np.isfinite(values).any())
+
+
+def _checked_gain(prediction: Any, shape: tuple[int, ...], index: int) -> np.ndarray:
+    value = getattr(prediction, "path_gain", prediction)
+    gain = np.asarray(value.numpy() if hasattr(value, "numpy") else value, dtype=np.float64)
+    if gain.shape != shape:
+        raise ValueError(f"predict: got shape {gain.shape} for receiver {index}, expected {shape}")
+    if not np.isfinite(gain).all() or gain.min() < 0:
+        raise ValueError(f"predict: got NaN, infinite or negative path gain for receiver {index}")
+    return gain
+
+
+def _unit(angles: Any) -> np.ndarray:
+    return directions_from_angles(np.asarray(angles)[..., 0], np.asarray(angles)[..., 1])
+
+
+def _summary(rows: dict[str, np.ndarray], where: np.ndarray, suffix: str) -> dict[str, float | None]:
+    def over(name: str, reduce: Callable[[np.ndarray], Any]) -> float | None:
+        values = rows[name][where]
+        values = values[~np.isnan(values)]
+        result = float(reduce(values)) if len(values) else float("nan")
+        return result if np.isfinite(result) else None
+
+    return {
+        f"psnr_db{suffix}": over("psnr_db", np.mean),
+        f"ssim{suffix}": over("ssim", np.mean),
+        f"rmse_db{suffix}": over("rmse_db", np.mean),
+        f"direction_median_deg{suffix}": over("direction_error_deg", np.median),
+        f"direction_within_1deg{suffix}": over("direction_error_deg", lambda e: np.mean(e <= 1.0 + 1e-9)),
+        f"direction_within_3deg{suffix}": over("direction_error_deg", lambda e: np.mean(e <= 3.0 + 1e-9)),
+        f"beam_gain_loss_db{suffix}": over("beam_gain_loss_db", np.mean),
+        f"tof_error_median_ns{suffix}": over("tof_error_ns", np.median),
+        f"aod_error_median_deg{suffix}": over("aod_error_deg", np.median),
+    }
+
+
+def _window_mean(image: np.ndarray) -> np.ndarray:
+    """Mean over every full window, shape ``(height - 6, width - 6)``."""
+    window = np.lib.stride_tricks.sliding_window_view
+    rows = window(image, SSIM_WINDOW, axis=0).mean(axis=-1)
+    return window(rows, SSIM_WINDOW, axis=1).mean(axis=-1)

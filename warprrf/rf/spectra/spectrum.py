@@ -1,0 +1,389 @@
+"""Spatial spectra: the equirectangular grid, the receiver beam that fills it, and the spectrum of one receiver.
+
+Row i has zenith (i + 1/2) pi / H, column j has azimuth -pi + (j + 1/2) 2 pi / W. A pixel holds path gain: received over
+transmitted power between isotropic antennas, averaged over vertical and horizontal transmit polarisation, summed over
+both receive polarisations; linear. Every path is spread by a von Mises-Fisher beam, kappa = 1 / sigma^2, taken at the
+pixel centres times the pixels' solid angles and normalised to sum to one over the pixels: the sum over pixels is the
+total path gain, and an isotropic field stays one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.kernels.radio import beam as beam_kernels
+
+BEAM_SIGMA_RAD = float(np.deg2rad(2.0))
+"""Default beam width: kappa = 1 / sigma^2 [rad]."""
+
+DEFAULT_SHAPE = (90, 180)
+"""Default grid: 2 by 2 degrees."""
+
+BEAM_CUTOFF = 7.0
+"""Beyond this many sigma a path is cut off: 106 dB below its peak; 2.3e-11 of its power, given back by normalising."""
+
+FLOOR_BELOW_MEDIAN_DB = 60.0
+"""The default N0 lies this far below the median over views of the view's maximum."""
+
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+def check_shape(shape: Any) -> tuple[int, int]:
+    """``shape`` as (rows, columns), each at least 2.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    try:
+        rows, columns = (int(n) for n in shape)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
+    if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
+        raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")
+    return rows, columns
+
+
+def pixel_angles(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Zenith of the rows, shape ``(H,)``, and azimuth of the columns, shape ``(W,)`` [rad], at pixel centres."""
+    rows, columns = check_shape(shape)
+    return (np.arange(rows) + 0.5) * np.pi / rows, -np.pi + (np.arange(columns) + 0.5) * 2.0 * np.pi / columns
+
+
+def pixel_directions(shape: tuple[int, int]) -> np.ndarray:
+    """Unit vectors from the receiver through the pixel centres, shape ``(H, W, 3)``, float64."""
+    zenith, azimuth = pixel_angles(shape)
+    return directions_from_angles(zenith[:, None], azimuth[None, :])
+
+
+@lru_cache(maxsize=8)
+def _pixel_list(shape: tuple[int, int]) -> np.ndarray:
+    """:func:`pixel_directions` as rows, not to be written to."""
+    pixels = pixel_directions(shape).reshape(-1, 3)
+    pixels.setflags(write=False)
+    return pixels
+
+
+def pixel_solid_angles(shape: tuple[int, int]) -> np.ndarray:
+    """Solid angle of one pixel of each row [sr], shape ``(H,)``; exact, so that all pixels sum to 4 pi."""
+    rows, columns = check_shape(shape)
+    zenith = np.arange(rows + 1) * np.pi / rows
+    return (np.cos(zenith[:-1]) - np.cos(zenith[1:])) * 2.0 * np.pi / columns
+
+
+def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    """``sub_pixels``^2 directions per pixel, pixel by pixel, of equal solid angle within one.
+
+    Returns:
+        Unit directions, shape ``(H W sub_pixels^2, 3)``, and their solid angles [sr].
+    """
+    rows, columns = shape
+    count = sub_pixels**2
+    step = min(
+        (a for a in range(1, count + 1) if np.gcd(a, count) == 1), key=lambda a: abs(a - count * _GOLDEN)
+    )
+    k, i, j = np.arange(count), np.arange(rows)[:, None, None], np.arange(columns)[None, :, None]
+    across = (k + np.mod(i * _GOLDEN, 1.0)) / count  # one value a row and direction: no two alike in a column
+    down = (k * step % count + np.mod(j * _GOLDEN, 1.0)) / count
+    top, bottom = np.cos(i * np.pi / rows), np.cos((i + 1) * np.pi / rows)
+    azimuth = -np.pi + (j + across) * 2.0 * np.pi / columns
+    directions = directions_from_angles(np.arccos(top + (bottom - top) * down), azimuth).reshape(-1, 3)
+    return directions, np.repeat(pixel_solid_angles(shape) / count, columns * count)
+
+
+def directions_from_angles(zenith: Any, azimuth: Any) -> np.ndarray:
+    """Unit vectors, shape ``(..., 3)``, of zenith in [0, pi] and azimuth in (-pi, pi] [rad]."""
+    zenith, azimuth = np.broadcast_arrays(np.asarray(zenith, float), np.asarray(azimuth, float))
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
+    )
+
+
+def angles_from_directions(directions: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Zenith in [0, pi] and azimuth in (-pi, pi] [rad] of vectors ``(..., 3)`` of any length."""
+    d = np.asarray(directions, dtype=np.float64)
+    azimuth = np.arctan2(d[..., 1], d[..., 0])
+    return np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]), np.where(azimuth == -np.pi, np.pi, azimuth)
+
+
+def transverse_basis(directions: Any) -> np.ndarray:
+    """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
+    zenith, azimuth = angles_from_directions(directions)
+    up = np.stack(
+        [np.cos(zenith) * np.cos(azimuth), np.cos(zenith) * np.sin(azimuth), -np.sin(zenith)], axis=-1
+    )
+    around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)], axis=-1)
+    return np.stack([up, around], axis=-2)
+
+
+def pixel_of(directions: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the pixel that each direction ``(..., 3)`` falls in."""
+    rows, columns = check_shape(shape)
+    zenith, azimuth = angles_from_directions(directions)
+    row = np.minimum((zenith * rows / np.pi).astype(np.int64), rows - 1)
+    return row, np.floor((azimuth + np.pi) * columns / (2.0 * np.pi)).astype(np.int64) % columns
+
+
+def to_db(path_gain: Any, floor: float) -> np.ndarray:
+    """10 log10(P + N0) [dB], of linear path gain and the noise floor N0."""
+    return 10.0 * np.log10(np.asarray(path_gain, dtype=np.float64) + floor)
+
+
+def default_floor(path_gain: np.ndarray) -> float:
+    """N0 of a data set ``(R, H, W)``: median over views of the view's maximum, less 60 dB.
+
+    Raises:
+        ValueError: if more than half of the views are empty.
+    """
+    peak = float(np.median(path_gain.reshape(len(path_gain), -1).max(axis=1)))
+    if not peak > 0.0:
+        raise ValueError(
+            "path_gain: more than half of the spectra are empty, expected power to set a floor from"
+        )
+    return peak * 10.0 ** (-FLOOR_BELOW_MEDIAN_DB / 10.0)
+
+
+class SpreadPaths(NamedTuple):
+    """Paths on the grid.
+
+    Attributes:
+        path_gain: Spread path gain, shape ``(H, W)``, float64.
+        strongest: Index of the path that gives the pixel most of its power, shape ``(H, W)``, int32; -1 where empty.
+    """
+
+    path_gain: np.ndarray
+    strongest: np.ndarray
+
+
+def spread(
+    directions: Any, powers: Any, shape: tuple[int, int], sigma: float = BEAM_SIGMA_RAD, *, device: Any = None
+) -> np.ndarray:
+    """Path gains spread by the receiver beam, shape ``(H, W)``, float64; sums to ``powers.sum()``. See spread_paths."""
+    return spread_paths(directions, powers, shape, sigma, device=device).path_gain
+
+
+def spread_paths(
+    directions: Any, powers: Any, shape: tuple[int, int], sigma: float = BEAM_SIGMA_RAD, *, device: Any = None
+) -> SpreadPaths:
+    """Path gains spread by the receiver beam, and each pixel's strongest path.
+
+    Args:
+        directions: Directions of arrival, shape ``(L, 3)``, normalised here.
+        powers: Path gains, linear, not negative, shape ``(L,)``.
+        shape: Rows and columns of the grid.
+        sigma: Beam width, kappa = 1 / sigma^2 [rad].
+
+    Raises:
+        ValueError: on a wrong shape, NaN, a negative gain, a direction of length zero, or a sigma that is not positive.
+    """
+    rows, columns = check_shape(shape)
+    d = _device.check_array("directions", directions, (None, 3))
+    power = _device.check_array("powers", powers, (len(d),))
+    if not (np.isfinite(sigma) and sigma > 0):
+        raise ValueError(f"sigma: got {sigma!r}, expected a positive beam width in radians")
+    if (power < 0).any():
+        raise ValueError(f"powers: got {int((power < 0).sum())} negative path gains, expected linear power")
+    lit = np.flatnonzero(power > 0)
+    if len(lit) == 0:
+        return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
+    d, power = d[lit], power[lit]
+    length = np.linalg.norm(d, axis=1, keepdims=True)
+    if (length == 0).any():
+        raise ValueError("directions: got a vector of length zero, expected directions of arrival")
+    d = d / length
+    row, column = pixel_of(d, (rows, columns))
+    cell = (row * columns + column).astype(np.int32)
+    order = np.argsort(cell, kind="stable")
+    starts = np.zeros(rows * columns + 1, dtype=np.int32)
+    starts[1:] = np.cumsum(np.bincount(cell, minlength=rows * columns))
+
+    where = _device.resolve(device)
+    grid = _beam_grid((rows, columns), float(sigma), str(where))
+    count = len(lit)
+    toward = wp.array(d[order], dtype=wp.vec3d, device=where)
+    nearest = wp.zeros(count, dtype=wp.float64, device=where)
+    total = wp.zeros(count, dtype=wp.float64, device=where)
+    cells = wp.array(cell[order], dtype=wp.int32, device=where)
+    beam = [grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit]
+    _device.launch(beam_kernels.beam_normaliser, count, [toward, cells, *beam, nearest, total], device=where)
+    scaled = wp.array(power[order] / total.numpy(), dtype=wp.float64, device=where)
+    image = wp.zeros((rows, columns), dtype=wp.float64, device=where)
+    best = wp.zeros((rows, columns), dtype=wp.int32, device=where)
+    first = wp.array(starts, dtype=wp.int32, device=where)
+    inputs = [toward, scaled, nearest, first, *beam, image, best]
+    _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
+    index = best.numpy()
+    return SpreadPaths(image.numpy(), np.where(index >= 0, lit[order][index], -1).astype(np.int32))
+
+
+def strongest_rays(
+    directions: wp.array, power: np.ndarray, shape: tuple[int, int], sigma: float, *, device: Any = None
+) -> np.ndarray:
+    """The ray that gives each pixel the most through the receiver beam, shape ``(H, W)`` int32; -1 where none does.
+
+    What :func:`spread_paths` finds for the same rays (but for how a beam's sum varies over the grid), in a fraction of
+    its time.
+
+    Args:
+        directions: unit vectors on the device, pixel by pixel, equally many in each pixel's cell.
+        power: of each, not negative.
+        shape: rows and columns of the grid.
+        sigma: beam width [rad].
+    """
+    rows, columns = check_shape(shape)
+    where = _device.resolve(device)
+    grid = _beam_grid((rows, columns), float(sigma), str(where))
+    with np.errstate(divide="ignore"):
+        log_power = np.log(np.asarray(power, np.float64))
+    log_power = np.maximum(log_power, -1e301)  # what is dark stays below where the kernel starts
+    top = log_power.reshape(rows * columns, -1).max(axis=1)
+    best = wp.zeros(rows * columns, dtype=wp.int32, device=where)
+    first_row, least_fall = _least_falls((rows, columns), float(sigma), str(where))
+    inputs = [
+        directions, len(power) // (rows * columns), wp.array(log_power, dtype=wp.float64, device=where),
+        wp.array(top, dtype=wp.float64, device=where), wp.float64(top.max()), grid.pixels, grid.half_widths, first_row,
+        least_fall, grid.kappa, grid.chord_limit, best,
+    ]  # fmt: skip
+    _device.launch(beam_kernels.strongest_rays, rows * columns, inputs, device=where)
+    return best.numpy().reshape(rows, columns)
+
+
+def unit_beams(directions: np.ndarray, shape: tuple[int, int], sigma: float) -> np.ndarray:
+    """The beam of each unit vector ``directions`` (L, 3) by itself, shape ``(L, H, W)`` float32; each sums to one.
+
+    The same beams as :func:`spread`, all images at once: for tens of paths, not for thousands.
+    """
+    rows, columns = check_shape(shape)
+    out = np.zeros((len(directions), rows * columns), np.float32)
+    pixels = _pixel_list((rows, columns))
+    solid_angle = np.repeat(pixel_solid_angles(shape), columns)
+    limit = 4.0 * np.sin(0.5 * _cutoff(shape, sigma)) ** 2 * (1.0 + 1e-12)
+    for k, d in enumerate(directions):
+        near = np.flatnonzero(pixels @ d >= 1.0 - 0.5 * limit - 1e-9)
+        chord = ((pixels[near] - d) ** 2).sum(axis=1)
+        near, chord = near[chord <= limit], chord[chord <= limit]
+        value = np.exp(-0.5 * (chord - chord.min()) / sigma**2) * solid_angle[near]
+        out[k, near] = value / value.sum()
+    return out.reshape(-1, rows, columns)
+
+
+def _cutoff(shape: tuple[int, int], sigma: float) -> float:
+    """Where a beam ends [rad]; one narrower than the grid still reaches the centre of the pixel it falls in."""
+    return float(min(max(BEAM_CUTOFF * sigma, np.hypot(np.pi / shape[0], 2.0 * np.pi / shape[1])), np.pi))
+
+
+class _BeamGrid(NamedTuple):
+    pixels: wp.array
+    solid_angles: wp.array
+    half_widths: wp.array
+    kappa: wp.float64
+    chord_limit: wp.float64
+
+
+@lru_cache(maxsize=8)
+def _beam_grid(shape: tuple[int, int], sigma: float, device: str) -> _BeamGrid:
+    """What both beam kernels need; ``half_widths[i, m]`` columns either side hold row i's share of paths in row m."""
+    rows, columns = shape
+    cutoff = _cutoff(shape, sigma)
+    zenith = pixel_angles(shape)[0]
+    edges = np.arange(rows + 1) * np.pi / rows
+    gap = np.maximum(0.0, np.maximum(edges[None, :-1] - zenith[:, None], zenith[:, None] - edges[None, 1:]))
+    lowest_sine = np.minimum(np.sin(edges[:-1]), np.sin(edges[1:]))
+    room = np.sin(0.5 * cutoff) ** 2 - np.sin(0.5 * gap) ** 2
+    # sin^2(dphi / 2) = (sin^2(cutoff / 2) - sin^2(dtheta / 2)) / (sin theta sin theta'), widest over the cell's row
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = room / (np.sin(zenith)[:, None] * lowest_sine[None, :])
+    azimuth = 2.0 * np.arcsin(np.sqrt(np.clip(np.nan_to_num(ratio, nan=1.0, posinf=1.0), 0.0, 1.0)))
+    half = np.ceil(azimuth * columns / (2.0 * np.pi) + 0.5).astype(np.int32)
+    half = np.where(room < 0, -1, np.minimum(half, columns)).astype(np.int32)
+    return _BeamGrid(
+        pixels=wp.array(pixel_directions(shape), dtype=wp.vec3d, device=device),
+        solid_angles=wp.array(pixel_solid_angles(shape), dtype=wp.float64, device=device),
+        half_widths=wp.array(half, dtype=wp.int32, device=device),
+        kappa=wp.float64(1.0 / sigma**2),
+        chord_limit=wp.float64(4.0 * np.sin(0.5 * cutoff) ** 2 * (1.0 + 1e-12)),
+    )
+
+
+@lru_cache(maxsize=8)
+def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.array, wp.array]:
+    """First row of cells that reach each row's pixels, and by how many nepers the beam of any ray in a cell falls there
+    at least: of the row, the cell's row after the first, and the columns between; infinite beyond the beam."""
+    rows, columns = shape
+    reaching = _beam_grid(shape, sigma, device).half_widths.numpy() >= 0
+    first, count = reaching.argmax(axis=1), int(reaching.sum(axis=1).max())
+    zenith = pixel_angles(shape)[0]
+    cell = np.minimum(first[:, None] + np.arange(count), rows - 1)
+    apart = np.cos(np.arange(columns // 2 + 1) * 2.0 * np.pi / columns)
+    cosine = np.cos(zenith)[:, None] * np.cos(zenith[cell])
+    sine = np.sin(zenith)[:, None] * np.sin(zenith[cell])
+    chord = np.sqrt(np.maximum(2.0 - 2.0 * (cosine[..., None] + sine[..., None] * apart), 0.0))
+    nearest = np.maximum(
+        chord - 0.5 * np.hypot(np.pi / rows, 2.0 * np.pi / columns), 0.0
+    )  # of a ray in the cell
+    fall = 0.5 * (nearest / sigma) ** 2 * (1.0 - 1e-6)
+    fall[nearest > 2.0 * np.sin(0.5 * _cutoff(shape, sigma)) * (1.0 + 1e-6)] = np.inf
+    return (
+        wp.array(first, dtype=wp.int32, device=device),
+        wp.array(fall.astype(np.float32), dtype=wp.float32, device=device),
+    )
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """The spatial spectrum of one receiver.
+
+    Attributes:
+        path_gain: Path gain per pixel [linear], shape ``(H, W)``.
+        delay_s: Delay of the pixel's strongest path [s], shape ``(H, W)``; NaN where empty.
+        aod: Its zenith and azimuth of departure at the transmitter [rad], shape ``(H, W, 2)``; NaN where empty.
+        floor: Noise floor N0 added before taking decibels [linear].
+        range_db: Lowest and highest value of the data set's dB images [dB].
+        std_db: Standard deviation of the dB image per pixel [dB], shape ``(H, W)``; None where it is not known.
+    """
+
+    path_gain: np.ndarray
+    delay_s: np.ndarray | None = None
+    aod: np.ndarray | None = None
+    floor: float = 0.0
+    range_db: tuple[float, float] | None = None
+    std_db: np.ndarray | None = None
+    attributes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.path_gain.shape[0], self.path_gain.shape[1]
+
+    @property
+    def path_gain_db(self) -> np.ndarray:
+        """10 log10(P + N0) [dB], shape ``(H, W)``."""
+        with np.errstate(divide="ignore"):
+            return to_db(self.path_gain, self.floor)
+
+    @property
+    def total_path_gain(self) -> float:
+        """Sum over the pixels [linear]."""
+        return float(np.sum(self.path_gain, dtype=np.float64))
+
+    def plot(self, ax: Any = None, **options: Any) -> Any:
+        """Draw the dB image over azimuth and zenith [degrees] into ``ax`` (a new one by default); returns the axes.
+
+        Raises:
+            ImportError: if matplotlib is missing.
+        """
+        pyplot = _device.require("matplotlib.pyplot", extra="plots")
+        if ax is None:
+            _, ax = pyplot.subplots(figsize=(8.0, 4.0))
+        low, high = self.range_db if self.range_db is not None else (None, None)
+        drawing: dict[str, Any] = {"vmin": low, "vmax": high, "cmap": "viridis", "aspect": "auto", **options}
+        image = ax.imshow(self.path_gain_db, extent=(-180.0, 180.0, 180.0, 0.0), **drawing)
+        ax.set_xlabel("azimuth [degrees]")
+        ax.set_ylabel("zenith [degrees]")
+        ax.figure.colorbar(image, ax=ax, label="path gain [dB]")
+        return ax
