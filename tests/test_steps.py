@@ -44,7 +44,7 @@ def test_a_step_is_redone_when_something_changed(tmp_path: Path, change: str) ->
     if change == "output":
         (tmp_path / "out.txt").unlink()
     if change == "damaged record":
-        (tmp_path / "one.step.json").write_text("{")
+        (tmp_path / ".steps/one.json").write_text("{")
     redone = _once(
         tmp_path,
         calls,
@@ -60,7 +60,7 @@ def test_a_step_that_does_not_write_its_output_is_an_error_and_stays_unfinished(
     with Steps(tmp_path) as steps:
         with pytest.raises(RuntimeError, match="without writing gone.txt"):
             steps.run("one", lambda attempt: {}, version=1, inputs=[], outputs=["gone.txt"])
-        assert not json.loads((tmp_path / "one.step.json").read_text())["finished"]
+        assert not json.loads((tmp_path / ".steps/one.json").read_text())["finished"]
 
 
 def test_scratch_stays_with_its_inputs_until_the_step_is_finished(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_scratch_stays_with_its_inputs_until_the_step_is_finished(tmp_path: Path
         else:
             attempt_with(value, fail)
     assert seen == [False, True, False, True, False]
-    assert not (tmp_path / "one.work").exists()
+    assert not (tmp_path / ".steps/one").exists()
 
 
 def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def _slow(folder: str) -> None:
 def test_a_killed_attempt_is_continued_and_its_time_counted(tmp_path: Path) -> None:
     process = multiprocessing.get_context("spawn").Process(target=_slow, args=(str(tmp_path),))
     process.start()
-    state = tmp_path / "slow.step.json"
+    state = tmp_path / ".steps/slow.json"
     deadline = time.monotonic() + 60
     recorded = 0.0
     while recorded < 0.2 and time.monotonic() < deadline:

@@ -68,7 +68,7 @@ class Steps:
     """A folder of resumable steps, as a context manager: one process at a time works in it.
 
     Args:
-        folder: where records, outputs and scratch lie; made if missing.
+        folder: where outputs lie, and in ``.steps`` records and scratch; made if missing.
         fresh: forget what is finished.
         progress: called as ``progress(stage, done, total)`` by what the steps report.
         shared: several processes may work here at once, which is safe for :meth:`arrays` alone.
@@ -86,14 +86,15 @@ class Steps:
         shared: bool = False,
     ) -> None:
         self.folder = Path(folder)
+        self._own = self.folder / ".steps"  # records, scratch and lock
         self._fresh, self._progress, self._shared = fresh, progress, shared
         self._lock: IO[str] | None = None
         self._records: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Steps:
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self._own.mkdir(parents=True, exist_ok=True)
         if not self._shared:
-            self._lock = (self.folder / ".lock").open("w")
+            self._lock = (self._own / "lock").open("w")
             try:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -129,19 +130,19 @@ class Steps:
         Raises:
             RuntimeError: if ``make`` returns and an output is missing.
         """
-        key, scratch = digest(name, version, list(inputs)), self.folder / f"{name}.work"
-        known = {} if self._fresh and name not in self._records else self._read(name)
-        same = known.get("key") == key
-        if same and known["finished"] and all((self.folder / file).exists() for file in outputs):
-            self._records[name] = known
-            return dict(known["figures"])
-        going_on = same and not known["finished"]
+        inputs = list(inputs)
+        kept = self.kept(name, version=version, inputs=inputs, outputs=outputs)
+        if kept is not None:
+            return kept
+        key, scratch = digest(name, version, inputs), self._own / name
+        known = self._read(name)
+        going_on = known.get("key") == key and not known["finished"]
         record: dict[str, Any] = {"key": key, "finished": False, "seconds": 0.0, "attempts": 0, "stages": {}}
         record |= {k: known[k] for k in ("seconds", "attempts", "stages") if going_on}
         record |= {"attempts": record["attempts"] + 1, "figures": {}}
         if not going_on and scratch.exists():
             shutil.rmtree(scratch)
-        scratch.mkdir(exist_ok=True)
+        scratch.mkdir(parents=True, exist_ok=True)
         start, before = time.monotonic(), record["seconds"]
         last = written = start
 
@@ -173,6 +174,17 @@ class Steps:
         write(finished=True, figures=plain(figures))
         shutil.rmtree(scratch)
         return dict(record["figures"])
+
+    def kept(
+        self, name: str, *, version: int, inputs: Iterable[Any], outputs: Sequence[str] = ()
+    ) -> dict[str, Any] | None:
+        """Figures of step ``name`` if it was finished with this version and these inputs, else None; see :meth:`run`."""
+        known = self._read(name)
+        same = known.get("key") == digest(name, version, list(inputs)) and known["finished"]
+        if not same or not all((self.folder / file).exists() for file in outputs):
+            return None
+        self._records[name] = known
+        return dict(known["figures"])
 
     def arrays(
         self, name: str, make: Callable[[], Mapping[str, Any]], *, version: int, inputs: Iterable[Any]
@@ -211,7 +223,7 @@ class Steps:
         return int(self._record(name)["attempts"])
 
     def _file(self, name: str) -> Path:
-        return self.folder / f"{name}.step.json"
+        return self._own / f"{name}.json"
 
     def _record(self, name: str) -> dict[str, Any]:
         if name not in self._records:
@@ -219,7 +231,9 @@ class Steps:
         return self._records[name]
 
     def _read(self, name: str) -> dict[str, Any]:
-        """The record of step ``name``; empty where there is none, or none that reads."""
+        """The record of step ``name``; empty where there is none, none that reads, or none that counts."""
+        if self._fresh and name not in self._records:
+            return {}
         try:
             return dict(json.loads(self._file(name).read_text()))
         except (FileNotFoundError, ValueError):
