@@ -22,8 +22,8 @@ import warp as wp
 from benchmarks.engine.peers import Scene
 from benchmarks.engine.scenes import gaussians, panorama, photo
 from benchmarks.machine import machine
-from benchmarks.stages import write_json
 from warprrf.device import Progress, require, resolve
+from warprrf.files import write_json
 from warprrf.geometry.splats import torch_functions as interop
 from warprrf.geometry.splats.rasterizer import RADIO, Rasterizer
 
