@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-sys.path[:0] = [str(Path(__file__).parent / "helpers"), str(Path(__file__).parent.parent)]
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE / "helpers"), str(HERE), str(HERE.parent)]
 
 NO_CUDA = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: none here")
 
