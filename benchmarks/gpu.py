@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +88,8 @@ def blending(sizes: Sizes, device: wp.Device) -> dict[str, Any]:
     g = gaussians(sizes.gaussians)
     slopes = np.random.default_rng(0).normal(size=(height, width, 3)).astype(np.float32)
     raster = Rasterizer(device=device)
-    inputs = [*raster.upload(g), wp.array(colors, dtype=wp.float32, device=device)]
-    for array in inputs:
+    inputs, features = raster.upload(g), wp.array(colors, dtype=wp.float32, device=device)
+    for array in (*inputs, features):
         array.requires_grad = True
     slope = wp.array(slopes, dtype=wp.float32, device=device)
     tape: list[wp.Tape] = []
@@ -96,11 +97,15 @@ def blending(sizes: Sizes, device: wp.Device) -> dict[str, Any]:
     def forward() -> None:
         tape[:] = [wp.Tape()]
         with tape[0]:
-            image = raster.rasterize(*inputs, cam)
+            image = raster.rasterize(*inputs, features, cam)
         image.features.grad.assign(slope)
 
     def backward() -> None:
         tape[0].backward()
+
+    def both() -> None:
+        forward()
+        backward()
 
     radio = Rasterizer(device=device, blending=RADIO)
     frozen, gains = radio.upload(g), wp.array(np.ones((len(g), 1)), dtype=wp.float32, device=device)
@@ -119,7 +124,7 @@ def blending(sizes: Sizes, device: wp.Device) -> dict[str, Any]:
         device,
     )
     found["kernels_ms"] = {
-        "forward and backward": _activities(lambda: (forward(), backward())),
+        "forward and backward": _activities(both),
         "spectrum": _activities(lambda: radio.rasterize(*frozen, gains, receiver)),
     }
     return found
@@ -180,8 +185,8 @@ def mesh_rays(sizes: Sizes, device: wp.Device) -> dict[str, Any]:
     ends = rng.uniform(-5, 5, (sizes.rays, 3))
     runs: dict[str, Callable[[], Any]] = {}
     for name, where in {"": device, "cpu_": resolve("cpu")}.items():
-        runs[f"{name}hits"] = lambda where=where: mesh.cast(origins, directions, device=where)
-        runs[f"{name}sights"] = lambda where=where: mesh.visible(origins, ends, device=where)
+        runs[f"{name}hits"] = partial(mesh.cast, origins, directions, device=where)
+        runs[f"{name}sights"] = partial(mesh.visible, origins, ends, device=where)
     found = _fastest(runs, sizes.repeats, device)
     agree = np.abs(
         mesh.cast(origins, directions, device=device).t - mesh.cast(origins, directions, device="cpu").t
