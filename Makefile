@@ -4,6 +4,7 @@
 #   make test       lint, types, import rules, documentation, tests: what CI runs
 #   make lint       the first three alone
 #   make docs       the documentation, into build/site: warnings are errors, links are checked
+#   make gpu        tests and times on a CUDA device, within ten minutes; without one a dry run on the CPU
 #   make data       regenerate data/lobby/ from nothing: scene, photos, spectra (hours; resumable)
 #   make notebooks  run the notebooks and store their outputs
 #   make clean      remove caches and build output (not .venv, data or runs)
@@ -27,7 +28,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
 export PYTHON
 
-.PHONY: help lobby test lint docs data notebooks clean setup setup-test
+.PHONY: help lobby test lint docs gpu data notebooks clean setup setup-test
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -74,6 +75,9 @@ docs: $(VENV)/.test
 
 test: lint docs
 	$(RUN) -m pytest $(ARGS)
+
+gpu: $(VENV)/.test
+	@$(RUN) -m benchmarks.gpu $(ARGS)
 
 notebooks: $(VENV)/.test
 	$(RUN) tools/run_notebooks.py
