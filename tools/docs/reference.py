@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import pkgutil
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -12,25 +14,20 @@ import warprrf
 
 GROUPS = {
     "geometry": ("Geometry", "Photos, cameras, Gaussians, meshes and rays: stage 1."),
-    "rf.em": ("Waves and materials", "Materials, and absorption by the air."),
     "rf.scene": (
         "Scenes and paths",
-        "A scene's mesh and materials; line of sight and mirror paths through it.",
+        "Materials and scenes, spectra by simulation, paths through a scene, arrays.",
     ),
     "rf.spectra": ("Spectra", "One spectrum, data sets of many, and how predictions are scored."),
     "rf.fields": (
         "Radio fields",
         "Stage 2: fitted models of a place, asked for spectra, paths, links and maps.",
     ),
-    "rf.channel": ("Channels and beams", "Arrays, codebooks, precoders, and the band plan."),
-    "rf.interop": ("Exchange", "Scenes and paths to and from other programs."),
 }
 WITH = {
-    "rf.simulate": "rf.scene",
-    "rf.paths": "rf.scene",
-    "rf.maps": "rf.fields",
-    "rf.relevance": "rf.fields",
-}
+    "rf.em": "rf.scene", "rf.simulate": "rf.scene", "rf.paths": "rf.scene", "rf.channel": "rf.scene",
+    "rf.maps": "rf.fields", "rf.relevance": "rf.fields",
+}  # fmt: skip
 """Packages whose names stand on another's page."""
 
 
@@ -38,7 +35,7 @@ def pages() -> dict[str, str]:
     """Path below ``docs/`` to reStructuredText: an index, a page a group, a page a public submodule, the commands."""
     groups: dict[str, list[str]] = {key: [] for key in GROUPS}
     modules: dict[str, ModuleType] = {}
-    for name in sorted(warprrf.__all__, key=str.lower):
+    for name in dir(warprrf):
         found = getattr(warprrf, name)
         if isinstance(found, ModuleType):
             modules[name] = found
@@ -51,17 +48,16 @@ def pages() -> dict[str, str]:
         for key, (title, words) in GROUPS.items()
         if groups[key]
     }
-    written |= {
-        f"reference/module-{name}.rst": _module_page(name, module) for name, module in modules.items()
-    }
+    written |= {f"reference/module-{name}.rst": _module_page(name, found) for name, found in modules.items()}
     written["reference/command-line.rst"] = _command_line()
     index = [
         _title("API reference"),
-        "Everything on these pages is reached as ``warprrf.NAME`` (``import warprrf as wr``) unless another module is named.",
+        "Names are reached as ``warprrf.NAME`` (``import warprrf as wr``), those of a module as ``wr.MODULE.NAME``. "
+        "``help(wr)`` and ``help(wr.MODULE)`` print the same lists.",
         ".. toctree::\n   :maxdepth: 2\n",
-        "\n".join(f"   {path.removeprefix('reference/').removesuffix('.rst')}" for path in written),
     ]
-    return {"reference/index.rst": "\n\n".join(index) + "\n", **written}
+    listed = "\n".join(f"   {path.removeprefix('reference/').removesuffix('.rst')}" for path in written)
+    return {"reference/index.rst": "\n\n".join(index) + "\n" + listed + "\n", **written}
 
 
 def _title(text: str) -> str:
@@ -92,12 +88,15 @@ def _models() -> list[type]:
 
 
 def _module_page(name: str, module: ModuleType) -> str:
-    parts = [_title(f"warprrf.{name}"), f".. currentmodule:: warprrf.{name}", inspect.getdoc(module) or ""]
-    for member in getattr(module, "__all__", ()):
+    about = ast.get_docstring(ast.parse(Path(module.__file__ or "").read_text())) or ""
+    parts = [_title(f"wr.{name}"), about.split("\n\n")[0]]
+    for member in dir(module):
         found = getattr(module, member)
-        if (inspect.isclass(found) or inspect.isfunction(found)) and member not in warprrf.__all__:
-            parts.append(_entry(module.__name__, member, found))
-    return "\n\n".join(parts) + "\n"
+        known = inspect.isclass(found) or inspect.isfunction(found)
+        listed = hasattr(module, "__path__") or getattr(found, "__module__", "") == module.__name__
+        if known and listed and not member.startswith("_"):
+            parts.append(_entry(found.__module__, member, found) if member not in dir(warprrf) else "")
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _command_line() -> str:
