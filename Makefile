@@ -3,6 +3,7 @@
 #   make lobby      install what is missing, then photos -> geometry -> radio -> evaluation into runs/lobby/ (resumable)
 #   make test       lint, types, import rules, tests: what CI runs
 #   make lint       the first three alone
+#   make gpu        tests and times on a CUDA device, within ten minutes; without one a dry run on the CPU
 #   make data       regenerate data/lobby/ from nothing: scene, photos, spectra (hours; resumable)
 #   make notebooks  run the notebooks and store their outputs
 #   make clean      remove caches and build output (not .venv, data or runs)
@@ -26,7 +27,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
 export PYTHON
 
-.PHONY: help lobby test lint data notebooks clean setup setup-test
+.PHONY: help lobby test lint gpu data notebooks clean setup setup-test
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -70,6 +71,9 @@ lint: $(VENV)/.test
 
 test: lint
 	$(RUN) -m pytest $(ARGS)
+
+gpu: $(VENV)/.test
+	@$(RUN) -m benchmarks.gpu $(ARGS)
 
 notebooks: $(VENV)/.test
 	$(RUN) tools/run_notebooks.py
