@@ -22,10 +22,10 @@ from benchmarks.machine import machine
 from benchmarks.pictures import figure_of
 from benchmarks.report import Report, Row, cell, columns_table
 from benchmarks.runner import Benchmark, Job, option
+from benchmarks.sionna_map import SionnaMap
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.interop.sionna_engine import SionnaMap
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
