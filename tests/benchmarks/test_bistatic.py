@@ -45,8 +45,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_room(tmp_path_factory.mktemp("room"))
 
 
-def whole(out: Path, data: Path, **changed: Any) -> dict[str, Any]:
-    options = {"data": (str(data),), "geometry": str(data / "reconstruction"), **OPTIONS, **changed}
+def whole(out: Path, room: Path, **changed: Any) -> dict[str, Any]:
+    options = {"data": (str(room),), "geometry": str(room / "reconstruction"), **OPTIONS, **changed}
     return execute(table.BENCHMARKS["bistatic"], table.Options(**options), Job(out, device="cpu"))
 
 

@@ -378,7 +378,7 @@ def _engine_points() -> str:
 @entry("engine-knobs")
 def _engine_knobs() -> str:
     words = {
-        "alpha_min": "least alpha that counts", "alpha_max": "largest alpha", "top_k": "Gaussians kept a pixel",
+        "alpha_min": "least alpha that counts", "top_k": "Gaussians kept a pixel",
         "precision": "precision", "resolution": "grid, rows x columns",
     }  # fmt: skip
     lines = []
@@ -400,30 +400,27 @@ def _short(value: Any) -> str:
 @entry("engine-times")
 def _engine_times() -> str:
     e = read("engine")
-    b, t = e["blend"], e["transport"]
-    lines = []
+    b, lines = e["blend"], []
     for run in b["runs"]:
         threads = "one thread" if run["threads"] == 1 else f"{run['threads']} threads"
-        for peer, ratio in run["speedup"].items():
-            other = {"torch": "a vectorised torch renderer", "opensplat": "OpenSplat's CPU rasteriser"}[peer]
-            lines.append([
-                f"forward and backward, {b['gaussians']} Gaussians, {b['shape'][1]} x {b['shape'][0]}, {threads}: "
-                f"speed over {other}", f"{ratio:.1f} times",
-            ])  # fmt: skip
-    s = b["spectrum"]
-    lines += [
-        [
-            f"panorama of {s['shape'][0]} x {s['shape'][1]} from {s['gaussians']} Gaussians",
-            f"{1e3 * s['render_s']:.0f} ms",
-        ],
-        ["blending weights of the same view", f"{1e3 * s['weights_s']:.0f} ms"],
-        ["one launch on two cores over two processes of half the work", f"{b['cores']['throughput']:.2f}"],
-        [
-            f"blending weights of {t['receivers']} receivers, {t['gaussians']} Gaussians, on disk: memory",
-            f"{t['store_peak_gb']:.1f} GB",
-        ],
-        ["the same: files", f"{t['disk_gb']:.1f} GB"],
-    ]
+        lines.append([
+            f"forward and backward, {b['gaussians']} Gaussians, {b['shape'][1]} x {b['shape'][0]}, {threads}: "
+            "speed over a vectorised torch renderer", f"{run['speedup']:.1f} times",
+        ])  # fmt: skip
+    rows, columns = e["sizes"]["shape"]
+    for r in e["growth"]:
+        if r["gaussians"] in (10_000, 100_000, 1_000_000):
+            lines.append(
+                [
+                    f"spectrum of {rows} x {columns} from {r['gaussians']} Gaussians",
+                    f"{1e3 * r['seconds']:.0f} ms",
+                ]
+            )
+    for r in e["rays"]:
+        name = {"scene": "the lobby", "bumpy sphere": "a bumpy sphere"}[r["mesh"]]
+        lines.append([
+            f"mesh rays, {name} ({r['faces']} faces), {r['kind']}: speed over bare Embree", f"{r['chosen']['over_bare']:.2f}",
+        ])  # fmt: skip
     return markdown(("figure", "value"), lines)
 
 
