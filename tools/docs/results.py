@@ -460,6 +460,71 @@ def _relevance() -> str:
     return markdown(("effect left out [dB]", *head), lines)
 
 
+@entry("map")
+def _map() -> str:
+    found = read("map")
+    lines = []
+    for r in found["ours"]:
+        mean = ", mean of four places a cell" if r["average"] > 1 else ""
+        lines.append([f"field, {r['rays']} rays a cell, up to {r['mirrors']} mirrors{mean}", *_map_errors(r)])
+    for r in found["sionna"]:
+        lines.append([f"RadioMapSolver, {r['samples']:.0e} samples", *_map_errors(r)])
+    return markdown(("map", "rms [dB]", "median [dB]", "line of sight", "blocked", "core seconds"), lines)
+
+
+def _map_errors(r: Row) -> list[str]:
+    keys = ("rms_db", "median_db", "rms_seen_db", "rms_blocked_db")
+    return [*(show(r[k], "{:.2f}") for k in keys), show(r["core_s"])]
+
+
+@entry("channel")
+def _channel() -> str:
+    found = read("channel")
+    names = {
+        "friis": "one path over 100 m",
+        "two_ray": "two rays over a slab, V and H",
+        "images": "four images in a corner",
+    }
+    lines = [
+        [f"closed form: {names[k]}", f"gain {v['gain']:.1e}, phase {v['phase_rad']:.1e} rad"]
+        for k, v in found["closed_forms"].items()
+    ]
+    r, s = found["lobby"], found["small"]
+    lines += [
+        [
+            f"{r['paths']} paths of {r['receivers']} receivers beside Sionna RT's",
+            f"gain {r['gain_db']:.3f} dB, delay {r['tau_s']:.1e} s, angles {r['departure_rad']:.0e} rad",
+        ],
+        [
+            "the same, paths with a leg shorter than 0.2 m included (Sionna RT's points are float32)",
+            f"gain {r['gain_db_all']:.3f} dB",
+        ],
+        ["paths that only Sionna RT has / only we have", f"{r['sionna_only']} / {r['ours_only']}"],
+        [
+            f"response of {s['paths']} paths, 64 x 4 elements, 256 frequencies",
+            f"{1e3 * s['grid_seconds']:.0f} ms, error {s['grid_error']:.0e}",
+        ],
+        ["the same by Sionna RT", f"{1e3 * s['sionna_seconds']:.0f} ms, error {s['sionna_error']:.0e}"],
+        [
+            "the same, dense sum in float64",
+            f"{1e3 * s['dense_seconds']:.0f} ms, error {s['dense_error']:.0e}",
+        ],
+    ]
+    return markdown(("figure", "value"), lines)
+
+
+@entry("plane-wave")
+def _plane_wave() -> str:
+    rows = read("channel")["plane_wave"]
+    away = sorted({r["distance_m"] for r in rows})
+    lines = []
+    for elements in sorted({r["elements"] for r in rows}):
+        side = round(elements**0.5)
+        losses = (_find(rows, elements=elements, distance_m=d) for d in away)
+        lines.append([f"{side} x {side}", *(show(r and r["beam_loss_db"], "{:.2g}") for r in losses)])
+    return markdown(("elements", *(f"{d:g} m" for d in away)), lines)
+
+
 # ------------------------------------------------------------------------------------------------- the README
 
 
