@@ -151,3 +151,134 @@ class RefineConfig:
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected at least 1")
         if self.sh_degree not in COEFFICIENTS:
             raise ValueError(f"sh_degree: got {self.sh_degree!r}, expected 0, 1, 2 or 3")
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """How Gaussians become a mesh with planar patches.
+
+    Attributes:
+        downscale: depth maps are rendered at the photos' size divided by this.
+        views: at most so many depth maps are fused, spread over all cameras.
+        alpha: a depth counts where at least so much light is blocked.
+        depth_spread: and where the blended depth and that of the dominant Gaussian differ by no more than this part.
+        voxel_m: side of a voxel of the fusion.
+        truncation_voxels: the distance field is truncated at so many voxels.
+        max_range_m: depths beyond this are left out.
+        edge_tolerance: a pixel is left out where inverse depth bends by more than this part of itself, per focal length
+            in pixels: on a plane it is linear in the image, in a corner it bends, across an occluding edge it jumps.
+        min_views: a surface is kept where at least this many depth maps saw it.
+        min_component_faces: connected pieces with fewer faces are dropped as floating debris.
+        patch_distance_m: a face this close to a plane can belong to its patch: a depth map's error.
+        patch_angle_deg: and its smoothed normal differs by no more than this.
+        min_patch_m2: smallest planar patch.
+        simplify_m: flat parts are made of faces of about this size in the end.
+    """
+
+    downscale: int = 2
+    views: int = 120
+    alpha: float = 0.6
+    depth_spread: float = 0.05
+    voxel_m: float = 0.05
+    truncation_voxels: float = 4.0
+    max_range_m: float = 12.0
+    edge_tolerance: float = 8.0
+    min_views: int = 2
+    min_component_faces: int = 200
+    patch_distance_m: float = 0.06
+    patch_angle_deg: float = 35.0
+    min_patch_m2: float = 0.15
+    simplify_m: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not self.voxel_m > 0:
+            raise ValueError(f"voxel_m: got {self.voxel_m}, expected a positive length in metres")
+
+
+@dataclass(frozen=True)
+class CompletionConfig:
+    """How a mesh is made whole (see :mod:`warprrf.geometry.photos.completion`). Votes count lines of sight.
+
+    Attributes:
+        cell_m: largest side of a box.
+        margin_m: space kept around the mesh.
+        aligned_deg: a plane this parallel to one of three perpendicular directions counts as parallel.
+        exact_deg, strong_m2: one this parallel, with a proven area above the second, keeps its own tilt (0.1 degrees
+            are 2 cm over 12 m): it is fitted better than the directions are.
+        least_share: of the mesh that has to lie on such planes; else it is no place of boxes.
+        same_side_m: planes facing one way and closer than this are two fits of one surface.
+        board_m: planes facing opposite ways can be closer, down to this: the two faces of a board.
+        gather_m2, gather_m: so much area of left-over faces within so much height makes one more plane.
+        reach_m: a face this close to a part of a plane that the photos proved belongs to it.
+        stride: every so many-th row and column of the depth maps is used.
+        snap_m: a depth agrees with the mesh when both are this close.
+        shy_m: a line of sight proves nothing this close to an end that lies on no plane.
+        step_m: spacing of samples along lines of sight.
+        beside_m: a hit votes for the boxes this far before and behind its plane: within the thinnest board.
+        sure_votes: votes that make half a certainty.
+        prior: votes by which a box that nobody saw leans to solid.
+        leak: share of the lines of sight that go astray: so many votes of a neighbour count for nothing.
+        behind: votes that a hit on a plane is worth: far more certain than a line of sight through a box.
+        trust: cost of a box that goes against all its votes, per square metre of its sides.
+        known: cost of a square metre of surface on a known plane; one where no plane is known costs 1.
+        rim_m, rim_share: a side is closed when planes this near to it cover so much of it.
+        seen_piece, least_seen: a flat piece of surface is seen when hits lie on so much of it, and at least so much of
+            all the surface must be; else the photos cover too little of the place for the rest to be inferred.
+        keep_m, keep_m2: pieces of the old mesh this far from every known plane, and this large, are kept.
+    """
+
+    cell_m: float = 0.1
+    margin_m: float = 0.3
+    aligned_deg: float = 4.0
+    exact_deg: float = 0.1
+    strong_m2: float = 2.0
+    least_share: float = 0.5
+    same_side_m: float = 0.035
+    board_m: float = 0.012
+    gather_m2: float = 0.08
+    gather_m: float = 0.03
+    reach_m: float = 0.12
+    stride: int = 5
+    snap_m: float = 0.12
+    shy_m: float = 0.1
+    step_m: float = 0.06
+    beside_m: float = 0.006
+    sure_votes: float = 10.0
+    prior: float = 0.3
+    leak: float = 0.05
+    behind: float = 2.0
+    trust: float = 0.6
+    known: float = 0.4
+    rim_m: float = 0.6
+    rim_share: float = 0.25
+    seen_piece: float = 0.1
+    least_seen: float = 0.7
+    keep_m: float = 0.12
+    keep_m2: float = 0.3
+
+
+@dataclass(frozen=True)
+class ReconstructionConfig:
+    """Settings of :func:`warprrf.reconstruct`.
+
+    Attributes:
+        max_features: SIFT features per photo.
+        pairs: which photos are matched, ``"auto"`` or ``"exhaustive"``.
+        max_reprojection_error: sparse points above it are dropped [pixels].
+        planes: how planes are found among sparse points.
+        sweep: how planes are corrected and completed by comparing the photos; None: not at all.
+        gaussians: Gaussians to start the refinement from (about).
+        refine: photometric refinement.
+        surface: from Gaussians to a mesh.
+        completion: how holes are closed and borders straightened where the planes allow it; None: not at all.
+    """
+
+    max_features: int = 2400
+    pairs: str = "auto"
+    max_reprojection_error: float = 1.0
+    planes: PlaneConfig = field(default_factory=PlaneConfig)
+    sweep: SweepConfig | None = field(default_factory=SweepConfig)
+    gaussians: int = 32_000
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    completion: CompletionConfig | None = field(default_factory=CompletionConfig)
