@@ -85,6 +85,6 @@ def of_patches(patches: PlanarPatches) -> Arrays:
 
 def to_patches(arrays: Arrays) -> PlanarPatches:
     """What :func:`of_patches` took apart."""
-    own = {name: arrays[f"patch_{name}"] for name in PATCHES}
+    own: dict[str, Any] = {name: arrays[f"patch_{name}"] for name in PATCHES}
     own |= {name: own[name].item() for name in ("tolerance_m", "two_sided")}
     return PlanarPatches(Mesh(arrays["vertices"], arrays["faces"]), **own)

@@ -131,4 +131,3 @@ def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera], *, min_views:
         occupied[plane.occupied] = seen.sum(axis=1) >= min_views
         result.append(replace(plane, occupied=occupied))
     return result
-

@@ -8,8 +8,9 @@ run continues, a change starts over from the first step that it changes.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from warprrf.geometry import geometry_files as files
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.photo_files import find_photos, match_names, read_photo
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.refine import refine
 from warprrf.geometry.photos.sfm import structure_from_motion
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale
@@ -88,9 +88,7 @@ def reconstruct(
             f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to"
         )
     with Steps(workspace, progress=progress) as steps:
-        planes, start = _start(steps, sparse, fitted, config, seed, device)
-        gaussians = _refined(steps, sparse, fitted, planes, start, config, device)
-        patches = _surface(steps, sparse, planes, gaussians, config, device)
+        gaussians, patches = _steps(steps, sparse, fitted, config, seed, device)
     return Reconstruction(
         gaussians,
         patches.mesh,
@@ -103,91 +101,66 @@ def reconstruct(
     )
 
 
-def _start(
+def _steps(
     steps: Steps,
     sparse: SparseModel,
     fitted: Mapping[str, Path],
     config: ReconstructionConfig,
     seed: int,
     device: Any,
-) -> tuple[list[Plane], Gaussians]:
-    """Planes, and the Gaussians that refinement starts from."""
-    path = steps.folder / "start.safetensors"
+) -> tuple[Gaussians, PlanarPatches]:
+    """The steps after structure from motion: planes and Gaussians to start from, Gaussians refined, mesh and patches.
 
-    def make(attempt: Attempt) -> dict[str, Any]:
+    Args:
+        fitted: the photos that Gaussians are fitted to, by name.
+    """
+    cameras = {name: sparse.cameras[name] for name in fitted}
+    photos = cache(lambda: [read_photo(photo) for photo in fitted.values()])
+
+    def start(attempt: Attempt) -> files.Arrays:
         planes, gaussians = start_of(
-            sparse,
-            {name: sparse.cameras[name] for name in fitted},
-            [read_photo(photo) for photo in fitted.values()],
-            config=config,
-            seed=seed,
-            progress=attempt.progress,
-            device=device,
+            sparse, cameras, photos(), config=config, seed=seed, progress=attempt.progress, device=device
         )
-        files.write(path, {**files.of_planes(planes), **files.of_gaussians(gaussians)})
-        return {"planes": len(planes), "gaussians": len(gaussians)}
+        return files.of_planes(planes) | files.of_gaussians(gaussians)
 
-    settings = [config.max_reprojection_error, config.planes, config.sweep, config.gaussians, seed]
-    inputs = [sparse, list(fitted), list(fitted.values()), *settings]
-    steps.run("start", make, version=VERSIONS["start"], inputs=inputs, outputs=[path.name])
-    arrays, _ = files.read(path)
-    return files.to_planes(arrays), files.to_gaussians(arrays)
-
-
-def _refined(
-    steps: Steps,
-    sparse: SparseModel,
-    fitted: Mapping[str, Path],
-    planes: Sequence[Plane],
-    start: Gaussians,
-    config: ReconstructionConfig,
-    device: Any,
-) -> Gaussians:
-    """The Gaussians that render the photos."""
-    path = steps.folder / "refined.safetensors"
-
-    def make(attempt: Attempt) -> dict[str, Any]:
+    def refined(attempt: Attempt) -> files.Arrays:
         gaussians = refine(
-            start,
-            [read_photo(photo) for photo in fitted.values()],
-            [sparse.cameras[name] for name in fitted],
+            files.to_gaussians(first),
+            photos(),
+            list(cameras.values()),
             config=config.refine,
             planes=planes,
             progress=attempt.progress,
             checkpoint=attempt.folder / "checkpoint.safetensors",
             device=device,
         )
-        files.write(path, files.of_gaussians(gaussians))
-        return {"gaussians": len(gaussians)}
+        return files.of_gaussians(gaussians)
 
-    inputs = [steps.key("start"), config.refine]
-    steps.run("refined", make, version=VERSIONS["refined"], inputs=inputs, outputs=[path.name])
-    return files.to_gaussians(files.read(path)[0])
-
-
-def _surface(
-    steps: Steps,
-    sparse: SparseModel,
-    planes: Sequence[Plane],
-    gaussians: Gaussians,
-    config: ReconstructionConfig,
-    device: Any,
-) -> PlanarPatches:
-    """The mesh and its planar patches."""
-    path = steps.folder / "surface.safetensors"
-
-    def make(attempt: Attempt) -> dict[str, Any]:
+    def surface(attempt: Attempt) -> files.Arrays:
+        everywhere = list(sparse.cameras.values())
         patches = fuse_gaussians(
-            gaussians,
-            list(sparse.cameras.values()),
-            planes=planes,
-            config=config,
-            progress=attempt.progress,
-            device=device,
+            gaussians, everywhere, planes=planes, config=config, progress=attempt.progress, device=device
         )
-        files.write(path, files.of_patches(patches))
-        return {"triangles": len(patches.mesh.faces), "patches": len(patches)}
+        return files.of_patches(patches)
 
+    settings = [config.max_reprojection_error, config.planes, config.sweep, config.gaussians, seed]
+    first = _kept(steps, "start", start, [sparse, list(fitted), list(fitted.values()), *settings])
+    planes = files.to_planes(first)
+    gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("start"), config.refine]))
+    photos.cache_clear()
     inputs = [steps.key("refined"), config.surface, config.completion]
-    steps.run("surface", make, version=VERSIONS["surface"], inputs=inputs, outputs=[path.name])
-    return files.to_patches(files.read(path)[0])
+    return gaussians, files.to_patches(_kept(steps, "surface", surface, inputs))
+
+
+def _kept(
+    steps: Steps, name: str, make: Callable[[Attempt], files.Arrays], inputs: Sequence[Any]
+) -> files.Arrays:
+    """Arrays of a step, from its file if it was made from the same inputs."""
+    path = steps.folder / f"{name}.safetensors"
+
+    def write(attempt: Attempt) -> dict[str, Any]:
+        files.write(path, make(attempt))
+        return {}
+
+    steps.run(name, write, version=VERSIONS[name], inputs=inputs, outputs=[path.name])
+    return files.read(path)[0]

@@ -227,9 +227,7 @@ def _merged(
                 break
         else:
             kept.append(plane)
-    kept = [
-        p for k, p in enumerate(kept) if not any(_echo(points, p, strong, config) for strong in kept[:k])
-    ]
+    kept = [p for k, p in enumerate(kept) if not any(_echo(points, p, strong, config) for strong in kept[:k])]
     refitted: list[Plane] = []
     for plane in kept:
         normal, offset, own = plane.normal, plane.offset, points[plane.inliers]

@@ -103,7 +103,9 @@ def detect_room_planes(
     if len(rest) < config.small_points:
         return large
     again = estimate_normals(points[rest], viewpoints[rest], neighbour_count=10)
-    small = detect_planes(points[rest], again, config=replace(config, min_points=config.small_points), seed=seed)
+    small = detect_planes(
+        points[rest], again, config=replace(config, min_points=config.small_points), seed=seed
+    )
     compact = []
     for plane in small:
         own = points[rest[plane.inliers]]

@@ -135,7 +135,9 @@ class _Refinement:
             name: wp.array(value.reshape(-1), dtype=int if name == "plane_of" else float, device=device)
             for name, value in arrays.items()
         }
-        self.gradients = {name: wp.zeros(n * k, dtype=float, device=device) for name, k in self.widths.items()}
+        self.gradients = {
+            name: wp.zeros(n * k, dtype=float, device=device) for name, k in self.widths.items()
+        }
         self.scales = wp.zeros(n, dtype=wp.vec3, requires_grad=True, device=device)
         self.opacities = wp.zeros(n, dtype=float, requires_grad=True, device=device)
         self.means = self.shaped("means", wp.vec3, (n,))
@@ -239,7 +241,9 @@ class _Refinement:
                 self.iteration = int((file.metadata() or {})["iteration"])
                 arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
         except (SafetensorError, OSError, KeyError) as error:
-            raise ValueError(f"checkpoint: {path} cannot be read ({error}); delete it to start over") from error
+            raise ValueError(
+                f"checkpoint: {path} cannot be read ({error}); delete it to start over"
+            ) from error
         self.load(arrays)
 
 

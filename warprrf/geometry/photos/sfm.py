@@ -206,7 +206,10 @@ def _match(
     colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, attempt: Attempt
 ) -> None:
     """Verified matches of pairs of photos, into ``matches.db``."""
-    working, listing = _copied(folder / "features.db", attempt.folder / "matches.db"), attempt.folder / "pairs.txt"
+    working, listing = (
+        _copied(folder / "features.db", attempt.folder / "matches.db"),
+        attempt.folder / "pairs.txt",
+    )
     with colmap.Database.open(str(working)) as database:
         counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
         blank = [n for n in names if counts[n] < 8]

@@ -18,7 +18,6 @@ from warprrf.geometry.photos.planes import Plane, detect_planes
 from warprrf.geometry.planar_patches import PlanarPatches
 
 FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
-GROWTH = 4  # rings of faces that a patch may take in from a seam
 
 
 def find_patches(
@@ -26,8 +25,8 @@ def find_patches(
 ) -> PlanarPatches:
     """Which faces of ``mesh`` lie on which of the given planes, or where none are given, on planes found among its faces.
 
-    A patch gathers the faces near its plane that face its way; islands too small to matter are left out, and faces
-    in a seam between patches join the patch whose plane they are nearest to. Patch k lies on ``planes[k]``.
+    A patch gathers the faces near its plane that face its way; islands too small to matter are left out. Patch k lies
+    on ``planes[k]``.
     """
     config = config or SurfaceConfig()
     normals, areas = smoothed_normals(mesh, 3), mesh.areas
@@ -48,28 +47,9 @@ def find_patches(
         label[better], best[better] = k, gap[better]
     piece = connected_pieces(mesh, label)
     label[np.bincount(piece, weights=areas)[piece] < 0.2 * config.min_patch_m2] = -1
-    label = _grown(label, mesh, planes, config.patch_distance_m)
     return PlanarPatches.from_planes(
         mesh, label, [p.normal for p in planes], [p.offset for p in planes], tolerance_m=FLAT_M
     )
-
-
-def _grown(label: np.ndarray, mesh: Mesh, planes: Sequence[Plane], distance_m: float) -> np.ndarray:
-    """Seam faces join the neighbouring patch whose plane all their corners are nearest to, ring by ring."""
-    ring = face_neighbours(mesh.faces)
-    normal = np.array([p.normal for p in planes]).reshape(-1, 3)
-    offset = np.array([p.offset for p in planes])
-    label = label.copy()
-    for _ in range(GROWTH):
-        face, side = np.nonzero((label < 0)[:, None] & (ring >= 0) & (label[ring] >= 0))
-        k = label[ring[face, side]]
-        gap = np.abs(np.einsum("fvi,fi->fv", mesh.triangles[face], normal[k]) - offset[k, None]).max(axis=1)
-        near = np.flatnonzero(gap < distance_m)
-        near = near[np.lexsort((-gap[near], face[near]))]  # of a face's neighbours the nearest plane is written last
-        if not len(near):
-            break
-        label[face[near]] = k[near]
-    return label
 
 
 def flattened(patches: PlanarPatches, *, limit_m: float = 0.15) -> PlanarPatches:

@@ -157,7 +157,7 @@ def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: Grey
     score = np.full(full.occupied.shape, np.nan)
     score[full.occupied] = np.where((contrast > config.contrast) & (views[:, 1] >= 0), agreement, np.nan)
     visible = np.zeros_like(full.occupied)
-    visible[full.occupied] = seen.any(axis=1)[group.ravel()]
+    visible[full.occupied] = np.asarray(seen.any(axis=1))[group.ravel()]
     return _Scored(full, wide.occupied, score, visible, full.count(points[plane.inliers]) > 0)
 
 
@@ -257,9 +257,7 @@ def _peaks(agreement: np.ndarray, least: float) -> np.ndarray:
 
     def around(*steps: int) -> np.ndarray:
         footprint = np.isin(np.arange(-4, 5), steps)[:, None, None]
-        return np.asarray(
-            ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0)
-        )
+        return np.asarray(ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0))
 
     return (agreement > least) & (agreement >= around(-1, 1)) & (agreement > around(-4, -3, 3, 4) + 0.15)
 
@@ -284,9 +282,7 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
     seen = visible_from(surface, centres, piece.normal, photos.cameras)
     views = choose_views(centres, piece.normal, seen, photos.cameras, photos.config)
     steps = np.arange(-0.05, 0.0501, FINE_M)
-    scores = [
-        float(photos.agreement(centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps
-    ]
+    scores = [float(photos.agreement(centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps]
     best = int(np.argmax(scores))
     if best in (0, len(steps) - 1) or scores[best] < 0.5:
         return None
@@ -295,7 +291,9 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
     return replace(piece, offset=float(z * piece.normal[2]), occupied=_closed(piece.occupied))
 
 
-def joined(planes: Sequence[Plane], levels: Sequence[Plane], config: SweepConfig | None = None) -> list[Plane]:
+def joined(
+    planes: Sequence[Plane], levels: Sequence[Plane], config: SweepConfig | None = None
+) -> list[Plane]:
     """``planes`` and ``levels`` with pieces of one plane united; new planes need a least area, a larger one where they
     face down (seen from below, stripes on a wall pass for a soffit)."""
     config = config or SweepConfig()

@@ -17,7 +17,7 @@ import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_topology import connected_pieces
-from warprrf.geometry.photos.completion.boxes import divide, least_surface, surface_of, without_hollows
+from warprrf.geometry.photos.completion.boxes import divide, least_surface, surface_of
 from warprrf.geometry.photos.completion.evidence import closed_sides, seen_share, vote_proven, votes
 from warprrf.geometry.photos.completion.room_planes import (
     FaceLevels,
@@ -72,7 +72,6 @@ def complete(
         free, solid = free + before, solid + behind
 
     filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces, config), config)
-    filled = without_hollows(grid, filled, np.array([c.position for c in cameras]))
     if filled.all():
         return patches
     whole, known = surface_of(grid, filled, patches.tolerance_m)

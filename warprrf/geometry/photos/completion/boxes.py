@@ -77,7 +77,8 @@ def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level], config: Comple
         stops = [level.height for level in own]
         stops = [min([low, *stops]) - config.margin_m, *stops, max([high, *stops]) + config.margin_m]
         steps = np.maximum(1, np.ceil(np.diff(stops) / config.cell_m).astype(int))
-        parts = [np.linspace(*ends, n + 1)[:-1] for *ends, n in zip(stops, stops[1:], steps, strict=False)]
+        between = zip(stops[:-1], stops[1:], steps, strict=True)
+        parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in between]
         height = np.append(np.concatenate(parts), stops[-1])
         normal, offset, known = np.tile(axes[axis], (len(height), 1)), height.copy(), height < -np.inf
         for k, level in zip(np.cumsum(steps), own, strict=False):
@@ -147,14 +148,6 @@ def _minimum_cut(
     return filled[:size].reshape(grid.shape)
 
 
-def without_hollows(grid: Grid, filled: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """``filled`` with every hollow filled that none of ``places`` (N, 3) lies in: no photo was taken there."""
-    piece, _ = ndimage.label(~filled)
-    index = grid.locate(places)
-    own = np.unique(piece.ravel()[index[index >= 0]])
-    return ~np.isin(piece, own[own > 0])
-
-
 def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[PlanarPatches, np.ndarray]:
     """The faces between free and solid boxes, a patch for each plane and side, and for each face whether its plane is
     known, shape ``(F,)`` bool."""
@@ -168,9 +161,9 @@ def surface_of(grid: Grid, filled: np.ndarray, tolerance_m: float) -> tuple[Plan
             index[:, a] += 1
             quad = []
             for along in ((0, 0), (1, 0), (1, 1), (0, 1)):
-                node = index.copy()
-                node[:, [b, c]] += along
-                quad.append(np.ravel_multi_index(tuple(node.T), nodes))
+                corner = index.copy()
+                corner[:, [b, c]] += along
+                quad.append(np.ravel_multi_index(tuple(corner.T), nodes))
             corners = np.stack(quad[::sign], axis=1)
             faces += [corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]
             tags += [np.stack([np.full(len(index), a), index[:, a], np.full(len(index), sign)], axis=1)] * 2

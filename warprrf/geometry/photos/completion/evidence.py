@@ -71,7 +71,9 @@ def _lines_of_sight(
     return o, d, ranges
 
 
-def vote_proven(grid: Grid, plane: Plane, level: Level, config: CompletionConfig) -> tuple[np.ndarray, np.ndarray]:
+def vote_proven(
+    grid: Grid, plane: Plane, level: Level, config: CompletionConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """Four votes of each occupied cell for free space before it, and for a solid behind, shape ``grid.shape`` each."""
     quarter = np.array([[i, j] for i in (-0.25, 0.25) for j in (-0.25, 0.25)]) * plane.cell_m
     points = (plane.cells()[:, None] + quarter @ plane.axes).reshape(-1, 3)

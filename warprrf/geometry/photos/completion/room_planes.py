@@ -87,7 +87,7 @@ def known_levels(
     mesh, count = patches.mesh, len(patches.mesh.faces)
     centres = mesh.triangles.mean(axis=1)
     candidates: list[tuple[float, Level, np.ndarray]] = []
-    for k in np.flatnonzero(patches.area > 0):
+    for k in np.flatnonzero(patches.area > 0).tolist():
         axis, sign = _parallel_to(patches.normal[k], axes, config)
         if axis < 0:
             continue
@@ -158,7 +158,10 @@ def _gatherings(
                     break
                 height = float(x[k : last[k]] @ area[k : last[k]] / gathered[k])
                 gap = np.abs(x - height)
-                yield Level(axis, sign, height, axes[axis], height), own[(gap < config.same_side_m) & (area > 0)]
+                yield (
+                    Level(axis, sign, height, axes[axis], height),
+                    own[(gap < config.same_side_m) & (area > 0)],
+                )
                 area = np.where(gap < 2 * config.same_side_m, 0.0, area)
 
 
