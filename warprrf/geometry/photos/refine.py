@@ -27,6 +27,7 @@ from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotatio
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
+from warprrf.steps import digest
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999  # of Adam's moments
 
@@ -48,10 +49,10 @@ def refine(
         images: photos in [0, 1], each ``(H, W, 3)``, one per camera.
         cameras: pinhole cameras of the same sizes.
         planes: detected planes; Gaussians on them are kept flat.
-        checkpoint: file to continue from if it exists and to keep up to date; it must be of the same arguments.
+        checkpoint: file to continue from if it exists and to keep up to date; of the same photos.
 
     Raises:
-        ValueError: if images and cameras do not match, or a checkpoint is damaged.
+        ValueError: if images and cameras do not match, or a checkpoint is of other arguments or damaged.
         RuntimeError: if the loss becomes NaN.
     """
     config = config or RefineConfig()
@@ -64,12 +65,13 @@ def refine(
             raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole")
         check_array(f"images[{k}]", image, (camera.height, camera.width, 3), np.float32)
     run = _Refinement(gaussians, _Targets(images, cameras, config, resolve(device)), config, planes)
+    key = "" if checkpoint is None else digest(config, gaussians, list(cameras), list(planes))
     if checkpoint is not None and Path(checkpoint).exists():
-        run.restore(Path(checkpoint))
+        run.restore(Path(checkpoint), key)
     while run.iteration < config.iterations:
         run.step()
         if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
-            run.store(Path(checkpoint))
+            run.store(Path(checkpoint), key)
         if progress is not None and (run.iteration % 20 == 0 or run.iteration == config.iterations):
             progress("refine", run.iteration, config.iterations)
     return run.result()
@@ -225,25 +227,30 @@ class _Refinement:
         sh = arrays["sh"].reshape(self.count, -1, 3)
         return Gaussians(arrays["means"], arrays["quaternions"], scales, opacity, sh)[keep]
 
-    def store(self, path: Path) -> None:
-        """Write the whole state."""
+    def store(self, path: Path, key: str) -> None:
+        """Write the whole state; ``key`` tells what it was made from."""
         from safetensors.numpy import save_file
 
-        metadata = {"iteration": str(self.iteration)}
+        metadata = {"iteration": str(self.iteration), "key": key}
         write_atomically(path, lambda file: save_file(self.arrays(), file, metadata))
 
-    def restore(self, path: Path) -> None:
+    def restore(self, path: Path, key: str) -> None:
         """Continue from a checkpoint."""
         from safetensors import SafetensorError, safe_open
 
         try:
             with safe_open(path, framework="np") as file:
-                self.iteration = int((file.metadata() or {})["iteration"])
+                metadata = file.metadata() or {}
+                self.iteration, stored = int(metadata["iteration"]), metadata["key"]
                 arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
         except (SafetensorError, OSError, KeyError) as error:
             raise ValueError(
                 f"checkpoint: {path} cannot be read ({error}); delete it to start over"
             ) from error
+        if stored != key:
+            raise ValueError(
+                f"checkpoint: {path} is of other settings or inputs; delete it or give another file"
+            )
         self.load(arrays)
 
 
