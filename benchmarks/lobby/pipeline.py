@@ -248,7 +248,7 @@ class Lobby:
             "surveyed": len(surveyed),
             "gaussians": len(found.gaussians),
             "triangles": len(found.mesh.faces),
-            "patches": len(found.patches),
+            "patches": len(found.patches or ()),
         }
 
     def geometry_error(self, attempt: Attempt) -> dict[str, Any]:
