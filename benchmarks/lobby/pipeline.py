@@ -29,6 +29,7 @@ from benchmarks.runner import Benchmark, Job, option
 from warprrf.files import write_arrays, write_atomically, write_json
 from warprrf.geometry.floor_plan import section
 from warprrf.geometry.mesh_files import write_mesh
+from warprrf.geometry.photos import pipeline as stage_1
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import read_photo
 from warprrf.rf.spectra import lookups, metrics
@@ -168,7 +169,7 @@ class Lobby:
         ]
         v = VERSIONS
         geometry = steps.run(
-            "geometry", self.geometry, version=v["geometry"], inputs=inputs,
+            "geometry", self.geometry, version=v["geometry"], inputs=[*inputs, stage_1.VERSIONS],
             outputs=("reconstruction", "geometry.ply", "mesh.ply", "cameras.json"),
         )  # fmt: skip
         base = [steps.key("geometry")]
