@@ -18,9 +18,9 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.patches import PlanarPatch, connected_pieces, smoothed_normals
+from warprrf.geometry.planar_patches import planar_patches as exact_patches
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import bounce
-from warprrf.rf.paths.trace import planar_patches as exact_patches
 
 ELEMENT_M = 0.5  # width of an element
 TEXELS = 3  # along an element
