@@ -220,7 +220,6 @@ def first_use(fresh, use, rounds=20):
     assert done.returncode == 0, f"exit status {done.returncode}\n{done.stderr[-2000:]}"
 
 
-@pytest.mark.xfail(strict=True, reason="first use builds ray queries without a lock")
 def test_a_mesh_may_be_asked_first_from_four_threads():
     first_use(
         "lambda: wr.Mesh(*FINE)",
@@ -228,7 +227,6 @@ def test_a_mesh_may_be_asked_first_from_four_threads():
     )
 
 
-@pytest.mark.xfail(strict=True, reason="first use builds ray queries without a lock")
 def test_a_field_may_be_asked_first_from_four_threads(tmp_path):
     make.bistatic().save(tmp_path / "field.safetensors")
     first_use(
