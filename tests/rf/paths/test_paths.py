@@ -11,7 +11,8 @@ from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, squa
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planar_patches import planar_patches
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection
+from warprrf.rf.em.fresnel import lobe, slab_reflection
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.trace import trace_paths
 
 F = 300e9

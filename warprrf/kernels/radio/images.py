@@ -166,26 +166,33 @@ def find_chains(
     offset: int,
     patches: Patches,
     patch: wp.array2d(dtype=wp.int32),
-    image: wp.array(dtype=wp.vec3d),
+    cones: Cones,
     points: wp.array(dtype=wp.vec3d),
+    leaf_middle: wp.array(dtype=wp.vec3d),
+    leaf_radius: wp.array(dtype=wp.float64),
     words: wp.array2d(dtype=wp.uint32),
 ):
-    """Which of the chains ``patch`` (C, k) reach each point through the boxes of their patches: bits, lowest first."""
-    k = offset + wp.tid()
-    row = k / words.shape[1]
-    begin = 32 * (k % words.shape[1])
+    """Which points each of the chains ``patch`` (C, k) reaches through the boxes of its patches: bits, lowest first.
+
+    Points stand in leaves of 32 with a ball around each, which the chain's cone must meet.
+    """
+    i = offset + wp.tid()
+    chain = i / words.shape[1]
+    leaf = i % words.shape[1]
     word = wp.uint32(0)
-    for bit in range(wp.min(32, patch.shape[0] - begin)):
-        here = points[row]
-        source = image[begin + bit]
-        inside = bool(True)
-        column = int(patch.shape[1])
-        while inside and column > 0:
-            column -= 1
-            here, source, inside = step_back(patches, patch[begin + bit, column], here, source)
-        if inside:
-            word = word | (wp.uint32(1) << wp.uint32(bit))
-    words[row, k % words.shape[1]] = word
+    apex = cones.apex[chain]
+    if cone_meets_ball(apex, cones.axis[chain], cones.sine[chain], leaf_middle[leaf], leaf_radius[leaf]):
+        for bit in range(wp.min(32, points.shape[0] - 32 * leaf)):
+            here = points[32 * leaf + bit]
+            source = apex
+            inside = bool(True)
+            column = int(patch.shape[1])
+            while inside and column > 0:
+                column -= 1
+                here, source, inside = step_back(patches, patch[chain, column], here, source)
+            if inside:
+                word = word | (wp.uint32(1) << wp.uint32(bit))
+    words[chain, leaf] = word
 
 
 @wp.kernel

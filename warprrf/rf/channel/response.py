@@ -47,8 +47,7 @@ from warprrf.rf.channel.sums import (
     gridded_sum,
     squint_sum,
 )
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import carrier_phase
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 DENSE_TERMS = 1e6
 """``method="auto"`` sums more terms than that (pairs x paths x frequencies) on a grid."""

@@ -38,7 +38,7 @@ from warprrf.kernels.radio.delays import (
     taps_vector,
 )
 from warprrf.rf.channel.lengths import PairLengths
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 
 OVERSAMPLING = 2
 LEAST_FREQUENCIES = 2 * TAPS

@@ -17,8 +17,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.paths.trace import MirrorTracer
 
 RAYS_FILE = "newrf_conference.npz"

@@ -15,8 +15,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.em.absorption import air_of
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.interop.llvm import select_llvm
 from warprrf.rf.paths.sionna import repeated

@@ -22,7 +22,6 @@ from warprrf.kernels.radio import images as kernels
 ALL_SPACE = 2.0  # a sine that stands for no cone
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
 BLOCK = 500_000  # chains that are unfolded at once
-MOST_BITS = 200_000_000  # pairs of a chain and a point that are tried at once
 
 
 @dataclass(frozen=True)
@@ -86,14 +85,9 @@ class MirrorImages:
         points = np.asarray(points, float).reshape(-1, 3)
         parts = [(np.zeros(0, int), np.zeros((0, order), np.int32), np.zeros((0, order, 3)))]
         if len(points) and len(self.patches):
-            middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
-            reach = 1e-6 + float(np.linalg.norm(points - middle, axis=1).max())
-            ends = wp.array(points, dtype=wp.vec3d, device=self.device)
-            for chains in self._blocks(order, middle, reach):
-                step = max(1, MOST_BITS // len(chains))
-                for first in range(0, len(points), step):
-                    row, patch, found = self._unfolded(chains, ends[first : min(first + step, len(points))])
-                    parts.append((row + first, patch, found))
+            ends = _Ends(points, self.device)
+            for chains in self._blocks(order, ends.middle, ends.radius):
+                parts.append(self._unfolded(chains, ends))
         row, patch, found = (np.concatenate(p) for p in zip(*parts, strict=True))
         by_row = np.argsort(row, kind="stable")
         return row[by_row], patch[by_row], found[by_row]
@@ -165,27 +159,44 @@ class MirrorImages:
         arrays = (counted, parent, patch, children.apex, children.axis, children.sine)
         return tuple(a.numpy() for a in arrays)
 
-    def _unfolded(self, chains: Chains, ends: wp.array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        where = self.device
-        words = wp.zeros((len(ends), -(-len(chains) // 32)), dtype=wp.uint32, device=where)
+    def _unfolded(self, chains: Chains, ends: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        where, cones = self.device, _cones(chains, self.device)
         patch = wp.array(chains.patch, dtype=wp.int32, device=where)
-        image = wp.array(chains.image, dtype=wp.vec3d, device=where)
-        _device.launch(
-            kernels.find_chains, words.size, [self._on_device, patch, image, ends, words], device=where
-        )
-        octets = words.numpy().astype("<u4", copy=False).view(np.uint8)
-        row, chain = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+        words = wp.zeros((len(chains), len(ends.leaf_radius)), dtype=wp.uint32, device=where)
+        inputs = [self._on_device, patch, cones, ends.points, ends.leaf_middle, ends.leaf_radius, words]
+        _device.launch(kernels.find_chains, words.size, inputs, device=where)
+        words_ = words.numpy()
+        chain, leaf = np.nonzero(words_)
+        octets = words_[chain, leaf].astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)
+        some, bit = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+        chain, row = chain[some], ends.order[32 * leaf[some] + bit]
         met = chains.patch[chain]
         point = wp.zeros(met.shape, dtype=wp.vec3d, device=where)
         inputs = [
             self._on_device,
             wp.array(met, dtype=wp.int32, device=where),
             wp.array(chains.image[chain], dtype=wp.vec3d, device=where),
-            wp.array(ends.numpy()[row], dtype=wp.vec3d, device=where),
+            wp.array(ends.positions[row], dtype=wp.vec3d, device=where),
             point,
         ]
         _device.launch(kernels.unfold_chains, len(row), inputs, device=where)
         return row, met, point.numpy().reshape(*met.shape, 3)
+
+
+class _Ends:
+    """Points where chains end, in leaves of 32 neighbours with a ball around each, and one around all."""
+
+    def __init__(self, points: np.ndarray, where: Any) -> None:
+        self.positions, self.order = points, _along_curve(points)
+        first = np.arange(0, len(points), 32)
+        low, high = (f.reduceat(points[self.order], first) for f in (np.minimum, np.maximum))
+        self.points = wp.array(points[self.order], dtype=wp.vec3d, device=where)
+        self.leaf_middle = wp.array(0.5 * (low + high), dtype=wp.vec3d, device=where)
+        self.leaf_radius = wp.array(
+            1e-6 + 0.5 * np.linalg.norm(high - low, axis=1), dtype=wp.float64, device=where
+        )
+        low, high = low.min(axis=0), high.max(axis=0)
+        self.middle, self.radius = 0.5 * (low + high), 1e-6 + 0.5 * float(np.linalg.norm(high - low))
 
 
 def _cones(chains: Chains, where: Any) -> Any:

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh, as_mesh
 from warprrf.geometry.planar_patches import PlanarPatches
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import MirrorPaths
 from warprrf.rf.paths.trace import MirrorTracer
 

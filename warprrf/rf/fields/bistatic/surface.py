@@ -112,7 +112,11 @@ class Surface:
             order[large] = np.arange(len(large))
             patch = order[patches.face_patch].astype(np.int32)
             planes = patches.normal[large], patches.offset[large]
-            normal, skin = mesh.face_normals, TRUE_SKIN_M
+            # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
+            normal, skin = mesh.face_normals.copy(), max(TRUE_SKIN_M, patches.tolerance_m)
+            flat = patches.face_patch >= 0
+            whole = patches.normal[patches.face_patch[flat]]
+            normal[flat] = np.where((whole * normal[flat]).sum(axis=1, keepdims=True) < 0, -whole, whole)
             if material is None:
                 group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
             else:
