@@ -16,7 +16,6 @@ from warprrf.geometry.splats.render import blend_weights, render
 from warprrf.kernels.raster.lanes import BLOCK, LANES
 from warprrf.kernels.raster.lanes import build as lane_functions
 
-needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: none here")
 CAMERAS = {
     "pinhole": photo(70, 45),
     "spherical": panorama(33, 66),
@@ -203,7 +202,7 @@ def test_features_need_not_be_contiguous():
     assert straight.features.numpy().max() > 0.3
 
 
-@needs_cuda
+@pytest.mark.cuda
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize(
     ("real", "rule", "channels"),
@@ -223,7 +222,7 @@ def test_a_gpu_blends_what_a_cpu_does(real, rule, channels, camera):
         assert np.abs(a - b).max() <= tolerance * np.abs(a).max()
 
 
-@needs_cuda
+@pytest.mark.cuda
 def test_a_gpu_lists_the_blocks_that_a_cpu_lists():
     for camera in CAMERAS.values():
         raster = Rasterizer(device="cpu", blending=RADIO, real=wp.float64)
@@ -237,7 +236,7 @@ def test_a_gpu_lists_the_blocks_that_a_cpu_lists():
         assert np.bitwise_count(found.masks.numpy()).sum() > 300
 
 
-@needs_cuda
+@pytest.mark.cuda
 @pytest.mark.parametrize("top_k", [1, 3, 16])
 def test_a_gpu_finds_the_strongest_weights_that_a_cpu_finds(top_k):
     for camera in CAMERAS.values():
