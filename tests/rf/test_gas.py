@@ -274,7 +274,7 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     assert three == pytest.approx(ends * chord**2, rel=0.015)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: SpectrumDataset) -> None:
     terms = Terms(line_of_sight=False, diffuse=False, mirror_order=0, indirect=True)
     field = BistaticField.prior(scene, dry, terms=terms)

@@ -106,7 +106,7 @@ def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(problem, tmp
         refine(start, photos, cameras, config=short, checkpoint=file, device="cpu")
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_gaussians_near_a_plane_are_pulled_flat_into_it():
     rng = np.random.default_rng(1)
     n = 200
@@ -130,7 +130,7 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
     assert np.degrees(np.arccos(np.clip(np.abs(held.normals[:, 2]), 0, 1))).max() < 1.0
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right():
     rng = np.random.default_rng(2)
     shape = (24, 20, 3)

@@ -77,7 +77,7 @@ def test_photos_agree_on_a_surface_and_nowhere_else(views):
     assert max(np.median(values[-0.1]), np.median(values[0.1])) < 0.3
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_agreement_is_the_mean_correlation_over_pairs(views):
     cameras, photos = views
     centre, axes = np.array([[0.9, -1.0, 0.02]]), plane_axes(np.array([0.0, 0, 1]))

@@ -9,7 +9,7 @@ from sionna_room import sionna_or_skip, write_scene
 from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.interop import llvm
-from warprrf.rf.interop.sionna_paths import repeated
+from warprrf.rf.paths.sionna import repeated
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.spectrum import pixel_of

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.device import is_cuda, launch, resolve
+from warprrf import device as devices
+from warprrf.device import launch, resolve
 from warprrf.geometry.splats.blending import RADIO as RADIO
 from warprrf.geometry.splats.blending import Blending as Blending
 from warprrf.geometry.splats.camera import Camera
@@ -25,7 +26,9 @@ from warprrf.kernels.raster import project as projection
 from warprrf.kernels.raster import sh as harmonics
 from warprrf.kernels.raster.view import PINHOLE, SPHERICAL, View
 
-PARTS = 8  # partial sums of gradients on a CPU, one writer each: the result does not depend on the thread count
+PARTS = (
+    8  # partial sums of gradients on a CPU, one writer each: the result does not depend on the thread count
+)
 GRAIN = 32  # a tile is work enough for few of them to be worth a thread
 PIXEL_TILE = 16  # pixels: side of a tile where each pixel has a thread of its own
 
@@ -102,7 +105,7 @@ class Rasterizer:
         self.device = resolve(device)
         self.blending = blending or Blending()
         self.real = real
-        self.per_pixel = per_pixel or is_cuda(self.device)
+        self.per_pixel = per_pixel or self.device.is_cuda
         self.kernels = reference if self.per_pixel else blocks
         self.tile = PIXEL_TILE if self.per_pixel else blocks.BLOCK
         self.threads_per_tile = PIXEL_TILE**2 if self.per_pixel else 1
@@ -146,12 +149,12 @@ class Rasterizer:
     def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
         """Write the colours to ``out``; returns the ray origin that :meth:`colors_adjoint` wants. Records nothing."""
         origin = wp.array([cam.position], dtype=self.vector(3), device=self.device)
-        launch(harmonics.build(self.real).colors, len(means), [means, sh, origin, out], device=self.device)
+        launch(self._built(harmonics.build).colors, len(means), [means, sh, origin, out], device=self.device)
         return origin
 
     def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
         """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
-        kernel = harmonics.build(self.real).colors
+        kernel = self._built(harmonics.build).colors
         launch(kernel, len(means), [means, sh, origin, out], device=self.device, adjoint=True)
 
     def prepare(
@@ -170,7 +173,7 @@ class Rasterizer:
         distance = wp.empty(n, dtype=float, device=device)
         splats = wp.empty(n, dtype=projection.splat_of(self.real), device=device)
         outputs = [span, count, distance, splats]
-        project = projection.project_kernel(self.real)
+        project = self._built(projection.build_project)
         launch(project, n, [*inputs, view, self.blending.rules, *outputs], device=device)
         ids, starts = _listed(span, count, distance, view)
         return Prepared(cam, view, inputs, splats, ids, starts)
@@ -210,9 +213,14 @@ class Rasterizer:
             wp.zeros(shape, dtype=self.real, device=self.device),
             wp.zeros(shape[:2], dtype=self.real, device=self.device),
         )
-        kernel = self.kernels.strongest_kernel(self.real)
+        kernel = self._built(self.kernels.build_strongest)
         self._launch_tiles(kernel, prepared, [*self._scene(prepared), *out])
         return out
+
+    def _built(self, build: Callable[..., Any], *arguments: Any) -> Any:
+        """A kernel of this precision; threads that want it first wait for one of them to make it."""
+        with devices.building:
+            return build(self.real, *arguments)
 
     def _background(self, features: wp.array, background: Any) -> wp.array:
         if isinstance(background, wp.array):
@@ -247,7 +255,7 @@ class Rasterizer:
         )
         outputs = [image.features, image.alpha, image.depth, image.transmittance, image.dominant, image.peak]
         for first in range(0, channels, projection.CHANNELS):
-            kernel = self.kernels.blend_kernel(self.real, min(channels - first, projection.CHANNELS))
+            kernel = self._built(self.kernels.build_blend, min(channels - first, projection.CHANNELS))
             inputs = [*self._scene(prepared), features, first, background, *outputs]
             self._launch_tiles(kernel, prepared, inputs)
         return image
@@ -264,29 +272,27 @@ class Rasterizer:
         sums_of_one = self.vector(projection.SUMS)
         seen = wp.zeros(n, dtype=self.real, device=self.device)
         for first in range(0, channels, projection.CHANNELS):
-            kernel = self.kernels.adjoint_kernel(self.real, min(channels - first, projection.CHANNELS))
+            kernel = self._built(self.kernels.build_adjoint, min(channels - first, projection.CHANNELS))
             sums = wp.zeros((len(cuts) - 1, n), dtype=sums_of_one, device=self.device)
             pixels = [*image.differentiable, *slopes]
             inputs = [*self._scene(prepared), parts, features, first, *pixels, sums]
             self._launch_tiles(kernel, prepared, inputs, cuts)
             launch(
-                projection.chain_kernel(self.real),
+                self._built(projection.build_chain),
                 n,
                 [*prepared.inputs, prepared.view, first, sums, *parameter_gradients, feature_gradient, seen],
                 device=self.device,
             )
         if background.requires_grad:
-            kernel = reference.background_kernel(self.real)
-            launch(
-                kernel, channels, [image.transmittance, slopes[0], background.grad], device=self.device
-            )
+            kernel = self._built(reference.build_background)
+            launch(kernel, channels, [image.transmittance, slopes[0], background.grad], device=self.device)
         return seen
 
     def _parts(self, prepared: Prepared) -> tuple[wp.array, list[int]]:
         """Which partial sum each tile adds to, and the tiles where the parts end: parts of equal work on a CPU, which
         launches each on one thread; a GPU adds atomically to one."""
         tiles = prepared.tiles
-        if is_cuda(self.device):
+        if self.device.is_cuda:
             return wp.zeros(tiles, dtype=int, device=self.device), [0, tiles]
         work = prepared.starts.numpy() + np.arange(tiles + 1)
         cuts = np.searchsorted(work, work[-1] * np.arange(PARTS + 1) / PARTS)
@@ -294,9 +300,7 @@ class Rasterizer:
         return wp.array(parts, dtype=int, device=self.device), cuts.tolist()
 
 
-def _listed(
-    span: wp.array, count: wp.array, distance: wp.array, view: View
-) -> tuple[wp.array, wp.array]:
+def _listed(span: wp.array, count: wp.array, distance: wp.array, view: View) -> tuple[wp.array, wp.array]:
     """Gaussians of every tile by range (as float32; ties by index), and where each tile's begin."""
     device, n = count.device, len(count)
     tiles = view.tiles_x * view.tiles_y

@@ -184,8 +184,8 @@ def block_functions(real: Any) -> SimpleNamespace:
 
 
 @cache
-def blend_kernel(real: Any, width: int) -> Any:
-    """As :func:`.reference.blend_kernel`."""
+def build_blend(real: Any, width: int) -> Any:
+    """As :func:`.reference.build_blend`."""
     lanes = wp.types.vector(LANES, real)
     integers = wp.types.vector(LANES, int)
     values = wp.types.vector(width, real)
@@ -275,8 +275,8 @@ def blend_kernel(real: Any, width: int) -> Any:
 
 
 @cache
-def adjoint_kernel(real: Any, width: int) -> Any:
-    """As :func:`.reference.adjoint_kernel`."""
+def build_adjoint(real: Any, width: int) -> Any:
+    """As :func:`.reference.build_adjoint`."""
     lanes = wp.types.vector(LANES, real)
     values = wp.types.vector(width, real)
     many = wp.types.matrix((width, LANES), real)
@@ -393,15 +393,15 @@ def adjoint_kernel(real: Any, width: int) -> Any:
 
 
 @cache
-def strongest_kernel(real: Any) -> Any:
-    """As :func:`.reference.strongest_kernel`."""
+def build_strongest(real: Any) -> Any:
+    """As :func:`.reference.build_strongest`."""
     lanes = wp.types.vector(LANES, real)
     integers = wp.types.vector(LANES, int)
     Splat = splat_of(real)
     of, block = lane_functions(real), block_functions(real)
     any_positive, where_positive, response = of.any_positive, of.where_positive, of.response
     rays, meet, behind = block.rays, block.meet, block.behind
-    lower, higher = of.lower, of.higher
+    lower = of.lower
 
     @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
     def strongest(

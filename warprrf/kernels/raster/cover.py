@@ -105,7 +105,8 @@ def covered_in_panorama(view: View, m: wp.vec3d, distance: wp.float64, c: wp.mat
 def covered_tiles(view: View, m: wp.vec3d, axes: wp.mat33d, extent: wp.float64, inside: bool):
     """Tiles that an ellipsoid can touch: first column, columns, first row, rows; columns wrap on a sphere.
 
-    Its half axes are the columns of ``axes``, the longest one ``extent``, its centre ``m``: in the view's axes. ``inside``: whether it holds the ray origin.
+    Its half axes are the columns of ``axes``, the longest one ``extent``, its centre ``m``, in the view's axes.
+    ``inside``: whether it holds the ray origin.
     """
     if inside:
         return wp.vec4i(0, view.tiles_x, 0, view.tiles_y)

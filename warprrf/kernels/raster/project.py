@@ -78,7 +78,7 @@ def whitened_frame(a: wp.vec3d):
 
 
 @cache
-def project_kernel(real: Any) -> Any:
+def build_project(real: Any) -> Any:
     """The kernel for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
@@ -180,7 +180,7 @@ def quaternion_gradient(q: wp.vec4d, y2: wp.mat33d, s: wp.vec3d):
 
 
 @cache
-def chain_kernel(real: Any) -> Any:
+def build_chain(real: Any) -> Any:
     """The kernel for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
@@ -229,6 +229,8 @@ def chain_kernel(real: Any) -> Any:
         opacities_grad[i] = opacities_grad[i] + real(y[wp.static(OF_OPACITY)])
         for k in range(wp.static(CHANNELS)):
             if first + k < features_grad.shape[1]:
-                features_grad[i, first + k] = features_grad[i, first + k] + real(y[wp.static(OF_FEATURES) + k])
+                features_grad[i, first + k] = features_grad[i, first + k] + real(
+                    y[wp.static(OF_FEATURES) + k]
+                )
 
     return chain

@@ -34,7 +34,7 @@ def behind(transmittance: Any, alpha: Any, rule: int):
 
 
 @cache
-def blend_kernel(real: Any, width: int) -> Any:
+def build_blend(real: Any, width: int) -> Any:
     """The kernel that blends ``width`` channels (1 to 4) at once, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
     values = wp.types.vector(width, real)
@@ -105,8 +105,8 @@ def blend_kernel(real: Any, width: int) -> Any:
 
 
 @cache
-def adjoint_kernel(real: Any, width: int) -> Any:
-    """The adjoint of ``blend``, as :func:`blend_kernel` makes it."""
+def build_adjoint(real: Any, width: int) -> Any:
+    """The adjoint of ``blend``, as :func:`build_blend` makes it."""
     vec3 = wp.types.vector(3, real)
     values = wp.types.vector(width, real)
     sums_of_one = wp.types.vector(SUMS, real)
@@ -203,7 +203,7 @@ def adjoint_kernel(real: Any, width: int) -> Any:
 
 
 @cache
-def background_kernel(real: Any) -> Any:
+def build_background(real: Any) -> Any:
     """The adjoint of ``blend`` with respect to the background, for ``wp.float32`` or ``wp.float64``."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -225,7 +225,7 @@ def background_kernel(real: Any) -> Any:
 
 
 @cache
-def strongest_kernel(real: Any) -> Any:
+def build_strongest(real: Any) -> Any:
     """The kernel that finds each pixel's largest blending weights, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
     Splat = splat_of(real)

@@ -8,12 +8,10 @@ from the element to the first interaction point, and from the last to the receiv
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.channel.path_arrays import PathArrays, points_along
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class PairLengths:
         return replace(self, target=self.target[:, order], extra=self.extra[:, order], scale=scale)
 
 
-def plane_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
+def plane_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
     """Plane waves: projections on the directions of departure and arrival.
 
     Args:
@@ -86,7 +84,7 @@ def plane_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> P
     )
 
 
-def spherical_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
+def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
     """Line of sight and mirrors: distances from the transmitting elements' images."""
     tx, rx, bounces = _ends(paths)
     each, some = np.arange(len(bounces)), bounces > 0
@@ -102,7 +100,7 @@ def spherical_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) 
     return PairLengths(receiving, target, extra=far - length, scale=length / far, spherical=True)
 
 
-def scattered_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
+def scattered_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
     """Diffuse paths: distances to the first interaction point and from the last."""
     tx, rx, bounces = _ends(paths)
     first = paths.vertices[:, 0] - tx
@@ -112,7 +110,7 @@ def scattered_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) 
     return PairLengths(receiving, last[None], extra=each - near, scale=near / each, spherical=True)
 
 
-def _ends(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Transmitter, receiver and numbers of interactions, which spherical waves need."""
     if paths.transmitter is None or paths.receiver is None:
         raise ValueError("paths: got ones without transmitter and receiver, which spherical waves need")
@@ -127,10 +125,7 @@ def _ends(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _mirrorings(tx: np.ndarray, rx: np.ndarray, vertices: np.ndarray, bounces: np.ndarray) -> np.ndarray:
     """What the bounces do to directions, shape ``(P, 3, 3)``: a product of reflections."""
     count, depth = vertices.shape[:2]
-    each = np.arange(count)
-    points = np.concatenate([np.broadcast_to(tx, (count, 1, 3)), vertices, np.zeros((count, 1, 3))], axis=1)
-    points[each, bounces + 1] = rx
-    legs = np.diff(points, axis=1)
+    legs = np.diff(points_along(tx, vertices, rx), axis=1)
     legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
     turned = np.broadcast_to(np.eye(3), (count, 3, 3))
     for k in range(depth):

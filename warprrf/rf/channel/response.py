@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from warprrf.rf.channel.lengths import (
     scattered_lengths,
     spherical_lengths,
 )
+from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.sums import (
     LEAST_FREQUENCIES,
     Sum,
@@ -49,9 +50,6 @@ from warprrf.rf.channel.sums import (
 from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.em.waves import carrier_phase
 
-if TYPE_CHECKING:
-    from warprrf.rf.paths.path_set import Paths
-
 DENSE_TERMS = 1e6
 """``method="auto"`` sums more terms than that (pairs x paths x frequencies) on a grid."""
 
@@ -60,7 +58,7 @@ _SERIES = 1e-8  # where the series of the air's frequency dependence is cut
 
 
 def frequency_response(
-    paths: Paths,
+    paths: PathArrays,
     frequencies_hz: Any,
     *,
     tx_array: PlanarArray | None = None,
@@ -123,7 +121,7 @@ def frequency_response(
 
 
 def channel_taps(
-    paths: Paths,
+    paths: PathArrays,
     bandwidth_hz: float,
     l_min: int,
     l_max: int,
@@ -179,7 +177,7 @@ def channel_taps(
 
 
 def impulse_response(
-    paths: Paths,
+    paths: PathArrays,
     *,
     tx_array: PlanarArray | None = None,
     rx_array: PlanarArray | None = None,
@@ -228,7 +226,7 @@ def impulse_response(
 
 
 def diffuse_power(
-    paths: Paths, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
+    paths: PathArrays, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
 ) -> np.ndarray:
     """Mean power that diffuse paths of random phase add to |H_mn|^2 of any pair of elements, shape ``()`` or ``(R,)``.
 
@@ -252,11 +250,11 @@ def diffuse_power(
 
 
 class _Link:
-    """Paths of one receiver between two arrays, ready to be summed."""
+    """PathArrays of one receiver between two arrays, ready to be summed."""
 
     def __init__(
         self,
-        paths: Paths,
+        paths: PathArrays,
         tx: PlanarArray,
         rx: PlanarArray,
         wave: str,
@@ -357,7 +355,7 @@ def _factorial(k: int) -> float:
     return float(np.prod(np.arange(1.0, k + 1)))
 
 
-def _amplitudes(paths: Paths, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
+def _amplitudes(paths: PathArrays, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
     """Amplitudes between elements at the arrays' centres, shape ``(Kr, Kt, P)``."""
     if tx.polarisation is None and rx.polarisation is None:
         return (paths.gain * np.sqrt(tx.gain(paths.departure) * rx.gain(paths.arrival)))[None, None]
@@ -376,7 +374,7 @@ def _amplitudes(paths: Paths, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
 
 
 def _each_receiver(
-    paths: Paths,
+    paths: PathArrays,
     one: Callable[[_Link], np.ndarray],
     tx_array: PlanarArray | None,
     rx_array: PlanarArray | None,
@@ -393,7 +391,7 @@ def _each_receiver(
 
 
 def _links(
-    paths: Paths,
+    paths: PathArrays,
     tx_array: PlanarArray | None,
     rx_array: PlanarArray | None,
     wave: str,
@@ -421,7 +419,7 @@ def _links(
     return links
 
 
-def _turns(paths: Paths, diffuse: str | None, seed: int, receiver: int) -> np.ndarray | None:
+def _turns(paths: PathArrays, diffuse: str | None, seed: int, receiver: int) -> np.ndarray | None:
     """Factor of each path's amplitude; None if diffuse paths are left out."""
     if diffuse == "power":
         return None

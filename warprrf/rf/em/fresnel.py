@@ -12,7 +12,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
+from warprrf.rf.em.waves import SPEED_OF_LIGHT as SPEED_OF_LIGHT
+
 LAMBERTIAN = 0
 """Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""
 

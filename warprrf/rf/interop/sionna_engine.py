@@ -19,7 +19,7 @@ from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.interop.llvm import select_llvm
-from warprrf.rf.interop.sionna_paths import repeated
+from warprrf.rf.paths.sionna import repeated
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
 

@@ -105,7 +105,7 @@ class BounceTracer:
         self.loss_per_m = float(loss_per_m)
         self.device = _device.resolve(device)
         # On a CPU Embree is three times as fast as the search inside the kernels, and worth being loaded for a grid.
-        self._searches = not _device.is_cuda(self.device) and o3d.installed()
+        self._searches = not self.device.is_cuda and o3d.installed()
         self.directions, self.solid_angle = sub_pixel_directions(shape, sub_pixels)
         self._directions = wp.array(self.directions, dtype=wp.vec3d, device=self.device)
         self._solid_angle = wp.array(self.solid_angle, dtype=wp.float32, device=self.device)

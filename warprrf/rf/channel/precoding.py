@@ -29,7 +29,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from warprrf.rf.channel.beams import _chunks, _codebook, _rays, _squared
-from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
 
 METHODS = ("mr", "zf", "slnr")
@@ -54,7 +54,7 @@ def transmit_covariance(sources: Any, tx_array: Any, rx_array: Any = None, *, rx
             users.
     """
     tx, book = _codebook("tx_array", tx_array).array, _codebook("rx_array", rx_array)
-    given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | Paths) else sources
+    given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
     rays = [found for source in given for found in _rays(source, _codebook("tx_array", tx_array))]
     if not rays:
         raise ValueError("sources: got none, expected a spectrum or paths for every user")

@@ -15,10 +15,9 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import carrier_phase, check_frequency
-from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase, check_frequency
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 SPECULAR, DIFFUSE = 1, 2
@@ -53,7 +52,7 @@ class SionnaPaths:
     interactions: np.ndarray
     vertices: np.ndarray
     synthetic_array: bool
-    _paths: Paths
+    _paths: PathArrays
     _options: dict[str, Any]
 
     def cir(
@@ -119,7 +118,7 @@ class SionnaPaths:
 
 
 def to_sionna(
-    paths: Paths,
+    paths: PathArrays,
     tx_array: PlanarArray | None = None,
     rx_array: PlanarArray | None = None,
     *,
@@ -135,7 +134,7 @@ def to_sionna(
     Raises:
         ValueError: as there.
     """
-    several = paths if paths.batched else Paths.stack([paths])
+    several = paths.as_several()
     options: dict[str, Any] = {"tx_array": tx_array, "rx_array": rx_array, "diffuse": diffuse, "seed": seed}
     coefficient, tau = impulse_response(several, **options)
     valid = several.valid & np.isfinite(tau)
@@ -167,26 +166,9 @@ def to_sionna(
 
 
 def from_sionna(
-    paths: Any, *, frequency_hz: float, transmitter: int = 0, drop_repeated: bool = False
-) -> Paths:
-    """Paths of ``sionna.rt.Paths`` from one transmitter to all receivers, with their Jones matrices.
-
-    Sionna's arrays must be one isotropic element of polarisation "VH" at either end, unrotated: their four coefficients
-    are the Jones matrix. The phase of ``gain`` is that of the delay alone.
-
-    Args:
-        paths: What a ``PathSolver`` returned, with ``synthetic_array=True``.
-        frequency_hz: The scene's carrier [Hz].
-        transmitter: Index of the transmitter.
-        drop_repeated: Leave out specular paths that repeat another one: Sionna counts a mirror of many small triangles
-            several times.
-
-    Returns:
-        Arrays ``(R, L)``, strongest path first.
-
-    Raises:
-        ValueError: for other arrays, or paths through or round obstacles (refraction, diffraction).
-    """
+    paths: Any, frequency_hz: float, transmitter: int, drop_repeated: bool
+) -> list[dict[str, Any]]:
+    """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
     carrier = check_frequency(frequency_hz)
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
     if not paths.synthetic_array or real.shape[1] != 2 or real.shape[3] != 2:
@@ -231,23 +213,24 @@ def from_sionna(
         turned = carrier_phase(carrier, tau[r, here])
         jones = np.moveaxis(a[r][:, :, here], -1, 0) * turned[:, None, None]
         gain = np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2))) * turned
-        one = Paths(
-            gain=gain,
-            tau=tau[r, here],
-            theta_r=angles[0][r, here],
-            phi_r=angles[1][r, here],
-            theta_t=angles[2][r, here],
-            phi_t=angles[3][r, here],
-            vertices=np.where((bounce != 0)[..., None], points[r, here], np.nan),
-            kind=np.where(count == 0, "los", np.where(diffuse, "diffuse", "mirror")).astype("<U7"),
-            valid=np.ones(len(here), dtype=bool),
-            jones=jones,
-            frequency_hz=carrier,
-            transmitter=sources[transmitter],
-            receiver=targets[r],
+        order = np.argsort(-np.abs(gain), kind="stable")
+        arrays = {
+            "gain": gain,
+            "tau": tau[r, here],
+            "theta_r": angles[0][r, here],
+            "phi_r": angles[1][r, here],
+            "theta_t": angles[2][r, here],
+            "phi_t": angles[3][r, here],
+            "vertices": np.where((bounce != 0)[..., None], points[r, here], np.nan),
+            "kind": np.where(count == 0, "los", np.where(diffuse, "diffuse", "mirror")).astype("<U7"),
+            "valid": np.ones(len(here), dtype=bool),
+            "jones": jones,
+        }
+        found.append(
+            {name: values[order] for name, values in arrays.items()}
+            | {"frequency_hz": carrier, "transmitter": sources[transmitter], "receiver": targets[r]}
         )
-        found.append(one.select(np.argsort(-np.abs(gain), kind="stable")))
-    return Paths.stack(found)
+    return found
 
 
 def repeated(tau: np.ndarray, arrival: np.ndarray, aod: np.ndarray, bounces: np.ndarray) -> np.ndarray:
