@@ -9,10 +9,13 @@ import warp as wp
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "helpers"), str(HERE), str(HERE.parent)]
 
-NO_CUDA = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: none here")
+
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("cuda") and not wp.is_cuda_available():
+        pytest.skip("needs a CUDA device: none here")
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=[NO_CUDA, pytest.mark.cuda])])
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def device(request):
     """Warp's default device while a test runs: the CPU, and again a GPU where there is one."""
     with wp.ScopedDevice(request.param):

@@ -15,7 +15,6 @@ from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
 from warprrf.geometry.splats.render import render
 from warprrf.kernels.raster.blocks import BLOCK
 
-needs_cuda = pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: none here")
 CAMERAS = {
     "pinhole": photo(70, 45),
     "spherical": panorama(33, 66),
@@ -168,7 +167,7 @@ def test_features_need_not_be_contiguous():
     assert straight.features.numpy().max() > 0.3
 
 
-OTHERS = [{"per_pixel": True}, pytest.param({"device": "cuda:0"}, marks=[needs_cuda, pytest.mark.cuda])]
+OTHERS = [{"per_pixel": True}, pytest.param({"device": "cuda:0"}, marks=pytest.mark.cuda)]
 
 
 @pytest.mark.parametrize("other", OTHERS, ids=["reference", "cuda"])
