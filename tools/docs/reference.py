@@ -95,7 +95,7 @@ def _module_page(name: str, module: ModuleType) -> str:
         known = inspect.isclass(found) or inspect.isfunction(found)
         listed = hasattr(module, "__path__") or getattr(found, "__module__", "") == module.__name__
         if known and listed and not member.startswith("_"):
-            parts.append(_entry(found.__module__, member, found) if member not in dir(warprrf) else "")
+            parts.append(_entry(module.__name__, member, found) if member not in dir(warprrf) else "")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
