@@ -22,8 +22,8 @@ from benchmarks.data import VERSIONS, Geometry
 from benchmarks.report import Row
 from warprrf.device import Progress
 from warprrf.files import write_atomically
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.em.materials import Material
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra import lookups, metrics

@@ -10,7 +10,7 @@ included; ours has the room's mesh.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from benchmarks.report import Report, cell, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress
 from warprrf.rf.interop.newrf import NewrfRays, load_newrf, match_rays
-from warprrf.rf.paths.mirror_chains import MirrorChains, mirror_chains
+from warprrf.rf.paths.mirror_paths import MirrorPaths
 from warprrf.rf.paths.reflections import fit_reflections
 from warprrf.rf.paths.trace import MirrorTracer
 
@@ -80,7 +80,7 @@ def run(options: Options, job: Job) -> Report:
         rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=job.device
     )
     start = time.perf_counter()
-    chains = mirror_chains(tracer, rays.receivers, 2)
+    chains = tracer.find(rays.receivers, 2)
     trace_s = time.perf_counter() - start
     job.progress("rays", 2, 2)
     other = np.concatenate([match.extra_receiver, match.receiver[~match.found]])
@@ -100,7 +100,7 @@ def run(options: Options, job: Job) -> Report:
 
 
 def _predictions(
-    rays: NewrfRays, chains: MirrorChains, counts: tuple[int, ...], other: np.ndarray, tick: Progress
+    rays: NewrfRays, chains: MirrorPaths, counts: tuple[int, ...], other: np.ndarray, tick: Progress
 ) -> list[dict[str, Any]]:
     """Rows of the table; every method predicts the same held-out receivers."""
     held_out = rays.split()[1]
@@ -157,18 +157,12 @@ def _predictions(
     return rows
 
 
-def _of(chains: MirrorChains, chosen: np.ndarray, count: int) -> MirrorChains:
+def _of(chains: MirrorPaths, chosen: np.ndarray, count: int) -> MirrorPaths:
     """The chains of some receivers, numbered anew."""
     number = np.full(count, -1)
     number[chosen] = np.arange(len(chosen))
-    keep = number[chains.receiver] >= 0
-    return MirrorChains(
-        number[chains.receiver[keep]],
-        chains.patch[keep],
-        chains.vertices[keep],
-        chains.length_m[keep],
-        chains.last_point[keep],
-    )
+    kept = chains.subset(np.flatnonzero(number[chains.receiver] >= 0))
+    return replace(kept, receiver=number[kept.receiver])
 
 
 def text(figures: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from benchmarks.bistatic import checks, table
 from benchmarks.bistatic.table import COMPARED, HARMONIC, UNTAUGHT
 from benchmarks.methods import METHODS, Effort, point_at_transmitter
 from benchmarks.runner import Job, execute
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra import lookups
 from warprrf.rf.spectra.metrics import angle_deg, strongest_direction
 from warprrf.steps import Attempt

@@ -28,7 +28,7 @@ from benchmarks.evaluation.runs import pictures_of, sweep
 from benchmarks.methods import METHODS, Effort
 from benchmarks.runner import Job, execute
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.metrics import angle_deg
 from warprrf.rf.spectra.spectrum import pixel_directions
 from warprrf.steps import Steps
