@@ -36,8 +36,10 @@ def setup(app: Any) -> dict[str, bool]:
 def make_files(app: Any) -> None:
     """Write the reference's pages and the figures below ``docs/`` (not kept in the repository)."""
     os.environ["COLUMNS"] = "92"  # argparse's help is as wide on every machine
-    for path, text in {**reference.pages(), **plots.figures()}.items():
-        file = Path(app.srcdir) / path
+    made = {Path(app.srcdir) / path: text for path, text in {**reference.pages(), **plots.figures()}.items()}
+    for old in (f for folder in {file.parent for file in made} for f in folder.glob("*") if f not in made):
+        old.unlink()
+    for file, text in made.items():
         file.parent.mkdir(exist_ok=True)
         if not file.is_file() or file.read_text() != text:
             file.write_text(text)
