@@ -18,6 +18,7 @@ from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.domains.python import PyObject
 
+FIELD = re.compile(r"^:(?:param|ivar) \w+(?:, \w+)+:")
 MADE = re.compile(r"<!-- (table|figure): ([\w-]+) -->")
 
 
@@ -26,6 +27,7 @@ def setup(app: Any) -> dict[str, bool]:
     next(field for field in PyObject.doc_field_types if field.name == "variable").label = "Attributes"
     app.connect("builder-inited", make_files)
     app.connect("source-read", put_tables)
+    app.connect("autodoc-process-docstring", whole_sentences, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", escape_bars)
     app.add_html_math_renderer(
         "mathml", inline_renderers=(inline_math, None), block_renderers=(block_math, None)
@@ -58,9 +60,16 @@ def put_tables(app: Any, name: str, source: list[str]) -> None:
     source[0] = MADE.sub(put, source[0])
 
 
+def whole_sentences(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
+    """A colon in the docstring of a property ends no type."""
+    if what in ("attribute", "property", "data"):
+        lines.insert(0, "")
+
+
 def escape_bars(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
-    """Absolute values in docstrings are no substitutions of reStructuredText."""
+    """Absolute values are no substitutions of reStructuredText, and several names of one field no type and name."""
     for i, line in enumerate(lines):
+        line = FIELD.sub(lambda m: m[0].replace(", ", ","), line)
         parts = line.split("``")
         parts[::2] = [re.sub(r"(?<!\\)\|", r"\\|", part) for part in parts[::2]]
         lines[i] = "``".join(parts)
