@@ -19,6 +19,7 @@ from latex2mathml.converter import convert
 from sphinx.domains.python import PyObject
 
 FIELD = re.compile(r"^:(?:param|ivar) \w+(?:, \w+)+:")
+MARK = "(no type)"
 MADE = re.compile(r"<!-- (table|figure): ([\w-]+) -->")
 
 
@@ -63,11 +64,12 @@ def put_tables(app: Any, name: str, source: list[str]) -> None:
 def whole_sentences(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
     """A colon in the docstring of a property ends no type."""
     if what in ("attribute", "property", "data"):
-        lines.insert(0, "")
+        lines.insert(0, MARK)
 
 
 def escape_bars(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
     """Absolute values are no substitutions of reStructuredText, and several names of one field no type and name."""
+    lines[:] = [line for line in lines if line.strip() != MARK]
     for i, line in enumerate(lines):
         line = FIELD.sub(lambda m: m[0].replace(", ", ","), line)
         parts = line.split("``")
