@@ -19,7 +19,7 @@ from benchmarks.engine.forms import RASTERISER
 from benchmarks.markdown import table
 from benchmarks.pictures import write_page
 from warprrf.geometry.splats.rasterizer import RADIO
-from warprrf.rf.fields.harmonic.single_bounce import FieldOptions
+from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.fields.harmonic.transport import ALPHA_MIN, TOP_K
 
 Row = dict[str, Any]
