@@ -134,8 +134,11 @@ def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:
     from sionna_room import sionna_or_skip, write_scene
 
     sionna = sionna_or_skip()
+    from warprrf.rf.interop.sionna_engine import Sampling
+
     common = {
-        "transmitter": [-5.0, 3.5, 2.7], "frequency_hz": F, "shape": SHAPE, "depth": 2, "samples": 20_000,
+        "transmitter": [-5.0, 3.5, 2.7], "frequency_hz": F, "shape": SHAPE,
+        "sampling": Sampling(depth=2, samples=20_000),
     }  # fmt: skip
     room = write_scene(tmp_path)
     off, on = (sionna(room, gas=gas, **common).solve([3.0, 4.0, 1.4]) for gas in (False, True))

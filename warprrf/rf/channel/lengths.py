@@ -44,29 +44,30 @@ class PairLengths:
         """Whether there is one element at either end, at the centre."""
         return len(self.place) == 1 and len(self.extra) == 1
 
-    def received(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Of separable ones: length [m] that receiving elements ``m`` add, ``(m, P)``, and factor of amplitudes."""
+    def received(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of separable ones: length [m] that receiving elements add, ``(M, P)``, and factor of amplitudes."""
         if not self.spherical:
-            return -(self.place[m] @ self.target[0].T), np.ones((1, 1))
-        source = self.target[0]
-        reach = np.linalg.norm(source - self.place[m][:, None], axis=-1)
-        far = np.linalg.norm(source, axis=-1)
+            return -(self.place @ self.target[0].T), np.ones((1, 1))
+        reach, far = self._reach(self.target[0], self.place[:, None])
         return reach - far, far / reach
 
-    def longer(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Added length [m] and factor of amplitudes for receiving elements ``m``, each ``(m, N, P)``."""
+    def longer(self) -> tuple[np.ndarray, np.ndarray]:
+        """Added length [m] and factor of amplitudes, each ``(M, N, P)``."""
         if self.separable:
-            added, ratio = self.received(m)
+            added, ratio = self.received()
             return added[:, None] + self.extra, ratio[:, None] * self.scale
-        source = self.target
-        reach = np.linalg.norm(source - self.place[m][:, None, None], axis=-1)
-        far = np.linalg.norm(source, axis=-1)
+        reach, far = self._reach(self.target, self.place[:, None, None])
         return self.extra + (reach - far), self.scale * (far / reach)
 
-    def taken(self, order: np.ndarray) -> PairLengths:
-        """Those of paths ``order``."""
-        scale = self.scale if self.scale.shape[1] == 1 else self.scale[:, order]
-        return replace(self, target=self.target[:, order], extra=self.extra[:, order], scale=scale)
+    @staticmethod
+    def _reach(source: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.linalg.norm(source - place, axis=-1), np.linalg.norm(source, axis=-1)
+
+    def between(self, m: slice, n: slice) -> PairLengths:
+        """Those of receiving elements ``m`` and transmitting ones ``n``."""
+        target = self.target if self.separable else self.target[n]
+        scale = self.scale if len(self.scale) == 1 else self.scale[n]
+        return replace(self, place=self.place[m], target=target, extra=self.extra[n], scale=scale)
 
 
 def plane_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:

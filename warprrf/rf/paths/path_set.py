@@ -7,14 +7,20 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.dispersion import Dispersion, dispersion
 from warprrf.rf.channel.path_arrays import PathArrays
-from warprrf.rf.channel.response import channel_taps, diffuse_power, frequency_response, impulse_response
+from warprrf.rf.channel.response import (
+    LinkOptions,
+    channel_taps,
+    diffuse_power,
+    frequency_response,
+    impulse_response,
+)
 from warprrf.rf.paths import files, sionna
 
 
@@ -27,17 +33,32 @@ class Paths(PathArrays):
     ``air``: see :class:`~warprrf.rf.channel.path_arrays.PathArrays`.
     """
 
-    def cir(self, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    def cir(self, **link: Unpack[LinkOptions]) -> tuple[np.ndarray, np.ndarray]:
         """Impulse response, one coefficient a path; see :func:`warprrf.rf.channel.response.impulse_response`."""
-        return impulse_response(self, **options)
+        return impulse_response(self, **link)
 
-    def cfr(self, frequencies_hz: Any, **options: Any) -> np.ndarray:
+    def cfr(
+        self,
+        frequencies_hz: Any,
+        *,
+        amplitude: str = "carrier",
+        method: str = "auto",
+        **link: Unpack[LinkOptions],
+    ) -> np.ndarray:
         """Frequency response; see :func:`warprrf.rf.channel.response.frequency_response`."""
-        return frequency_response(self, frequencies_hz, **options)
+        return frequency_response(self, frequencies_hz, amplitude=amplitude, method=method, **link)
 
-    def taps(self, bandwidth_hz: float, l_min: int, l_max: int, **options: Any) -> np.ndarray:
+    def taps(
+        self,
+        bandwidth_hz: float,
+        l_min: int,
+        l_max: int,
+        *,
+        center_hz: float | None = None,
+        **link: Unpack[LinkOptions],
+    ) -> np.ndarray:
         """Taps of the discrete baseband channel; see :func:`warprrf.rf.channel.response.channel_taps`."""
-        return channel_taps(self, bandwidth_hz, l_min, l_max, **options)
+        return channel_taps(self, bandwidth_hz, l_min, l_max, center_hz=center_hz, **link)
 
     def diffuse_power(
         self, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
