@@ -25,7 +25,7 @@ def find_photos(photos: Any) -> dict[str, Path]:
         ValueError: if the folder or files do not exist, or too few photos are there.
     """
     if isinstance(photos, str | os.PathLike):
-        root = Path(photos)
+        root = Path(photos).absolute()
         if not root.is_dir():
             raise ValueError(
                 f"photos: {root} is not a folder; expected a folder of photos or a list of image files"
@@ -40,7 +40,7 @@ def find_photos(photos: Any) -> dict[str, Path]:
         parents = {str(p.resolve().parent) for p in files}
         root = Path(os.path.commonpath(parents)) if parents else Path()
         files = [p.resolve() for p in files]
-    named = {p.relative_to(root).as_posix(): p.resolve() for p in files}
+    named = {p.relative_to(root).as_posix(): p for p in files}
     if len(named) < MIN_PHOTOS:
         raise ValueError(
             f"photos: got {len(named)} photos in {root}, expected at least {MIN_PHOTOS} "

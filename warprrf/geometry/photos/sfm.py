@@ -141,17 +141,10 @@ def _quiet(colmap: ModuleType) -> Iterator[None]:
         colmap.logging.minloglevel = before
 
 
-def _linked(folder: Path, named: Mapping[str, Path]) -> Path:
-    """``folder`` with the photos under their names, which is where COLMAP looks for them."""
-    shutil.rmtree(folder, ignore_errors=True)
-    for name, path in named.items():
-        link = folder / name
-        link.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            link.symlink_to(path)
-        except OSError:  # a file system without links
-            shutil.copyfile(path, link)
-    return folder
+def _root(named: Mapping[str, Path]) -> Path:
+    """The folder that photos' names are relative to, which is where COLMAP looks for them."""
+    name, path = next(iter(named.items()))
+    return path.parents[name.count("/")]
 
 
 def _copied(source: Path, target: Path) -> Path:
@@ -176,7 +169,7 @@ def _extract(
     """Features of the photos, into ``features.db``."""
     max_features, camera_model = settings
     names = list(named)
-    images = _linked(attempt.folder / "images", named)
+    images = _root(named)
     working = attempt.folder / "features.db"
     working.unlink(missing_ok=True)
     colmap.Database.open(str(working)).close()
@@ -288,7 +281,7 @@ def _map(
 ) -> list[int]:
     """Poses and points from the matches, into the folder ``model``; returns how many photos smaller models hold."""
     working = _copied(folder / "matches.db", attempt.folder / "matches.db")
-    images, report = _linked(attempt.folder / "images", named), attempt.progress
+    images, report = _root(named), attempt.progress
     options = colmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time
