@@ -67,7 +67,7 @@ def _psnr() -> Any:
         ax.set_xticks([10, 50, 100, 400], ["10", "50", "100", "400"])
         ax.minorticks_off()
     axes[0].set_ylabel("PSNR [dB]")
-    axes[0].legend(fontsize=7)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7)
     return figure
 
 
@@ -136,5 +136,5 @@ def _ablation() -> Any:
     ax.set_yticks(range(len(names)), names)
     ax.invert_yaxis()
     ax.set_xlabel("PSNR [dB]")
-    ax.legend(fontsize=7)
+    ax.legend(fontsize=7, loc="lower right")
     return figure

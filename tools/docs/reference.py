@@ -21,7 +21,7 @@ GROUPS = {
     "rf.spectra": ("Spectra", "One spectrum, data sets of many, and how predictions are scored."),
     "rf.fields": (
         "Radio fields",
-        "Stage 2: fitted models of a place, asked for spectra, paths, links and maps.",
+        "Stage 2: fitted models of a place, which give spectra, paths, links and maps.",
     ),
 }
 WITH = {
@@ -95,7 +95,7 @@ def _module_page(name: str, module: ModuleType) -> str:
         known = inspect.isclass(found) or inspect.isfunction(found)
         listed = hasattr(module, "__path__") or getattr(found, "__module__", "") == module.__name__
         if known and listed and not member.startswith("_"):
-            parts.append(_entry(found.__module__, member, found) if member not in dir(warprrf) else "")
+            parts.append(_entry(module.__name__, member, found) if member not in dir(warprrf) else "")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

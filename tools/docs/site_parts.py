@@ -35,7 +35,7 @@ def setup(app: Any) -> dict[str, bool]:
 
 def make_files(app: Any) -> None:
     """Write the reference's pages and the figures below ``docs/`` (not kept in the repository)."""
-    os.environ["COLUMNS"] = "96"  # argparse's help is as wide on every machine
+    os.environ["COLUMNS"] = "92"  # argparse's help is as wide on every machine
     for path, text in {**reference.pages(), **plots.figures()}.items():
         file = Path(app.srcdir) / path
         file.parent.mkdir(exist_ok=True)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.antenna import _sampled
 from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
 

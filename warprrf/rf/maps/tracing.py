@@ -15,7 +15,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.bounces import Met
 from warprrf.rf.fields.bistatic.field import BistaticField

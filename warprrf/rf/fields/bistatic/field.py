@@ -26,7 +26,7 @@ import numpy as np
 from warprrf.device import check_array
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air, air_of
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files
 from warprrf.rf.fields.bistatic.bounces import BounceTracer

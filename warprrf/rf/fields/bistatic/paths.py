@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.sight import Composed, Sight
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.spectrum import angles_from_directions
