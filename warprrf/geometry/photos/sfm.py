@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, require
-from warprrf.geometry.photos.photo_files import MIN_PHOTOS, check_photos, find_photos, some
+from warprrf.geometry.photos.photo_files import MIN_PHOTOS, Photos, check_photos, find_photos, some
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.splats.camera import Camera
 from warprrf.steps import Attempt, Steps
@@ -39,7 +39,7 @@ MATCH_BATCH = 400
 
 
 def structure_from_motion(
-    photos: Any,
+    photos: Photos,
     *,
     workspace: str | os.PathLike[str],
     max_features: int = 2400,

@@ -1,4 +1,4 @@
-"""What refinement starts from: the sparse points cleaned, their planes found, completed and covered with Gaussians."""
+"""Before the refinement: sparse points cleaned, their planes found, completed and covered with Gaussians."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 
 
-def start_of(
+def initialise(
     sparse: SparseModel,
     cameras: Mapping[str, Camera],
     images: Sequence[np.ndarray],
