@@ -11,13 +11,13 @@ from views import look
 
 import warprrf as wr
 from warprrf.geometry import geometry_files as files
-from warprrf.geometry.photos import pipeline as from_photos
+from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.photos import sparse
 from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
 from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
-from warprrf.geometry.photos.pipeline import reconstruct
 from warprrf.geometry.photos.planes import Plane, plane_axes
+from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.discs import discs_on_mesh
 
