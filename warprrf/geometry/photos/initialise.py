@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.geometry.photos.cells import occupancy, seen_cells
+from warprrf.geometry.photos.cells import meeting, occupancy, seen_cells
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
 from warprrf.geometry.photos.planes import Plane, aligned
@@ -76,7 +76,7 @@ def initialise(
                 levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
                 report("planes", 3 + k, 5)
             planes = joined(planes, levels, config.sweep)
-    planes = seen_cells(planes, list(sparse.cameras.values()))
+    planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
     gaussians = initial_gaussians(
         points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
     )
