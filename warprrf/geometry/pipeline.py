@@ -18,20 +18,20 @@ from numpy.typing import ArrayLike
 
 from warprrf.device import Progress
 from warprrf.geometry import geometry_files as files
+from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.initialise import initialise
 from warprrf.geometry.photos.photo_files import Photos, find_photos, match_names, read_photo
 from warprrf.geometry.photos.refine import refine
-from warprrf.geometry.photos.sfm import structure_from_motion
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {"initial": 1, "refined": 1, "surface": 1}
-"""Of the steps after structure from motion: counted up by whoever changes what a step computes."""
+VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 1, "surface": 1}
+"""Of all steps: counted up by whoever changes what a step computes."""
 
 
 def reconstruct(
@@ -75,7 +75,7 @@ def reconstruct(
     if known_positions is not None:
         match_names("known_positions", known_positions, list(named))
 
-    sparse = structure_from_motion(
+    sparse = sfm.structure_from_motion(
         photos,
         workspace=workspace,
         max_features=config.max_features,

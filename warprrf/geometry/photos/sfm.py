@@ -27,6 +27,9 @@ from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.splats.camera import Camera
 from warprrf.steps import Attempt, Steps
 
+VERSIONS = {"features": 1, "matches": 1, "model": 1}
+"""Of the steps: counted up by whoever changes what a step computes."""
+
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 
 # Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
@@ -96,11 +99,11 @@ def structure_from_motion(
     with Steps(folder, progress=progress) as steps, _quiet(colmap):
         colmap.set_random_seed(seed)
         inputs = [list(named), list(named.values()), max_features, camera_model, colmap.__version__]
-        steps.run("features", features, version=1, inputs=inputs, outputs=["features.db"])
+        steps.run("features", features, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
         inputs = [steps.key("features"), pairs, seed]
-        steps.run("matches", matches, version=1, inputs=inputs, outputs=["matches.db"])
+        steps.run("matches", matches, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
         inputs = [steps.key("matches"), seed]
-        found = steps.run("model", model, version=1, inputs=inputs, outputs=["model"])
+        found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _sparse_model(colmap.Reconstruction(str(folder / "model")), list(named))
         return replace(result, other_models=tuple(found["other_models"]))
 
