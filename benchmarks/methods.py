@@ -21,8 +21,8 @@ from warprrf.device import Progress
 from warprrf.marks import code_mark
 from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.sight import Sight
-from warprrf.rf.fields.bistatic.training import BistaticTransport
+from warprrf.rf.fields.bistatic.training import TrainingViews
+from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.fields.harmonic.field import HarmonicField
 from warprrf.rf.spectra import lookups
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -171,7 +171,7 @@ def point_at_transmitter(ds: SpectrumDataset, device: Any = None) -> Callable[[A
     return predict
 
 
-def sight_of(rays: BistaticTransport) -> Callable[[Any], Sight]:
+def view_of(rays: TrainingViews) -> Callable[[Any], ReceiverView]:
     """What was traced for a receiver, by its position."""
-    known = {s.receiver.tobytes(): s for s in rays.sights}
+    known = {v.receivers[0].tobytes(): v for v in rays.views}
     return lambda receiver: known[np.asarray(receiver, np.float64).tobytes()]

@@ -98,8 +98,8 @@ def run_map(
         wanted += [(shape, FEWER_MIRRORS) for shape in shapes[:-1]]
     steps = len(wanted) + len(samples) + 2
     started = time.perf_counter(), time.process_time()
-    fitted.sent(fitted.transmitter)  # once for a transmitter, whatever the map
-    fitted.mirror_tree(fitted.transmitter)
+    fitted.sent_radiance(fitted.transport())  # once for a transmitter, whatever the map
+    fitted.transport().mirror_tree(fitted.terms.mirror_order)
     prepared = _spent(started)
     maps: list[RadioMap] = []
     fitted.radio_map(height, 8.0 * cell)  # kernels are loaded

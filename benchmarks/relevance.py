@@ -151,11 +151,11 @@ def _judge(full: BistaticField, found: list[Relevance], receivers: np.ndarray) -
     images: list[list[np.ndarray]] = [[] for _ in fields]
     seconds = np.zeros((len(fields), len(receivers)))
     for field in fields:
-        field.compose(field.see(receivers[0]))
+        field.render(field.view(receivers[0]))
     for r, receiver in enumerate(receivers):
         for k, field in enumerate(fields):
             start = time.perf_counter()
-            images[k].append(field.compose(field.see(receiver)).image)
+            images[k].append(field.render(field.view(receiver)).image)
             seconds[k, r] = time.perf_counter() - start
     truth, rows = np.stack(images[0]), []
     for k, one in enumerate(found, start=1):

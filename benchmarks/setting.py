@@ -16,7 +16,7 @@ import warprrf as wr
 from benchmarks.lobby.spectra import FILES
 from benchmarks.stages import fingerprint
 from warprrf.device import Progress
-from warprrf.rf.fields.bistatic.training import BistaticTransport, trace
+from warprrf.rf.fields.bistatic.training import TrainingViews, trace
 from warprrf.rf.fields.files import fingerprint as fingerprint_arrays
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -90,7 +90,7 @@ class Geometry:
 
     def __init__(self, reconstruction: Path, scene: Path, device: Any = None) -> None:
         self.folder, self.xml, self.device = reconstruction, scene, device
-        self._rays: dict[str, tuple[str, BistaticTransport]] = {}
+        self._rays: dict[str, tuple[str, TrainingViews]] = {}
         self._weights: dict[str, tuple[str, Transport, float]] = {}
 
     @cached_property
@@ -122,17 +122,15 @@ class Geometry:
         *,
         slot: str = "train",
         true: bool = False,
-        lobes: tuple[int, ...] | None = None,
         progress: Progress | None = None,
-    ) -> BistaticTransport:
+    ) -> TrainingViews:
         """What the receivers of ``ds`` see of the reconstruction, or of the true scene; one set is kept per slot."""
-        key = fingerprint([ds.receivers, ds.transmitter, ds.frequency_hz, list(ds.shape), true, lobes or ()])
+        key = fingerprint([ds.receivers, ds.transmitter, ds.frequency_hz, list(ds.shape), true])
         if self._rays.get(slot, ("",))[0] != key:
             self._rays.pop(slot, None)  # hundreds of receivers fill gigabytes: not two sets at once
             seen = trace(
                 self.scene if true else self.reconstruction,
                 ds,
-                lobes=lobes,
                 device=self.device,
                 progress=progress,
             )

@@ -178,7 +178,7 @@ toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
 rows = []
 for shape in ((15, 30), (30, 60), (60, 120)):
     coarse = replace(field, shape=shape)
-    coarse.tracer, coarse.beam  # made once for a grid
+    coarse.spectrum(seen[0])  # set-up, made once for a grid
     seconds, spectra = seconds_of(lambda coarse=coarse: [coarse.spectrum(p) for p in near], repeats=1)
     angle = []
     for spectrum, direction in zip(spectra, toward, strict=True):

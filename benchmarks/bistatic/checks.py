@@ -13,16 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.bistatic.methods import sight_of
+from benchmarks.bistatic.adam import fit_groups_adam
+from benchmarks.bistatic.methods import view_of
 from benchmarks.setting import Geometry, Truth
 from warprrf.device import Progress
 from warprrf.rf.fields.bistatic import fit as group_fit
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.training import ROWS
+from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.response import SpectrumPixels, respond
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.training import Selection
 from warprrf.rf.fields.bistatic.uncertainty import negative_log_likelihood
 from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra import metrics
+from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import pixel_directions, to_db
 
@@ -60,14 +65,14 @@ def ablation(
     Receivers are asked with cached rays, so ``seconds_per_spectrum`` is without them.
     """
     train = truth.train(count)
-    rays = geometry.rays(train, true=true, lobes=options.get("lobes"), progress=progress)
+    rays = geometry.rays(train, true=true, progress=progress)
     place = geometry.scene if true else geometry.reconstruction
     field = BistaticField.fit(
         place, train, transport=rays, device=geometry.device, progress=progress, **options
     )
-    sight = sight_of(geometry.rays(truth.test, slot="test", true=true, progress=progress))
+    view = view_of(geometry.rays(truth.test, slot="test", true=true, progress=progress))
     found = metrics.evaluate(
-        truth.test, lambda rx: field.spectrum(rx, sight=sight(rx)), progress=progress
+        truth.test, lambda rx: field.spectrum(rx, view=view(rx)), progress=progress
     )  # fmt: skip
     return {"fit_s": field.report["fit_time_s"], "choices": field.report["choices"], **found}
 
@@ -125,28 +130,29 @@ def optimisers(truth: Truth, count: int, geometry: Geometry, seed: int, progress
     """
     train = truth.train(count)
     rays = geometry.rays(train, progress=progress)
-    start = BistaticField.prior(rays.surface, train, device=geometry.device)
+    beam, lobes = BeamOperator(train.shape, train.beam_sigma_rad, device=geometry.device), Terms().lobes
     rng = np.random.default_rng(seed)
     pixels = train.shape[0] * train.shape[1]
     target = to_db(train.path_gain, train.floor) - 10.0 * np.log10(train.floor)
-    views = []
-    for r, sight in enumerate(rays.sights):
-        chosen = np.sort(rng.choice(pixels, min(pixels, max(200, ROWS // count)), replace=False))
-        views.append(start.view(sight, chosen, target[r]).tied(rays.surface.material))
-        progress("views", r + 1, len(rays.sights))
+    most, readings = min(pixels, max(200, Selection().readings // count)), []
+    for r, view in enumerate(rays.views):
+        chosen = np.sort(rng.choice(pixels, most, replace=False))
+        response = respond(view, SpectrumPixels(beam, chosen), lobes, train.floor)
+        readings.append(group_fit.Reading(response, target[r].ravel()[chosen]).tied(rays.surface.material))
+        progress("views", r + 1, len(rays.views))
     surface = rays.surface
     area = np.bincount(surface.material[surface.group], surface.mesh.areas)
-    prior = group_fit.Parameters.prior(len(area), len(start.terms.lobes))
-    group_fit.objective(views, prior)  # tables are made on first use, which is no fit's time
+    prior = Parameters.prior(len(area), len(lobes))
+    group_fit.objective(readings, prior, 3.0)  # tables are made on first use, which is no fit's time
     times: list[float] = []
     began = time.perf_counter()
     newton = group_fit.fit_groups(
-        views, prior, area, progress=lambda *_: times.append(time.perf_counter() - began)
+        readings, prior, area, progress=lambda *_: times.append(time.perf_counter() - began)
     )
     newton_s = time.perf_counter() - began
     progress("optimisers", 1, 2)
     began = time.perf_counter()
-    adam = group_fit.fit_groups_adam(views, prior, area, steps=ADAM_STEPS)
+    adam = fit_groups_adam(readings, prior, area, steps=ADAM_STEPS)
     adam_s = time.perf_counter() - began
     progress("optimisers", 2, 2)
     losses = [adam.losses[0], *newton.losses]  # both start from the same parameters
@@ -163,7 +169,7 @@ def optimisers(truth: Truth, count: int, geometry: Geometry, seed: int, progress
         },
         "adam_reaches_s": float(adam_at[near[0]]) if len(near) else None,
         "parameters": newton.layout.size,
-        "pixels": sum(len(v.target_db) for v in views),
+        "pixels": sum(len(r.target_db) for r in readings),
     }  # fmt: skip
 
 

@@ -18,15 +18,15 @@ from benchmarks.methods import (
     fit_lookup,
     method_mark,
     point_at_transmitter,
-    sight_of,
     untaught,
+    view_of,
 )
 from benchmarks.setting import Geometry, Truth
 from warprrf.device import Progress
 from warprrf.files import write_atomically
 from warprrf.rf.spectra import metrics
 
-__all__ = ["HARMONIC", "UNTAUGHT", "VARIANTS", "point_at_transmitter", "score", "sight_of", "source_of"]
+__all__ = ["HARMONIC", "UNTAUGHT", "VARIANTS", "point_at_transmitter", "score", "view_of", "source_of"]
 
 HARMONIC: dict[str, dict[str, Any]] = {
     "rf3dgs+": {},

@@ -42,8 +42,8 @@ from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.single_bounce import FieldOptions, SingleBounce
 from warprrf.rf.fields.harmonic.targets import targets
 from warprrf.rf.fields.harmonic.transport import Transport
-from warprrf.rf.fields.receivers import check_receiver
 from warprrf.rf.paths.trace import Paths
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
 
 if TYPE_CHECKING:
