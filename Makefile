@@ -1,8 +1,10 @@
 # warprrf: `make lobby` reconstructs the lobby from photos, fits its radio field and reports every error.
 #
 #   make lobby      install what is missing, then photos -> geometry -> radio -> evaluation into runs/lobby/ (resumable)
-#   make test       lint, types, import rules, tests: what CI runs
+#   make test       lint, types, import rules, documentation, tests: what CI runs
 #   make lint       the first three alone
+#   make docs       the documentation, into build/site: warnings are errors, links are checked
+#   make gpu        tests and times on a CUDA device, within ten minutes; without one a dry run on the CPU
 #   make data       regenerate data/lobby/ from nothing: scene, photos, spectra (hours; resumable)
 #   make notebooks  run the notebooks and store their outputs
 #   make clean      remove caches and build output (not .venv, data or runs)
@@ -26,7 +28,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
 export PYTHON
 
-.PHONY: help lobby test lint data notebooks clean setup setup-test
+.PHONY: help lobby test lint docs gpu data notebooks clean setup setup-test
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -48,7 +50,7 @@ $(VENV)/.sionna: $(VENV)/.lobby
 
 $(VENV)/.test: $(VENV)/.made pyproject.toml constraints.txt
 	bash tools/system_packages.sh llvm
-	$(RUN) -m pip install -q -c constraints.txt -e '.[all,test]'
+	$(RUN) -m pip install -q -c constraints.txt -e '.[all,docs,test]'
 	# Its wheel asks for an older NumPy than it needs, so it is no extra: only its scenario reader is tested against.
 	$(RUN) -m pip install -q --no-deps 'DeepMIMO==4.0.5' && $(RUN) -m pip install -q requests
 	touch $(VENV)/.lobby $(VENV)/.sionna $@
@@ -68,12 +70,18 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 	PYTHONPATH=. $(BIN)/lint-imports --no-cache
 
-test: lint
+docs: $(VENV)/.test
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/site
+
+test: lint docs
 	$(RUN) -m pytest $(ARGS)
+
+gpu: $(VENV)/.test
+	@$(RUN) -m benchmarks.gpu $(ARGS)
 
 notebooks: $(VENV)/.test
 	$(RUN) tools/run_notebooks.py
 
 clean:
-	rm -rf .cache build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf docs/reference docs/figures .cache build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -75,9 +75,9 @@ def run_channel(
     ]
     if sionna:
         stages.append(("lobby", lambda: against_sionna(scene, receivers, seed, device)))
-        stages.append(("small", lambda: small_response(scene, device)))
+        stages.append(("small", lambda: small_response(scene)))
     if large:
-        stages.append(("large", lambda: [large_response(s, seed, device) for s in (False, True)]))
+        stages.append(("large", lambda: [large_response(s, seed) for s in (False, True)]))
     report: dict[str, Any] = {"machine": machine(device), "seed": seed}
     for k, (name, measure) in enumerate(stages):
         if progress is not None:
@@ -213,7 +213,7 @@ def against_sionna(
     }
 
 
-def small_response(scene: str | os.PathLike[str], device: Any = None, repeats: int = 5) -> dict[str, Any]:
+def small_response(scene: str | os.PathLike[str], repeats: int = 5) -> dict[str, Any]:
     """1000 paths, 64 x 4 elements, 256 frequencies over 69.12 GHz: seconds beside Sionna's own ``cfr``, and errors.
 
     Errors are of the largest entry, against the dense float64 sum of the same coefficients and delays. Sionna holds
@@ -239,15 +239,15 @@ def small_response(scene: str | os.PathLike[str], device: Any = None, repeats: i
     rows["sionna_seconds"], theirs = _timed(sionna, repeats)
     rows["sionna_error"] = float(np.abs(theirs - truth).max() / np.abs(truth).max())
     for name in ("grid", "dense"):
-        ours = partial(paths.cfr, f, squint=False, method=name, device=device, **ports)
+        ours = partial(paths.cfr, f, squint=False, method=name, **ports)
         rows[f"{name}_seconds"], h = _timed(ours, repeats)
         rows[f"{name}_error"] = float(np.abs(h - truth).max() / np.abs(truth).max())
-    rows["squint_seconds"], _ = _timed(partial(paths.cfr, f, device=device, **ports), repeats)
+    rows["squint_seconds"], _ = _timed(partial(paths.cfr, f, **ports), repeats)
     rows["times_faster"] = rows["sionna_seconds"] / rows["grid_seconds"]
     return rows
 
 
-def large_response(squint: bool, seed: int = 0, device: Any = None) -> dict[str, Any]:
+def large_response(squint: bool, seed: int = 0) -> dict[str, Any]:
     """1e5 paths, 1024 x 16 elements, 2048 frequencies over 69.12 GHz: seconds, and errors against dense float64 sums.
 
     Paths bounce once at random points of the walls of a room of 18 x 12 x 4 m, with random phases. The error is the
@@ -258,11 +258,9 @@ def large_response(squint: bool, seed: int = 0, device: Any = None) -> dict[str,
     f = channel.frequencies_hz(2048)
     tx, rx = PlanarArray(4, 4), PlanarArray(32, 32, orientation=(np.pi, 0, 0))
     # Kernels are compiled once a machine, not once a call.
-    paths.select(np.arange(10)).cfr(
-        f[:64], tx_array=tx, squint=squint, diffuse="given", method="grid", device=device
-    )
+    paths.select(np.arange(10)).cfr(f[:64], tx_array=tx, squint=squint, diffuse="given", method="grid")
     start, cpu = time.perf_counter(), time.process_time()
-    h = paths.cfr(f, tx_array=tx, rx_array=rx, squint=squint, diffuse="given", device=device)
+    h = paths.cfr(f, tx_array=tx, rx_array=rx, squint=squint, diffuse="given")
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
     rng = np.random.default_rng(seed)
     flat = np.abs(h).reshape(-1)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import machine
+from benchmarks.sionna_map import SionnaMap
 from benchmarks.stages import fingerprint, write_json
 from warprrf import device as _device
 from warprrf.device import Progress
@@ -25,7 +26,6 @@ from warprrf.files import write_atomically, write_text
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.interop.sionna_engine import SionnaMap
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset

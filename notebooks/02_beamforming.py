@@ -26,7 +26,7 @@
 # 6. [How large an array?](#size)
 # 7. [Several users](#users) at once
 #
-# It runs on a CPU in half a minute, on few receivers; `warprrf bench beams` makes the figures that count. Metres, hertz,
+# It runs on a CPU in half a minute, on few receivers; `python -m benchmarks beams` makes the figures that count. Metres, hertz,
 # radians; path gain is linear unless it says dB.
 
 # %%

@@ -15,7 +15,7 @@
 # # Speed against error: what each knob costs and buys
 #
 # Every knob of the library trades time for error. This notebook turns them one at a time and draws both, on sizes small
-# enough for a minute; `warprrf bench engine` and `warprrf bench map` do the same on sizes worth quoting.
+# enough for a minute; `python -m benchmarks engine` and `python -m benchmarks map` do the same on sizes worth quoting.
 #
 # 1. [The rasteriser](#raster): cutoff, weights kept per pixel, resolution
 # 2. [Rays per pixel](#rays) of the deterministic engine

@@ -11,13 +11,6 @@ import warp as wp
 
 from warprrf.device import MIN_SPLIT, Recording, launch
 
-DEVICES = [
-    "cpu",
-    pytest.param(
-        "cuda:0",
-        marks=pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: none here"),
-    ),
-]
 COUNT = 5 * MIN_SPLIT + 3  # cut unevenly wherever there are threads
 
 
@@ -35,7 +28,6 @@ def arrays(device):
     )
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_recorded_launches_work_on_what_their_arrays_hold_by_then(device):
     def both(x, between, out):
         launch(add_scaled, COUNT, [2.0, x, between], device=device)
@@ -55,7 +47,6 @@ def test_recorded_launches_work_on_what_their_arrays_hold_by_then(device):
     assert len(np.unique(recorded[2].numpy())) > COUNT // 2
 
 
-@pytest.mark.parametrize("device", DEVICES)
 def test_a_recording_keeps_its_arrays(device):
     x, _, out = arrays(device)
     there = weakref.ref(x)

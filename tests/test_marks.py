@@ -1,11 +1,8 @@
 """The mark of code follows what a module runs when it is loaded, and nothing else."""
 
-import re
-
 import pytest
 
 from warprrf import marks
-from warprrf.geometry.photos import pipeline as from_photos
 from warprrf.marks import code_mark
 
 SOURCES = {
@@ -81,10 +78,3 @@ def test_the_version_of_a_package_is_part_of_the_mark(monkeypatch):
 def test_a_module_without_source_is_refused(name):
     with pytest.raises(ValueError, match=f"modules: '{name}' has no source file"):
         code_mark(name)
-
-
-@pytest.mark.parametrize("step", from_photos.STEP_CODE)
-def test_every_optional_package_that_a_step_uses_counts(step):
-    modules, packages = from_photos.STEP_CODE[step]
-    sources = [marks._file(name).read_text() for name in marks._sources(modules)]
-    assert set(packages) == {name for text in sources for name in re.findall(r'require\("(\w+)', text)}

@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import cache, partial
 from itertools import pairwise
-from threading import local
+from threading import RLock, local
 from types import ModuleType
 from typing import Any
 
@@ -46,16 +46,6 @@ def resolve(device: Any = None) -> wp.Device:
         raise ValueError(f"device: got {device!r}, expected one of {known}") from error
 
 
-def is_cuda(device: wp.Device) -> bool:
-    """Whether work on ``device`` is laid out for a GPU: ask this, not the device."""
-    return device.is_cuda or _stand_in is not None
-
-
-# A function ``(kernel, dim, inputs, *, adjoint)`` in place of CUDA launches: tests set it, to run on a CPU what is
-# compiled for a GPU. While it is set every device passes for CUDA.
-_stand_in: Callable[..., None] | None = None
-
-
 @cache
 def threads() -> int:
     """CPU threads that one launch is split over: ``WARPRRF_THREADS`` if set, else the cores this process may use."""
@@ -70,6 +60,21 @@ def threads() -> int:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=max(threads() - 1, 1), thread_name_prefix="warprrf")
+
+
+building = RLock()
+"""Held while something shared is built at its first use: hierarchies of a mesh, modules of kernels."""
+
+
+def _after_fork() -> None:
+    """A forked child has none of its parent's threads: its pool and its lock are new."""
+    global building
+    building = RLock()
+    _pool.cache_clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 def launch(
@@ -93,7 +98,7 @@ def launch(
     if dim <= 0:
         return
     device = resolve(device)
-    if is_cuda(device):
+    if device.is_cuda:
         bounds: Sequence[int] = [0, dim]
     elif cuts is not None:
         bounds = cuts
@@ -106,13 +111,8 @@ def launch(
         bounds = [dim * k // count for k in range(count + 1)]
     recording: Recording | None = getattr(_recorder, "active", None)
     arguments = [bounds[0], *inputs]
-    if _stand_in is not None:
-        run = partial(_stand_in, kernel, dim, arguments, adjoint=adjoint)
-        run()
-        if recording is not None:
-            recording.again.append(run)
-        return
-    kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
+    with building:
+        kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
     if recording is not None:

@@ -18,7 +18,7 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.device import Progress
 from warprrf.rf.em.materials import Material
-from warprrf.rf.interop.sionna_engine import SionnaEngine
+from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_of, to_db
@@ -88,7 +88,8 @@ def calibrate_sionna(
     begun = time.perf_counter()
     engine = _GradientEngine(
         scene, transmitter=train.transmitter, frequency_hz=train.frequency_hz, shape=train.shape,
-        beam_sigma_rad=train.beam_sigma_rad, depth=depth, samples=samples, seed=seed, device=device,
+        beam_sigma_rad=train.beam_sigma_rad,
+        sampling=Sampling(depth=depth, samples=samples, seed=seed), device=device,
     )  # fmt: skip
     beam = BeamOperator(train.shape, train.beam_sigma_rad, device=device)
     first = _unbound(scene.materials, float(train.frequency_hz))
@@ -201,9 +202,9 @@ class _GradientEngine(SionnaEngine):
         self._scene.add(self._rt.Receiver("rx", position=receiver.tolist()))
         try:
             paths = self._solver(
-                self._scene, max_depth=self.depth, max_num_paths_per_src=self._path_cap,
-                samples_per_src=self.samples, synthetic_array=True, los=True, specular_reflection=True,
-                diffuse_reflection=True, refraction=self.refraction, seed=seed,
+                self._scene, max_depth=self.sampling.depth, max_num_paths_per_src=self._path_cap,
+                samples_per_src=self.sampling.samples, synthetic_array=True, los=True, specular_reflection=True,
+                diffuse_reflection=True, refraction=self.sampling.refraction, seed=seed,
             )  # fmt: skip
         finally:
             self._scene.remove("rx")

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.beams.links import Ends
 from warprrf.rf.channel.beams import select_beams, select_beams_multiuser, signal_over_interference
-from warprrf.rf.channel.precoders import precoded_sinr, precoders, transmit_covariance
+from warprrf.rf.channel.precoding import precoded_sinr, precoders, transmit_covariance
 from warprrf.rf.paths.path_set import Paths
 
 USERS = (2, 4, 8, 16)

@@ -4,8 +4,6 @@ Two yardsticks, both Embree through Open3D on the same threads: ``embree bare`` 
 float32 and returns float32 distances; ``embree from arrays`` starts, as :meth:`Mesh.cast` does, from float64 origins
 and directions of any length, and so packs and normalises them in NumPy first. ``Mesh.cast`` returns float64 distances
 besides. ``Mesh.visible`` is compared with Embree's search for any hit, which judges the ends of a segment in float32.
-The yardsticks take rays as they come; ``Mesh`` sorts those without order on a large mesh, and asks the few faces that
-block most segments before the hierarchy: so it can be faster than they are. They would gain nothing from its chunks.
 All of one row are run in turn in one process, in another order each time, and the best of the repeats counts: by the
 clock, and by processor time, which other work on the machine disturbs less.
 """
@@ -20,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, resolve, threads
-from warprrf.geometry.embree import EmbreeScene
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.o3d import installed
+from warprrf.geometry.rays import EmbreeScene
 from warprrf.rf.scene import Scene
 
 
@@ -136,7 +134,7 @@ def _measure(
     }
     agreement = {}
     if installed():
-        scene = EmbreeScene(mesh.vertices - mesh.center, mesh.faces)
+        scene = EmbreeScene(mesh.vertices - mesh.center, mesh.faces, np.arange(len(mesh.faces)))
         packed = _pack(mesh, origins, directions)
         runners["embree bare"] = lambda: scene.cast(packed)
         runners["embree from arrays"] = lambda: scene.cast(_pack(mesh, origins, directions))
@@ -159,7 +157,7 @@ def _measure_sight(
     }
     agreement = {}
     if installed():
-        scene = EmbreeScene(mesh.vertices - mesh.center, mesh.faces)
+        scene = EmbreeScene(mesh.vertices - mesh.center, mesh.faces, np.arange(len(mesh.faces)))
         packed = np.column_stack([a - mesh.center, b - a]).astype(np.float32)
         runners["embree bare"] = lambda: scene.blocked(packed)
         runners["embree from arrays"] = lambda: scene.blocked(

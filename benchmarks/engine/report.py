@@ -29,7 +29,7 @@ TOLERANCE_DB, WORST_DB = 0.05, 2.0
 POINT_TOLERANCE_M = 1e-3  # a wavelength at 300 GHz
 FORM_TOLERANCE = 1e-3  # mean error of a response in every regime: a step of alpha that no cutoff of ours sees
 EXPONENTIAL_TOLERANCE = 1e-6  # what the deepest image, 60 dB, can show
-ASKED_RAYS = {"chosen": 0.9, "warp": 0.25}
+ASKED_RAYS = {"chosen": 0.6, "warp": 0.25}
 ASKED_SPECTRUM_S = {"gaussians": 100_000, "seconds": 0.150}
 
 NAMES = {

@@ -16,12 +16,11 @@ from typing import Any
 from benchmarks.engine import knobs, report
 from benchmarks.engine.blend import run_blend
 from benchmarks.engine.forms import exponential_forms, response_forms
-from benchmarks.engine.gpu import run_gpu
 from benchmarks.engine.rays import run_rays
 from benchmarks.engine.transport import run_transport
 from benchmarks.machine import machine
 from benchmarks.stages import StagedRun, plain, write_json
-from warprrf.device import Progress, resolve, threads
+from warprrf.device import Progress, threads
 from warprrf.marks import code_mark
 
 
@@ -104,7 +103,7 @@ def run_engine(
     Returns:
         What ``engine.json`` holds: rows by measurement (``alpha_min``, ``alpha_max``, ``top_k``, ``precision``,
         ``resolution``, ``points``, ``responses``, ``exponentials``, ``counts``, ``growth``, ``receivers``, ``rays``,
-        ``blend`` (None without torch), ``gpu`` (None without a GPU too), ``transport``), ``machine`` and ``sizes``.
+        ``blend`` (None without torch), ``transport``), ``machine`` and ``sizes``.
 
     Raises:
         ValueError: on a broken ``out``, or another run at work there, or if ``opensplat`` is no checkout.
@@ -129,7 +128,7 @@ def run_engine(
             {**options, "scene": str(scene)},
             "benchmarks.engine.rays",
         )
-        found["blend"] = found["gpu"] = None
+        found["blend"] = None
         if importlib.util.find_spec("torch") is not None:
             n, width, height = size.blend
             found["blend"] = stages.figures(
@@ -146,13 +145,6 @@ def run_engine(
                 {"blend": size.blend, "repeats": size.repeats, "opensplat": opensplat and str(opensplat)},
                 "benchmarks.engine.blend",
             )
-            if resolve(device).is_cuda:
-                found["gpu"] = stages.figures(
-                    "gpu",
-                    lambda tell: run_gpu(seed=seed, device=device, progress=tell),
-                    {},
-                    "benchmarks.engine.gpu",
-                )
         n, measured, receivers = size.stored
         found["transport"] = stages.figures(
             "transport",

@@ -222,13 +222,13 @@ def _calibrated(task: Task) -> Fitted:
 
 def _sionna(scene: Scene, task: Task) -> Fitted:
     """Sionna RT's PathSolver on ``scene``, which it has read when this returns."""
-    from warprrf.rf.interop.sionna_engine import SionnaEngine
+    from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 
     test = task.test
     engine = SionnaEngine(
         scene, transmitter=test.transmitter, frequency_hz=test.frequency_hz, shape=test.shape,
-        beam_sigma_rad=test.beam_sigma_rad, depth=task.depth, samples=task.effort.sionna_samples,
-        seed=task.seed + 1, device=task.geometry.device,
+        beam_sigma_rad=test.beam_sigma_rad,
+        sampling=Sampling(depth=task.depth, samples=task.effort.sionna_samples, seed=task.seed + 1), device=task.geometry.device,
     )  # fmt: skip
 
     def predict(receiver: Any) -> Spectrum:

@@ -260,7 +260,7 @@ def _geometry(
         "surveyed": len(surveyed),
         "gaussians": len(reconstruction.gaussians),
         "triangles": len(reconstruction.mesh.faces),
-        "patches": len(reconstruction.patches),
+        "patches": len(reconstruction.patches or ()),
     }
 
 

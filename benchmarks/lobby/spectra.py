@@ -19,7 +19,7 @@ import numpy as np
 from warprrf.device import Progress
 from warprrf.files import write_text
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.interop.sionna_engine import SionnaEngine
+from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import sample_receivers, simulate
 from warprrf.rf.spectra.dataset import assign_roles
@@ -137,7 +137,7 @@ def compare_engines(
     points = who.receivers[who.sample[SAMPLE_TRAINING : SAMPLE_TRAINING + receivers]]
     common: dict[str, Any] = {"transmitter": TRANSMITTER, "frequency_hz": FREQUENCY_HZ, "shape": SHAPE}
     ours = ExactEngine(scene, **common, device=device)
-    theirs = SionnaEngine(scene, **common, depth=1, samples=samples, device=device)
+    theirs = SionnaEngine(scene, **common, sampling=Sampling(depth=1, samples=samples), device=device)
     ours.receive(points[0])
     theirs.receive(points[0])
     figures: dict[str, list[float]] = {

@@ -10,7 +10,6 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from benchmarks.engine.blend import run_blend
-from benchmarks.engine.gpu import run_gpu
 from benchmarks.engine.peers import Scene, take_turns
 from benchmarks.engine.torch_renderer import render_with_torch
 from warprrf.device import threads
@@ -199,15 +198,6 @@ def test_blend_benchmark_runs_small_and_its_two_images_are_one(tmp_path):
 
 def _failing(scene, parameters):
     raise FloatingPointError("planted")
-
-
-def test_gpu_benchmark_runs_without_a_gpu_beside_no_peer(tmp_path):
-    out = tmp_path / "gpu.json"
-    found = run_gpu(out, n=400, width=40, height=30, shape=(12, 24), repeats=2, device="cpu")
-    assert found["ours"]["seconds"] == found["ours"]["forward_s"] + found["ours"]["backward_s"] > 0
-    assert found["gsplat"] is None and "over_gsplat" not in found
-    assert found["spectrum_s"] > 0
-    assert json.loads(out.read_text())["gaussians"] == 400
 
 
 def test_a_renderer_that_fails_in_its_process_is_named(capfd):

@@ -179,7 +179,7 @@ def test_a_method_is_marked_by_the_code_that_it_runs() -> None:
         "bistatic": "warprrf.rf.fields.bistatic.fit",
         "rf3dgs+": "warprrf.rf.fields.harmonic.fitting",
         "nerf2": "benchmarks.baselines.training",
-        "sionna": "warprrf.rf.interop.sionna_paths",
+        "sionna": "warprrf.rf.paths.sionna",
         "nearest": "warprrf.rf.spectra.lookups",
     }
     for name, module in own.items():

@@ -29,7 +29,7 @@ def box_exit(origin, d, low, high):
         return np.where(d > 0, (high - origin) / d, (low - origin) / d).min(axis=1)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_hits_are_exact_in_float64():
     origin, d = np.array([1.23456789, -2.3456789, 1.1111]), directions(20_000)
     hit = room().cast(origin, d)
@@ -68,7 +68,7 @@ def test_points_on_surfaces_see_each_other():
     assert mesh.visible(wall, floor).all()
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_a_screen_blocks_exactly_its_shadow():
     screen = Mesh([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]], [[0, 1, 2], [0, 2, 3]])
     rng = np.random.default_rng(2)
@@ -87,7 +87,7 @@ def test_thin_sheet_just_off_the_end_still_blocks():
     assert sheet.visible([0.1, 0.2, 0.0], [0.1, 0.2, -3.0])[0]
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_distance_to_a_box_from_outside_and_inside():
     mesh = Mesh(*box((-1, -1, -1), (1, 1, 1)))
     p = np.random.default_rng(3).uniform(-3, 3, (3000, 3))

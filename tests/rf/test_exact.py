@@ -32,7 +32,7 @@ def room(material):
     return one_material(Mesh(*box_mesh(LOW, HIGH, inward=True)), material)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize(("h1", "h2", "apart"), [(1.5, 1.0, 3.0), (2.5, 1.0, 8.0), (0.5, 3.0, 0.0)])
 def test_infinite_lambertian_conductor(h1, h2, apart):
     # Total diffuse power: (lambda / 4 pi D)^2 S^2 2 cos(theta_img), D the image distance, cos = (h1 + h2) / D.

@@ -136,8 +136,11 @@ def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:
     from sionna_room import sionna_or_skip, write_scene
 
     sionna = sionna_or_skip()
+    from warprrf.rf.interop.sionna_engine import Sampling
+
     common = {
-        "transmitter": [-5.0, 3.5, 2.7], "frequency_hz": F, "shape": SHAPE, "depth": 2, "samples": 20_000,
+        "transmitter": [-5.0, 3.5, 2.7], "frequency_hz": F, "shape": SHAPE,
+        "sampling": Sampling(depth=2, samples=20_000),
     }  # fmt: skip
     room = write_scene(tmp_path)
     off, on = (sionna(room, gas=gas, **common).solve([3.0, 4.0, 1.4]) for gas in (False, True))
@@ -278,7 +281,7 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     assert three == pytest.approx(ends * chord**2, rel=0.015)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: SpectrumDataset) -> None:
     terms = Terms(line_of_sight=False, diffuse=False, mirror_order=0, indirect=True)
     field = BistaticField.prior(scene, dry, terms=terms)

@@ -2,7 +2,8 @@
 
 The bounding volume hierarchy is Warp's, or Embree's for many rays on a CPU, in float32 and about the mesh's own
 centre; it names the face that is hit. Distances and points are then recomputed in float64 from that face's plane,
-because at 300 GHz a wavelength is 1 mm and float32 alone errs by 5e-5 m at 5 m.
+because at 300 GHz a wavelength is 1 mm and float32 alone errs by 5e-5 m at 5 m. Hierarchies are built at the first
+query, which may come from several threads at once.
 """
 
 from __future__ import annotations
@@ -15,8 +16,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.geometry.ray_room import room_for_copy
-from warprrf.geometry.rays import Hit, RaySearch, ray_arrays
+from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces
 
 ENDPOINT_CLEARANCE = 1e-4
@@ -66,6 +66,7 @@ class Mesh:
             )
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
+        self._search: RaySearch | None = None
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -129,13 +130,16 @@ class Mesh:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
         return self.bounds.mean(axis=0)
 
-    @cached_property
+    @property
     def _rays(self) -> RaySearch:
-        return RaySearch(self.triangles, self.face_normals, self.vertices, self.faces, self.bounds)
+        with _device.building:
+            if self._search is None:
+                self._search = RaySearch(self.vertices, self.faces, self.face_normals, self.bounds)
+            return self._search
 
     def on_device(self, device: Any = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""
-        return self._rays.on_device(_device.resolve(device))
+        return self._rays.on_device(_device.resolve(device))[0]
 
     def cast(self, origins: Any, directions: Any, *, device: Any = None, backend: str = "auto") -> Hit:
         """The nearest surface along rays; one that passes through a ray's very start is not met.
@@ -155,15 +159,13 @@ class Mesh:
             ValueError: on a wrong shape, NaN, a direction of length zero, an unknown back end, or Embree on a GPU.
             ImportError: if Embree is asked for and Open3D is not installed.
         """
-        o, d = ray_arrays(origins, directions)
-        # Points may be asked for after the caller has changed its arrays.
-        own = room_for_copy(o), room_for_copy(d)
-        t, face = self._rays.nearest(
-            o, d, reach=np.full(1, np.inf), clearance=0.0, device=device, backend=backend, own=own
-        )
+        o, d = check_rows(("origins", origins), ("directions", directions))
+        where = _device.resolve(device)
+        t, face = self._rays.nearest(o, d, device=where, backend=backend)
         if face.min(initial=0) < 0 and self.is_closed:
-            self._rays.recast(o, d, t, face, device=device, backend=backend)
-        return Hit(t, face, self.face_normals, *own)
+            self._rays.recast(o, d, t, face, device=where, backend=backend)
+        # Points may be asked for after the caller has changed its arrays.
+        return Hit(t, face, self.face_normals, o.copy(), d.copy())
 
     def visible(
         self,
@@ -187,15 +189,9 @@ class Mesh:
         Returns:
             Shape ``(N,)``, bool.
         """
-        start = np.atleast_2d(_device.check_array("a", a, finite=False))
-        end = np.atleast_2d(_device.check_array("b", b, finite=False))
-        if start.ndim != 2 or start.shape[1] != 3 or end.ndim != 2 or end.shape[1] != 3:
-            raise ValueError(f"a, b: got shapes {np.shape(a)} and {np.shape(b)}, expected (N, 3) or (3,)")
-        if len(start) != len(end) and 1 not in (len(start), len(end)):
-            raise ValueError(
-                f"a, b: got {len(start)} and {len(end)} points, expected as many of each, or one of either"
-            )
-        return self._rays.free(start, end, clearance=clearance, device=device, backend=backend)
+        start, end = check_rows(("a", a), ("b", b))
+        where = _device.resolve(device)
+        return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
     def closest(self, points: Any, *, device: Any = None) -> Closest:
         """The nearest point of the surface to each of ``points`` (N, 3) [m], in float64 once the face is known."""

@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.geometry import geometry_files as stored
+from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
-from warprrf.geometry.photos import sfm, surface
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.fusion import complete_seen, fuse_gaussians
-from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.surface import PlanarPatch
+from warprrf.geometry.photos.fusion import fuse_gaussians
+from warprrf.geometry.photos.sfm import read_colmap
+from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 
 FILE = "reconstruction.safetensors"
-FORMAT = 1
+FORMAT = 2  # 1 held a list of patches, each with its faces
 
 
 class Reconstruction:
@@ -31,8 +30,7 @@ class Reconstruction:
     Attributes:
         gaussians: the Gaussians.
         cameras: photo name to :class:`Camera`; empty for splats without poses.
-        patches: planar patches of the mesh, largest first.
-        planes: planes detected among the sparse points.
+        patches: planar patches of the mesh, largest first; None without a mesh.
         scale_rms_m: rms distance left between surveyed and reconstructed camera positions [m]; NaN without survey.
         metric: whether lengths are metres (else they are an assumed scale).
         unposed: names of photos without a pose.
@@ -45,8 +43,7 @@ class Reconstruction:
         mesh: Mesh | None = None,
         cameras: Mapping[str, Camera] | None = None,
         *,
-        patches: Sequence[PlanarPatch] = (),
-        planes: Sequence[Plane] = (),
+        patches: PlanarPatches | None = None,
         scale_rms_m: float = float("nan"),
         metric: bool = True,
         unposed: Sequence[str] = (),
@@ -55,8 +52,7 @@ class Reconstruction:
         self.gaussians = gaussians
         self._mesh = mesh
         self.cameras = dict(cameras or {})
-        self.patches = list(patches)
-        self.planes = list(planes)
+        self.patches = patches
         self.scale_rms_m = float(scale_rms_m)
         self.metric = bool(metric)
         self.unposed = tuple(unposed)
@@ -99,14 +95,12 @@ class Reconstruction:
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
         }  # fmt: skip
-        stored.write(
-            Path(folder) / FILE,
-            header,
-            gaussians=self.gaussians,
-            planes=self.planes,
-            patches=self.patches,
-            mesh=self._mesh,
-        )
+        arrays = files.of_gaussians(self.gaussians)
+        if self.patches is not None:
+            arrays |= files.of_patches(self.patches)
+        elif self._mesh is not None:
+            arrays |= {"vertices": self._mesh.vertices, "faces": self._mesh.faces}
+        files.write(Path(folder) / FILE, arrays, header)
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Reconstruction:
@@ -120,28 +114,23 @@ class Reconstruction:
             raise ValueError(
                 f"folder: {folder} holds no {FILE}; expected a folder that Reconstruction.save wrote"
             )
-        found = stored.read(path)
-        header = found.header
+        arrays, header = files.read(path)
         if header.get("format") != FORMAT:
-            raise ValueError(f"folder: {path} has format {header.get('format')}, this version reads {FORMAT}")
+            raise ValueError(
+                f"folder: {path} has format {header.get('format')}, this version reads {FORMAT}; make it again from "
+                "its photos (reconstruct)"
+            )
         try:
-            cameras = {
-                name: Camera(
-                    c["kind"],
-                    c["size"][0],
-                    c["size"][1],
-                    np.array(c["world_to_camera"]),
-                    **dict(zip(("fx", "fy", "cx", "cy"), c["lens"], strict=True)),
-                )  # fmt: skip
-                for name, c in header["cameras"].items()
-            }
+            patches = files.to_patches(arrays) if "patch_face_patch" in arrays else None
+            mesh = None if patches is None else patches.mesh
+            if mesh is None and "faces" in arrays:
+                mesh = Mesh(arrays["vertices"], arrays["faces"])
             rms = header["scale_rms_m"]
             return cls(
-                found.gaussians,
-                found.mesh if found.has_mesh else None,
-                cameras,
-                patches=found.patches,
-                planes=found.planes,
+                files.to_gaussians(arrays),
+                mesh,
+                {name: _camera(camera) for name, camera in header["cameras"].items()},
+                patches=patches,
                 scale_rms_m=float("nan") if rms is None else rms,
                 metric=header["metric"],
                 unposed=header["unposed"],
@@ -173,57 +162,23 @@ class Reconstruction:
             FileNotFoundError, ValueError: if a file is missing, damaged, or no surface can be fused.
         """
         gaussians = Gaussians.load_ply(ply)
-        cameras = sfm.read_colmap(colmap).cameras if colmap is not None else {}
-        config = config or ReconstructionConfig()
-        patches: list[PlanarPatch] = []
-        if mesh is None and cameras:
-            mesh, patches = fuse_gaussians(
+        cameras = read_colmap(colmap).cameras if colmap is not None else {}
+        patches: PlanarPatches | None = None
+        if mesh is not None:
+            mesh = mesh if isinstance(mesh, Mesh) else _mesh_from_file(mesh)
+            patches = planar_patches(mesh)
+        elif cameras:
+            patches = fuse_gaussians(
                 gaussians, list(cameras.values()), config=config, progress=progress, device=device
             )
-        elif mesh is not None:
-            mesh = mesh if isinstance(mesh, Mesh) else _mesh_from_file(mesh)
-            patches = surface.planar_patches(mesh, distance_m=0.01, min_area_m2=config.min_patch_m2)
+            mesh = patches.mesh
         return cls(gaussians, mesh, cameras, patches=patches)
 
 
-def completed(
-    reconstruction: Reconstruction,
-    *,
-    config: ReconstructionConfig | None = None,
-    progress: Progress | None = None,
-    device: Any = None,
-) -> Reconstruction:
-    """``reconstruction`` with its mesh completed, as :func:`warprrf.reconstruct` does: for one saved without that.
-
-    Depth maps are rendered again at its cameras. Without cameras, or where its mesh has no planes along three
-    perpendicular directions, the mesh stays as it is.
-
-    Raises:
-        ValueError: if there is no mesh.
-    """
-    mesh, patches = reconstruction.mesh, reconstruction.patches
-    if reconstruction.cameras:
-        mesh, patches = complete_seen(
-            mesh,
-            patches,
-            reconstruction.gaussians,
-            list(reconstruction.cameras.values()),
-            planes=reconstruction.planes,
-            config=config,
-            progress=progress,
-            device=device,
-        )
-    return Reconstruction(
-        reconstruction.gaussians,
-        mesh,
-        reconstruction.cameras,
-        patches=patches,
-        planes=reconstruction.planes,
-        scale_rms_m=reconstruction.scale_rms_m,
-        metric=reconstruction.metric,
-        unposed=reconstruction.unposed,
-        held_out=reconstruction.held_out,
-    )
+def _camera(stored: Mapping[str, Any]) -> Camera:
+    width, height = stored["size"]
+    lens = dict(zip(("fx", "fy", "cx", "cy"), stored["lens"], strict=True))
+    return Camera(stored["kind"], width, height, np.array(stored["world_to_camera"]), **lens)
 
 
 def _mesh_from_file(path: str | os.PathLike[str]) -> Mesh:

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import os
-import zipfile
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf.device import Progress
-from warprrf.files import write_atomically
 from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
-from warprrf.rf.interop.sionna_engine import SionnaEngine
+from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
+from warprrf.steps import Steps, digest
 
 ENGINES = ("exact", "sionna")
 WALL_CLEARANCE_M = 1e-4
@@ -97,40 +95,36 @@ def simulate(
     air = air_of(gas, frequency)
     check_positions(scene, source, points, device=device)
 
-    common = {
+    common: dict[str, Any] = {
         "transmitter": source,
         "frequency_hz": frequency,
         "shape": grid,
         "beam_sigma_rad": beam_sigma_rad,
     }
-    settings: dict[str, Any] = {"sub_pixels": SUB_PIXELS} if engine == "exact" else {}
-    if engine == "sionna":
-        settings = {"depth": depth, "samples": samples, "refraction": refraction, "seed": seed}
-    if air is not None:  # without, finished receivers of before go on counting
-        settings["gas"] = air
+    sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
     versions = _versions(engine)
-    surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
-    cache = (
-        None if workspace is None else _Cache(Path(workspace), engine, settings, common, versions, surfaces)
-    )
     running: ExactEngine | SionnaEngine | None = None
+
+    def receive(point: np.ndarray) -> ReceivedPaths:
+        nonlocal running
+        if running is None and engine == "exact":
+            running = ExactEngine(scene, **common, gas=air, device=device)
+        elif running is None:
+            running = SionnaEngine(scene, **common, sampling=sampling, gas=air, device=device)
+        return running.receive(point)
+
+    surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
+    inputs = digest(engine, common, air, surfaces, None if engine == "exact" else (sampling, versions))
     results = []
     for k, point in enumerate(points):
         if progress is not None:
             progress("simulate", k, len(points))
-        found = None if cache is None else cache.load(point)
-        if found is None:
-            if running is None:
-                running = _start(engine, scene, common, settings, device)
-            found = running.receive(point)
-            if cache is not None:
-                cache.save(point, found)
-        results.append(found)
+        results.append(receive(point) if workspace is None else _kept(workspace, inputs, point, receive))
     if progress is not None:
         progress("simulate", len(points), len(points))
-    single = {"depth": 1} if engine == "exact" else {"refraction": int(refraction)}
-    kept = {name: value for name, value in settings.items() if name not in ("seed", "refraction", "gas")}
-    kept |= {} if air is None else air.attributes
+    settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
+    if engine == "exact":
+        settings = {"depth": 1, "sub_pixels": SUB_PIXELS}
     return SpectrumDataset.from_spectra(
         receivers=points,
         transmitter=source,
@@ -144,7 +138,9 @@ def simulate(
         seed=seed,
         role=roles,
         floor=floor,
-        attributes={**single, **kept, **{f"version_{name}": value for name, value in versions.items()}},
+        attributes=settings
+        | ({} if air is None else air.attributes)
+        | {f"version_{name}": value for name, value in versions.items()},
     )
 
 
@@ -223,12 +219,6 @@ def sample_receivers(
     )
 
 
-def _start(engine: str, scene: Any, common: Any, settings: Any, device: Any) -> ExactEngine | SionnaEngine:
-    if engine == "exact":
-        return ExactEngine(scene, **common, **settings, device=device)
-    return SionnaEngine(scene, **common, **settings, device=device)
-
-
 def _versions(engine: str) -> dict[str, str]:
     packages = {"warprrf": "warprrf", "warp": "warp-lang", "numpy": "numpy"}
     if engine == "sionna":
@@ -242,58 +232,17 @@ def _versions(engine: str) -> dict[str, str]:
     return found
 
 
-class _Cache:
-    """One file a receiver, named by everything that its spectrum depends on."""
+def _kept(
+    workspace: str | os.PathLike[str],
+    inputs: str,
+    point: np.ndarray,
+    receive: Callable[[np.ndarray], ReceivedPaths],
+) -> ReceivedPaths:
+    """What ``receive`` returns for ``point``, in single precision, from the file of an earlier run if there is one."""
 
-    def __init__(
-        self,
-        folder: Path,
-        engine: str,
-        settings: dict[str, Any],
-        common: dict[str, Any],
-        versions: dict[str, str],
-        surfaces: tuple[np.ndarray, ...],
-    ) -> None:
-        self.folder = folder
-        # Our own version is left out: a run goes on after an update; a new solver starts afresh.
-        solver = {k: v for k, v in versions.items() if k in ("sionna_rt", "mitsuba", "drjit")}
-        revision = REVISION if engine == "exact" else 0
-        digest = hashlib.sha256(
-            repr((engine, revision, sorted(settings.items()), sorted(solver.items()))).encode()
-        )
-        for name in sorted(common):
-            digest.update(np.asarray(common[name], dtype=np.float64).tobytes())
-        for array in surfaces:
-            digest.update(np.ascontiguousarray(array).tobytes())
-        self._base = digest
-
-    def _path(self, point: np.ndarray) -> Path:
-        digest = self._base.copy()
-        digest.update(point.tobytes())
-        return self.folder / f"{digest.hexdigest()[:24]}.npz"
-
-    def load(self, point: np.ndarray) -> ReceivedPaths | None:
-        """A finished receiver, or None; a file cut short is as good as none."""
-        path = self._path(point)
-        if not path.is_file():
-            return None
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                kinds = data["kinds"].tolist()
-                return ReceivedPaths(
-                    path_gain=data["path_gain"],
-                    delay_s=data["delay_s"],
-                    aod=data["aod"],
-                    line_of_sight=bool(data["line_of_sight"]),
-                    totals=dict(zip(kinds, data["totals"].tolist(), strict=True)),
-                )
-        except (zipfile.BadZipFile, EOFError, KeyError, ValueError):
-            path.unlink()
-            return None
-
-    def save(self, point: np.ndarray, found: ReceivedPaths) -> None:
-        """Keep a finished receiver."""
-        arrays: dict[str, Any] = {
+    def make() -> dict[str, np.ndarray]:
+        found = receive(point)
+        return {
             "path_gain": found.path_gain.astype(np.float32),
             "delay_s": found.delay_s,
             "aod": found.aod.astype(np.float32),
@@ -301,4 +250,14 @@ class _Cache:
             "kinds": np.array(list(found.totals)),
             "totals": np.array(list(found.totals.values())),
         }
-        write_atomically(self._path(point), lambda file: np.savez(file, **arrays))
+
+    with Steps(workspace, shared=True) as steps:
+        name = digest(inputs, point)[:24]
+        held = steps.arrays(name, make, version=REVISION, inputs=[inputs, point])
+    return ReceivedPaths(
+        path_gain=held["path_gain"],
+        delay_s=held["delay_s"],
+        aod=held["aod"],
+        line_of_sight=bool(held["line_of_sight"]),
+        totals=dict(zip(held["kinds"].tolist(), held["totals"].tolist(), strict=True)),
+    )

@@ -5,12 +5,15 @@ import pytest
 
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import PlanarPatch, planar_patches
 from warprrf.geometry.photos.completion import complete
-from warprrf.geometry.photos.completion.dividers import directions
+from warprrf.geometry.photos.completion.room_planes import directions
+from warprrf.geometry.photos.config import CompletionConfig, SurfaceConfig
+from warprrf.geometry.photos.snapping import find_patches, largest_first
+from warprrf.geometry.planar_patches import PlanarPatches
 
 pytest.importorskip("scipy")
 
+FLAT = SurfaceConfig(patch_distance_m=0.01)
 ROOM = np.array([[0.0, 0.0, 0.0], [4.0, 3.0, 2.5]])
 
 
@@ -75,11 +78,12 @@ def seen(mesh, truth, views):
     return depths
 
 
-def run(broken, whole, places, **options):
+def run(broken, whole, places, min_patch_m2=0.15):
     mesh, truth = as_mesh(broken), as_mesh(whole)
     views = cameras(np.asarray(places, dtype=float))
-    patches = planar_patches(mesh, distance_m=0.01)
-    return complete(mesh, patches, views, seen(mesh, truth, views), stride=3, **options), truth
+    patches = find_patches(mesh, config=FLAT)
+    whole = complete(patches, views, seen(mesh, truth, views), config=CompletionConfig(stride=3))
+    return largest_first(whole, min_patch_m2), truth
 
 
 def spread(low, high, count=4000, seed=1):
@@ -94,19 +98,19 @@ def test_a_punched_room_is_closed_again_and_every_patch_lies_on_its_plane():
     broken = punched(room, (1.0, 1.0, -1.0), (2.0, 2.2, 1.0))  # floor
     broken = punched(broken, (3.9, 0.5, 0.8), (5.0, 1.5, 1.9))  # wall
     broken = punched(broken, (2.5, 2.0, 2.0), (5.0, 4.0, 4.0))  # a corner of the ceiling with its walls
-    (mesh, patches), truth = run(broken, room, INSIDE)
+    patches, truth = run(broken, room, INSIDE)
+    mesh = patches.mesh
     directions_ = np.random.default_rng(0).standard_normal((4000, 3))
     np.testing.assert_allclose(
         mesh.cast(INSIDE[0], directions_).t, truth.cast(INSIDE[0], directions_).t, atol=2e-3
     )
     assert len(patches) == 6
     assert mesh.areas.sum() == pytest.approx(truth.areas.sum(), rel=2e-3)
-    for patch in patches:
-        np.testing.assert_allclose(mesh.triangles[patch.faces] @ patch.normal, patch.offset, atol=1e-6)
-        np.testing.assert_allclose(mesh.face_normals[patch.faces] @ patch.normal, 1, atol=1e-6)
-        assert mesh.areas[patch.faces].sum() == pytest.approx(patch.area, rel=1e-6)
-    faces = np.concatenate([p.faces for p in patches])
-    assert len(np.unique(faces)) == len(faces)
+    for k in range(6):
+        own = patches.faces(k)
+        np.testing.assert_allclose(mesh.triangles[own] @ patches.normal[k], patches.offset[k], atol=1e-6)
+        np.testing.assert_allclose(mesh.face_normals[own] @ patches.normal[k], 1, atol=1e-6)
+        assert mesh.areas[own].sum() == pytest.approx(patches.area[k], rel=1e-6)
 
 
 def test_a_doorway_seen_through_stays_open():
@@ -118,7 +122,8 @@ def test_a_doorway_seen_through_stays_open():
     )  # fmt: skip
     room = np.concatenate([box(*ROOM, sign=-1), punched(wall, *door), rim])
     broken = punched(room, (1.8, 0.2, 1.0), (2.2, 0.6, 1.6))  # a hole in both faces of the wall
-    (mesh, _), truth = run(broken, room, [*INSIDE, [0.8, 1.5, 1.0], [3.2, 1.5, 1.0]])
+    patches, truth = run(broken, room, [*INSIDE, [0.8, 1.5, 1.0], [3.2, 1.5, 1.0]])
+    mesh = patches.mesh
     y, z = np.meshgrid(np.linspace(0.05, 2.95, 40), np.linspace(0.05, 2.45, 40))
     here = np.stack([np.full(y.size, 1.5), y.ravel(), z.ravel()], axis=1)
     there = here + [1.0, 0, 0]
@@ -132,7 +137,8 @@ def test_both_sides_of_a_thin_wall_are_completed():
     room = np.concatenate([box(*ROOM, sign=-1), box((2.0, 0.0, 0.0), (2.1, 2.0, 2.5))])
     broken = punched(room, (1.9, 0.5, 0.8), (2.05, 1.1, 1.6))  # holes in the two faces, at different places
     broken = punched(broken, (2.05, 0.9, 0.4), (2.2, 1.5, 1.0))
-    (mesh, _), _ = run(broken, room, INSIDE)
+    patches, _ = run(broken, room, INSIDE)
+    mesh = patches.mesh
     y, z = np.meshgrid(np.linspace(0.1, 1.8, 30), np.linspace(0.1, 2.4, 30))
     for x, sign, face in ((1.0, 1.0, 2.0), (3.0, -1.0, 2.1)):
         start = np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
@@ -145,7 +151,8 @@ def test_an_l_shaped_table_stays_an_l():
     room = np.concatenate([box(*ROOM, sign=-1), table])
     broken = punched(room, (1.7, 1.1, 0.7), (2.2, 1.4, 0.9))
     places = [[0.5, 0.5, 1.8], [3.3, 0.6, 1.8], [3.0, 2.4, 1.8], [0.6, 2.5, 1.8], [2.2, 2.1, 1.8]]
-    (mesh, _), _ = run(broken, room, places)
+    patches, _ = run(broken, room, places)
+    mesh = patches.mesh
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(0.3, 3.7, 60), np.linspace(0.3, 2.7, 60)))
     above = np.stack([x, y, np.full(len(x), 2.0)], axis=1)
     height = 2.0 - mesh.cast(above, [0, 0, -1.0]).t
@@ -157,14 +164,15 @@ def test_a_mesh_without_planes_or_views_stays_as_it_is():
     rng = np.random.default_rng(0)
     mesh = Mesh(rng.random((30, 3)), rng.integers(0, 30, (40, 3)))
     views = cameras([[0.5, 0.5, 0.5]])
-    assert complete(mesh, [], views, [np.ones((80, 80))] * 6) == (mesh, [])
-    room = as_mesh(box(*ROOM, sign=-1))
-    patches = planar_patches(room, distance_m=0.01)
-    assert complete(room, patches, [], []) == (room, patches)
-    slope = PlanarPatch(np.array([0.6, 0.0, 0.8]), 0.0, np.arange(3), 1.0)
-    assert directions(mesh, [slope]) is None
+    none = PlanarPatches.from_planes(mesh, np.full(40, -1), np.zeros((0, 3)), [], tolerance_m=1e-6)
+    assert complete(none, views, [np.ones((80, 80))] * 6) is none
+    patches = find_patches(as_mesh(box(*ROOM, sign=-1)), config=FLAT)
+    assert complete(patches, [], []) is patches
+    label = np.where(np.arange(40) < 3, 0, -1)
+    slope = PlanarPatches.from_planes(mesh, label, [[0.6, 0.0, 0.8]], [0.0], tolerance_m=1e-6)
+    assert directions(slope, CompletionConfig()) is None
     with pytest.raises(ValueError, match="depths: got 0 maps for 6"):
-        complete(room, patches, views, [])
+        complete(patches, views, [])
 
 
 def test_a_place_seen_in_part_only_is_not_guessed():
@@ -172,10 +180,10 @@ def test_a_place_seen_in_part_only_is_not_guessed():
     end = punched(hall, (1.0, -1.0, 0.05), (10.0, 7.0, 6.0))
     end = punched(end, (1.0, 0.5, -1.0), (7.5, 7.0, 1.0))  # and a strip of the floor, up to the camera
     mesh = as_mesh(end)
-    patches = planar_patches(mesh, distance_m=0.01)
+    patches = find_patches(mesh, config=FLAT)
     views = [cameras([[8.0, 3.0, 2.0]])[3]]  # looks there
     depths = seen(mesh, as_mesh(hall), views)
-    assert complete(mesh, patches, views, depths, stride=1, cell_m=0.25) == (mesh, patches)
+    assert complete(patches, views, depths, config=CompletionConfig(stride=1, cell_m=0.25)) is patches
 
 
 def test_an_oblique_surface_is_kept():
@@ -183,11 +191,12 @@ def test_an_oblique_surface_is_kept():
     ramp = sheet(2, 0.0, (1.0, 1.0), (2.0, 2.0), 1)
     ramp[..., 2] = 0.4 + 0.5 * (ramp[..., 0] - 1.0)  # a board in the air, 27 degrees steep
     whole = np.concatenate([room, ramp, ramp[:, ::-1] - [0, 0, 0.04]])  # its two faces
-    (mesh, patches), _ = run(whole, whole, INSIDE)
+    patches, _ = run(whole, whole, INSIDE)
+    mesh = patches.mesh
     n = np.array([-0.5, 0.0, 1.0]) / np.sqrt(1.25)
-    both = [p for p in patches if abs(p.normal @ n) > 0.999]
-    assert len(both) == 2
-    assert sum(p.area for p in both) == pytest.approx(2 * np.sqrt(1.25), rel=1e-3)
+    both = np.abs(patches.normal @ n) > 0.999
+    assert both.sum() == 2
+    assert patches.area[both].sum() == pytest.approx(2 * np.sqrt(1.25), rel=1e-3)
     points = spread((1.1, 1.1, 2.0), (1.9, 1.9, 2.4))
     np.testing.assert_allclose(
         points[:, 2] - mesh.cast(points, [0, 0, -1.0]).t, 0.4 + 0.5 * (points[:, 0] - 1), atol=1e-6
@@ -199,13 +208,14 @@ def test_a_turned_room_is_closed_along_its_own_directions():
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     room = box(*ROOM, sign=-1)
     broken = punched(room, (1.0, 1.0, -1.0), (2.0, 2.2, 1.0)) @ turn.T
-    (mesh, patches), truth = run(broken, room @ turn.T, np.array(INSIDE) @ turn.T)
+    patches, truth = run(broken, room @ turn.T, np.array(INSIDE) @ turn.T)
+    mesh = patches.mesh
     assert len(patches) == 6
     assert mesh.areas.sum() == pytest.approx(truth.areas.sum(), rel=2e-3)
 
 
 def test_each_plane_and_side_is_one_patch_the_largest_first():
     room = box(*ROOM, sign=-1)
-    (_, patches), _ = run(punched(room, (1, 1, -1), (2, 2, 1)), room, INSIDE, min_patch_m2=9.0)
+    patches, _ = run(punched(room, (1, 1, -1), (2, 2, 1)), room, INSIDE, min_patch_m2=9.0)
     # Floor and ceiling measure 12 m^2, the walls across y 10, the others 7.5.
-    assert [p.area for p in patches] == pytest.approx([12, 12, 10, 10], rel=2e-3)
+    assert patches.area == pytest.approx([12, 12, 10, 10], rel=2e-3)

@@ -180,8 +180,9 @@ def test_finished_work_is_reused_and_repeats_itself(posed, lobby, tmp_path):
     # Stopped while mapping, with rubbish left behind: the same model comes out of the matches.
     shutil.copytree(workspace, tmp_path / "w", symlinks=True)
     shutil.rmtree(tmp_path / "w" / "sfm" / "model")
-    (tmp_path / "w" / "sfm" / "working.db").write_bytes(b"half written")
-    (tmp_path / "w" / "sfm" / "mapping" / "0").mkdir(parents=True)
+    scratch = tmp_path / "w" / "sfm" / ".steps" / "model"
+    (scratch / "mapping" / "0").mkdir(parents=True)
+    (scratch / "matches.db").write_bytes(b"half written")
     resumed = sfm.structure_from_motion(
         lobby[0], workspace=tmp_path / "w", max_features=1500, progress=lambda s, d, n: stages.append(s)
     )
@@ -197,37 +198,6 @@ def test_other_photos_do_not_reuse_old_work(posed, lobby, tmp_path):
     )
     assert stages == {"features", "matching", "mapping"}
     assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:9])
-
-
-def test_work_of_other_code_is_done_again_and_says_so(posed, lobby, tmp_path, monkeypatch, caplog):
-    shutil.copytree(posed[0], tmp_path / "w", symlinks=True)
-    options = {"workspace": tmp_path / "w", "max_features": 1500}
-    stages = set()
-    monkeypatch.setattr(sfm, "code_mark", lambda *modules, packages: f"new code, {packages}")
-    sparse = sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
-    assert stages == {"features", "matching", "mapping"}
-    assert len(caplog.messages) == 1 and "other code" in caplog.messages[0]
-    # COLMAP's threads leave a little to chance.
-    assert sparse.cameras.keys() == posed[1].cameras.keys()
-    assert len(sparse.points) == pytest.approx(len(posed[1].points), rel=0.1)
-    # The same mark again: resumed. A workspace from before there were marks: done again.
-    stages.clear()
-    sfm.structure_from_motion(lobby[0], progress=lambda s, d, n: stages.add(s), **options)
-    assert stages == set() and len(caplog.messages) == 1
-    stamp = tmp_path / "w" / "sfm" / "photos.json"
-    old = json.loads(stamp.read_text())
-    assert "pycolmap" in old.pop("code")
-    stamp.write_text(json.dumps(old))
-
-    class Begun(Exception):
-        pass
-
-    def begin(stage, done, total):
-        raise Begun(stage)
-
-    with pytest.raises(Begun, match="features"):
-        sfm.structure_from_motion(lobby[0], progress=begin, **options)
-    assert len(caplog.messages) == 2
 
 
 def test_colmap_models_are_read_in_both_formats(posed, tmp_path):

@@ -7,8 +7,12 @@ import pytest
 import views
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos import surface
-from warprrf.geometry.photos.planes import Plane, dilate, plane_axes
+from warprrf.geometry.photos.cells import occupancy, visible_from
+from warprrf.geometry.photos.config import SurfaceConfig
+from warprrf.geometry.photos.fusion import fuse_depth, range_to_depth
+from warprrf.geometry.photos.planes import Plane, detect_planes, plane_axes
+from warprrf.geometry.photos.points import clean_points, estimate_normals
+from warprrf.geometry.photos.snapping import find_patches, flattened, largest_first, simplified
 from warprrf.geometry.splats.camera import Camera
 
 pytest.importorskip("open3d")
@@ -42,7 +46,7 @@ def fused():
     rng = np.random.default_rng(0)
     cameras = room_cameras()
     depths = [room_range(c) + 0.004 * rng.standard_normal((c.height, c.width)) for c in cameras]
-    return surface.fuse_depth(depths, cameras, voxel_m=0.05)
+    return fuse_depth(depths, cameras)
 
 
 def grid_on(plane_normal, offset, size=1.0, step=0.05):
@@ -58,12 +62,12 @@ def test_planted_outliers_are_cleaned_and_little_else():
     rng = np.random.default_rng(0)
     good = np.concatenate([rng.uniform(-1, 1, (2000, 2)), 0.003 * rng.standard_normal((2000, 1))], axis=1)
     bad = rng.uniform(-3, 3, (40, 3)) + [0, 0, 5]
-    keep = surface.clean_points(np.concatenate([good, bad]))
+    keep = clean_points(np.concatenate([good, bad]))
     assert not keep[2000:].any()
     assert keep[:2000].mean() > 0.97
     error, length = np.full(2000, 0.3), np.full(2000, 4)
     error[:10], length[10:20] = 3.0, 2
-    keep = surface.clean_points(good, reprojection_error=error, track_length=length)
+    keep = clean_points(good, reprojection_error=error, track_length=length)
     assert not keep[:20].any()
 
 
@@ -72,7 +76,7 @@ def test_normals_of_a_sphere_are_radial_and_face_the_eye():
     radial = rng.standard_normal((4000, 3))
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
     for eye, sign in (([0.0, 0, 0], -1), (5 * radial, 1)):
-        normals = surface.estimate_normals(2 * radial, eye)
+        normals = estimate_normals(2 * radial, eye)
         cosine = sign * (normals * radial).sum(axis=1)
         assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 12
         assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 2
@@ -96,7 +100,7 @@ def test_planes_are_found_in_noisy_points_with_outliers():
     points.append(rng.uniform(-2, 2, (800, 3)))
     stray = rng.standard_normal((800, 3))
     normals.append(stray / np.linalg.norm(stray, axis=1, keepdims=True))
-    found = surface.detect_planes(np.concatenate(points), np.concatenate(normals))
+    found = detect_planes(np.concatenate(points), np.concatenate(normals))
     assert len(found) == len(truth)
     for k, (normal, offset) in enumerate(truth):
         match = max(found, key=lambda p: p.normal @ normal)
@@ -113,7 +117,7 @@ def test_the_two_sides_of_a_thin_wall_are_two_planes():
     front, back = grid_on([1, 0, 0], 0.005), grid_on([1, 0, 0], -0.005)
     points = np.concatenate([front, back])
     normals = np.repeat([[1.0, 0, 0], [-1.0, 0, 0]], [len(front), len(back)], axis=0)
-    found = surface.detect_planes(points, normals)
+    found = detect_planes(points, normals)
     assert sorted(np.round(p.normal @ [1, 0, 0]) for p in found) == [-1, 1]
     for plane in found:
         assert plane.offset == pytest.approx(0.005, abs=1e-9)
@@ -123,18 +127,18 @@ def test_noise_around_a_plane_is_no_second_plane_but_a_poster_is():
     rng = np.random.default_rng(3)
     wall = np.concatenate([rng.uniform(-2, 2, (4000, 2)), 0.02 * rng.standard_normal((4000, 1))], axis=1)
     up = np.tile([0.0, 0, 1], (4000, 1))
-    assert len(surface.detect_planes(wall, up)) == 1
+    assert len(detect_planes(wall, up)) == 1
     inside = (np.abs(wall[:, :2]) < 0.5).all(axis=1)
     poster = wall * [1, 1, 0.05]
     poster[inside, 2] += 0.08
-    offsets = sorted(p.offset for p in surface.detect_planes(poster, up))
+    offsets = sorted(p.offset for p in detect_planes(poster, up))
     assert offsets == pytest.approx([0, 0.08], abs=1e-3)
 
 
 def test_detection_repeats_itself_for_a_seed():
     rng = np.random.default_rng(4)
     points, normals = rng.uniform(-1, 1, (3000, 3)) * [1, 1, 0.02], np.tile([0.0, 0, 1], (3000, 1))
-    a, b = (surface.detect_planes(points, normals, seed=5) for _ in range(2))
+    a, b = (detect_planes(points, normals, seed=5) for _ in range(2))
     assert [(p.offset, *p.normal) for p in a] == [(p.offset, *p.normal) for p in b]
 
 
@@ -144,12 +148,12 @@ def test_a_plane_is_empty_where_one_sees_through_it():
     plane = Plane(np.array([0.0, 1, 0]), 0.0, np.flatnonzero(~window))
     eyes = np.tile([0.0, 3, 0], (int(window.sum()), 1))
     targets = frame[window] * [2, 1, 2] - [0, 3, 0]  # three metres behind, straight through the window
-    (found,) = surface.occupancy([plane], frame, eyes, targets, cell_m=0.1)
+    (found,) = occupancy([plane], frame, eyes, targets)
     assert not found.covers(np.array([[0.0, 0, 0], [0.2, 0, -0.2]])).any()
     assert found.covers(np.array([[0.8, 0, 0.8], [-0.7, 0, 0.0], [0.0, 0, 0.9]])).all()
     assert not found.covers(np.array([[1.8, 0, 0]])).any()
     # Nobody looks through: the hole is filled, as a bare patch of wall would be.
-    (closed,) = surface.occupancy([plane], frame, eyes[:0], targets[:0], cell_m=0.1)
+    (closed,) = occupancy([plane], frame, eyes[:0], targets[:0])
     assert closed.covers(np.array([[0.0, 0, 0]])).all()
     assert closed.area() > found.area() + 0.5
 
@@ -157,18 +161,10 @@ def test_a_plane_is_empty_where_one_sees_through_it():
 def test_cells_of_a_plane_lie_on_it():
     normal = np.array([0.6, 0.0, 0.8])
     points = grid_on(normal, 1.3)
-    (plane,) = surface.occupancy(
-        [Plane(normal, 1.3, np.arange(len(points)))], points, points[:0], points[:0], cell_m=0.1
-    )
+    (plane,) = occupancy([Plane(normal, 1.3, np.arange(len(points)))], points, points[:0], points[:0])
     cells = plane.cells()
     assert plane.covers(cells).all() and len(cells) == plane.occupied.sum()
     np.testing.assert_allclose(plane.distance(cells), 0, atol=1e-12)
-
-
-def test_dilation_grows_by_whole_cells():
-    mask = np.zeros((7, 7), dtype=bool)
-    mask[3, 3] = True
-    assert dilate(mask, 2).sum() == 25
 
 
 # ------------------------------------------------------------------------------------------------ fusion
@@ -178,7 +174,7 @@ def test_range_becomes_depth_along_the_axis():
     camera = look([0.0, 0, 1], [1.0, 0.3, 0.8])
     points = camera.position + 2.7 * camera.directions().reshape(-1, 3)
     _, depth = camera.project(points)
-    got = surface.range_to_depth(np.full((camera.height, camera.width), 2.7), camera)
+    got = range_to_depth(np.full((camera.height, camera.width), 2.7), camera)
     np.testing.assert_allclose(got.ravel(), depth, rtol=1e-12)
 
 
@@ -213,7 +209,7 @@ def test_fused_sphere():
         b = d @ camera.position
         inside = b**2 - camera.position @ camera.position + radius**2
         depths.append(np.where(inside > 0, -b - np.sqrt(np.maximum(inside, 0)), np.inf))
-    mesh = surface.fuse_depth(depths, cameras, voxel_m=0.04)
+    mesh = fuse_depth(depths, cameras, config=SurfaceConfig(voxel_m=0.04))
     error = np.linalg.norm(mesh.vertices, axis=1) - radius
     assert abs(np.median(error)) < 4e-3
     assert np.percentile(np.abs(error), 95) < 0.02
@@ -222,13 +218,13 @@ def test_fused_sphere():
 def test_bad_depth_maps_are_refused():
     camera = look([0.0, 0, 1], [1.0, 0, 1])
     with pytest.raises(ValueError, match="got 0 maps for 1"):
-        surface.fuse_depth([], [camera])
+        fuse_depth([], [camera])
     with pytest.raises(ValueError, match=r"depths\[0\]: got shape \(3, 3\)"):
-        surface.fuse_depth([np.ones((3, 3))], [camera])
+        fuse_depth([np.ones((3, 3))], [camera])
     with pytest.raises(ValueError, match="spherical"):
-        surface.fuse_depth([np.ones((4, 8))], [Camera.spherical(8, 4, position=[0, 0, 0])])
+        fuse_depth([np.ones((4, 8))], [Camera.spherical(8, 4, position=[0, 0, 0])])
     with pytest.raises(ValueError, match="no surface"):
-        surface.fuse_depth([np.full((120, 160), np.inf)], [camera])
+        fuse_depth([np.full((120, 160), np.inf)], [camera])
 
 
 # ------------------------------------------------------------------------------------------------ patches
@@ -244,25 +240,24 @@ def walls():
 
 @pytest.mark.parametrize("known", [True, False])
 def test_patches_of_a_room_are_its_six_sides(fused, known):
-    patches = surface.planar_patches(fused, planes=walls() if known else ())
+    patches = largest_first(find_patches(fused, walls() if known else ()), 0.15)
     assert len(patches) == 6
     size = HIGH - LOW
-    for patch in patches:
-        axis = np.abs(patch.normal).argmax()
-        wall = LOW[axis] if patch.normal[axis] > 0 else HIGH[axis]
-        assert np.degrees(np.arccos(np.abs(patch.normal[axis]))) < 0.2
-        assert abs(patch.offset - patch.normal[axis] * wall) < 4e-3
-        assert patch.area == pytest.approx(np.prod(size) / size[axis], rel=0.08)
-    every = np.concatenate([p.faces for p in patches])
-    assert len(np.unique(every)) == len(every) > 0.98 * len(fused.faces)
+    for normal, offset, area in zip(patches.normal, patches.offset, patches.area, strict=True):
+        axis = np.abs(normal).argmax()
+        wall = LOW[axis] if normal[axis] > 0 else HIGH[axis]
+        assert np.degrees(np.arccos(np.abs(normal[axis]))) < 0.2
+        assert abs(offset - normal[axis] * wall) < 4e-3
+        assert area == pytest.approx(np.prod(size) / size[axis], rel=0.08)
+    assert (patches.face_patch >= 0).mean() > 0.98
 
 
 def test_flattened_patches_are_flat_with_sharp_edges(fused):
-    patches = surface.planar_patches(fused, planes=walls())
-    flat = surface.flatten(fused, patches)
-    for patch in patches:
-        corners = flat.vertices[flat.faces[patch.faces]]
-        assert np.median(np.abs(corners @ patch.normal - patch.offset)) < 1e-12
+    patches = flattened(find_patches(fused, walls()))
+    flat = patches.mesh
+    for k in range(6):
+        corners = flat.triangles[patches.faces(k)]
+        assert np.median(np.abs(corners @ patches.normal[k] - patches.offset[k])) < 1e-12
     assert np.percentile(room_distance(flat.vertices), 99) < 1e-9
     # The edge of wall and floor was rounded by the voxels, and is no more.
     at = [LOW[0], 0.3, LOW[2]]
@@ -271,26 +266,17 @@ def test_flattened_patches_are_flat_with_sharp_edges(fused):
 
 
 def test_simplified_room_is_the_same_surface_with_few_faces(fused):
-    patches = surface.planar_patches(fused, planes=walls())
-    flat = surface.flatten(fused, patches)
-    coarse, kept = surface.simplify(flat, patches)
-    assert len(coarse.faces) < 0.15 * len(flat.faces)
+    flat = flattened(find_patches(fused, walls()))
+    coarse = simplified(flat)
+    assert len(coarse.mesh.faces) < 0.15 * len(flat.mesh.faces)
     d = np.random.default_rng(0).standard_normal((20_000, 3))
     origin = np.tile([0.1, 0.2, 1.1], (len(d), 1))
-    before, after = flat.cast(origin, d), coarse.cast(origin, d)
+    before, after = flat.mesh.cast(origin, d), coarse.mesh.cast(origin, d)
     assert after.valid.mean() > before.valid.mean() - 2e-3
     both = before.valid & after.valid
     assert np.percentile(np.abs(after.t[both] - before.t[both]), 99) < 1e-3
-    for patch in kept:
-        assert (coarse.face_normals[patch.faces] @ patch.normal > 0).all()
-
-
-def test_a_model_with_two_triangles_a_side_has_its_sides_as_patches():
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    mesh = Mesh(corners, [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    patches = surface.planar_patches(mesh, distance_m=0.01)
-    assert [p.area for p in patches] == pytest.approx([6, 6, 3, 3, 2, 2])
+    for k in range(6):
+        assert (coarse.mesh.face_normals[coarse.faces(k)] @ coarse.normal[k] > 0).all()
 
 
 def test_visibility_knows_frame_side_and_obstacles():
@@ -298,8 +284,8 @@ def test_visibility_knows_frame_side_and_obstacles():
     points = np.array([[2.0, 0, 1], [-2.0, 0, 1], [2.0, 0, 1], [2.0, 0.5, 1]])
     normals = np.array([[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0], [-1, 0, 0]])
     shade = Mesh([[1, -0.1, 0], [1, 0.1, 0], [1, 0.1, 2], [1, -0.1, 2]], [[0, 1, 2], [0, 2, 3]])
-    assert surface.visible_from(None, points, normals, [camera], clearance_m=0.01)[:, 0].tolist() == [
+    assert visible_from(None, points, normals, [camera], clearance_m=0.01)[:, 0].tolist() == [
         True, False, False, True,
     ]  # fmt: skip
-    seen = surface.visible_from(surface.Occluder(shade), points, normals, [camera], clearance_m=0.01)[:, 0]
+    seen = visible_from(shade, points, normals, [camera], clearance_m=0.01)[:, 0]
     assert seen.tolist() == [False, False, False, True]

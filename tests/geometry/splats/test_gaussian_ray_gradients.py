@@ -153,7 +153,7 @@ class WholePath:
         return out
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("seed", range(SCENES))
 def test_gradients_match_finite_differences_to_1e_6(seed):
     path = WholePath(seed)

@@ -73,7 +73,7 @@ def expect_hits(found, expected):
         assert found.left[ray] == pytest.approx(left, rel=1e-9, abs=1e-14)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("order", ["peak", "range"])
 @pytest.mark.parametrize("k", [1, 4, 64])
@@ -87,7 +87,7 @@ def test_hits_are_those_of_brute_force(rule, order, k):
     expect_hits(found, expected)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("rule", RULES)
 def test_transmittance_is_that_of_brute_force_and_of_the_way_back(rule):
     rng = np.random.default_rng(2)
@@ -206,7 +206,7 @@ def test_between_two_equal_points_everything_passes():
     np.testing.assert_array_equal(rays.transmittance([[2, 0, 0], [0, 0, 0]], [[2, 0, 0], [0, 0, 0]]), [1, 1])
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_needles_of_one_to_ten_thousand_are_exact():
     rng = np.random.default_rng(8)
     n = 200

@@ -71,7 +71,7 @@ CAMERAS = {
 }
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize("rule", ["product", "exp"])
 def test_agrees_with_brute_force_in_float64_away_from_the_cutoff(camera, rule):
@@ -91,7 +91,7 @@ def test_agrees_with_brute_force_in_float64_away_from_the_cutoff(camera, rule):
     assert np.abs(out.features - color).max() < 4 / 255
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_blending_weights_rebuild_the_image(camera):
     rng = np.random.default_rng(4)
@@ -206,7 +206,7 @@ def gradient_error(values, camera, rule, rng, *, spoil=None):
     return worst
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("rule", ["product", "exp"])
 @pytest.mark.parametrize("kind", ["pinhole", "spherical"])
 def test_gradients_of_every_input_through_the_tape_match_finite_differences(kind, rule):

@@ -110,7 +110,7 @@ def test_the_length_of_a_quaternion_changes_no_pixel(length):
     assert np.allclose(ours32(entered, pinhole()), unit, atol=1e-5)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("seed", range(6))
 def test_needles_of_one_to_ten_thousand(seed):
     rng = np.random.default_rng(seed)
@@ -155,7 +155,7 @@ def test_ten_micrometre_gaussians_at_ten_metres():
     assert np.abs(ours32(aside, cam) - expected).max() < 0.05
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("mean", [(3.0, -2.0, 5.0), (0.0, 0.0, 250.0), (80.0, 0.0, 0.0)])
 @pytest.mark.parametrize("kind", ["pinhole", "spherical"])
 def test_hundred_metre_gaussians(mean, kind):
@@ -234,7 +234,7 @@ def test_turning_a_scene_over_the_seam_rolls_its_panorama():
         assert np.abs(np.roll(still, columns, axis=1) - turned).max() < 2e-5
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_equal_ranges_are_blended_in_the_order_given():
     g = gaussians([[0, 0, 2.0]] * 3, [0.3] * 3, opacities=(0.5, 0.25, 0.75))
     for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
@@ -261,7 +261,7 @@ def test_opacity_zero_contributes_nothing_and_opacity_one_hides_what_is_behind()
     assert photo.features[16, 16] == pytest.approx([0, 0.99, 0.01 * 0.5], abs=1e-6)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("rule", ["product", "exp"])
 def test_gradients_at_opacity_zero_and_one_are_those_of_the_blend(rule):
     """On the axis the image is a1 + T(a1) a2 with features one and two behind: derivatives in closed form."""
@@ -288,7 +288,7 @@ def test_gradients_at_opacity_zero_and_one_are_those_of_the_blend(rule):
             assert np.isfinite(array.grad.numpy()).all()
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("count", [0, 3])
 def test_none_visible_is_the_background_and_has_no_gradient_but_the_backgrounds(count):
     raster = Rasterizer(device="cpu", real=wp.float64)

@@ -105,7 +105,6 @@ def test_response_is_the_sum_over_paths(squint, method):
     np.testing.assert_allclose(h, expected, atol=(1e-11 if method == "dense" else 1e-6) * largest)
 
 
-@pytest.mark.on_cuda_too
 @pytest.mark.parametrize("count", [16, 17, 63, 256])
 @pytest.mark.parametrize("descending", [False, True])
 def test_grid_matches_dense_for_any_count_and_order(count, descending):
@@ -125,7 +124,6 @@ def spherical_truth(tx, rx, image, sending, receiving, f):
     return SPEED_OF_LIGHT / (4 * np.pi * F * d) * np.exp(-2j * np.pi * f / SPEED_OF_LIGHT * d)
 
 
-@pytest.mark.on_cuda_too
 @pytest.mark.parametrize("method", ["dense", "grid"])
 def test_spherical_waves_are_those_of_every_pair_of_elements(method):
     """Line of sight and a mirror on a perfect reflector, 4 x 4 to 8 x 8 elements half a metre away."""

@@ -9,7 +9,8 @@ from sionna_room import sionna_or_skip, write_scene
 from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.interop import llvm
-from warprrf.rf.interop.sionna_paths import repeated
+from warprrf.rf.interop.sionna_engine import Sampling
+from warprrf.rf.paths.sionna import repeated
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.spectrum import pixel_of
@@ -27,7 +28,7 @@ def scene(tmp_path_factory):
 def engines(scene):
     sionna = sionna_or_skip()
     common = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
-    return ExactEngine(scene, **common), sionna(scene, depth=1, **common)
+    return ExactEngine(scene, **common), sionna(scene, sampling=Sampling(depth=1), **common)
 
 
 @pytest.mark.parametrize("rx", [SEES, BLOCKED])
@@ -58,7 +59,9 @@ def test_line_of_sight_and_mirrors_agree_in_power_delay_and_direction(engines, r
 def test_one_seed_gives_the_same_paths_in_the_same_order(scene):
     """Sionna itself stores them in whatever order its threads end."""
     sionna = sionna_or_skip()
-    engine = sionna(scene, depth=2, samples=20_000, transmitter=TX, frequency_hz=F, shape=SHAPE)
+    engine = sionna(
+        scene, sampling=Sampling(depth=2, samples=20_000), transmitter=TX, frequency_hz=F, shape=SHAPE
+    )
     first = engine.solve(SEES)
     assert len(first["tau"]) > 5000 and (np.diff(first["tau"]) >= 0).all()
     for _ in range(4):
@@ -70,7 +73,7 @@ def test_one_seed_gives_the_same_paths_in_the_same_order(scene):
 def test_two_mirror_reflections_agree_in_power(scene):
     sionna = sionna_or_skip()
     common = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE}
-    found = sionna(scene, depth=2, samples=200_000, **common).solve(SEES)
+    found = sionna(scene, sampling=Sampling(depth=2, samples=200_000), **common).solve(SEES)
     sharp = ~found["diffuse"]
     paths = ExactEngine(scene, **common).tracer.trace(SEES, 2)
     a, b = np.argsort(paths.tau), np.argsort(found["tau"][sharp])

@@ -195,7 +195,7 @@ def test_map_of_a_furnished_room_has_a_hole(found: RadioMap) -> None:
     assert (found.total_path_gain[found.free] >= 0.999999 * found.best_path_gain[found.free]).all()
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_all_chains_of_mirrors_are_tried(scene: RadioScene) -> None:
     tree = MirrorTree(Surface.of(scene), TX, 3)
     for order in (1, 2, 3):

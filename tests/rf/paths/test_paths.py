@@ -94,7 +94,7 @@ def test_swapping_the_ends_keeps_gain_and_delay():
         np.testing.assert_allclose(there.theta_r[a], back.theta_t[b], atol=1e-9)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_a_screen_takes_away_what_it_hides():
     floor, screen = (
         square(50.0),

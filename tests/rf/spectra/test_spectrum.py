@@ -148,7 +148,7 @@ def test_beams_made_at_once_are_those_made_one_by_one(sigma: float) -> None:
         assert np.allclose(beam, alone, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_strongest_ray_of_a_pixel_is_that_of_the_spread_paths() -> None:
     import warp as wp
 

@@ -1,22 +1,30 @@
-"""From Gaussians to a surface: depth maps rendered at cameras, fused to a mesh, flattened onto planes, made whole."""
+"""From Gaussians to a surface: depth maps rendered at cameras, fused to a mesh, snapped to planes, made whole.
+
+Fusion is Open3D's truncated signed distance field (Curless and Levoy, "A volumetric method for building complex models
+from range images", 1996).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import Progress, check_array
+from warprrf.geometry import o3d as o3d_package
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos import surface
 from warprrf.geometry.photos.completion import complete
-from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
 from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.surface import PlanarPatch
+from warprrf.geometry.photos.snapping import find_patches, flattened, largest_first, simplified
+from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
+
+BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
 
 
 def fuse_gaussians(
@@ -27,83 +35,133 @@ def fuse_gaussians(
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
     device: Any = None,
-) -> tuple[Mesh, list[PlanarPatch]]:
-    """Mesh of Gaussians from depth maps rendered at ``cameras``, and its planar patches; planes known beforehand are
-    what the mesh snaps to first."""
+) -> PlanarPatches:
+    """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first; planes
+    known beforehand are what it is snapped to."""
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    small, depths = _depth_maps(gaussians, cameras, config, report, device)
+    views, depths = depth_maps(gaussians, cameras, config=config.surface, progress=report, device=device)
     report("surface", 0, 4)
-    mesh = surface.fuse_depth(depths, small, voxel_m=config.voxel_m)
+    mesh = fuse_depth(depths, views, config=config.surface)
     report("surface", 1, 4)
-    patches = surface.planar_patches(
-        mesh, planes=planes, distance_m=config.patch_distance_m, min_area_m2=config.min_patch_m2
-    )
-    flat = surface.flatten(mesh, patches)
+    patches = flattened(find_patches(mesh, planes, config.surface))
     report("surface", 2, 4)
-    result = surface.simplify(flat, patches)
+    if config.completion is not None:
+        patches = complete(patches, views, depths, planes=planes, config=config.completion)
     report("surface", 3, 4)
-    if config.complete:
-        result = _complete(*result, small, depths, planes, config)
+    patches = simplified(patches, cell_m=config.surface.simplify_m)
     report("surface", 4, 4)
-    return result
+    return largest_first(patches, config.surface.min_patch_m2)
 
 
-def complete_seen(
-    mesh: Mesh,
-    patches: Sequence[PlanarPatch],
+def depth_maps(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     *,
-    planes: Sequence[Plane] = (),
-    config: ReconstructionConfig | None = None,
-    progress: Progress | None = None,
+    config: SurfaceConfig,
+    progress: Progress,
     device: Any = None,
-) -> tuple[Mesh, list[PlanarPatch]]:
-    """``mesh`` and its patches made whole by depth maps of ``gaussians`` at ``cameras``."""
-    config = config or ReconstructionConfig()
-    report = progress or (lambda stage, done, total: None)
-    small, depths = _depth_maps(gaussians, cameras, config, report, device)
-    return _complete(mesh, patches, small, depths, planes, config)
-
-
-def _complete(
-    mesh: Mesh,
-    patches: Sequence[PlanarPatch],
-    cameras: Sequence[Camera],
-    depths: Sequence[np.ndarray],
-    planes: Sequence[Plane],
-    config: ReconstructionConfig,
-) -> tuple[Mesh, list[PlanarPatch]]:
-    return complete(
-        mesh, patches, cameras, depths, planes=planes,
-        cell_m=config.complete_cell_m, min_patch_m2=config.min_patch_m2,
-    )  # fmt: skip
-
-
-def _depth_maps(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    config: ReconstructionConfig,
-    report: Progress,
-    device: Any,
 ) -> tuple[list[Camera], list[np.ndarray]]:
-    """Smaller cameras spread over all ``cameras``, and their depths, 0 where no Gaussian is reliable."""
-    chosen = list(cameras)
-    if len(chosen) > config.depth_views:
-        chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, config.depth_views).round().astype(int)]
-    small, depths = [], []
-    for k, camera in enumerate(chosen):
-        report("depth", k, len(chosen))
+    """Smaller cameras spread over all ``cameras``, and the ranges that they see [m], 0 where no Gaussian is reliable."""
+    chosen = np.linspace(0, len(cameras) - 1, min(len(cameras), config.views)).round().astype(int)
+    views, depths = [], []
+    for k, index in enumerate(chosen):
+        progress("depth", k, len(chosen))
+        camera = cameras[index]
         view = camera.resized(
-            max(1, camera.width // config.depth_downscale), max(1, camera.height // config.depth_downscale)
+            max(1, camera.width // config.downscale), max(1, camera.height // config.downscale)
         )
         out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
         with np.errstate(invalid="ignore"):
-            solid = (out.alpha >= config.alpha) & (
-                np.abs(out.depth - out.peak) <= config.depth_spread * out.peak
-            )
-        depths.append(np.where(solid, out.depth, 0.0))
-        small.append(view)
-    report("depth", len(chosen), len(chosen))
-    return small, depths
+            agree = np.abs(out.depth - out.peak) <= config.depth_spread * out.peak
+        depths.append(np.where(agree & (out.alpha >= config.alpha), out.depth, 0.0))
+        views.append(view)
+    progress("depth", len(chosen), len(chosen))
+    return views, depths
+
+
+def fuse_depth(
+    depths: Sequence[Any], cameras: Sequence[Camera], *, config: SurfaceConfig | None = None
+) -> Mesh:
+    """One mesh from depth maps of pinhole cameras, by a truncated signed distance field.
+
+    Args:
+        depths: Euclidean range per pixel [m], each ``(height, width)`` of its camera; inf, NaN or 0 where unknown.
+        cameras: pinhole cameras, one a depth map.
+        config: sizes and limits.
+
+    Raises:
+        ValueError: when the numbers of maps and cameras differ, a camera is not a pinhole, a map has another shape
+            than its camera, or no surface comes out.
+    """
+    config = config or SurfaceConfig()
+    o3d = o3d_package.load()
+    if len(depths) != len(cameras) or not len(depths):
+        raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
+    core = o3d.core
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)), config.voxel_m, BLOCK_VOXELS, BLOCKS
+    )
+    filled = False
+    for k, (given, camera) in enumerate(zip(depths, cameras, strict=True)):
+        if camera.kind != "pinhole":
+            raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
+        depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
+        z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
+        z[(depth > config.max_range_m) | ~_smooth(z, config.edge_tolerance / camera.fx)] = 0.0
+        if not (z > 0).any():
+            continue
+        image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
+        # The grid reads the pixel that a voxel's projection falls into: pixel centres at +0.5, as ours.
+        lens = core.Tensor(np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]))
+        pose = core.Tensor(np.array(camera.world_to_camera, dtype=np.float64))
+        limits = (1.0, config.max_range_m, config.truncation_voxels)
+        blocks = grid.compute_unique_block_coordinates(image, lens, pose, *limits)
+        grid.integrate(blocks, image, lens, pose, *limits)
+        filled = True
+    raw = grid.extract_triangle_mesh(config.min_views - 0.5).to_legacy() if filled else None
+    if raw is None or len(raw.triangles) == 0:
+        raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
+    return _without_debris(_ordered(o3d, raw), config)
+
+
+def _without_debris(raw: Any, config: SurfaceConfig) -> Mesh:
+    raw.merge_close_vertices(1e-4 * config.voxel_m)
+    raw.remove_degenerate_triangles()
+    label, count, _ = raw.cluster_connected_triangles()
+    raw.remove_triangles_by_mask(np.asarray(count)[np.asarray(label)] < config.min_component_faces)
+    raw.remove_unreferenced_vertices()
+    if len(raw.triangles) == 0:
+        raise ValueError(f"min_component_faces: no connected piece has {config.min_component_faces} faces")
+    return Mesh(np.asarray(raw.vertices), np.asarray(raw.triangles))
+
+
+def _ordered(o3d: ModuleType, raw: Any) -> Any:
+    """The mesh with vertices and faces in an order of their own, not in that in which threads found them."""
+    vertices, faces = np.asarray(raw.vertices), np.asarray(raw.triangles)
+    order = np.lexsort(vertices.T[::-1])
+    faces = np.argsort(order)[faces]
+    turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    faces = np.take_along_axis(faces, turn, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    return o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices[order]), o3d.utility.Vector3iVector(faces.astype(np.int32))
+    )
+
+
+def range_to_depth(distance: np.ndarray, camera: Camera) -> np.ndarray:
+    """Depth along the optical axis [m] of Euclidean ranges ``(H, W)`` in a pinhole image."""
+    x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    return distance / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
+
+
+def _smooth(z: np.ndarray, tolerance: float) -> np.ndarray:
+    """Pixels with a depth whose inverse is nearly linear towards both neighbours, along rows and columns."""
+    known = z > 0
+    inverse = np.where(known, 1 / np.where(known, z, 1.0), np.nan)
+    fine = known.copy()
+    with np.errstate(invalid="ignore"):
+        fine[1:-1] &= ~(np.abs(np.diff(inverse, n=2, axis=0)) > tolerance * inverse[1:-1])
+        fine[:, 1:-1] &= ~(np.abs(np.diff(inverse, n=2, axis=1)) > tolerance * inverse[:, 1:-1])
+    return fine

@@ -1,39 +1,35 @@
 """Stage 1: from photos and a few surveyed camera positions to Gaussians, a mesh and its planar patches, in metres.
 
 Structure from motion, similarity to metres, cleaning, planes, initial Gaussians, photometric refinement, depth maps,
-fusion, planar patches. Every finished step is kept in the workspace under a fingerprint of all that it was made from,
-inputs and code: a stopped run continues, a change starts over from the first step that it changes.
+fusion, planar patches. Every finished step is kept in the workspace for the inputs that it was made from: a stopped
+run continues, a change starts over from the first step that it changes.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from warprrf.device import Progress
-from warprrf.geometry.geometry_files import Steps
+from warprrf.geometry import geometry_files as files
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.photo_files import find_photos, match_names, read_photo
 from warprrf.geometry.photos.refine import refine
 from warprrf.geometry.photos.sfm import structure_from_motion
-from warprrf.geometry.photos.sparse import align_to_known, assume_scale
+from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale
 from warprrf.geometry.photos.start import start_of
+from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import Reconstruction
-from warprrf.geometry.splats.camera import Camera
-from warprrf.marks import code_mark
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.steps import Attempt, Steps
 
-STEP_CODE = {
-    "start": (("warprrf.geometry.photos.start", "warprrf.geometry.photos.photo_files"), ("open3d", "PIL")),
-    "refined": (("warprrf.geometry.photos.refine", "warprrf.geometry.photos.photo_files"), ("PIL",)),
-    "surface": (("warprrf.geometry.photos.fusion",), ("open3d",)),
-}
-"""Modules that a step after structure from motion runs, and the packages whose version counts."""
+VERSIONS = {"start": 1, "refined": 1, "surface": 1}
+"""Of the steps after structure from motion: counted up by whoever changes what a step computes."""
 
 
 def reconstruct(
@@ -68,8 +64,10 @@ def reconstruct(
         ImportError: if the extra ``photos`` is not installed.
     """
     config = config or ReconstructionConfig()
-    if iterations is not None:
-        config = replace(config, refine=replace(config.refine, iterations=iterations))
+    if iterations is None:
+        iterations = config.refine.iterations
+    refinement = replace(config.refine, seed=seed, iterations=iterations)
+    config = replace(config, refine=refinement)
     named = find_photos(photos)
     skipped = set(match_names("held_out", held_out, list(named)))
     if known_positions is not None:
@@ -84,70 +82,18 @@ def reconstruct(
         progress=progress,
     )
     sparse = align_to_known(sparse, known_positions) if known_positions is not None else assume_scale(sparse)
-    cameras = {n: c for n, c in sparse.cameras.items() if n not in skipped}
-    if not cameras:
+    fitted = {name: named[name] for name in sparse.cameras if name not in skipped}
+    if not fitted:
         raise ValueError(
             f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to"
         )
-    steps = Steps(
-        Path(workspace),
-        [
-            (Path(workspace) / "sfm" / "photos.json").read_text(),
-            [[n, c.world_to_camera.tolist()] for n, c in sparse.cameras.items()],
-            sorted(skipped),
-            asdict(config),
-            seed,
-        ],
-    )
-    images: list[np.ndarray] = []
-
-    def photos_of(cameras: Mapping[str, Camera]) -> list[np.ndarray]:
-        if not images:
-            images.extend(read_photo(named[n]) for n in cameras)
-        return images
-
-    def make_start(key: str) -> dict[str, Any]:
-        planes, gaussians = start_of(
-            sparse, cameras, photos_of(cameras), config=config, seed=seed, progress=progress, device=device
-        )
-        return {"planes": planes, "gaussians": gaussians}
-
-    def make_refined(key: str) -> dict[str, Any]:
-        gaussians = refine(
-            start.gaussians,
-            photos_of(cameras),
-            list(cameras.values()),
-            config=config.refine,
-            planes=planes,
-            seed=seed,
-            progress=progress,
-            checkpoint=steps.only(f"refine-{key[:12]}.checkpoint", "refine-*.checkpoint"),
-            device=device,
-        )
-        return {"gaussians": gaussians}
-
-    def make_surface(key: str) -> dict[str, Any]:
-        mesh, patches = fuse_gaussians(
-            gaussians,
-            list(sparse.cameras.values()),
-            planes=planes,
-            config=config,
-            progress=progress,
-            device=device,
-        )
-        return {"mesh": mesh, "patches": patches}
-
-    start = steps.step("start", code_of("start"), make_start)
-    planes = start.planes
-    gaussians = steps.step("refined", code_of("refined"), make_refined).gaussians
-    images.clear()
-    surface = steps.step("surface", code_of("surface"), make_surface)
+    with Steps(workspace, progress=progress) as steps:
+        gaussians, patches = _steps(steps, sparse, fitted, config, seed, device)
     return Reconstruction(
         gaussians,
-        surface.mesh,
+        patches.mesh,
         sparse.cameras,
-        patches=surface.patches,
-        planes=planes,
+        patches=patches,
         scale_rms_m=sparse.scale_rms_m,
         metric=sparse.metric,
         unposed=sparse.unposed,
@@ -155,7 +101,66 @@ def reconstruct(
     )
 
 
-def code_of(step: str) -> str:
-    """Mark of the code of a step of :data:`STEP_CODE`."""
-    modules, packages = STEP_CODE[step]
-    return code_mark(*modules, packages=packages)
+def _steps(
+    steps: Steps,
+    sparse: SparseModel,
+    fitted: Mapping[str, Path],
+    config: ReconstructionConfig,
+    seed: int,
+    device: Any,
+) -> tuple[Gaussians, PlanarPatches]:
+    """The steps after structure from motion: planes and Gaussians to start from, Gaussians refined, mesh and patches.
+
+    Args:
+        fitted: the photos that Gaussians are fitted to, by name.
+    """
+    cameras = {name: sparse.cameras[name] for name in fitted}
+    photos = cache(lambda: [read_photo(photo) for photo in fitted.values()])
+
+    def start(attempt: Attempt) -> files.Arrays:
+        planes, gaussians = start_of(
+            sparse, cameras, photos(), config=config, seed=seed, progress=attempt.progress, device=device
+        )
+        return files.of_planes(planes) | files.of_gaussians(gaussians)
+
+    def refined(attempt: Attempt) -> files.Arrays:
+        gaussians = refine(
+            files.to_gaussians(first),
+            photos(),
+            list(cameras.values()),
+            config=config.refine,
+            planes=planes,
+            progress=attempt.progress,
+            checkpoint=attempt.folder / "checkpoint.safetensors",
+            device=device,
+        )
+        return files.of_gaussians(gaussians)
+
+    def surface(attempt: Attempt) -> files.Arrays:
+        everywhere = list(sparse.cameras.values())
+        patches = fuse_gaussians(
+            gaussians, everywhere, planes=planes, config=config, progress=attempt.progress, device=device
+        )
+        return files.of_patches(patches)
+
+    settings = [config.max_reprojection_error, config.planes, config.sweep, config.gaussians, seed]
+    first = _kept(steps, "start", start, [sparse, list(fitted), list(fitted.values()), *settings])
+    planes = files.to_planes(first)
+    gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("start"), config.refine]))
+    photos.cache_clear()
+    inputs = [steps.key("refined"), config.surface, config.completion]
+    return gaussians, files.to_patches(_kept(steps, "surface", surface, inputs))
+
+
+def _kept(
+    steps: Steps, name: str, make: Callable[[Attempt], files.Arrays], inputs: Sequence[Any]
+) -> files.Arrays:
+    """Arrays of a step, from its file if it was made from the same inputs."""
+    path = steps.folder / f"{name}.safetensors"
+
+    def write(attempt: Attempt) -> dict[str, Any]:
+        files.write(path, make(attempt))
+        return {}
+
+    steps.run(name, write, version=VERSIONS[name], inputs=inputs, outputs=[path.name])
+    return files.read(path)[0]

@@ -8,9 +8,7 @@ metres. Everything runs on the CPU and repeats itself for a given seed.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 import os
 import shutil
 import sqlite3
@@ -24,11 +22,10 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, require
-from warprrf.files import write_text
 from warprrf.geometry.photos.photo_files import MIN_PHOTOS, check_photos, find_photos, some
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.splats.camera import Camera
-from warprrf.marks import code_mark, log_other_code
+from warprrf.steps import Attempt, Steps
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 
@@ -53,8 +50,8 @@ def structure_from_motion(
 ) -> SparseModel:
     """Camera poses and sparse points of ``photos``, in the model's own units (see :mod:`~warprrf.geometry.photos.sparse`).
 
-    Finished steps are kept in ``workspace`` and reused as long as photos, options, pycolmap and this code stay the
-    same, so that a stopped run goes on where it was.
+    Finished steps are kept in ``workspace`` and reused as long as photos, options and pycolmap stay the same, so that
+    a stopped run goes on where it was.
 
     Args:
         photos: a folder, or a sequence of image files, all of one size and from one undistorted camera.
@@ -83,19 +80,29 @@ def structure_from_motion(
     colmap = require("pycolmap", extra="photos")
     named = find_photos(photos)
     check_photos(named)
+
+    def features(attempt: Attempt) -> dict[str, Any]:
+        _extract(colmap, folder, named, (max_features, camera_model), attempt)
+        return {}
+
+    def matches(attempt: Attempt) -> dict[str, Any]:
+        _match(colmap, folder, list(named), pairs, seed, attempt)
+        return {}
+
+    def model(attempt: Attempt) -> dict[str, Any]:
+        return {"other_models": _map(colmap, folder, named, seed, attempt)}
+
     folder = Path(workspace) / "sfm"
-    options = {"max_features": max_features, "camera_model": camera_model, "pairs": pairs, "seed": seed}
-    _open_workspace(folder, named, options, code_mark(__name__, packages=("pycolmap",)))
-    report = progress or (lambda stage, done, total: None)
-    with _quiet(colmap):
+    with Steps(folder, progress=progress) as steps, _quiet(colmap):
         colmap.set_random_seed(seed)
-        if not (folder / "model" / "points3D.bin").is_file():
-            _extract(colmap, folder, list(named), max_features, camera_model, report)
-            _match(colmap, folder, list(named), pairs, seed, report)
-            _map(colmap, folder, named, seed, report)
-        model = colmap.Reconstruction(str(folder / "model"))
-        others = json.loads((folder / "model" / "others.json").read_text())
-        return replace(_sparse_model(model, list(named)), other_models=tuple(others))
+        inputs = [list(named), list(named.values()), max_features, camera_model, colmap.__version__]
+        steps.run("features", features, version=1, inputs=inputs, outputs=["features.db"])
+        inputs = [steps.key("features"), pairs, seed]
+        steps.run("matches", matches, version=1, inputs=inputs, outputs=["matches.db"])
+        inputs = [steps.key("matches"), seed]
+        found = steps.run("model", model, version=1, inputs=inputs, outputs=["model"])
+        result = _sparse_model(colmap.Reconstruction(str(folder / "model")), list(named))
+        return replace(result, other_models=tuple(found["other_models"]))
 
 
 def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
@@ -134,41 +141,25 @@ def _quiet(colmap: ModuleType) -> Iterator[None]:
         colmap.logging.minloglevel = before
 
 
-def _open_workspace(folder: Path, named: Mapping[str, Path], options: dict[str, Any], code: str) -> None:
-    """Make ``folder`` hold the work of this code on these photos, with these options: what others left there goes."""
-    state = {
-        "options": options,
-        "photos": {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in named.items()},
-        "code": code,
-    }
-    stamp = folder / "photos.json"
-    if stamp.is_file():
-        before = json.loads(stamp.read_text())
-        if before == state:
-            return
-        if before | {"code": code} == state:
-            log_other_code(folder)
-    if folder.is_dir():
-        for part in ("photos.json", "features.db", "matches.db", "working.db", "pairs.txt"):
-            (folder / part).unlink(missing_ok=True)
-        for part in ("model", "mapping", "images"):
-            shutil.rmtree(folder / part, ignore_errors=True)
-    images = folder / "images"
+def _linked(folder: Path, named: Mapping[str, Path]) -> Path:
+    """``folder`` with the photos under their names, which is where COLMAP looks for them."""
+    shutil.rmtree(folder, ignore_errors=True)
     for name, path in named.items():
-        link = images / name
+        link = folder / name
         link.parent.mkdir(parents=True, exist_ok=True)
         try:
             link.symlink_to(path)
         except OSError:  # a file system without links
             shutil.copyfile(path, link)
-    write_text(stamp, json.dumps(state))
+    return folder
 
 
-def _fresh_copy(source: Path | None, target: Path) -> None:
-    for suffix in ("", "-wal", "-shm", "-journal"):
+def _copied(source: Path, target: Path) -> Path:
+    """``target``, a fresh copy of a database."""
+    for suffix in ("-wal", "-shm", "-journal"):
         Path(f"{target}{suffix}").unlink(missing_ok=True)
-    if source is not None:
-        shutil.copyfile(source, target)
+    shutil.copyfile(source, target)
+    return target
 
 
 def _settle(working: Path, final: Path) -> None:
@@ -180,12 +171,14 @@ def _settle(working: Path, final: Path) -> None:
 
 
 def _extract(
-    colmap: ModuleType, folder: Path, names: list[str], max_features: int, camera_model: str, report: Progress
+    colmap: ModuleType, folder: Path, named: Mapping[str, Path], settings: tuple[int, str], attempt: Attempt
 ) -> None:
-    if (folder / "features.db").is_file():
-        return
-    working, images = folder / "working.db", folder / "images"
-    _fresh_copy(None, working)
+    """Features of the photos, into ``features.db``."""
+    max_features, camera_model = settings
+    names = list(named)
+    images = _linked(attempt.folder / "images", named)
+    working = attempt.folder / "features.db"
+    working.unlink(missing_ok=True)
     colmap.Database.open(str(working)).close()
     reader = colmap.ImageReaderOptions(camera_model=camera_model)
     # Importing first numbers the images by name; extraction alone numbers them as threads finish.
@@ -195,7 +188,7 @@ def _extract(
     extraction.sift.max_num_features = max_features
     extraction.sift.peak_threshold = PEAK_THRESHOLD
     for start in range(0, len(names), EXTRACT_BATCH):
-        report("features", start, len(names))
+        attempt.progress("features", start, len(names))
         colmap.extract_features(
             working,
             images,
@@ -205,17 +198,18 @@ def _extract(
             extraction_options=extraction,
             device=colmap.Device.cpu,
         )
-    report("features", len(names), len(names))
+    attempt.progress("features", len(names), len(names))
     _settle(working, folder / "features.db")
 
 
 def _match(
-    colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, report: Progress
+    colmap: ModuleType, folder: Path, names: list[str], pairs: str, seed: int, attempt: Attempt
 ) -> None:
-    if (folder / "matches.db").is_file():
-        return
-    working, listing = folder / "working.db", folder / "pairs.txt"
-    _fresh_copy(folder / "features.db", working)
+    """Verified matches of pairs of photos, into ``matches.db``."""
+    working, listing = (
+        _copied(folder / "features.db", attempt.folder / "matches.db"),
+        attempt.folder / "pairs.txt",
+    )
     with colmap.Database.open(str(working)) as database:
         counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
         blank = [n for n in names if counts[n] < 8]
@@ -226,12 +220,12 @@ def _match(
             )
         chosen = list(itertools.combinations(names, 2))
         if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
-            chosen = _promising_pairs(database, names, report)
+            chosen = _promising_pairs(database, names, attempt.progress)
     matching = colmap.FeatureMatchingOptions(use_gpu=False)
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     for start in range(0, len(chosen), MATCH_BATCH):
-        report("matching", start, len(chosen))
+        attempt.progress("matching", start, len(chosen))
         listing.write_text("".join(f"{a} {b}\n" for a, b in chosen[start : start + MATCH_BATCH]))
         colmap.match_image_pairs(
             working,
@@ -240,8 +234,7 @@ def _match(
             verification_options=verification,
             device=colmap.Device.cpu,
         )
-    listing.unlink(missing_ok=True)
-    report("matching", len(chosen), len(chosen))
+    attempt.progress("matching", len(chosen), len(chosen))
     _settle(working, folder / "matches.db")
 
 
@@ -290,16 +283,17 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
     return [(names[i], names[j]) for i, j in itertools.combinations(range(len(names)), 2) if keep[i, j]]
 
 
-def _map(colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int, report: Progress) -> None:
-    working, output = folder / "working.db", folder / "mapping"
-    _fresh_copy(folder / "matches.db", working)
-    shutil.rmtree(output, ignore_errors=True)
-    output.mkdir()
+def _map(
+    colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int, attempt: Attempt
+) -> list[int]:
+    """Poses and points from the matches, into the folder ``model``; returns how many photos smaller models hold."""
+    working = _copied(folder / "matches.db", attempt.folder / "matches.db")
+    images, report = _linked(attempt.folder / "images", named), attempt.progress
     options = colmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time
     options.min_model_size = MIN_PHOTOS
-    models: dict[int, Any] = {}
+    models: list[Any] = []
     for relaxed in (False, True):
         # Few photos, or all from nearly one direction: a weaker first pair, when COLMAP's own limits find none.
         if relaxed:
@@ -308,37 +302,38 @@ def _map(colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int,
             options.mapper.abs_pose_min_num_inliers = 20
         posed = itertools.count(2)
         report("mapping", 0, len(named))
-        models = colmap.incremental_mapping(
+        output = attempt.folder / "mapping"
+        shutil.rmtree(output, ignore_errors=True)
+        output.mkdir()
+        found = colmap.incremental_mapping(
             working,
-            folder / "images",
+            images,
             output,
             options,
             next_image_callback=lambda posed=posed: report(
                 "mapping", min(next(posed), len(named)), len(named)
             ),
         )
-        models = {k: m for k, m in models.items() if m.num_reg_images() >= MIN_PHOTOS}
+        models = [m for m in found.values() if m.num_reg_images() >= MIN_PHOTOS]
         if models:
             break
     if not models:
         with colmap.Database.open(str(working)) as database:
-            linked = int(
-                (np.array(database.read_two_view_geometry_num_inliers()[1]) >= options.min_num_matches).sum()
-            )
+            inliers = np.array(database.read_two_view_geometry_num_inliers()[1])
         raise ValueError(
-            f"photos: too few matches between the {len(named)} photos to pose any ({linked} pairs of photos match); "
-            f"expected photos of one textured place that overlap by half or more: {some(list(named))}"
+            f"photos: too few matches between the {len(named)} photos to pose any "
+            f"({(inliers >= options.min_num_matches).sum()} pairs of photos match); expected photos of one textured "
+            f"place that overlap by half or more: {some(list(named))}"
         )
-    largest, *others = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
-    partial = folder / "model.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
-    largest.write_binary(str(partial))
-    (partial / "others.json").write_text(json.dumps([m.num_reg_images() for m in others]))
-    os.replace(partial, folder / "model")
-    shutil.rmtree(output, ignore_errors=True)
-    _fresh_copy(None, working)
+    largest, *others = sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    whole = attempt.folder / "model"
+    shutil.rmtree(whole, ignore_errors=True)
+    whole.mkdir()
+    largest.write_binary(str(whole))
+    shutil.rmtree(folder / "model", ignore_errors=True)
+    os.replace(whole, folder / "model")
     report("mapping", len(named), len(named))
+    return [m.num_reg_images() for m in others]
 
 
 def _sparse_model(model: Any, names: Sequence[str]) -> SparseModel:

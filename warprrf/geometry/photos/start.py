@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.geometry.photos import surface, sweep
-from warprrf.geometry.photos.edges import meeting
-from warprrf.geometry.photos.initial_gaussians import initial_gaussians, seen_cells
-from warprrf.geometry.photos.planes import Plane, aligned, occupancy
+from warprrf.geometry.photos.cells import occupancy, seen_cells
+from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.initial_gaussians import initial_gaussians
+from warprrf.geometry.photos.planes import Plane, aligned
+from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
+from warprrf.geometry.photos.sparse import SparseModel
+from warprrf.geometry.photos.sweep import GreyPhotos, joined, level_planes, proven_cells
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from warprrf.geometry.photos.config import ReconstructionConfig
-    from warprrf.geometry.photos.sparse import SparseModel
 
 
 def start_of(
@@ -50,7 +49,7 @@ def start_of(
         raise ValueError(
             f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
         )
-    keep = surface.clean_points(
+    keep = clean_points(
         sparse.points,
         reprojection_error=sparse.reprojection_error,
         track_length=sparse.track_length,
@@ -59,35 +58,27 @@ def start_of(
     if keep.sum() < 3:  # a handful of photos: few points are seen three times
         keep[:] = True
     sparse = sparse.subset(keep)
-    normals = surface.estimate_normals(sparse.points, sparse.viewpoints())
-    planes = surface.detect_room_planes(
-        sparse.points,
-        normals,
-        sparse.viewpoints(),
-        distance_m=config.plane_distance_m,
-        min_points=config.plane_points,
-        seed=seed,
-    )
-    planes = aligned(planes, sparse.points) if sparse.metric else planes
+    points, viewpoints = sparse.points, sparse.viewpoints()
+    normals = estimate_normals(points, viewpoints)
+    planes = detect_room_planes(points, normals, viewpoints, config=config.planes, seed=seed)
+    planes = aligned(planes, points) if sparse.metric else planes
     eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
-    targets = np.repeat(sparse.points, sparse.track_length, axis=0)
-    planes = occupancy(planes, sparse.points, eyes, targets, cell_m=config.cell_m)
+    lines = eyes, np.repeat(points, sparse.track_length, axis=0)
+    planes = occupancy(planes, points, *lines, config=config.planes)
     report("planes", 1, 5)
-    if config.sweep and len(cameras) > 2 and planes:
-        photos = sweep.Photos.upload(list(cameras.values()), images, device)
-        planes = sweep.proven_cells(planes, sparse.points, photos)
+    if config.sweep is not None and len(cameras) > 2 and planes:
+        photos = GreyPhotos.upload(list(cameras.values()), images, config.sweep, device)
+        planes = proven_cells(planes, points, photos)
         report("planes", 2, 5)
         if sparse.metric:  # else z is not up
             levels = []
             for k, up in enumerate((True, False)):
-                levels += sweep.level_planes(
-                    planes, sparse.points, photos, eyes, targets, cell_m=config.cell_m, up=up
-                )
+                levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
                 report("planes", 3 + k, 5)
-            planes = sweep.joined(planes, levels)
-    planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
-    start = initial_gaussians(
-        sparse.points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
+            planes = joined(planes, levels, config.sweep)
+    planes = seen_cells(planes, list(sparse.cameras.values()))
+    gaussians = initial_gaussians(
+        points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
     )
     report("planes", 5, 5)
-    return planes, start
+    return planes, gaussians

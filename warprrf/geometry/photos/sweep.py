@@ -13,398 +13,326 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy import ndimage
 
 from warprrf.device import launch, resolve
-from warprrf.geometry.photos.initial_gaussians import plane_occluder
-from warprrf.geometry.photos.planes import CONTESTED_M, Plane, dilate, plane_axes
-from warprrf.geometry.photos.surface import visible_from
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.cells import PARALLEL, plane_mesh, visible_from
+from warprrf.geometry.photos.config import SweepConfig
+from warprrf.geometry.photos.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
 
-VIEWS = 5  # photos compared
-MIN_ANGLE = np.radians(
-    6.0
-)  # between any two of them, seen from the patch: without parallax every height fits
-PATCH_M = 0.12  # side of a patch
-AGREES, DISAGREES = 0.6, 0.25  # mean correlation of a true patch, and of one that is certainly not
-CONTRAST = 0.012  # flatter patches prove nothing
-STEP_M = 0.03  # between heights of the sweep
-COARSE_M = 0.3  # cells that share the choice of photos
+FINE_M = 0.005  # a plane's height is settled in steps of this length
 
 
 @dataclass(frozen=True)
-class Photos:
+class GreyPhotos:
     """Grey photos and their projections on a device.
 
     Attributes:
         cameras: pinhole cameras of one size.
         grey: all photos, flat float32.
         projections: rows of the 3x4 projection matrices, shape ``(cameras, 3)`` of vec4.
+        config: settings of the comparison.
+        device: Warp device.
     """
 
     cameras: Sequence[Camera]
     grey: wp.array
     projections: wp.array
-    device: Any
+    config: SweepConfig
+    device: wp.Device
 
     @classmethod
-    def upload(cls, cameras: Sequence[Camera], images: Sequence[np.ndarray], device: Any = None) -> Photos:
+    def upload(
+        cls,
+        cameras: Sequence[Camera],
+        images: Sequence[np.ndarray],
+        config: SweepConfig | None = None,
+        device: Any = None,
+    ) -> GreyPhotos:
         """Photos ``(H, W, 3)`` in [0, 1] of ``cameras``."""
-        device = resolve(device)
-        grey = np.stack(
-            [i @ np.array([0.299, 0.587, 0.114], dtype=np.float32) for i in images]
-        )  # ITU-R BT.601 luma
+        where = resolve(device)
+        luma = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
+        grey = np.stack([i @ luma for i in images])
         rows = np.zeros((len(cameras), 3, 4), dtype=np.float32)
         for k, c in enumerate(cameras):
             lens = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
             rows[k] = lens @ c.world_to_camera[:3]
         return cls(
-            cameras, wp.array(grey.ravel(), dtype=wp.float32, device=device),
-            wp.array(rows, dtype=wp.vec4, device=device), device,
-        )  # fmt: skip
+            cameras,
+            wp.array(grey.ravel(), dtype=wp.float32, device=where),
+            wp.array(rows, dtype=wp.vec4, device=where),
+            config or SweepConfig(),
+            where,
+        )
 
     def agreement(
         self, centres: np.ndarray, axes: np.ndarray, views: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Correlation in [-1, 1] and contrast of the patches at ``centres`` (N, 3) over ``views`` (N, V), -1 padded."""
-        n = len(centres)
-        result = wp.zeros(n, dtype=wp.float32, device=self.device)
-        contrast = wp.zeros(n, dtype=wp.float32, device=self.device)
+        n, device = len(centres), self.device
+        result, contrast = (wp.zeros(n, dtype=wp.float32, device=device) for _ in range(2))
         launch(
             patch_agreement,
             n,
             [
-                wp.array(centres, dtype=wp.vec3, device=self.device), wp.vec3(*axes[0]), wp.vec3(*axes[1]),
-                PATCH_M / (SIDE - 1), wp.array(views, dtype=wp.int32, device=self.device), self.projections, self.grey,
-                self.cameras[0].width, self.cameras[0].height, result, contrast,
+                wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]),
+                self.config.patch_m / (SIDE - 1), wp.array(views, dtype=wp.int32, device=device), self.projections,
+                self.grey, self.cameras[0].width, self.cameras[0].height, result, contrast,
             ],
-            device=self.device,
+            device=device,
         )  # fmt: skip
         return result.numpy(), contrast.numpy()
 
 
 def choose_views(
-    points: np.ndarray, normals: np.ndarray, seen: np.ndarray, cameras: Sequence[Camera], count: int = VIEWS
+    points: np.ndarray, normal: np.ndarray, seen: np.ndarray, cameras: Sequence[Camera], config: SweepConfig
 ) -> np.ndarray:
-    """For each point the photos that show it largest among those that see it, no two from nearly the same direction.
+    """For each point on a plane of this ``normal`` the photos that show it largest among those that see it, no two from
+    nearly the same direction.
 
     Returns:
-        Camera indices, shape ``(N, count)`` int32, -1 padded.
+        Camera indices, shape ``(N, config.views)`` int32, -1 padded.
     """
-    positions = np.array([c.position for c in cameras])
-    line = positions[None] - points[:, None]
+    line = np.array([c.position for c in cameras])[None] - points[:, None]
     distance = np.linalg.norm(line, axis=2)
     line /= np.maximum(distance, 1e-9)[..., None]
-    worth = np.where(seen, np.einsum("nci,ni->nc", line, normals) / distance**2, -1.0)
-    chosen = np.full((len(points), count), -1, dtype=np.int32)
+    worth = np.where(seen, line @ normal / distance**2, -1.0)  # pixels on a square metre
+    chosen = np.full((len(points), config.views), -1, dtype=np.int32)
     rows = np.arange(len(points))
-    for k in range(count):
+    for k in range(config.views):
         best = worth.argmax(axis=1)
         good = worth[rows, best] > 0
         chosen[good, k] = best[good]
-        close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(MIN_ANGLE)
+        close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(np.radians(config.min_angle_deg))
         worth = np.where(close, -1.0, worth)
     return chosen
 
 
-def proven_cells(
-    planes: Sequence[Plane],
-    points: np.ndarray,
-    photos: Photos,
-    *,
-    reach_m: float = 2.5,
-    large_m2: float = 3.0,
-) -> list[Plane]:
-    """``planes`` with their cells corrected by the photos: extended (large planes, up to ``reach_m``) where the photos
+@dataclass(frozen=True)
+class _Scored:
+    """A plane with all cells that might be its own, and for each of them, on the grid: whether it was occupied before,
+    how well photos agree on it (NaN: nothing proved), whether any sees it, and whether a point of the plane lies there.
+    """
+
+    plane: Plane
+    before: np.ndarray
+    score: np.ndarray
+    visible: np.ndarray
+    own: np.ndarray
+
+
+def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos) -> list[Plane]:
+    """``planes`` with their cells corrected by the photos: extended (large planes far, others little) where the photos
     agree, emptied where they disagree and no point of the plane is near. Of two parallel planes close to each other,
     such as a sign and its wall, the one that the photos agree on more has the cell."""
-    surface = plane_occluder(planes)
-    wide, candidates, insides, scores, visible, own = [], [], [], [], [], []
-    for plane in planes:
-        reach = int(round(reach_m / plane.cell_m)) if plane.area() >= large_m2 else 2
-        padded = _padded(plane, reach)
-        grid = dilate(padded.occupied, reach)
-        full = replace(padded, occupied=grid)
-        centres = full.cells()
-        views, seen = _shared_views(full, surface, photos.cameras)
-        agreement, contrast = photos.agreement(centres, plane.axes, views)
-        score = np.full(grid.shape, np.nan)
-        score[grid] = np.where((contrast > CONTRAST) & (views[:, 1] >= 0), agreement, np.nan)
-        sees = np.zeros(grid.shape, dtype=bool)
-        sees[grid] = seen
-        feet = np.zeros(grid.shape, dtype=bool)
-        index = np.floor((padded.to_plane(points[plane.inliers]) - padded.corner) / padded.cell_m).astype(int)
-        feet[tuple(np.clip(index, 0, np.array(grid.shape) - 1).T)] = True
-        wide.append(full)
-        candidates.append(grid)
-        insides.append(padded.occupied)
-        scores.append(score)
-        visible.append(sees)
-        own.append(feet)
+    surface = plane_mesh(planes)
+    scored = [_scored(plane, surface, points, photos) for plane in planes]
     result = []
-    for k, plane in enumerate(wide):
+    for k, this in enumerate(scored):
         with np.errstate(invalid="ignore"):
-            yes, no = scores[k] > AGREES, scores[k] < DISAGREES
-        grown = _majority(yes, 5) & ~insides[k]
-        cut = _majority(no, 3) & ~dilate(own[k], 1)
-        lost = np.zeros_like(grown)
-        cells = plane.cells()
-        mine = np.nan_to_num(scores[k][candidates[k]], nan=0.3)
-        for other in range(len(wide)):
-            rival = wide[other]
-            if other == k or rival.normal @ plane.normal < np.cos(np.radians(10.0)):
-                continue
-            near = np.abs(rival.distance(cells)) < CONTESTED_M
-            index = np.floor((rival.to_plane(cells) - rival.corner) / rival.cell_m).astype(int)
-            near &= ((index >= 0) & (index < rival.occupied.shape)).all(axis=1)
-            index = np.where(near[:, None], index, 0)
-            spot = (index[:, 0], index[:, 1])
-            there = insides[other][spot]
-            theirs = np.nan_to_num(scores[other][spot], nan=0.3)
-            beaten = near & there & ((theirs > mine) | own[other][spot])
-            lost[candidates[k]] |= beaten & ~own[k][candidates[k]]
-            grown[candidates[k]] &= ~(near & there)
-        kept = insides[k] & ~cut & ~lost
+            yes, no = this.score > photos.config.agrees, this.score < photos.config.disagrees
+        lost, taken = _rivals(this, scored[:k] + scored[k + 1 :], photos.config.contested_m)
+        grown = _majority(yes, 5) & ~this.before & ~taken
+        kept = this.before & ~(_majority(no, 3) & ~dilate(this.own, 1)) & ~lost
         attached = _pieces(grown | kept, 6) & grown
-        result.append(replace(plane, occupied=(kept | attached) & visible[k]))
+        result.append(replace(this.plane, occupied=(kept | attached) & this.visible))
     return result
 
 
-def _shared_views(plane: Plane, surface: Any, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Photos to compare at each occupied cell, chosen once for every 2 x 2 cells, and whether any photo sees it."""
-    index = np.argwhere(plane.occupied)
+def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: GreyPhotos) -> _Scored:
+    config = photos.config
+    reach = int(round(config.reach_m / plane.cell_m)) if plane.area() >= config.large_m2 else 2
+    wide = plane.widened(reach)
+    full = replace(wide, occupied=dilate(wide.occupied, reach))
+    # Photos are chosen once for every 2 x 2 cells.
+    index = np.argwhere(full.occupied)
     key, group = np.unique(index // 2, axis=0, return_inverse=True)
-    group = group.ravel()
-    centres = plane.to_world(plane.corner + (2 * key + 1.0) * plane.cell_m)
-    normals = np.broadcast_to(plane.normal, centres.shape)
-    seen = visible_from(surface, centres, normals, cameras, clearance_m=0.05)
-    return choose_views(centres, normals, seen, cameras)[group], np.asarray(seen.any(axis=1))[group]
+    middle = full.to_world(full.corner + (2 * key + 1.0) * full.cell_m)
+    seen = visible_from(surface, middle, full.normal, photos.cameras)
+    views = choose_views(middle, full.normal, seen, photos.cameras, config)[group.ravel()]
+    agreement, contrast = photos.agreement(full.cells(), full.axes, views)
+    score = np.full(full.occupied.shape, np.nan)
+    score[full.occupied] = np.where((contrast > config.contrast) & (views[:, 1] >= 0), agreement, np.nan)
+    visible = np.zeros_like(full.occupied)
+    visible[full.occupied] = np.asarray(seen.any(axis=1))[group.ravel()]
+    return _Scored(full, wide.occupied, score, visible, full.count(points[plane.inliers]) > 0)
+
+
+def _rivals(this: _Scored, others: Sequence[_Scored], contested_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cells that a parallel plane close by has the better claim to, and cells that one holds already."""
+    plane = this.plane
+    lost, taken = (np.zeros_like(this.before) for _ in range(2))
+    unproven = 0.3  # what photos that prove nothing count as, between agreement and disagreement
+    cells, mine = plane.cells(), np.nan_to_num(this.score[plane.occupied], nan=unproven)
+    for other in others:
+        if other.plane.normal @ plane.normal < PARALLEL:
+            continue
+        place, inside = other.plane.cell_of(cells)
+        held = inside & (np.abs(other.plane.distance(cells)) < contested_m) & other.before[place]
+        better = (np.nan_to_num(other.score[place], nan=unproven) > mine) | other.own[place]
+        lost[plane.occupied] |= held & better
+        taken[plane.occupied] |= held
+    return lost & ~this.own, taken
 
 
 def level_planes(
     planes: Sequence[Plane],
     points: np.ndarray,
-    photos: Photos,
-    eyes: np.ndarray,
-    targets: np.ndarray,
+    photos: GreyPhotos,
+    lines: tuple[np.ndarray, np.ndarray],
     *,
     cell_m: float = 0.1,
-    min_cells: int = 15,
     up: bool = True,
 ) -> list[Plane]:
     """Horizontal planes (z is up) that photos prove and ``planes`` lack: seats, table tops, platforms, soffits.
 
     Args:
         points: sparse points; the sweep spans their extent.
-        min_cells: fewest cells of a plane.
-        eyes, targets: lines of sight from cameras to points, shape ``(L, 3)``: what they cross is no surface.
+        lines: lines of sight from cameras to points, shape ``(L, 3)`` each: what they cross is no surface.
+        cell_m: side of a cell.
         up: surfaces that face up; else those that face down.
     """
+    config = photos.config
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
-    heights = np.array([c.position[2] for c in photos.cameras])
-    bottom, top = (low[2], min(high[2], heights.max())) if up else (max(low[2], heights.min()), high[2])
-    levels = np.arange(bottom - 0.06, top + 0.06, STEP_M)
+    eyes = np.array([c.position[2] for c in photos.cameras])
+    bottom, top = (low[2], min(high[2], eyes.max())) if up else (max(low[2], eyes.min()), high[2])
+    levels = np.arange(bottom - 0.06, top + 0.06, config.step_m)
     if len(levels) < 3:
         return []
     normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
-    axes = plane_axes(normal)
-    shape = np.ceil((high[:2] - low[:2]) / cell_m).astype(int) + 1
-    cells = np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 2)
-    ground = np.zeros((len(cells), 3))
-    ground[:, :2] = low[:2] + (cells + 0.5) * cell_m
-    coarse = max(1, int(round(COARSE_M / cell_m)))
-    key, group = np.unique(cells // coarse, axis=0, return_inverse=True)
-    group = group.ravel()
-    middle = np.zeros((len(key), 3))
-    middle[:, :2] = low[:2] + (key + 0.5) * coarse * cell_m
-    surface = plane_occluder(planes)
-    every = max(1, int(round(0.09 / STEP_M)))
-    agreement = np.full((len(levels), len(cells)), -1.0, dtype=np.float32)
-    views = np.zeros((len(cells), VIEWS), dtype=np.int32)
-    for k, z in enumerate(levels):
-        if k % every == 0:
-            middle[:, 2] = levels[min(k + every // 2, len(levels) - 1)]
-            normals = np.broadcast_to(normal, middle.shape)
-            seen = visible_from(surface, middle, normals, photos.cameras, clearance_m=0.03)
-            views = choose_views(middle, normals, seen, photos.cameras)[group]
-        some = np.flatnonzero(views[:, 2] >= 0)  # three photos at least
-        if not len(some):
-            continue
-        ground[:, 2] = z
-        value, contrast = photos.agreement(ground[some], axes, views[some])
-        agreement[k, some] = np.where(contrast > CONTRAST, value, -1.0)
-    # A surface is a clear peak along the vertical.
-    padded = np.pad(agreement, ((4, 4), (0, 0)), constant_values=-1.0)
-    near = np.max([padded[4 + s : 4 + s + len(levels)] for s in (-1, 1)], axis=0)
-    far = np.max([padded[4 + s : 4 + s + len(levels)] for s in (-4, -3, 3, 4)], axis=0)
-    peak = (agreement > AGREES) & (agreement >= near) & (agreement > far + 0.15)
-    known = np.zeros_like(peak)
-    for plane in planes:
-        if plane.normal @ normal > 0.99:
-            for k, z in enumerate(levels):
-                ground[:, 2] = z
-                known[k] |= (np.abs(plane.distance(ground)) < 0.05) & plane.covers(ground)
-    peak &= ~known
+    shape = np.ceil(np.abs(plane_axes(normal)[:, :2] @ (high - low)[:2]) / cell_m).astype(int) + 1
+    corner = np.minimum(plane_axes(normal)[:, :2] @ low[:2], plane_axes(normal)[:, :2] @ high[:2])
+    nothing = np.zeros(0, dtype=np.int64)
+    whole = Plane(normal, 0.0, nothing, FINE_M, corner, cell_m, np.ones(shape, dtype=bool))
+    surface = plane_mesh(planes)
+    agreement = _swept(whole, levels, surface, photos)
+    peak = _peaks(agreement, config.agrees) & ~_known(whole, levels, planes)
     found: list[Plane] = []
     while True:
-        votes = peak.sum(axis=1)
-        votes = votes + np.concatenate([votes[1:], [0]]) + np.concatenate([[0], votes[:-1]])
+        votes = ndimage.convolve1d(peak.sum(axis=(1, 2)), [1, 1, 1], mode="constant")
         k = int(votes.argmax())
-        if votes[k] < min_cells:
+        if votes[k] < config.min_cells:
             return found
         band = slice(max(0, k - 1), k + 2)
-        columns = peak[band].any(axis=0)
-        mask = np.zeros(shape, dtype=bool)
-        mask[tuple(cells[columns].T)] = True
-        strong = agreement[band].max(axis=0) > 0.8 * AGREES
-        soft = np.zeros(shape, dtype=bool)
-        soft[tuple(cells[strong].T)] = True
-        mask = _pieces((mask | (dilate(mask, 1) & soft)), min_cells)
-        peak[max(0, k - 2) : k + 3] &= ~columns[None]
-        if mask.sum() < min_cells:
-            continue
-        # Every connected piece has a height of its own.
-        for piece in _split(mask):
-            level = _settled(piece, levels[k], low[:2], cell_m, normal, axes, photos, surface)
-            if level is not None and _crossed(level, eyes, targets) < 0.2:
-                found.append(level)
+        mask = peak[band].any(axis=0)
+        peak[max(0, k - 2) : k + 3] &= ~mask
+        mask |= dilate(mask, 1) & (agreement[band].max(axis=0) > 0.8 * config.agrees)
+        pieces, count = ndimage.label(_pieces(mask, config.min_cells))
+        for number in range(1, count + 1):  # every connected piece has a height of its own
+            piece = replace(whole, offset=float(levels[k] * normal[2]), occupied=pieces == number)
+            level = _settled(piece, surface, photos)
+            if level is not None:
+                crossed = (level.seen_through(*lines, 0.05) > 0) & level.occupied
+                if crossed.sum() < 0.2 * level.occupied.sum():
+                    found.append(level)
 
 
-def _crossed(plane: Plane, eyes: np.ndarray, targets: np.ndarray) -> float:
-    """Share of the plane's cells that a line of sight passes through, to a point more than 5 cm behind."""
-    before, behind = plane.distance(eyes), plane.distance(targets)
-    through = (before > 0) & (behind < -0.05)
-    share = (before[through] / (before[through] - behind[through]))[:, None]
-    crossing = plane.to_plane(eyes[through] + share * (targets[through] - eyes[through]))
-    index = np.floor((crossing - plane.corner) / plane.cell_m).astype(int)
-    index = index[((index >= 0) & (index < plane.occupied.shape)).all(axis=1)]
-    hit = np.zeros(plane.occupied.shape, dtype=bool)
-    hit[tuple(index.T)] = True
-    return float((hit & plane.occupied).sum() / max(1, plane.occupied.sum()))
+def _swept(whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyPhotos) -> np.ndarray:
+    """Agreement of the photos at every level and cell, shape ``(levels, A, B)``; -1 where nothing is proved.
+
+    Photos are chosen once for blocks of 3 x 3 cells and 3 levels.
+    """
+    index = np.argwhere(whole.occupied)
+    key, group = np.unique(index // 3, axis=0, return_inverse=True)
+    middle = whole.to_world(whole.corner + (key + 0.5) * 3 * whole.cell_m)
+    cells = whole.cells()
+    agreement = np.full((len(levels), len(cells)), -1.0, dtype=np.float32)
+    for k, z in enumerate(levels):
+        if k % 3 == 0:
+            middle[:, 2] = levels[min(k + 1, len(levels) - 1)]
+            seen = visible_from(surface, middle, whole.normal, photos.cameras, clearance_m=0.03)
+            views = choose_views(middle, whole.normal, seen, photos.cameras, photos.config)[group.ravel()]
+            some = np.flatnonzero(views[:, 2] >= 0)  # three photos at least
+        cells[:, 2] = z
+        value, contrast = photos.agreement(cells[some], whole.axes, views[some])
+        agreement[k, some] = np.where(contrast > photos.config.contrast, value, -1.0)
+    return agreement.reshape(len(levels), *whole.occupied.shape)
 
 
-def joined(
-    planes: Sequence[Plane],
-    levels: Sequence[Plane],
-    *,
-    offset_m: float = 0.008,
-    up_m2: float = 0.3,
-    down_m2: float = 2.0,
-) -> list[Plane]:
-    """``planes`` and ``levels`` with pieces of one plane united; new planes need an area of ``up_m2``, or ``down_m2``
-    where they face down (seen from below, stripes on a wall pass for a soffit)."""
-    result = list(planes)
-    for level in sorted(levels, key=lambda p: -p.area()):
-        twin = next(
-            (
-                k
-                for k, p in enumerate(result)
-                if p.normal @ level.normal > np.cos(np.radians(1.0))
-                and np.abs(p.distance(level.cells())).mean() < offset_m
-            ),
-            None,
-        )
-        if twin is None:
-            result.append(level)
-        else:
-            result[twin] = _united(result[twin], level)
-    least = [0.0] * len(planes) + [up_m2 if p.normal[2] > 0 else down_m2 for p in result[len(planes) :]]
-    return [p for p, area in zip(result, least, strict=True) if p.area() >= area]
+def _peaks(agreement: np.ndarray, least: float) -> np.ndarray:
+    """Where a surface shows as a clear peak along the vertical."""
+
+    def around(*steps: int) -> np.ndarray:
+        footprint = np.isin(np.arange(-4, 5), steps)[:, None, None]
+        return np.asarray(ndimage.maximum_filter(agreement, footprint=footprint, mode="constant", cval=-1.0))
+
+    return (agreement > least) & (agreement >= around(-1, 1)) & (agreement > around(-4, -3, 3, 4) + 0.15)
 
 
-def _united(plane: Plane, other: Plane) -> Plane:
-    uv = np.concatenate([plane.to_plane(plane.cells()), plane.to_plane(other.cells())])
-    cell = plane.cell_m
-    index = np.round((uv - plane.corner) / cell - 0.5).astype(int)
-    low = index.min(axis=0)
-    occupied = np.zeros(index.max(axis=0) - low + 1, dtype=bool)
-    occupied[tuple((index - low).T)] = True
-    return replace(plane, corner=plane.corner + low * cell, occupied=_closed(occupied))
+def _known(whole: Plane, levels: np.ndarray, planes: Sequence[Plane]) -> np.ndarray:
+    """Which cells of which levels lie on planes that are known, shape ``(levels, A, B)``."""
+    known = np.zeros((len(levels), *whole.occupied.shape), dtype=bool)
+    cells = whole.cells()
+    for plane in planes:
+        if plane.normal @ whole.normal > 0.99:
+            for k, z in enumerate(levels):
+                cells[:, 2] = z
+                near = (np.abs(plane.distance(cells)) < 0.05) & plane.covers(cells)
+                known[k] |= near.reshape(whole.occupied.shape)
+    return known
 
 
-def _settled(
-    mask: np.ndarray,
-    z: float,
-    corner: np.ndarray,
-    cell_m: float,
-    normal: np.ndarray,
-    axes: np.ndarray,
-    photos: Photos,
-    surface: Any,
-) -> Plane | None:
-    """The plane of a piece found near height ``z``, at the height where its photos agree best (to 5 mm)."""
-    cells = np.argwhere(mask)
-    centres = np.zeros((len(cells), 3))
-    centres[:, :2] = corner + (cells + 0.5) * cell_m
-    centres[:, 2] = z
-    normals = np.broadcast_to(normal, centres.shape)
-    seen = visible_from(surface, centres, normals, photos.cameras, clearance_m=0.05)
-    views = choose_views(centres, normals, seen, photos.cameras)
-    steps = np.arange(-0.05, 0.0501, 0.005)
-    scores = []
-    for step in steps:
-        centres[:, 2] = z + step
-        scores.append(float(photos.agreement(centres, axes, views)[0].mean()))
+def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | None:
+    """A horizontal piece moved to the height where its photos agree best; None where no height within 5 cm does."""
+    centres = piece.cells()
+    z = piece.offset * piece.normal[2]
+    seen = visible_from(surface, centres, piece.normal, photos.cameras)
+    views = choose_views(centres, piece.normal, seen, photos.cameras, photos.config)
+    steps = np.arange(-0.05, 0.0501, FINE_M)
+    scores = [float(photos.agreement(centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps]
     best = int(np.argmax(scores))
     if best in (0, len(steps) - 1) or scores[best] < 0.5:
         return None
     a, b, c = scores[best - 1 : best + 2]
-    z = z + steps[best] + 0.005 * 0.5 * (a - c) / min(a - 2 * b + c, -1e-9)
-    # In the plane's own axes: for a level plane they are x and +-y.
-    uv = centres[:, :2] * np.array([axes[0][0], axes[1][1]])
-    first = uv.min(axis=0) - 0.5 * cell_m
-    index = np.round((uv - first) / cell_m - 0.5).astype(int)
-    occupied = np.zeros(index.max(axis=0) + 1, dtype=bool)
-    occupied[tuple(index.T)] = True
-    return Plane(
-        normal,
-        float(z * normal[2]),
-        np.zeros(0, dtype=np.int64),
-        0.005,
-        axes,
-        first,
-        cell_m,
-        _closed(occupied),
-    )
+    z += steps[best] + FINE_M * 0.5 * (a - c) / min(a - 2 * b + c, -1e-9)  # top of the parabola
+    return replace(piece, offset=float(z * piece.normal[2]), occupied=_closed(piece.occupied))
 
 
-def _padded(plane: Plane, cells: int) -> Plane:
-    return replace(
-        plane, occupied=np.pad(plane.occupied, cells), corner=np.asarray(plane.corner) - cells * plane.cell_m
-    )
+def joined(
+    planes: Sequence[Plane], levels: Sequence[Plane], config: SweepConfig | None = None
+) -> list[Plane]:
+    """``planes`` and ``levels`` with pieces of one plane united; new planes need a least area, a larger one where they
+    face down (seen from below, stripes on a wall pass for a soffit)."""
+    config = config or SweepConfig()
+    result = list(planes)
+    for level in sorted(levels, key=lambda p: -p.area()):
+        for k, plane in enumerate(result):
+            near = np.abs(plane.distance(level.cells())).mean() < config.same_plane_m
+            if near and plane.normal @ level.normal > np.cos(np.radians(1.0)):
+                result[k] = _united(plane, level)
+                break
+        else:
+            result.append(level)
+    least = [config.up_m2 if p.normal[2] > 0 else config.down_m2 for p in result[len(planes) :]]
+    large = [p for p, area in zip(result[len(planes) :], least, strict=True) if p.area() >= area]
+    return result[: len(planes)] + large
+
+
+def _united(plane: Plane, other: Plane) -> Plane:
+    """``plane`` with the cells of ``other`` too."""
+    centres = np.concatenate([plane.cells(), other.cells()])
+    index = np.round((plane.to_plane(centres) - plane.corner) / plane.cell_m - 0.5).astype(int)
+    low = index.min(axis=0)
+    occupied = np.zeros(index.max(axis=0) - low + 1, dtype=bool)
+    occupied[tuple((index - low).T)] = True
+    return replace(plane, corner=plane.corner + low * plane.cell_m, occupied=_closed(occupied))
 
 
 def _majority(mask: np.ndarray, of_nine: int) -> np.ndarray:
-    padded = np.pad(mask, 1).astype(int)
-    a, b = mask.shape
-    return mask & (sum(padded[i : i + a, j : j + b] for i in range(3) for j in range(3)) >= of_nine)
+    """Cells of ``mask`` that belong to at least so many with their neighbours, themselves counted."""
+    return mask & (ndimage.convolve(mask.astype(int), AROUND.astype(int), mode="constant") >= of_nine)
 
 
 def _closed(mask: np.ndarray) -> np.ndarray:
-    grown = np.pad(mask, 1)
-    return (~dilate(~dilate(grown, 1), 1))[1:-1, 1:-1] | mask
-
-
-def _labels(mask: np.ndarray) -> np.ndarray:
-    """Connected pieces (four neighbours) numbered from 1, by spreading the largest number."""
-    label = np.where(mask, np.arange(1, mask.size + 1).reshape(mask.shape), 0)
-    while True:
-        padded = np.pad(label, 1)
-        spread = np.max(
-            [padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:], label], axis=0
-        )
-        spread = np.where(mask, spread, 0)
-        if (spread == label).all():
-            return label
-        label = spread
+    """``mask`` with gaps of up to two cells closed."""
+    grown = np.pad(mask, 2)
+    return np.asarray(ndimage.binary_closing(grown, AROUND)[2:-2, 2:-2]) | mask
 
 
 def _pieces(mask: np.ndarray, smallest: int) -> np.ndarray:
-    label = _labels(mask)
-    values, counts = np.unique(label[label > 0], return_counts=True)
-    return np.isin(label, values[counts >= smallest])
-
-
-def _split(mask: np.ndarray) -> list[np.ndarray]:
-    label = _labels(mask)
-    return [label == v for v in np.unique(label[label > 0])]
+    """``mask`` without connected pieces (four neighbours) of fewer cells than ``smallest``."""
+    label, _ = ndimage.label(mask)
+    return mask & (np.bincount(label.ravel())[label] >= smallest)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.device import check_array, is_cuda, launch, resolve
+from warprrf.device import check_array, launch, resolve
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import RADIO, RULES, Blending
 from warprrf.geometry.splats.tape import active_tape, gradient, with_gradients
@@ -260,7 +260,7 @@ class GaussianRays:
         """Run a hit-wise adjoint, then add its sums to the gradients of the parameters."""
         if count == 0 or len(self) == 0:
             return
-        pieces = 1 if is_cuda(self.device) else min(CPU_PIECES, count)
+        pieces = 1 if self.device.is_cuda else min(CPU_PIECES, count)
         sums = wp.zeros((pieces, len(self), kernels.SUMS), dtype=wp.float64, device=self.device)
         launch(kernel, count, [count, pieces, *inputs, sums], device=self.device, pieces=pieces)
         _, quaternions, scales, _ = self.inputs

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.device import MIN_SPLIT, PIECES_PER_THREAD, is_cuda, launch, resolve, threads
+from warprrf.device import MIN_SPLIT, PIECES_PER_THREAD, launch, resolve, threads
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.tape import active_tape, gradient, with_gradients
@@ -138,7 +138,7 @@ class Rasterizer:
         self.rules.alpha_min = self.blending.alpha_min
         self.rules.alpha_max = self.blending.alpha_max
         self.rules.transmittance_min = self.blending.transmittance_min
-        self.on_gpu = is_cuda(self.device)
+        self.on_gpu = self.device.is_cuda
 
     def vector(self, size: int) -> Any:
         """Warp's vector type of this precision."""

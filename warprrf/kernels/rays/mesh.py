@@ -14,23 +14,16 @@ BAD = wp.constant(-2)
 """Face of a ray that is not finite or has no direction."""
 AGAIN = wp.constant(-3)
 """Face of a ray that met a surface at its start and goes on from the distance stored in its place."""
-FREE = wp.constant(0)
-"""Segment that nothing blocks."""
-BLOCKED = wp.constant(1)
-"""Segment that a surface blocks."""
-
-ROUNDING = wp.constant(wp.float64(3.6e-7))
+ROUNDING = 3.6e-7
 """What float32 may displace a surface along a ray, over the largest coordinate: six roundings of 2^-24."""
 # A ray's start is on a plane if no further from it than this, over the largest coordinate: float64 rounding.
 _ON_PLANE = wp.constant(wp.float64(1e-12))
 GRAZING = 1e-7
 """Below this |normal . direction| the plane equation is worse than the float32 distance."""
 
+_ROUNDING = wp.constant(wp.float64(ROUNDING))
 _GRAZING = wp.constant(wp.float64(GRAZING))
 _FAR = wp.constant(wp.float64(1e30))
-# Beyond these a hit is neither grazing nor at the ray's start, without a closer look.
-STEEP_SQUARE = wp.constant(wp.float64(1e-12))
-CLEAR = wp.constant(wp.float64(1e-9))
 _STEPS = 8
 
 
@@ -92,7 +85,7 @@ def search(
 ):
     """Distance [m] and face of what a ray meets beyond ``clearance`` and within ``reach``; inf and MISS if nothing."""
     unit = direction / length
-    step = ROUNDING * scale
+    step = _ROUNDING * scale
     start = clearance - step
     most = wp.min(reach, _FAR)
     found = wp.float64(wp.inf)
@@ -146,31 +139,71 @@ def cast_rays(
 
 
 @wp.kernel(enable_backward=False)
-def look(
+def pack_rays(
     offset: int,
-    mesh: wp.uint64,
+    center: wp.vec3d,
+    radius: wp.float64,
+    clearance: wp.float64,
+    start: wp.array(dtype=wp.float64),
+    origins: wp.array(dtype=wp.vec3d),
+    directions: wp.array(dtype=wp.vec3d),
+    rays: wp.array(dtype=wp.vec3),
+):
+    """Each ray as a pair (point, unit direction) in float32; a bad one holds NaN and meets nothing.
+
+    Rays begin at ``start`` [m]; if that is empty, at ``clearance``, less the rounding.
+    """
+    i = offset + wp.tid()
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    unit = direction / wp.length(direction)
+    begin = clearance - _ROUNDING * rounding_scale(origin, radius)
+    if start.shape[0] > 0:
+        begin = start[i]
+    rays[2 * i] = narrow(origin + begin * unit)
+    rays[2 * i + 1] = narrow(unit)
+
+
+@wp.kernel(enable_backward=False)
+def place_hits(
+    offset: int,
     center: wp.vec3d,
     radius: wp.float64,
     planes: wp.array(dtype=wp.vec4d),
     clearance: wp.float64,
-    starts: wp.array(dtype=wp.vec3d),
-    ends: wp.array(dtype=wp.vec3d),
-    sight: wp.array(dtype=wp.int8),
+    start: wp.array(dtype=wp.float64),
+    origins: wp.array(dtype=wp.vec3d),
+    directions: wp.array(dtype=wp.vec3d),
+    met_at: wp.array(dtype=wp.float32),
+    met: wp.array(dtype=wp.int32),
+    distance: wp.array(dtype=wp.float64),
+    face: wp.array(dtype=wp.int32),
 ):
-    """Whether each segment is FREE but for ``clearance`` at its ends, or BLOCKED."""
+    """Distances [m] in float64 to the faces ``met`` by rays of :func:`pack_rays`, ``met_at`` in float32 from there.
+
+    Where a surface at the ray's start was met, ``face`` becomes AGAIN and ``distance`` that at which to go on.
+    """
     i = offset + wp.tid()
-    origin = starts[wp.min(i, starts.shape[0] - 1)] - center
-    way = (ends[wp.min(i, ends.shape[0] - 1)] - center) - origin
-    length = wp.length(way)
+    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
+    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    length = wp.length(direction)
     scale = rounding_scale(origin, radius)
-    if not (wp.isfinite(scale) and wp.isfinite(length)):
-        sight[i] = wp.int8(BAD)
-        return
-    if length <= wp.float64(2.0) * clearance:
-        sight[i] = wp.int8(FREE)
-        return
-    t, name = search(mesh, planes, origin, way, length, scale, clearance, length - clearance)
-    sight[i] = wp.int8(wp.where(name >= 0 and t < length - clearance, BLOCKED, FREE))
+    name = met[i]
+    t = wp.float64(wp.inf)
+    if is_bad(scale, length):
+        name = BAD
+    elif name >= 0:
+        step = _ROUNDING * scale
+        begin = clearance - step
+        if start.shape[0] > 0:
+            begin = start[i]
+        near = begin + wp.float64(met_at[i])
+        t = plane_distance(origin, direction, length, scale, planes[name], near, clearance)
+        if wp.isnan(t):
+            t = near + step
+            name = AGAIN
+    distance[i] = t
+    face[i] = name
 
 
 @wp.kernel

@@ -1,7 +1,11 @@
-"""From propagation paths to channels: the paths of a receiver, what arrays make of them, and their files.
+"""Channels from propagation paths: arrays, frequency responses, dispersion, beams, precoders, the band plan.
 
-``path_set`` holds paths (:class:`Paths`), whoever found them. From them ``response`` computes channels between two
-``arrays`` (``lengths``: what elements add to paths, ``sums``: the sums over paths), ``dispersion`` spreads in delay and
-angle, ``beams`` the beams to choose. ``files``, ``sionna_paths`` and ``deepmimo`` are formats, ``band_plan`` the
-channels of IEEE 802.15.3d. Nothing here knows of a field, of an engine or of how paths are found.
+``path_arrays`` holds paths, whoever found them. From them ``response`` computes channels between two ``arrays``
+(``lengths``: what elements add to paths, ``sums``: the sums over paths), ``dispersion`` spreads in delay and angle,
+``beams`` and ``precoding`` what to send, ``band_plan`` the channels of IEEE 802.15.3d. Nothing here knows of a field,
+of an engine or of how paths are found.
 """
+
+from warprrf.lazy import attach
+
+__getattr__, __dir__, __doc__ = attach(__file__, __doc__)

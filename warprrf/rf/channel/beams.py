@@ -26,7 +26,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
-from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions
 
 MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
@@ -273,7 +273,7 @@ def select_beams_multiuser(
     if not (np.isfinite(noise) and noise > 0):
         raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")
     tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
-    given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | Paths) else sources
+    given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
     gains = [_pair_gains(rays, tx, rx) for source in given for rays in _rays(source, tx)]
     if not gains:
         raise ValueError("sources: got none, expected a spectrum or paths for every user")
@@ -338,7 +338,7 @@ _Rays = tuple[np.ndarray | None, np.ndarray, np.ndarray]
 def _rays(source: Any, tx: Codebook) -> Iterator[_Rays]:
     """Departure (None if it does not matter), arrival and power of what reaches each receiver of ``source``."""
     directed = tx.array.elements > 1 or not _isotropic(tx.array)
-    if isinstance(source, Paths):
+    if isinstance(source, PathArrays):
         for paths in source.each():
             kept = paths.select(np.flatnonzero(paths.power > 0))
             departure = kept.departure
@@ -419,7 +419,7 @@ def _isotropic(array: PlanarArray) -> bool:
 
 
 def _several(source: Any) -> bool:
-    return isinstance(source, Paths) and source.batched
+    return isinstance(source, PathArrays) and source.batched
 
 
 def _largest(values: np.ndarray, count: int) -> np.ndarray:

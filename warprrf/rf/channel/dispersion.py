@@ -9,14 +9,12 @@ angular spread, and its section 7.5 for the K-factor: power of the line of sight
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from warprrf import device as _device
-
-if TYPE_CHECKING:
-    from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.channel.path_arrays import PathArrays
 
 COHERENCE = 0.5
 """Default share of the maximum that defines the coherence bandwidth."""
@@ -53,7 +51,7 @@ class Dispersion:
     coherence_bandwidth_hz: np.ndarray
 
 
-def dispersion(paths: Paths) -> Dispersion:
+def dispersion(paths: PathArrays) -> Dispersion:
     """All measures of ``paths``.
 
     Raises:

@@ -8,12 +8,10 @@ from the element to the first interaction point, and from the last to the receiv
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.channel.path_arrays import PathArrays, points_along
 
 
 @dataclass(frozen=True)
@@ -46,32 +44,33 @@ class PairLengths:
         """Whether there is one element at either end, at the centre."""
         return len(self.place) == 1 and len(self.extra) == 1
 
-    def received(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Of separable ones: length [m] that receiving elements ``m`` add, ``(m, P)``, and factor of amplitudes."""
+    def received(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of separable ones: length [m] that receiving elements add, ``(M, P)``, and factor of amplitudes."""
         if not self.spherical:
-            return -(self.place[m] @ self.target[0].T), np.ones((1, 1))
-        source = self.target[0]
-        reach = np.linalg.norm(source - self.place[m][:, None], axis=-1)
-        far = np.linalg.norm(source, axis=-1)
+            return -(self.place @ self.target[0].T), np.ones((1, 1))
+        reach, far = self._reach(self.target[0], self.place[:, None])
         return reach - far, far / reach
 
-    def longer(self, m: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Added length [m] and factor of amplitudes for receiving elements ``m``, each ``(m, N, P)``."""
+    def longer(self) -> tuple[np.ndarray, np.ndarray]:
+        """Added length [m] and factor of amplitudes, each ``(M, N, P)``."""
         if self.separable:
-            added, ratio = self.received(m)
+            added, ratio = self.received()
             return added[:, None] + self.extra, ratio[:, None] * self.scale
-        source = self.target
-        reach = np.linalg.norm(source - self.place[m][:, None, None], axis=-1)
-        far = np.linalg.norm(source, axis=-1)
+        reach, far = self._reach(self.target, self.place[:, None, None])
         return self.extra + (reach - far), self.scale * (far / reach)
 
-    def taken(self, order: np.ndarray) -> PairLengths:
-        """Those of paths ``order``."""
-        scale = self.scale if self.scale.shape[1] == 1 else self.scale[:, order]
-        return replace(self, target=self.target[:, order], extra=self.extra[:, order], scale=scale)
+    @staticmethod
+    def _reach(source: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.linalg.norm(source - place, axis=-1), np.linalg.norm(source, axis=-1)
+
+    def between(self, m: slice, n: slice) -> PairLengths:
+        """Those of receiving elements ``m`` and transmitting ones ``n``."""
+        target = self.target if self.separable else self.target[n]
+        scale = self.scale if len(self.scale) == 1 else self.scale[n]
+        return replace(self, place=self.place[m], target=target, extra=self.extra[n], scale=scale)
 
 
-def plane_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
+def plane_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
     """Plane waves: projections on the directions of departure and arrival.
 
     Args:
@@ -86,7 +85,7 @@ def plane_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> P
     )
 
 
-def spherical_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
+def spherical_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
     """Line of sight and mirrors: distances from the transmitting elements' images."""
     tx, rx, bounces = _ends(paths)
     each, some = np.arange(len(bounces)), bounces > 0
@@ -102,7 +101,7 @@ def spherical_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) 
     return PairLengths(receiving, target, extra=far - length, scale=length / far, spherical=True)
 
 
-def scattered_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
+def scattered_lengths(paths: PathArrays, sending: np.ndarray, receiving: np.ndarray) -> PairLengths:
     """Diffuse paths: distances to the first interaction point and from the last."""
     tx, rx, bounces = _ends(paths)
     first = paths.vertices[:, 0] - tx
@@ -112,7 +111,7 @@ def scattered_lengths(paths: Paths, sending: np.ndarray, receiving: np.ndarray) 
     return PairLengths(receiving, last[None], extra=each - near, scale=near / each, spherical=True)
 
 
-def _ends(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _ends(paths: PathArrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Transmitter, receiver and numbers of interactions, which spherical waves need."""
     if paths.transmitter is None or paths.receiver is None:
         raise ValueError("paths: got ones without transmitter and receiver, which spherical waves need")
@@ -127,10 +126,7 @@ def _ends(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _mirrorings(tx: np.ndarray, rx: np.ndarray, vertices: np.ndarray, bounces: np.ndarray) -> np.ndarray:
     """What the bounces do to directions, shape ``(P, 3, 3)``: a product of reflections."""
     count, depth = vertices.shape[:2]
-    each = np.arange(count)
-    points = np.concatenate([np.broadcast_to(tx, (count, 1, 3)), vertices, np.zeros((count, 1, 3))], axis=1)
-    points[each, bounces + 1] = rx
-    legs = np.diff(points, axis=1)
+    legs = np.diff(points_along(tx, vertices, rx), axis=1)
     legs = legs / np.linalg.norm(legs, axis=2, keepdims=True)
     turned = np.broadcast_to(np.eye(3), (count, 3, 3))
     for k in range(depth):

@@ -25,32 +25,20 @@ isotropic antennas. Absorption that is in the gains (:meth:`Paths.with_gas`) fol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from math import factorial
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
-from warprrf.rf.channel.lengths import (
-    PairLengths,
-    plane_lengths,
-    scattered_lengths,
-    spherical_lengths,
-)
-from warprrf.rf.channel.sums import (
-    LEAST_FREQUENCIES,
-    Sum,
-    dense_sum,
-    gridded_sum,
-    squint_sum,
-)
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import carrier_phase
-
-if TYPE_CHECKING:
-    from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.channel.lengths import PairLengths, plane_lengths, scattered_lengths, spherical_lengths
+from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.channel.sums import LEAST_FREQUENCIES, Sum, dense_sum, gridded_sum, squint_sum
+from warprrf.rf.em.absorption import Air
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 
 DENSE_TERMS = 1e6
 """``method="auto"`` sums more terms than that (pairs x paths x frequencies) on a grid."""
@@ -59,35 +47,43 @@ _EVEN = 1e-9  # frequencies are equally spaced if they are so to this share of t
 _SERIES = 1e-8  # where the series of the air's frequency dependence is cut
 
 
+class LinkOptions(TypedDict, total=False):
+    """What stands at the ends of the paths, and how waves cross the arrays.
+
+    Attributes:
+        tx_array: Transmitting array about the transmitter; one isotropic element by default.
+        rx_array: Receiving array about every receiver; one isotropic element by default.
+        wave: "plane" (default) or "spherical".
+        squint: Whether elements differ in delay (default) or only in carrier phase.
+        diffuse: "random_phase", "power" or "given"; must be stated if there are diffuse paths.
+        seed: Of the random phases; 0 by default.
+        normalize_delays: Count delays (and phases) from each receiver's first path; False by default.
+    """
+
+    tx_array: PlanarArray | None
+    rx_array: PlanarArray | None
+    wave: str
+    squint: bool
+    diffuse: str | None
+    seed: int
+    normalize_delays: bool
+
+
 def frequency_response(
-    paths: Paths,
+    paths: PathArrays,
     frequencies_hz: Any,
     *,
-    tx_array: PlanarArray | None = None,
-    rx_array: PlanarArray | None = None,
-    wave: str = "plane",
-    squint: bool = True,
-    diffuse: str | None = None,
-    seed: int = 0,
     amplitude: str = "carrier",
-    normalize_delays: bool = False,
     method: str = "auto",
-    device: Any = None,
+    **link: Unpack[LinkOptions],
 ) -> np.ndarray:
     """Channel frequency response at ``frequencies_hz`` (F,), absolute [Hz].
 
     Args:
-        tx_array: Transmitting array about the transmitter; one isotropic element by default.
-        rx_array: Receiving array about every receiver; one isotropic element by default.
-        wave: "plane" or "spherical".
-        squint: Whether elements differ in delay or only in carrier phase.
-        diffuse: "random_phase", "power" or "given"; must be stated if there are diffuse paths.
-        seed: Of the random phases.
         amplitude: "carrier", or "friis" for the factor carrier / f.
-        normalize_delays: Count delays (and phases) from each receiver's first path.
         method: "dense", exact to rounding; "grid" for equally spaced frequencies, errs by about 1e-7 of the root of the
             paths' power; "auto" takes the grid where the dense sum has more than :data:`DENSE_TERMS` terms.
-        device: Where the grid is filled.
+        **link: See :class:`LinkOptions`.
 
     Returns:
         Shape ``(M, N, F)`` for paths of one receiver, ``(R, M, N, F)`` for several, complex128: M receiving and N
@@ -108,34 +104,27 @@ def frequency_response(
         raise ValueError(
             f"frequencies_hz: method 'grid' needs at least {LEAST_FREQUENCIES} equally spaced ones; use 'dense'"
         )
-
-    def one(link: _Link) -> np.ndarray:
-        terms = link.terms * len(f)
-        gridded = method == "grid" or (method == "auto" and even and terms > DENSE_TERMS)
-        h = np.zeros((*link.ports, len(f)), dtype=complex)
-        for index, ports, job in link.jobs():
-            h[ports] += _response(job, f, link, link.length_m[index], gridded, device)
+    found = []
+    for one in _links(paths, **link):
+        many = one.ports[0] * one.ports[1] * len(one.tau) * len(f) > DENSE_TERMS
+        gridded = method == "grid" or (method == "auto" and even and many)
+        h = np.zeros((*one.ports, len(f)), dtype=complex)
+        for index, ports, job in one.jobs():
+            h[ports] += _response(job, f, one.absorption(f), one.tau[index] * SPEED_OF_LIGHT, gridded)
         if amplitude == "friis":
-            h = h * (link.carrier_hz / f)
-        return h if link.shift_s == 0.0 else h * carrier_phase(-f, link.shift_s)
-
-    return _each_receiver(paths, one, tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays)
+            h = h * (one.carrier_hz / f)
+        found.append(h if one.shift_s == 0.0 else h * carrier_phase(-f, one.shift_s))
+    return np.stack(found) if paths.batched else found[0]
 
 
 def channel_taps(
-    paths: Paths,
+    paths: PathArrays,
     bandwidth_hz: float,
     l_min: int,
     l_max: int,
     *,
     center_hz: float | None = None,
-    tx_array: PlanarArray | None = None,
-    rx_array: PlanarArray | None = None,
-    wave: str = "plane",
-    squint: bool = True,
-    diffuse: str | None = None,
-    seed: int = 0,
-    normalize_delays: bool = False,
+    **link: Unpack[LinkOptions],
 ) -> np.ndarray:
     """Taps of the discrete baseband channel behind ideal low-pass filters of ``bandwidth_hz`` W.
 
@@ -148,7 +137,7 @@ def channel_taps(
         l_min, l_max: First and last tap. A path of delay tau falls on tap W tau: count delays from the first path
             (``normalize_delays``) or let the taps reach that far.
         center_hz: Centre of the band; the carrier by default.
-        tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays: see :func:`frequency_response`.
+        **link: See :class:`LinkOptions`.
 
     Returns:
         Shape ``(M, N, L)`` or ``(R, M, N, L)``, complex128.
@@ -162,36 +151,27 @@ def channel_taps(
         raise ValueError(f"l_max: got {l_max}, expected at least l_min, {l_min}")
     lags = np.arange(l_min, l_max + 1)
 
-    def one(link: _Link) -> np.ndarray:
-        offset = (link.carrier_hz if center_hz is None else float(center_hz)) - link.carrier_hz
+    def taps(one: _Link) -> np.ndarray:
+        offset = (one.carrier_hz if center_hz is None else float(center_hz)) - one.carrier_hz
 
         def basis(delay: np.ndarray, which: slice) -> np.ndarray:
-            since = delay - link.shift_s
-            pulse = np.sinc(lags[which] - bandwidth_hz * since[..., None])
+            pulse = np.sinc(lags[which] - bandwidth_hz * (delay - one.shift_s)[..., None])
             return pulse if offset == 0.0 else pulse * carrier_phase(offset, delay)[..., None]
 
-        h = np.zeros((*link.ports, len(lags)), dtype=complex)
-        for _, ports, job in link.jobs():
+        h = np.zeros((*one.ports, len(lags)), dtype=complex)
+        for _, ports, job in one.jobs():
             h[ports] += dense_sum(job, basis, len(lags))
-        return h * carrier_phase(-(link.carrier_hz + offset), link.shift_s)
+        return h * carrier_phase(-(one.carrier_hz + offset), one.shift_s)
 
-    return _each_receiver(paths, one, tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays)
+    found = [taps(one) for one in _links(paths, **link)]
+    return np.stack(found) if paths.batched else found[0]
 
 
-def impulse_response(
-    paths: Paths,
-    *,
-    tx_array: PlanarArray | None = None,
-    rx_array: PlanarArray | None = None,
-    wave: str = "plane",
-    diffuse: str | None = None,
-    seed: int = 0,
-    normalize_delays: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
+def impulse_response(paths: PathArrays, **link: Unpack[LinkOptions]) -> tuple[np.ndarray, np.ndarray]:
     """Baseband impulse response: one coefficient a path and pair of ports, and the delays.
 
     Args:
-        tx_array, rx_array, wave, diffuse, seed, normalize_delays: see :func:`frequency_response`.
+        **link: See :class:`LinkOptions`; without ``squint``, since every pair's own delays are returned.
 
     Returns:
         Coefficients, exp(-j 2 pi f_c tau) included, shape ``(M, N, L)`` or ``(R, M, N, L)``, complex128, 0 where padded
@@ -202,33 +182,25 @@ def impulse_response(
         ValueError: naming the argument.
     """
     count = paths.gain.shape[-1]
-
-    def one(link: _Link) -> tuple[np.ndarray, np.ndarray]:
-        a = np.zeros((*link.ports, count), dtype=complex)
-        each = np.full((*link.ports, count), np.nan)
-        for index, (received, sent), job in link.jobs():
-            longer, ratio = job.lengths.longer(slice(None))
-            delay = longer / SPEED_OF_LIGHT
-            place = received, sent, link.index[index]
-            turned = carrier_phase(link.carrier_hz, delay) * carrier_phase(-link.carrier_hz, link.shift_s)
-            a[place] = job.amplitude * ratio * turned
-            each[place] = delay + job.tau - link.shift_s
-        if wave == "spherical":
-            return a, each
+    spherical = link.get("wave") == "spherical"
+    coefficients, delays = [], []
+    for one in _links(paths, **link):
+        a = np.zeros((*one.ports, count), dtype=complex)
+        each = np.full((*one.ports, count), np.nan)
+        for index, (received, sent), job in one.jobs():
+            factor, longer = job.pairs(one.carrier_hz)
+            place = received, sent, one.index[index]
+            a[place] = job.amplitude * factor * carrier_phase(-one.carrier_hz, one.shift_s)
+            each[place] = longer / SPEED_OF_LIGHT + job.tau - one.shift_s
         tau = np.full(count, np.nan)
-        tau[link.index] = link.tau - link.shift_s
-        return a, tau
-
-    _choice("wave", wave, ("plane", "spherical"))
-    links = _links(paths, tx_array, rx_array, wave, False, diffuse, seed, normalize_delays)
-    found = [one(link) for link in links]
-    if not paths.batched:
-        return found[0]
-    return np.stack([a for a, _ in found]), np.stack([tau for _, tau in found])
+        tau[one.index] = one.tau - one.shift_s
+        coefficients.append(a)
+        delays.append(each if spherical else tau)
+    return (np.stack(coefficients), np.stack(delays)) if paths.batched else (coefficients[0], delays[0])
 
 
 def diffuse_power(
-    paths: Paths, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
+    paths: PathArrays, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
 ) -> np.ndarray:
     """Mean power that diffuse paths of random phase add to |H_mn|^2 of any pair of elements, shape ``()`` or ``(R,)``.
 
@@ -251,61 +223,37 @@ def diffuse_power(
 # --------------------------------------------------------------------------------------------- one receiver's link
 
 
+@dataclass(frozen=True)
 class _Link:
-    """Paths of one receiver between two arrays, ready to be summed."""
+    """Paths of one receiver between two arrays, ready to be summed.
 
-    def __init__(
-        self,
-        paths: Paths,
-        tx: PlanarArray,
-        rx: PlanarArray,
-        wave: str,
-        squint: bool,
-        turn: np.ndarray | None,
-        normalize_delays: bool,
-    ) -> None:
-        kept = paths.valid if turn is not None else paths.valid & (paths.kind != "diffuse")
-        self.index = np.flatnonzero(kept)
-        chosen = paths.select(self.index)
-        chosen.check_delays()
-        self.carrier_hz = paths.carrier_hz
-        self.wavelength_m = SPEED_OF_LIGHT / self.carrier_hz
-        self.tau = chosen.tau
-        self.length_m = chosen.length_m
-        self.air = paths.air
-        self.squint = squint
-        self.amplitude = _amplitudes(chosen, tx, rx)
-        if turn is not None:
-            self.amplitude = self.amplitude * turn[self.index]
-        self.shift_s = float(self.tau.min()) if normalize_delays and len(self.tau) else 0.0
-        places = tx.positions(self.wavelength_m), rx.positions(self.wavelength_m)
-        self.groups: list[tuple[np.ndarray, PairLengths]] = []
-        if wave == "plane":
-            self.groups.append((np.arange(len(self.tau)), plane_lengths(chosen, *places)))
-        else:
-            scattered = chosen.kind == "diffuse"
-            for index, lengths in (
-                (np.flatnonzero(~scattered), spherical_lengths),
-                (np.flatnonzero(scattered), scattered_lengths),
-            ):
-                if len(index):
-                    self.groups.append((index, lengths(chosen.select(index), *places)))
-        self.ports = (rx.ports, tx.ports)
+    Attributes:
+        index: Which of the receiver's paths are summed, P of them.
+        tau: Their delays [s], shape ``(P,)``.
+        amplitude: Between elements at the arrays' centres, shape ``(Kr, Kt, P)``, K polarisations at either end.
+        lengths: What elements' places add, for groups of paths (indices into the P).
+        shift_s: Delay that counts as zero.
+        ports: Of the receiving and of the transmitting array.
+    """
 
-    @property
-    def terms(self) -> float:
-        """Pairs of ports times paths."""
-        return float(self.ports[0] * self.ports[1]) * len(self.tau)
+    index: np.ndarray
+    tau: np.ndarray
+    amplitude: np.ndarray
+    lengths: list[tuple[np.ndarray, PairLengths]]
+    shift_s: float
+    ports: tuple[int, int]
+    carrier_hz: float
+    squint: bool
+    air: Air | None
 
     def jobs(self) -> Iterator[tuple[np.ndarray, tuple[slice, slice], Sum]]:
         """Sums to add up: the paths that they are over, the ports that they belong to."""
-        for index, lengths in self.groups:
+        for index, lengths in self.lengths:
             rows, columns = len(lengths.place), len(lengths.extra)
-            for a, received in enumerate(self.amplitude):
-                for b, amplitude in enumerate(received):
-                    ports = slice(a * rows, (a + 1) * rows), slice(b * columns, (b + 1) * columns)
-                    job = Sum(amplitude[index], self.tau[index], lengths, self.carrier_hz, self.squint)
-                    yield index, ports, job
+            for a, b in np.ndindex(self.amplitude.shape[:2]):
+                ports = slice(a * rows, (a + 1) * rows), slice(b * columns, (b + 1) * columns)
+                amplitude = self.amplitude[a, b, index]
+                yield index, ports, Sum(amplitude, self.tau[index], lengths, self.carrier_hz, self.squint)
 
     def absorption(self, f: np.ndarray) -> np.ndarray | None:
         """Loss per metre over that at the carrier [neper/m], shape ``(F,)``; None without air."""
@@ -315,18 +263,70 @@ class _Link:
         return np.log(10.0) / 20.0 * change
 
 
+def _links(
+    paths: PathArrays,
+    tx_array: PlanarArray | None = None,
+    rx_array: PlanarArray | None = None,
+    wave: str = "plane",
+    squint: bool = True,
+    diffuse: str | None = None,
+    seed: int = 0,
+    normalize_delays: bool = False,
+) -> Iterator[_Link]:
+    """The link of each receiver; :class:`LinkOptions` says what the options mean."""
+    _choice("wave", wave, ("plane", "spherical"))
+    if diffuse is not None:
+        _choice("diffuse", diffuse, ("random_phase", "power", "given"))
+    elif (paths.valid & (paths.kind == "diffuse")).any():
+        raise ValueError(
+            "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
+            "(left out of the sum) or 'given' (phases as they are)"
+        )
+    tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
+    carrier = paths.carrier_hz
+    places = [array.positions(SPEED_OF_LIGHT / carrier) for array in (tx, rx)]
+    for k in range(len(paths.gain) if paths.batched else 1):
+        own = paths.row(k) if paths.batched else paths
+        scattered = own.kind == "diffuse"
+        index = np.flatnonzero(own.valid & ~scattered if diffuse == "power" else own.valid)
+        chosen = own.select(index)
+        chosen.check_delays()
+        amplitude = _amplitudes(chosen, tx, rx)
+        if diffuse == "random_phase":
+            turns = np.zeros(len(own.gain))
+            turns[scattered] = np.random.default_rng([seed, k]).random(int(scattered.sum()))
+            amplitude = amplitude * carrier_phase(-1.0, turns[index])
+        if wave == "plane":
+            groups = [(np.arange(len(index)), plane_lengths(chosen, *places))]
+        else:
+            split = (~scattered[index], spherical_lengths), (scattered[index], scattered_lengths)
+            groups = [
+                (np.flatnonzero(some), lengths(chosen.select(some), *places))
+                for some, lengths in split
+                if some.any()
+            ]
+        yield _Link(
+            index=index,
+            tau=chosen.tau,
+            amplitude=amplitude,
+            lengths=groups,
+            shift_s=float(chosen.tau.min()) if normalize_delays and len(index) else 0.0,
+            ports=(rx.ports, tx.ports),
+            carrier_hz=carrier,
+            squint=squint,
+            air=paths.air,
+        )
+
+
 def _response(
-    job: Sum, f: np.ndarray, link: _Link, length_m: np.ndarray, gridded: bool, device: Any
+    job: Sum, f: np.ndarray, loss: np.ndarray | None, length_m: np.ndarray, gridded: bool
 ) -> np.ndarray:
     if len(job.tau) == 0:
         return np.zeros((*job.shape, len(f)), dtype=complex)
-    loss = link.absorption(f)
     if gridded:
-        if loss is None:
-            return gridded_sum(job, f, device)
-        return _gridded_with_air(job, f, loss, length_m, device)
+        return gridded_sum(job, f) if loss is None else _gridded_with_air(job, f, loss, length_m)
     factor = None if loss is None else np.exp(-loss * length_m[:, None])
-    if job.squint and job.lengths.separable and not job.lengths.alone:
+    if job.own_delays and job.lengths.separable:
         return squint_sum(job, f, factor)
 
     def basis(delay: np.ndarray, which: slice) -> np.ndarray:
@@ -336,28 +336,21 @@ def _response(
     return dense_sum(job, basis, len(f))
 
 
-def _gridded_with_air(
-    job: Sum, f: np.ndarray, loss: np.ndarray, length_m: np.ndarray, device: Any
-) -> np.ndarray:
+def _gridded_with_air(job: Sum, f: np.ndarray, loss: np.ndarray, length_m: np.ndarray) -> np.ndarray:
     """exp(-loss L) as a series in L about its middle: one gridded sum a term."""
     middle = 0.5 * (length_m.min() + length_m.max())
     reach = max(0.5 * float(np.ptp(length_m)), 1e-12)
     size = reach * np.abs(loss).max()
     about = (length_m - middle) / reach
-    total, term, k = np.zeros((*job.shape, len(f)), dtype=complex), 1.0, 0
-    while term > _SERIES:
-        part = gridded_sum(replace(job, amplitude=job.amplitude * about**k), f, device)
-        total += part * ((-loss * reach) ** k / _factorial(k))
+    total, k = np.zeros((*job.shape, len(f)), dtype=complex), 0
+    while size**k / factorial(k) > _SERIES:
+        part = gridded_sum(replace(job, amplitude=job.amplitude * about**k), f)
+        total += part * ((-loss * reach) ** k / factorial(k))
         k += 1
-        term = size**k / _factorial(k)
     return total * np.exp(-loss * middle)
 
 
-def _factorial(k: int) -> float:
-    return float(np.prod(np.arange(1.0, k + 1)))
-
-
-def _amplitudes(paths: Paths, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
+def _amplitudes(paths: PathArrays, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
     """Amplitudes between elements at the arrays' centres, shape ``(Kr, Kt, P)``."""
     if tx.polarisation is None and rx.polarisation is None:
         return (paths.gain * np.sqrt(tx.gain(paths.departure) * rx.gain(paths.arrival)))[None, None]
@@ -373,64 +366,6 @@ def _amplitudes(paths: Paths, tx: PlanarArray, rx: PlanarArray) -> np.ndarray:
         )
     received, sent = rx.field(paths.arrival), tx.field(paths.departure)
     return np.einsum("apx,pxy,bpy->abp", received, paths.jones, sent)
-
-
-def _each_receiver(
-    paths: Paths,
-    one: Callable[[_Link], np.ndarray],
-    tx_array: PlanarArray | None,
-    rx_array: PlanarArray | None,
-    wave: str,
-    squint: bool,
-    diffuse: str | None,
-    seed: int,
-    normalize_delays: bool,
-) -> np.ndarray:
-    found = [
-        one(link) for link in _links(paths, tx_array, rx_array, wave, squint, diffuse, seed, normalize_delays)
-    ]
-    return np.stack(found) if paths.batched else found[0]
-
-
-def _links(
-    paths: Paths,
-    tx_array: PlanarArray | None,
-    rx_array: PlanarArray | None,
-    wave: str,
-    squint: bool,
-    diffuse: str | None,
-    seed: int,
-    normalize_delays: bool,
-) -> list[_Link]:
-    _choice("wave", wave, ("plane", "spherical"))
-    if diffuse is not None:
-        _choice("diffuse", diffuse, ("random_phase", "power", "given"))
-    elif (paths.valid & (paths.kind == "diffuse")).any():
-        raise ValueError(
-            "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
-            "(left out of the sum) or 'given' (phases as they are)"
-        )
-    tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
-    if not paths.batched:
-        turns = _turns(paths, diffuse, seed, 0)
-        return [_Link(paths, tx, rx, wave, squint, turns, normalize_delays)]
-    links = []
-    for k in range(len(paths.gain)):
-        one = paths.row(k)
-        links.append(_Link(one, tx, rx, wave, squint, _turns(one, diffuse, seed, k), normalize_delays))
-    return links
-
-
-def _turns(paths: Paths, diffuse: str | None, seed: int, receiver: int) -> np.ndarray | None:
-    """Factor of each path's amplitude; None if diffuse paths are left out."""
-    if diffuse == "power":
-        return None
-    factor = np.ones(len(paths.gain), dtype=complex)
-    if diffuse == "random_phase":
-        scattered = paths.kind == "diffuse"
-        drawn = np.random.default_rng([seed, receiver]).random(int(scattered.sum()))
-        factor[scattered] = np.exp(2j * np.pi * drawn)
-    return factor
 
 
 def _choice(name: str, value: Any, allowed: tuple[str, ...]) -> None:

@@ -7,31 +7,17 @@ integrates to one over the hemisphere.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
+from warprrf.rf.em.materials import Material
+from warprrf.rf.em.waves import SPEED_OF_LIGHT as SPEED_OF_LIGHT
+
 LAMBERTIAN = 0
 """Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""
-
-
-class RadioMaterial(Protocol):
-    """What propagation needs to know of a material."""
-
-    name: str
-    thickness_m: float
-    pattern: str
-    alpha_r: Any
-
-    def permittivity(self, frequency_hz: float) -> complex:
-        """Relative permittivity, with a negative imaginary part for losses."""
-        ...
-
-    def scattering_coefficient(self, frequency_hz: float) -> float:
-        """Scattering coefficient S in [0, 1]."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -51,27 +37,17 @@ class SurfaceTable:
     alpha_r: np.ndarray
 
 
-def surface_table(materials: list[Any], frequency_hz: float) -> SurfaceTable:
+def surface_table(materials: Sequence[Material], frequency_hz: float) -> SurfaceTable:
     """The table of ``materials`` at ``frequency_hz``.
 
     Raises:
-        ValueError: if the frequency lies outside a material's band, or a lobe is not known.
+        ValueError: if the frequency lies outside a material's band.
     """
-    alpha = []
-    for m in materials:
-        if m.pattern not in ("lambertian", "directive"):
-            raise ValueError(
-                f"material {m.name!r}: got pattern {m.pattern!r}, expected 'lambertian' or 'directive'"
-            )
-        alpha.append(LAMBERTIAN if m.pattern == "lambertian" else int(m.alpha_r))
-        if m.pattern == "directive" and alpha[-1] < 1:
-            raise ValueError(
-                f"material {m.name!r}: got alpha_r {m.alpha_r!r}, expected a whole number of at least 1"
-            )
+    alpha = [LAMBERTIAN if m.pattern == "lambertian" else int(m.alpha_r) for m in materials]
     return SurfaceTable(
-        permittivity=np.array([complex(m.permittivity(frequency_hz)) for m in materials]),
+        permittivity=np.array([m.permittivity(frequency_hz) for m in materials]),
         thickness_m=np.array([float(m.thickness_m) for m in materials]),
-        scattering=np.array([float(m.scattering_coefficient(frequency_hz)) for m in materials]),
+        scattering=np.array([m.scattering_coefficient(frequency_hz) for m in materials]),
         alpha_r=np.array(alpha, dtype=np.int32),
     )
 
@@ -83,15 +59,8 @@ def slab_reflection(
 
     Source: ITU-R P.2040-4, eqs. (37a), (37b), (43a), (44). A perfect conductor gives -1 and +1.
     """
-    cos = np.asarray(cos_incidence, dtype=np.float64)
-    eta = np.asarray(permittivity, dtype=np.complex128)
-    root = np.sqrt(eta - (1.0 - cos**2))
-    te = (cos - root) / (cos + root)
-    tm = (eta * cos - root) / (eta * cos + root)
-    thickness = np.asarray(thickness_m, dtype=np.float64)
-    endless = np.isinf(thickness)
-    q = 2.0 * np.pi * np.where(endless, 0.0, thickness) / wavelength_m * root  # eq. (44)
-    echo = np.where(endless, 0.0, np.exp(-2j * q))
+    te, tm, once = _slab(cos_incidence, permittivity, thickness_m, wavelength_m)
+    echo = once**2
     return te * (1.0 - echo) / (1.0 - te**2 * echo), tm * (1.0 - echo) / (1.0 - tm**2 * echo)  # eq. (43a)
 
 
@@ -102,17 +71,22 @@ def slab_transmission(
 
     Source: ITU-R P.2040-4, eqs. (37a), (37b), (43b), (44).
     """
+    te, tm, once = _slab(cos_incidence, permittivity, thickness_m, wavelength_m)
+    return (1.0 - te**2) * once / (1.0 - te**2 * once**2), (1.0 - tm**2) * once / (1.0 - tm**2 * once**2)
+
+
+def _slab(
+    cos_incidence: Any, permittivity: Any, thickness_m: Any, wavelength_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reflection of the first face, TE and TM, and what is left of a wave that goes once through; eqs. (37), (44)."""
     cos = np.asarray(cos_incidence, dtype=np.float64)
     eta = np.asarray(permittivity, dtype=np.complex128)
-    root = np.sqrt(eta - (1.0 - cos**2))
     thickness = np.asarray(thickness_m, dtype=np.float64)
+    root = np.sqrt(eta - (1.0 - cos**2))
     endless = np.isinf(thickness)
-    once = np.where(
-        endless, 0.0, np.exp(-2j * np.pi * np.where(endless, 0.0, thickness) / wavelength_m * root)
-    )
-    te = (cos - root) / (cos + root)
-    tm = (eta * cos - root) / (eta * cos + root)
-    return (1.0 - te**2) * once / (1.0 - te**2 * once**2), (1.0 - tm**2) * once / (1.0 - tm**2 * once**2)
+    q = 2.0 * np.pi * np.where(endless, 0.0, thickness) / wavelength_m * root
+    once = np.where(endless, 0.0, np.exp(-1j * q))
+    return (cos - root) / (cos + root), (eta * cos - root) / (eta * cos + root), once
 
 
 def lobe(alpha_r: int, cos_incidence: Any, cos_scatter: Any, cos_to_mirror: Any) -> np.ndarray:

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-SPEED_OF_LIGHT = 299792458.0  # m/s
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
 PATTERNS = ("lambertian", "directive")
 

@@ -1,4 +1,4 @@
-"""Carriers and the phase that a delay gives them."""
+"""The speed of light, carriers, and the phase that a delay gives them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import check_array
+
+SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
 
 
 def check_frequency(frequency_hz: Any) -> float:

@@ -1,1 +1,5 @@
-"""Other tools' formats and engines: Sionna RT, DeepMIMO, NeWRF, scenes for ray tracers."""
+"""Other people's software and files: Sionna RT, DeepMIMO, NeWRF, digital twins for ray tracers."""
+
+from warprrf.lazy import attach
+
+__getattr__, __dir__, __doc__ = attach(__file__, __doc__)

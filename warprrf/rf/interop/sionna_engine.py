@@ -9,26 +9,23 @@ no absorption by the air; where asked for, every path is given that of its own l
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.em.absorption import air_of
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.materials import Material
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.interop.llvm import select_llvm
-from warprrf.rf.interop.sionna_paths import repeated
+from warprrf.rf.paths.sionna import DIFFUSE, repeated
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
 
-# Sionna's default cap of 1e6 paths truncates silently; each sample can give one path a bounce.
-_PATHS_PER_SAMPLE_AND_BOUNCE = 1
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
-_DIFFUSE = 2  # sionna.rt.InteractionType.DIFFUSE
-_VACUUM_PERMITTIVITY = 8.8541878128e-12  # CODATA 2018 [F/m]
 
 
 def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
@@ -76,7 +73,7 @@ def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
     return loaded
 
 
-def _radio_material(loaded: Any, rt: Any, material: Any, frequency: float) -> Any:
+def _radio_material(loaded: Any, rt: Any, material: Material, frequency: float) -> Any:
     """The material of this name in Sionna's scene, added if it has none that can be set, with our values."""
     if not np.isfinite(material.thickness_m):
         raise ValueError(
@@ -86,9 +83,8 @@ def _radio_material(loaded: Any, rt: Any, material: Any, frequency: float) -> An
     if type(radio) is not rt.RadioMaterial:  # an ITU material keeps its own permittivity
         radio = rt.RadioMaterial(f"warprrf-{material.name}")  # objects and materials share one set of names
         loaded.add(radio)
-    eta = complex(material.permittivity(frequency))
-    radio.relative_permittivity = eta.real
-    radio.conductivity = -eta.imag * 2.0 * np.pi * frequency * _VACUUM_PERMITTIVITY
+    radio.relative_permittivity = material.relative_permittivity(frequency)
+    radio.conductivity = material.conductivity(frequency)
     radio.thickness = float(material.thickness_m)
     radio.scattering_coefficient = float(material.scattering_coefficient(frequency))
     radio.xpd_coefficient = 0.0
@@ -102,16 +98,33 @@ def _radio_material(loaded: Any, rt: Any, material: Any, frequency: float) -> An
 def sionna_rt() -> Any:
     """Sionna RT, on a variant of Mitsuba and an LLVM that it can use."""
     select_llvm()
-    _select_variant()
+    select_variant()
     return _device.require("sionna.rt", extra="sionna")
 
 
-def _select_variant() -> Any:
+def select_variant() -> Any:
     """Mitsuba, on a variant for radio: it may be on another, for photos, and Sionna needs the one of its import."""
     mitsuba = _device.require("mitsuba", extra="sionna")
     if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
         mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
     return mitsuba
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How Sionna RT looks for paths.
+
+    Attributes:
+        depth: Most bounces on a path.
+        samples: Rays from the transmitter.
+        refraction: Whether paths go through slabs.
+        seed: Seed of the ray directions.
+    """
+
+    depth: int = 3
+    samples: int = 1_000_000
+    refraction: bool = False
+    seed: int = 0
 
 
 class SionnaEngine:
@@ -123,10 +136,7 @@ class SionnaEngine:
         frequency_hz: Carrier frequency [Hz].
         shape: Rows and columns of the spectrum.
         beam_sigma_rad: Receiver beam width [rad].
-        depth: Most bounces on a path.
-        samples: Rays from the transmitter.
-        refraction: Whether paths go through slabs.
-        seed: Seed of the ray directions.
+        sampling: How Sionna looks for paths.
         gas: Absorption of the air: see :meth:`Paths.with_gas`.
         device: Where beams are spread (Sionna takes its own: CUDA where there is a GPU).
 
@@ -143,10 +153,7 @@ class SionnaEngine:
         frequency_hz: float,
         shape: tuple[int, int],
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
-        depth: int = 3,
-        samples: int = 1_000_000,
-        refraction: bool = False,
-        seed: int = 0,
+        sampling: Sampling | None = None,
         gas: Any = False,
         device: Any = None,
     ) -> None:
@@ -154,7 +161,7 @@ class SionnaEngine:
         self.beam_sigma_rad = beam_sigma_rad
         self.transmitter = _device.check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
-        self.depth, self.samples, self.refraction, self.seed = depth, samples, refraction, seed
+        self.sampling = Sampling() if sampling is None else sampling
         self.air = air_of(gas)
         self.device = device
         self._rt = sionna_rt()
@@ -178,20 +185,20 @@ class SionnaEngine:
         Without ``specular`` reflections every ray scatters, and at depth 1 Sionna's result hardly depends on chance.
         """
         point = _device.check_array("receiver", receiver, (3,))
-        _select_variant()
+        select_variant()
         self._scene.add(self._rt.Receiver("rx", position=point.tolist()))
         try:
             paths = self._solver(
                 self._scene,
-                max_depth=self.depth,
+                max_depth=self.sampling.depth,
                 max_num_paths_per_src=self._path_cap,
-                samples_per_src=self.samples,
+                samples_per_src=self.sampling.samples,
                 synthetic_array=True,
                 los=True,
                 specular_reflection=specular,
                 diffuse_reflection=True,
-                refraction=self.refraction,
-                seed=self.seed,
+                refraction=self.sampling.refraction,
+                seed=self.sampling.seed,
             )
             found = self._read(paths)
         finally:
@@ -203,7 +210,8 @@ class SionnaEngine:
 
     @property
     def _path_cap(self) -> int:
-        return self.samples * max(self.depth, 1) * _PATHS_PER_SAMPLE_AND_BOUNCE + 100_000
+        """Sionna's default of 1e6 paths truncates silently; each sample can give one path a bounce."""
+        return self.sampling.samples * max(self.sampling.depth, 1) + 100_000
 
     def _read(self, paths: Any) -> dict[str, np.ndarray]:
         """Sionna's arrays of one receiver and transmitter; both antennas are two polarisations at one place."""
@@ -222,7 +230,7 @@ class SionnaEngine:
             "tau": field(paths.tau),
             "arrival": directions_from_angles(field(paths.theta_r), field(paths.phi_r)),
             "aod": np.column_stack([field(paths.theta_t), field(paths.phi_t)]),
-            "diffuse": (kinds == _DIFFUSE).any(axis=0)[valid],
+            "diffuse": (kinds == DIFFUSE).any(axis=0)[valid],
             "bounces": (kinds != 0).sum(axis=0)[valid],
         }
         # Sionna stores paths in the order in which its threads end; sorted, one seed's numbers are always the same
@@ -263,77 +271,3 @@ class SionnaEngine:
                 "diffuse": float(power[diffuse].sum()),
             },
         )
-
-
-class SionnaMap:
-    """Sionna RT's RadioMapSolver for one transmitter on a horizontal grid of square cells.
-
-    Path gain is averaged over each cell by Sionna, and over vertical and horizontal transmit polarisation by us; its
-    receiver is isotropic and takes every polarisation.
-
-    Args:
-        scene: Scene loaded from an XML file.
-        transmitter: Position [m], shape ``(3,)``.
-        frequency_hz: Carrier frequency [Hz].
-        x: Centres of the cells [m], evenly spaced, shape ``(X,)``, at least two.
-        y: The same, shape ``(Y,)``, at the same spacing.
-        height_m: Of the plane.
-        depth: Most bounces on a path: specular and diffuse ones, without refraction.
-
-    Raises:
-        ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
-        ValueError: if the scene was not loaded from a file, or the cells are not square.
-    """
-
-    def __init__(
-        self,
-        scene: Any,
-        *,
-        transmitter: Any,
-        frequency_hz: float,
-        x: Any,
-        y: Any,
-        height_m: float,
-        depth: int = 3,
-    ) -> None:
-        columns, rows = _device.check_array("x", x, (None,)), _device.check_array("y", y, (None,))
-        steps = np.concatenate([np.diff(columns), np.diff(rows)])
-        if len(columns) < 2 or not (steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-6)):
-            raise ValueError(
-                f"x, y: got steps of {np.unique(steps.round(6)).tolist()} m, expected square cells"
-            )
-        self.shape, self.depth = (len(rows), len(columns)), depth
-        self._cell = float(steps[0])
-        self._middle = [0.5 * (columns[0] + columns[-1]), 0.5 * (rows[0] + rows[-1]), height_m]
-        self._rt = sionna_rt()
-        self._scene = load_sionna_scene(scene, frequency_hz=check_frequency(frequency_hz))
-        self._solver = self._rt.RadioMapSolver()
-        self._scene.rx_array = self._array("V")
-        place = _device.check_array("transmitter", transmitter, (3,))
-        self._scene.add(self._rt.Transmitter("tx", position=place.tolist()))
-
-    def _array(self, polarisation: str) -> Any:
-        return self._rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarisation)
-
-    def __call__(self, samples: int, *, seed: int) -> np.ndarray:
-        """Mean path gain of every cell [linear], shape ``(Y, X)``; half of ``samples`` in each polarisation."""
-        mitsuba = _select_variant()
-        rows, columns = self.shape
-        total = np.zeros(self.shape)
-        for k, polarisation in enumerate("VH"):
-            self._scene.tx_array = self._array(polarisation)
-            solved = self._solver(
-                self._scene,
-                center=mitsuba.Point3f(*(float(v) for v in self._middle)),
-                orientation=mitsuba.Point3f(0.0),
-                # a little less, since Sionna rounds up to whole cells
-                size=mitsuba.Point2f((columns - 1e-3) * self._cell, (rows - 1e-3) * self._cell),
-                cell_size=mitsuba.Point2f(self._cell, self._cell),
-                samples_per_tx=max(samples // 2, 1),
-                max_depth=self.depth,
-                diffuse_reflection=True,
-                refraction=False,
-                seed=2 * seed + k,
-            )
-            total += 0.5 * np.asarray(solved.path_gain.numpy(), np.float64)[0]
-        return total

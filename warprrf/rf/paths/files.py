@@ -1,4 +1,9 @@
-"""Paths as NetCDF-4 files: dimensions ``receiver``, ``path``, ``vertex``, ``xyz``; complex numbers as two."""
+"""Paths as NetCDF-4 files: dimensions ``receiver``, ``path``, ``vertex``, ``xyz``; complex numbers as two.
+
+``gain_real`` and ``gain_imag`` (receiver, path) hold the gain at ``frequency_hz`` between isotropic antennas, its power
+averaged over transmit and summed over receive polarisations; ``jones_real`` and ``jones_imag`` the Jones matrices,
+where known.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +15,8 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.files import write_atomically
+from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.paths.path_set import Paths
 
 KINDS = ("", "los", "mirror", "diffuse")
 """What the values 0, 1, ... of the variable ``kind`` mean."""
@@ -27,41 +32,25 @@ _UNITS = {
 }
 
 
-def save_paths(paths: Paths, path: str | os.PathLike[str]) -> None:
-    """Write ``paths`` to a NetCDF-4 file, whole or not at all.
-
-    ``gain_real`` and ``gain_imag`` (receiver, path) hold the gain at ``frequency_hz`` between isotropic antennas, its
-    power averaged over transmit and summed over receive polarisations; ``jones_real`` and ``jones_imag`` the Jones
-    matrices, where known.
-    """
+def write(path: str | os.PathLike[str], paths: PathArrays) -> None:
+    """Write ``paths`` to a NetCDF-4 file, whole or not at all."""
     xarray = _device.require("xarray", extra="all")
-    several = paths if paths.batched else Paths.stack([paths])
-    kinds = np.searchsorted(sorted(KINDS), several.kind)
-    codes = np.array([KINDS.index(k) for k in sorted(KINDS)], dtype=np.int8)[kinds]
+    several = paths.as_several()
+    codes = sum(k * (several.kind == name) for k, name in enumerate(KINDS))
+    flags = {"flag_values": list(range(len(KINDS))), "flag_meanings": "none los mirror diffuse"}
+    points = {"units": "m", "long_name": "interaction points from the transmitter on"}
     variables: dict[str, Any] = {
-        "gain_real": (_SEVERAL, several.gain.real, {"units": "1"}),
-        "gain_imag": (_SEVERAL, several.gain.imag, {"units": "1"}),
-        "vertices": (
-            (*_SEVERAL, "vertex", "xyz"),
-            several.vertices,
-            {"units": "m", "long_name": "interaction points from the transmitter on"},
-        ),
-        "kind": (
-            _SEVERAL,
-            codes,
-            {"flag_values": list(range(len(KINDS))), "flag_meanings": "none los mirror diffuse"},
-        ),
+        "vertices": ((*_SEVERAL, "vertex", "xyz"), several.vertices, points),
+        "kind": (_SEVERAL, np.asarray(codes, dtype=np.int8), flags),
         "valid": (_SEVERAL, several.valid.astype(np.int8), {}),
     }
     for name, (unit, text) in _UNITS.items():
         variables[name] = (_SEVERAL, getattr(several, name), {"units": unit, "long_name": text})
-    if several.jones is not None:
-        for part in ("real", "imag"):
-            variables[f"jones_{part}"] = (
-                (*_SEVERAL, "receive", "transmit"),
-                getattr(several.jones, part),
-                {"units": "1"},
-            )
+    for part in ("real", "imag"):
+        variables[f"gain_{part}"] = (_SEVERAL, getattr(several.gain, part), {"units": "1"})
+        if several.jones is not None:
+            matrix = (*_SEVERAL, "receive", "transmit")
+            variables[f"jones_{part}"] = (matrix, getattr(several.jones, part), {"units": "1"})
     if several.receiver is not None:
         variables["receiver_position"] = (("receiver", "xyz"), several.receiver, {"units": "m"})
     if several.transmitter is not None:
@@ -75,8 +64,8 @@ def save_paths(paths: Paths, path: str | os.PathLike[str]) -> None:
     write_atomically(path, lambda file: data.to_netcdf(file, engine="h5netcdf"))
 
 
-def load_paths(path: str | os.PathLike[str]) -> Paths:
-    """Read what :func:`save_paths` wrote.
+def read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
+    """The fields of what :func:`write` wrote, as paths of several receivers, and whether it was one receiver's.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -90,16 +79,16 @@ def load_paths(path: str | os.PathLike[str]) -> Paths:
             raise ValueError(f"path: {path} holds {data.attrs.get('format')!r}, expected {_FORMAT!r}")
         held = {name: np.asarray(data[name].values) for name in data.variables}
         attributes = dict(data.attrs)
-    several = Paths(
-        gain=held["gain_real"] + 1j * held["gain_imag"],
-        vertices=held["vertices"],
-        kind=np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
-        valid=held["valid"].astype(bool),
-        jones=held["jones_real"] + 1j * held["jones_imag"] if "jones_real" in held else None,
-        frequency_hz=float(attributes["frequency_hz"]) if "frequency_hz" in attributes else None,
-        transmitter=held.get("transmitter_position"),
-        receiver=held.get("receiver_position"),
-        air=Air.from_attributes(attributes),
+    fields: dict[str, Any] = {
+        "gain": held["gain_real"] + 1j * held["gain_imag"],
+        "vertices": held["vertices"],
+        "kind": np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
+        "valid": held["valid"].astype(bool),
+        "jones": held["jones_real"] + 1j * held["jones_imag"] if "jones_real" in held else None,
+        "frequency_hz": float(attributes["frequency_hz"]) if "frequency_hz" in attributes else None,
+        "transmitter": held.get("transmitter_position"),
+        "receiver": held.get("receiver_position"),
+        "air": Air.from_attributes(attributes),
         **{name: held[name] for name in _UNITS},
-    )
-    return several[0] if int(attributes["single_receiver"]) else several
+    }
+    return fields, bool(attributes["single_receiver"])

@@ -1,367 +1,122 @@
-"""Propagation paths of one receiver or several, and what is computed from them: channels, dispersion, files.
+"""Propagation paths, and what is computed from them: channels, dispersion, files.
 
-Angles: arrival points from the receiver to the last interaction, departure from the transmitter to the first.
-
-Polarisation. ``gain`` is one complex number a path, |gain|^2 being the path gain averaged over vertical and horizontal
-transmit polarisation and summed over both receive polarisations: its power is defined, its phase is that of the delay
-(and, where materials are known, of the TE reflections). A polarised amplitude needs ``jones``: the 2x2 matrix from the
-transmitted field along (zenith unit vector, azimuth unit vector) of the departure to the received field along those of
-the arrival, Friis and exp(-j 2 pi f tau) included, so that ``|gain|^2`` is half its squared Frobenius norm. Only paths
-traced in a scene with materials, or taken from a solver, have it; spectra and fields hold powers alone.
+The arrays are those of :class:`~warprrf.rf.channel.path_arrays.PathArrays`, which also explains angles and polarisation.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any, Unpack
 
 import numpy as np
 
-from warprrf.rf.em.absorption import Air, air_of
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import carrier_phase
-from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
-
-if TYPE_CHECKING:
-    from warprrf.rf.channel.arrays import PlanarArray
-    from warprrf.rf.channel.dispersion import Dispersion
-    from warprrf.rf.interop.sionna_paths import SionnaPaths
-
-_PER_PATH = ("gain", "tau", "theta_r", "phi_r", "theta_t", "phi_t", "vertices", "kind", "valid", "jones")
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.dispersion import Dispersion, dispersion
+from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.channel.response import (
+    LinkOptions,
+    channel_taps,
+    diffuse_power,
+    frequency_response,
+    impulse_response,
+)
+from warprrf.rf.paths import files, sionna
 
 
 @dataclass(frozen=True)
-class Paths:
+class Paths(PathArrays):
     """Paths of one receiver, arrays ``(L,)``, or of several, arrays ``(R, L)`` padded where ``valid`` is False.
 
-    Attributes:
-        gain: Complex gain between isotropic antennas, exp(-j 2 pi f tau) included; |gain|^2 is path gain averaged over
-            vertical and horizontal transmit polarisation and summed over both receive polarisations. 0 where padded.
-        tau: Delay [s]; NaN where padded, as the angles are.
-        theta_r: Zenith of arrival [rad].
-        phi_r: Azimuth of arrival [rad].
-        theta_t: Zenith of departure [rad].
-        phi_t: Azimuth of departure [rad].
-        vertices: Interaction points from the transmitter on [m], shape ``(..., depth, 3)``; NaN past the last.
-        kind: "los", "mirror" or "diffuse"; "" where padded.
-        valid: Whether there is a path.
-        jones: Polarised complex gain, shape ``(..., 2, 2)``: received over transmitted, both along zenith and azimuth
-            unit vectors; NaN for paths without, None if no path has it. 0 where padded.
-        frequency_hz: Carrier that ``gain`` and ``jones`` hold at [Hz]; None if not known.
-        transmitter: Position [m], shape ``(3,)``; None if not known.
-        receiver: Position ``(3,)`` or positions ``(R, 3)`` [m]; None if not known.
-        air: The air whose absorption (ITU-R P.676) is in ``gain`` and ``jones``; None for none.
+    ``gain`` (complex, exp(-j 2 pi f tau) included), ``tau`` [s], ``theta_r``, ``phi_r``, ``theta_t``, ``phi_t`` [rad],
+    ``vertices`` [m], ``kind``, ``valid`` and, where known, ``jones``, ``frequency_hz``, ``transmitter``, ``receiver`` and
+    ``air``: see :class:`~warprrf.rf.channel.path_arrays.PathArrays`.
     """
 
-    gain: np.ndarray
-    tau: np.ndarray
-    theta_r: np.ndarray
-    phi_r: np.ndarray
-    theta_t: np.ndarray
-    phi_t: np.ndarray
-    vertices: np.ndarray
-    kind: np.ndarray
-    valid: np.ndarray
-    jones: np.ndarray | None = None
-    frequency_hz: float | None = None
-    transmitter: np.ndarray | None = None
-    receiver: np.ndarray | None = None
-    air: Air | None = None
-
-    @property
-    def power(self) -> np.ndarray:
-        """Path gain |gain|^2 [linear], shape as ``gain``; 0 where padded."""
-        return np.abs(self.gain) ** 2
-
-    @property
-    def length_m(self) -> np.ndarray:
-        """Unfolded length [m]; NaN where padded."""
-        return self.tau * SPEED_OF_LIGHT
-
-    @property
-    def arrival(self) -> np.ndarray:
-        """Unit vectors from the receiver to the last interaction, shape ``(..., 3)``."""
-        return directions_from_angles(self.theta_r, self.phi_r)
-
-    @property
-    def departure(self) -> np.ndarray:
-        """Unit vectors from the transmitter to the first interaction, shape ``(..., 3)``."""
-        return directions_from_angles(self.theta_t, self.phi_t)
-
-    @property
-    def batched(self) -> bool:
-        """Whether the arrays are those of several receivers, ``(R, L)``."""
-        return self.gain.ndim == 2
-
-    def __getitem__(self, receiver: int) -> Paths:
-        """The paths of one of several receivers, without padding.
-
-        Raises:
-            TypeError: for paths of one receiver.
-        """
-        one = self.row(receiver)
-        return one.select(np.flatnonzero(one.valid))
-
-    def row(self, receiver: int) -> Paths:
-        """The paths of one of several receivers, padded as they are.
-
-        Raises:
-            TypeError: for paths of one receiver.
-        """
-        if not self.batched:
-            raise TypeError("paths of one receiver cannot be indexed by receiver; expected paths of several")
-        point = None if self.receiver is None else self.receiver[receiver]
-        return replace(self._taken(receiver), receiver=point)
-
-    def _taken(self, index: Any) -> Paths:
-        """Every array at ``index``."""
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _PER_PATH}
-        taken: dict[str, Any] = {name: None if v is None else v[index] for name, v in arrays.items()}
-        return replace(self, **taken)
-
-    def each(self) -> Iterator[Paths]:
-        """The paths of one receiver after another, without padding."""
-        if self.batched:
-            yield from (self[k] for k in range(len(self.gain)))
-        else:
-            yield self.select(np.flatnonzero(self.valid))
-
-    def select(self, chosen: Any) -> Paths:
-        """Paths ``chosen`` of one receiver: indices in any order, or a mask ``(L,)``.
-
-        Raises:
-            TypeError: for paths of several receivers.
-        """
-        if self.batched:
-            raise TypeError(
-                "paths of several receivers cannot be selected from at once; index a receiver first"
-            )
-        return self._taken(chosen)
-
-    def with_gas(self, gas: Any = True) -> Paths:
-        """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
-
-        Args:
-            gas: False for none, True for the standard atmosphere, :class:`Air`, or a :class:`Relevance`, which says
-                whether the absorption is worth its tolerance.
-
-        Raises:
-            ValueError: if the carrier or a path's delay is not known, or the carrier is outside ITU-R P.676.
-        """
-        air = air_of(gas)
-        if air == self.air:
-            return self
-        self.check_delays()
-        carrier = self.carrier_hz
-        change = 0.0 if air is None else air.attenuation_db_per_m(carrier)
-        change -= 0.0 if self.air is None else self.air.attenuation_db_per_m(carrier)
-        loss = 10.0 ** (-change * np.nan_to_num(self.length_m) / 20.0)
-        jones = None if self.jones is None else self.jones * loss[..., None, None]
-        return replace(self, gain=self.gain * loss, jones=jones, air=air)
-
-    @property
-    def carrier_hz(self) -> float:
-        """Carrier [Hz].
-
-        Raises:
-            ValueError: if it is not known.
-        """
-        if self.frequency_hz is None:
-            raise ValueError(
-                "paths: got ones without frequency_hz, expected the carrier that their gains hold at "
-                "(dataclasses.replace(paths, frequency_hz=...))"
-            )
-        return self.frequency_hz
-
-    def check_delays(self) -> None:
-        """Raises ValueError if a path has no delay."""
-        unknown = int((self.valid & ~np.isfinite(self.tau)).sum())
-        if unknown:
-            raise ValueError(f"paths: got {unknown} without a delay, expected tau for every path")
-
-    # ------------------------------------------------------------------------------- what is computed from paths
-
-    def cir(self, **options: Any) -> tuple[np.ndarray, np.ndarray]:
+    def cir(self, **link: Unpack[LinkOptions]) -> tuple[np.ndarray, np.ndarray]:
         """Impulse response, one coefficient a path; see :func:`warprrf.rf.channel.response.impulse_response`."""
-        from warprrf.rf.channel.response import impulse_response
+        return impulse_response(self, **link)
 
-        return impulse_response(self, **options)
-
-    def cfr(self, frequencies_hz: Any, **options: Any) -> np.ndarray:
+    def cfr(
+        self,
+        frequencies_hz: Any,
+        *,
+        amplitude: str = "carrier",
+        method: str = "auto",
+        **link: Unpack[LinkOptions],
+    ) -> np.ndarray:
         """Frequency response; see :func:`warprrf.rf.channel.response.frequency_response`."""
-        from warprrf.rf.channel.response import frequency_response
+        return frequency_response(self, frequencies_hz, amplitude=amplitude, method=method, **link)
 
-        return frequency_response(self, frequencies_hz, **options)
-
-    def taps(self, bandwidth_hz: float, l_min: int, l_max: int, **options: Any) -> np.ndarray:
+    def taps(
+        self,
+        bandwidth_hz: float,
+        l_min: int,
+        l_max: int,
+        *,
+        center_hz: float | None = None,
+        **link: Unpack[LinkOptions],
+    ) -> np.ndarray:
         """Taps of the discrete baseband channel; see :func:`warprrf.rf.channel.response.channel_taps`."""
-        from warprrf.rf.channel.response import channel_taps
+        return channel_taps(self, bandwidth_hz, l_min, l_max, center_hz=center_hz, **link)
 
-        return channel_taps(self, bandwidth_hz, l_min, l_max, **options)
-
-    def diffuse_power(self, **options: Any) -> np.ndarray:
+    def diffuse_power(
+        self, *, tx_array: PlanarArray | None = None, rx_array: PlanarArray | None = None
+    ) -> np.ndarray:
         """Mean power that diffuse paths add to any pair of elements; see
         :func:`warprrf.rf.channel.response.diffuse_power`."""
-        from warprrf.rf.channel.response import diffuse_power
-
-        return diffuse_power(self, **options)
+        return diffuse_power(self, tx_array=tx_array, rx_array=rx_array)
 
     def dispersion(self) -> Dispersion:
         """Delay and angular spreads, K-factor and coherence bandwidth; see
         :func:`warprrf.rf.channel.dispersion.dispersion`."""
-        from warprrf.rf.channel.dispersion import dispersion
-
         return dispersion(self)
 
     def to_sionna(
         self,
         tx_array: PlanarArray | None = None,
         rx_array: PlanarArray | None = None,
-        **options: Any,
-    ) -> SionnaPaths:
-        """Arrays in the shapes and conventions of Sionna RT; see :func:`warprrf.rf.interop.sionna_paths.to_sionna`."""
-        from warprrf.rf.interop.sionna_paths import to_sionna
+        *,
+        diffuse: str | None = None,
+        seed: int = 0,
+    ) -> sionna.SionnaPaths:
+        """Arrays in the shapes and conventions of Sionna RT; see :func:`warprrf.rf.paths.sionna.to_sionna`."""
+        return sionna.to_sionna(self, tx_array, rx_array, diffuse=diffuse, seed=seed)
 
-        return to_sionna(self, tx_array, rx_array, **options)
-
-    @staticmethod
-    def from_sionna(paths: Any, **options: Any) -> Paths:
-        """Paths that Sionna RT solved; see :func:`warprrf.rf.interop.sionna_paths.from_sionna`."""
-        from warprrf.rf.interop.sionna_paths import from_sionna
-
-        return from_sionna(paths, **options)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to a NetCDF-4 file; see :func:`warprrf.rf.paths.files.save_paths`."""
-        from warprrf.rf.paths.files import save_paths
-
-        save_paths(self, path)
-
-    @staticmethod
-    def load(path: str | os.PathLike[str]) -> Paths:
-        """Read what :meth:`save` wrote; see :func:`warprrf.rf.paths.files.load_paths`."""
-        from warprrf.rf.paths.files import load_paths
-
-        return load_paths(path)
-
-    # ----------------------------------------------------------------------------------------------- making paths
-
-    @staticmethod
-    def from_points(
-        transmitter: np.ndarray,
-        receiver: np.ndarray,
-        vertices: np.ndarray,
-        amplitude: np.ndarray,
-        kind: np.ndarray,
-        frequency_hz: float,
-        jones: np.ndarray | None = None,
+    @classmethod
+    def from_sionna(
+        cls, paths: Any, *, frequency_hz: float, transmitter: int = 0, drop_repeated: bool = False
     ) -> Paths:
-        """Paths of one receiver from their interaction points ``(L, depth, 3)``, NaN past the last.
+        """Paths that Sionna RT solved, with their Jones matrices, arrays ``(R, L)``, strongest path first.
+
+        Sionna's arrays must be one isotropic element of polarisation "VH" at either end, unrotated: their four
+        coefficients are the Jones matrix. The phase of ``gain`` is that of the delay alone.
 
         Args:
-            amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
-            jones: Polarised gain before exp(-j 2 pi f tau), complex, shape ``(L, 2, 2)``.
+            paths: What a ``PathSolver`` returned, with ``synthetic_array=True``.
+            frequency_hz: The scene's carrier [Hz].
+            transmitter: Index of the transmitter.
+            drop_repeated: Leave out specular paths that repeat another one: Sionna counts a mirror of many small
+                triangles several times.
+
+        Raises:
+            ValueError: for other arrays, or paths through or round obstacles (refraction, diffraction).
         """
-        count, depth = vertices.shape[:2]
-        bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
-        points = np.concatenate(
-            [np.broadcast_to(transmitter, (count, 1, 3)), vertices, np.zeros((count, 1, 3))], 1
-        )
-        each = np.arange(count)
-        points[each, bounces + 1] = receiver
-        steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
-        tau = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1) / SPEED_OF_LIGHT
-        theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
-        theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
-        turned = carrier_phase(frequency_hz, tau)
-        return Paths(
-            gain=amplitude * turned,
-            tau=tau,
-            theta_r=theta_r,
-            phi_r=phi_r,
-            theta_t=theta_t,
-            phi_t=phi_t,
-            vertices=vertices,
-            kind=kind,
-            valid=np.ones(count, dtype=bool),
-            jones=None if jones is None else jones * turned[:, None, None],
-            frequency_hz=float(frequency_hz),
-            transmitter=np.array(transmitter, dtype=np.float64),
-            receiver=np.array(receiver, dtype=np.float64),
-        )
+        found = sionna.from_sionna(paths, frequency_hz, transmitter, drop_repeated)
+        return cls.stack([cls(**arrays) for arrays in found])
 
-    @staticmethod
-    def concatenate(parts: Sequence[Paths]) -> Paths:
-        """All paths of one receiver."""
-        depth = max(p.vertices.shape[1] for p in parts)
-        names = [n for n in _PER_PATH if n not in ("vertices", "jones")]
-        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-        jones = None
-        if any(p.jones is not None for p in parts):
-            jones = np.concatenate([_polarised(p) for p in parts])
-        return Paths(
-            vertices=np.concatenate([_deepen(p.vertices, depth) for p in parts]),
-            jones=jones,
-            **joined,
-            **_common(parts),
-            receiver=parts[0].receiver,
-        )
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write to a NetCDF-4 file, whole or not at all; :mod:`warprrf.rf.paths.files` describes it."""
+        files.write(path, self)
 
-    @staticmethod
-    def stack(parts: Sequence[Paths]) -> Paths:
-        """Paths of several receivers, padded to the longest list: arrays ``(R, L)``."""
-        length = max((len(p.gain) for p in parts), default=0)
-        depth = max((p.vertices.shape[1] for p in parts), default=1)
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Paths:
+        """Read what :meth:`save` wrote.
 
-        def pad(array: np.ndarray, fill: Any) -> np.ndarray:
-            widths = [(0, length - len(array))] + [(0, 0)] * (array.ndim - 1)
-            return np.pad(array, widths, constant_values=fill)
-
-        fills = {"gain": 0.0, "kind": "", "valid": False}
-        names = [n for n in _PER_PATH if n not in ("vertices", "jones")]
-        stacked: dict[str, Any] = {
-            n: np.stack([pad(getattr(p, n), fills.get(n, np.nan)) for p in parts]) for n in names
-        }
-        jones, receiver = None, None
-        if any(p.jones is not None for p in parts):
-            jones = np.stack([pad(_polarised(p), 0.0) for p in parts])
-        if all(p.receiver is not None for p in parts):
-            receiver = np.stack([np.asarray(p.receiver) for p in parts])
-        return Paths(
-            vertices=np.stack([pad(_deepen(p.vertices, depth), np.nan) for p in parts]),
-            jones=jones,
-            **stacked,
-            **_common(parts),
-            receiver=receiver,
-        )
-
-
-def _deepen(vertices: np.ndarray, depth: int) -> np.ndarray:
-    return np.pad(vertices, [(0, 0), (0, depth - vertices.shape[1]), (0, 0)], constant_values=np.nan)
-
-
-def _polarised(paths: Paths) -> np.ndarray:
-    """``jones``, or NaN for each path."""
-    return np.full((len(paths.gain), 2, 2), np.nan + 0j) if paths.jones is None else paths.jones
-
-
-def _common(parts: Sequence[Paths]) -> dict[str, Any]:
-    """What all parts share.
-
-    Raises:
-        ValueError: if they differ in carrier, transmitter or air.
-    """
-    if not parts:
-        return {}
-    first = parts[0]
-    for p in parts[1:]:
-        same = p.frequency_hz == first.frequency_hz and p.air == first.air
-        if p.transmitter is not None and first.transmitter is not None:
-            same &= bool(np.array_equal(p.transmitter, first.transmitter))
-        if not same:
-            raise ValueError(
-                "parts: got paths of another carrier, transmitter or air, expected the same for all"
-            )
-    return {"frequency_hz": first.frequency_hz, "transmitter": first.transmitter, "air": first.air}
+        Raises:
+            FileNotFoundError: if there is no such file.
+            ValueError: if the file holds something else.
+        """
+        arrays, one_receiver = files.read(path)
+        several = cls(**arrays)
+        return several[0] if one_receiver else several

@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from warprrf.device import check_array
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, to_db
-
-if TYPE_CHECKING:
-    from warprrf.rf.spectra.dataset import SpectrumDataset
 
 SAME_PLACE_M = 1e-9  # a receiver nearer than this to a training one is that one
 

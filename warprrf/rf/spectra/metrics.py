@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from warprrf.device import Progress
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import (
     Spectrum,
     directions_from_angles,
@@ -25,9 +26,6 @@ from warprrf.rf.spectra.spectrum import (
     pixel_solid_angles,
     to_db,
 )
-
-if TYPE_CHECKING:
-    from warprrf.rf.spectra.dataset import SpectrumDataset
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity

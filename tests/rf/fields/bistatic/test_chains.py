@@ -36,7 +36,7 @@ def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.
     return np.stack(stops, axis=1), normal, np.stack(cosine, axis=1)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     """The image method on the true scene multiplies Jones matrices; means of single mirrors miss them by decibels."""
     mesh, part = joined(

@@ -125,7 +125,7 @@ def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
     assert lit.render(seen).further.sum() == pytest.approx(extra.sum(), rel=1e-6)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_what_groups_send_on_adds_up(scene: RadioScene) -> None:
     surface = Surface.of(scene)
     ds = spectra(scene, RECEIVERS[:1])

@@ -87,7 +87,7 @@ def spectra(truth: HarmonicField) -> SimpleNamespace:
 # --- the model's equations
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("rule", ["product", "exp"])
 @pytest.mark.parametrize("gain", ["exp", "linear"])
 def test_a_pixel_is_the_papers_equations(rule: str, gain: str) -> None:

@@ -106,7 +106,7 @@ def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray)
     return float(0.8 * np.abs(a - b).mean() + 0.2 * (1 - similarity.mean()))
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("kind", ["exp", "linear", "signed"])
 @pytest.mark.parametrize("with_unit", [False, True])
 def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_unit: bool) -> None:
@@ -160,7 +160,7 @@ def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch: pytest.
     assert np.array_equal(results[0][1], results[1][1])
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign() -> None:
     """Kingma and Ba 2015: after bias correction the first update is rate * g / |g|."""
     problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
@@ -204,7 +204,7 @@ def test_weighted_means_are_those_of_the_pixels_that_see_a_gaussian() -> None:
         assert m == pytest.approx(np.average(values.ravel()[pixel[mine]], weights=t.weight[mine]))
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 def test_harmonics_on_the_device_are_the_textbooks() -> None:
     problem = Problem(synthetic_transport(), precision=np.float64)
     expected = harmonics_by_hand(pixel_directions(SHAPE).reshape(-1, 3))

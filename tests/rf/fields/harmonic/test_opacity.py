@@ -65,7 +65,7 @@ def test_listed_responses_give_the_weights_that_the_rasteriser_gives() -> None:
     assert np.allclose(found.pixel_weight, thinner.pixel_weight, atol=5e-3)
 
 
-@pytest.mark.on_cuda_too
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("with_unit", [False, True])
 def test_gradient_by_opacity_against_finite_differences(with_unit: bool) -> None:
     listed = listed_pairs()

@@ -12,118 +12,102 @@ no such place stays whole as it is. Lengths in metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import PlanarPatch, connected_pieces, simplify
-from warprrf.geometry.photos.completion.boxes import divide, least_surface, surface_of, without_hollows
-from warprrf.geometry.photos.completion.dividers import (
-    Labels,
+from warprrf.geometry.mesh_topology import connected_pieces
+from warprrf.geometry.photos.completion.boxes import divide, least_surface, surface_of
+from warprrf.geometry.photos.completion.evidence import closed_sides, seen_share, vote_proven, votes
+from warprrf.geometry.photos.completion.room_planes import (
+    FaceLevels,
     claim_proven,
     directions,
-    known_planes,
-    proven_planes,
+    known_levels,
+    proven_levels,
 )
-from warprrf.geometry.photos.completion.evidence import closed_sides, seen_share, vote_proven, votes
+from warprrf.geometry.photos.config import CompletionConfig
 from warprrf.geometry.photos.planes import Plane
+from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.camera import Camera
-
-# Where less than this of all the surface is seen, photos cover too little of the place for the rest to be inferred.
-LEAST_SEEN = 0.7
-# Pieces of the old mesh this far from every known plane, and this large, are kept.
-KEEP_M, KEEP_M2 = 0.12, 0.3
 
 
 def complete(
-    mesh: Mesh,
-    patches: Sequence[PlanarPatch],
+    patches: PlanarPatches,
     cameras: Sequence[Camera],
     depths: Sequence[np.ndarray],
     *,
     planes: Sequence[Plane] = (),
-    cell_m: float = 0.1,
-    stride: int = 5,
-    min_patch_m2: float = 0.15,
-    seed: int = 0,
-) -> tuple[Mesh, list[PlanarPatch]]:
-    """``mesh`` with holes closed, borders straightened and islands in the air removed, where its planes allow it.
+    config: CompletionConfig | None = None,
+) -> PlanarPatches:
+    """The mesh of ``patches`` with holes closed, borders straightened and islands in the air removed.
 
     Args:
-        mesh: flattened onto its ``patches``.
+        patches: of the mesh, which is flattened onto them; patch k lies on ``planes[k]``.
         cameras, depths: what was seen: Euclidean range per pixel [m], 0 where unknown, each ``(height, width)``.
         planes: planes known beforehand; their occupied cells are evidence of their own.
-        cell_m: largest side of a box.
-        stride: every so many-th row and column of the depth maps is used.
-        min_patch_m2: smallest patch returned.
-        seed: of the places of samples.
+        config: sizes, tolerances and weights.
 
     Returns:
-        The mesh and its patches, largest first; what was given when most of the mesh lies on no planes along three
-        perpendicular directions, or the photos show so little of the place that most of it would be a guess.
+        The mesh with its patches, one for each plane and side; what was given when most of the mesh lies on no planes
+        along three perpendicular directions, or the photos show so little of the place that most would be a guess.
 
     Raises:
         ValueError: when the numbers of cameras and depth maps differ.
     """
+    config = config or CompletionConfig()
     if len(depths) != len(cameras):
         raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
-    axes = directions(mesh, patches)
+    mesh, axes = patches.mesh, directions(patches, config)
     if axes is None or not len(cameras):
-        return mesh, list(patches)
-    dividers, labels = known_planes(mesh, patches, planes, axes)
-    proven = list(proven_planes(planes, axes, dividers))
-    claim_proven(mesh, labels, axes, proven)
-    grid = divide(mesh, axes, dividers, cell_m)
-    free, solid = votes(grid, mesh, labels, cameras, depths, stride, seed)
-    for plane, divider in proven:
-        vote_proven(grid, plane, divider, free, solid)
-    filled = least_surface(grid, free, solid, closed_sides(grid, mesh, labels))
-    filled = without_hollows(grid, filled, np.array([c.position for c in cameras]))
+        return patches
+    levels, faces = known_levels(patches, planes, axes, config)
+    proven = proven_levels(planes, axes, levels, config)
+    claim_proven(mesh, faces, axes, proven, config)
+
+    grid = divide(mesh, axes, levels, config)
+    free, solid = votes(grid, mesh, faces, cameras, depths, config)
+    for plane, level in proven:
+        before, behind = vote_proven(grid, plane, level, config)
+        free, solid = free + before, solid + behind
+
+    filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces, config), config)
     if filled.all():
-        return mesh, list(patches)
-    whole, parts, known = surface_of(grid, filled)
-    if seen_share(grid, whole, parts, solid) < LEAST_SEEN:
-        return mesh, list(patches)
-    whole, parts = _with_rest(whole, parts, known, mesh, patches, labels)
-    whole, parts = simplify(whole, parts)
-    return whole, sorted((p for p in parts if p.area >= min_patch_m2), key=lambda p: -p.area)
+        return patches
+    whole, known = surface_of(grid, filled, patches.tolerance_m)
+    if seen_share(grid, whole, solid, config) < config.least_seen:
+        return patches
+    return _with_rest(whole, known, patches, faces, config)
 
 
 def _with_rest(
-    whole: Mesh,
-    parts: Sequence[PlanarPatch],
+    whole: PlanarPatches,
     known: np.ndarray,
-    mesh: Mesh,
-    patches: Sequence[PlanarPatch],
-    labels: Labels,
-) -> tuple[Mesh, list[PlanarPatch]]:
+    patches: PlanarPatches,
+    faces: FaceLevels,
+    config: CompletionConfig,
+) -> PlanarPatches:
     """The completed surface with round or oblique pieces of the old mesh in place of the steps made for them."""
-    centres = mesh.triangles.mean(axis=1)
-    rest = labels.axis < 0
+    new, old = whole.mesh, patches.mesh
+    centres = old.triangles.mean(axis=1)
+    rest = faces.axis < 0
     if known.any():
-        rest[rest] = Mesh(whole.vertices, whole.faces[known]).distance(centres[rest]) > KEEP_M
-    piece = connected_pieces(mesh, np.where(rest, 0, -1))
-    rest &= np.bincount(piece, weights=mesh.areas * rest)[piece] >= KEEP_M2
+        rest[rest] = Mesh(new.vertices, new.faces[known]).distance(centres[rest]) > config.keep_m
+    piece = connected_pieces(old, np.where(rest, 0, -1))
+    rest &= np.bincount(piece, weights=old.areas * rest)[piece] >= config.keep_m2
     if not rest.any():
-        return whole, list(parts)
-    own = np.flatnonzero(rest)
+        return whole
     stays = known.copy()
     if not known.all():
-        near = Mesh(mesh.vertices, mesh.faces[own]).distance(whole.triangles[~known].mean(axis=1))
-        stays[~known] = near > KEEP_M
-    old = np.flatnonzero(stays)
-    place = np.full(len(whole.faces), -1)
-    place[old] = np.arange(len(old))
-    new = np.full(len(mesh.faces), -1)
-    new[own] = len(old) + np.arange(len(own))
-    faces = np.concatenate([whole.faces[old], mesh.faces[own] + len(whole.vertices)])
-    used, faces = np.unique(faces, return_inverse=True)
-    joint = Mesh(np.concatenate([whole.vertices, mesh.vertices])[used], faces.reshape(-1, 3))
-    result = []
-    for p, number in [(p, place) for p in parts] + [(p, new) for p in patches]:
-        left = number[p.faces]
-        left = left[left >= 0]
-        if len(left):
-            result.append(replace(p, faces=left, area=float(joint.areas[left].sum())))
-    return joint, result
+        steps = new.triangles[~known].mean(axis=1)
+        stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > config.keep_m
+    corners = np.concatenate([new.faces[stays], old.faces[rest] + len(new.vertices)])
+    used, corners = np.unique(corners, return_inverse=True)
+    own = patches.face_patch[rest]
+    return PlanarPatches.from_planes(
+        Mesh(np.concatenate([new.vertices, old.vertices])[used], corners.reshape(-1, 3)),
+        np.concatenate([whole.face_patch[stays], np.where(own >= 0, own + len(whole), -1)]),
+        np.concatenate([whole.normal, patches.normal]),
+        np.concatenate([whole.offset, patches.offset]),
+        tolerance_m=patches.tolerance_m,
+    )

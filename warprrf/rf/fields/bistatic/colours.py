@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import connected_pieces
+from warprrf.geometry.mesh_topology import connected_pieces
 from warprrf.geometry.splats.gaussians import Gaussians
 
 LARGE_PIECE_M2 = 1.5  # a piece of a patch this large is a group of its own

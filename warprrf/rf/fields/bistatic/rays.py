@@ -141,7 +141,7 @@ class RayGrid:
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""
-        by_embree = not _device.is_cuda(self.device) and o3d.installed() and count >= mesh_rays.EMBREE_RAYS
+        by_embree = not self.device.is_cuda and o3d.installed() and count >= mesh_rays.EMBREE_RAYS
         return "embree" if by_embree else "warp"
 
     def light(self, hits: Hits, source: np.ndarray) -> Illumination:

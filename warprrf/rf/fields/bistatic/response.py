@@ -64,7 +64,7 @@ class SpectrumPixels:
         """Each path's beam."""
         if view.beams is None:
             raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
-        return view.beams.reshape(len(view.beams), -1)[:, self.pixels]
+        return view.beams.reshape(len(view.beams), self.bins(view)[1])[:, self.pixels]
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def respond(view: ReceiverView, measurement: Measurement, lobes: tuple[int, ...]
     bins, count = measurement.bins(view)
     group, images = resolve(t.surface, view.hits.face, view.light, lobes, t.wavelength_m, bins, count)
     read = measurement.of_bins(images.reshape(count, -1)) / np.float32(floor)
-    bounce = np.ascontiguousarray(read.T).reshape(*images.shape[1:], -1)
+    bounce = np.ascontiguousarray(read.T).reshape(*images.shape[1:], len(read))
     strong = np.abs(bounce).max(axis=(1, 2, 3), initial=0.0) > NEGLIGIBLE
     ray, face, unit = view.seen()
     seen, indirect = _read_by_group(measurement, bins[ray], count, t.surface.group[face], unit / floor)
@@ -251,7 +251,7 @@ def _blocks(r: Response, p: Parameters, layout: Layout) -> Iterator[_Block]:
     mixed = weight[:, :, None] * alpha[:, None, :]
     per_group = int(np.prod(mixed.shape[1:]))
     yield (
-        r.bounce.reshape(-1, count),
+        r.bounce.reshape(mixed.size, count),
         mixed.ravel(),
         [
             (np.repeat(layout.weight(r.group).ravel(), mixed.shape[2]), mixed.ravel()),

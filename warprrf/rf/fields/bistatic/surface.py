@@ -18,7 +18,8 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.cache import Cache
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.patches import PlanarPatch, smoothed_normals
+from warprrf.geometry.mesh_topology import smoothed_normals
+from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import bounce
 from warprrf.rf.fields.bistatic.colours import colour_groups
@@ -102,9 +103,10 @@ class Surface:
             )
         material = getattr(geometry, "face_material", None)
         gaussians = getattr(geometry, "gaussians", None)
-        found = list(getattr(geometry, "patches", []))
-        if material is None and found and isinstance(gaussians, Gaussians):
-            normal, patch, planes = _reconstructed_patches(mesh, found)
+        found = getattr(geometry, "patches", None)
+        if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
+            patch, planes = found.face_patch, (found.normal, found.offset)
+            normal = _normals(found)
             group, sort, colour = colour_groups(mesh, patch, gaussians)
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
@@ -218,13 +220,11 @@ def _split_long(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     return Mesh(vertices, np.concatenate(done_faces)), np.concatenate(done_parent)
 
 
-def _reconstructed_patches(
-    mesh: Mesh, patches: list[PlanarPatch]
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+def _normals(patches: PlanarPatches) -> np.ndarray:
+    """Normal of each face: of its patch, on the side that it is wound for, else smoothed, shape ``(F, 3)``."""
+    mesh, own = patches.mesh, patches.face_patch >= 0
     normal = smoothed_normals(mesh, 3)
-    label = np.full(len(mesh.faces), -1, np.int32)
-    for k, patch in enumerate(patches):
-        label[patch.faces] = k
-        normal[patch.faces] = patch.normal
-    planes = np.array([p.normal for p in patches]), np.array([p.offset for p in patches])
-    return normal, label, planes
+    flat = patches.normal[patches.face_patch[own]]
+    turned = (flat * mesh.face_normals[own]).sum(axis=1) < 0
+    normal[own] = np.where(turned[:, None], -flat, flat)
+    return normal

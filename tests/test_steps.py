@@ -1,0 +1,209 @@
+"""Steps keep what is finished, redo what changed, go on where a killed attempt was, and count its time."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warprrf import steps as module
+from warprrf.files import plain, write_text
+from warprrf.steps import Attempt, Steps, digest
+
+
+def _once(
+    folder: Path, calls: list[str], value: int, *, given: object = 0, version: int = 1, fresh: bool = False
+) -> int:
+    with Steps(folder, fresh=fresh) as steps:
+
+        def make(attempt: Attempt) -> dict[str, int]:
+            calls.append("make")
+            write_text(folder / "out.txt", str(value))
+            return {"value": value}
+
+        return int(steps.run("one", make, version=version, inputs=[given], outputs=["out.txt"])["value"])
+
+
+def test_a_finished_step_is_not_done_again(tmp_path: Path) -> None:
+    calls: list[str] = []
+    assert [_once(tmp_path, calls, 1), _once(tmp_path, calls, 2)] == [1, 1]
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("change", ["input", "version", "output", "fresh", "damaged record"])
+def test_a_step_is_redone_when_something_changed(tmp_path: Path, change: str) -> None:
+    calls: list[str] = []
+    _once(tmp_path, calls, 1)
+    if change == "output":
+        (tmp_path / "out.txt").unlink()
+    if change == "damaged record":
+        (tmp_path / ".steps/one.json").write_text("{")
+    redone = _once(
+        tmp_path,
+        calls,
+        2,
+        given=int(change == "input"),
+        version=1 + (change == "version"),
+        fresh=change == "fresh",
+    )
+    assert (redone, len(calls)) == (2, 2)
+
+
+def test_a_step_that_does_not_write_its_output_is_an_error_and_stays_unfinished(tmp_path: Path) -> None:
+    with Steps(tmp_path) as steps:
+        with pytest.raises(RuntimeError, match="without writing gone.txt"):
+            steps.run("one", lambda attempt: {}, version=1, inputs=[], outputs=["gone.txt"])
+        assert not json.loads((tmp_path / ".steps/one.json").read_text())["finished"]
+
+
+def test_scratch_stays_with_its_inputs_until_the_step_is_finished(tmp_path: Path) -> None:
+    seen: list[bool] = []
+
+    def attempt_with(value: int, fail: bool) -> None:
+        def make(attempt: Attempt) -> dict[str, int]:
+            seen.append((attempt.folder / "half.txt").exists())
+            (attempt.folder / "half.txt").write_text("half")
+            if fail:
+                raise KeyboardInterrupt
+            return {}
+
+        with Steps(tmp_path) as steps:
+            steps.run("one", make, version=1, inputs=[value])
+
+    for value, fail in ((1, True), (1, True), (2, True), (2, False), (3, False)):
+        if fail:
+            with pytest.raises(KeyboardInterrupt):
+                attempt_with(value, fail)
+        else:
+            attempt_with(value, fail)
+    assert seen == [False, True, False, True, False]
+    assert not (tmp_path / ".steps/one").exists()
+
+
+def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path: Path) -> None:
+    made: list[int] = []
+
+    def ask(value: int) -> dict[str, np.ndarray]:
+        def make() -> dict[str, np.ndarray]:
+            made.append(value)
+            return {"gain": np.full((2, 3), value, np.float32), "flag": np.array(True)}
+
+        with Steps(tmp_path, shared=True) as steps:
+            return steps.arrays("receiver", make, version=1, inputs=[np.array([value])])
+
+    for value in (1, 1, 2, 2):
+        found = ask(value)
+        assert set(found) == {"gain", "flag"} and found["gain"].dtype == np.float32
+        np.testing.assert_array_equal(found["gain"], value)
+    assert made == [1, 2]
+    whole = (tmp_path / "receiver.npz").read_bytes()
+    for damage in (b"", whole[: len(whole) // 2]):
+        (tmp_path / "receiver.npz").write_bytes(damage)
+        np.testing.assert_array_equal(ask(2)["gain"], 2)
+    assert made == [1, 2, 2, 2]
+
+
+def test_digest_follows_names_and_content_of_files_not_dates(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.jpg").write_bytes(b"one")
+    before = digest(folder)
+    os.utime(folder / "a.jpg", (0, 0))
+    assert digest(folder) == before
+    (folder / "a.jpg").rename(folder / "b.jpg")
+    renamed = digest(folder)
+    (folder / "b.jpg").write_bytes(b"two")
+    assert len({before, renamed, digest(folder)}) == 3
+    with pytest.raises(FileNotFoundError):
+        digest(folder / "gone.jpg")
+
+
+@dataclass(frozen=True)
+class _Config:
+    rate: float = 0.1
+    shape: tuple[int, int] = (2, 3)
+
+
+@dataclass(frozen=True)
+class _Other:
+    rate: float = 0.1
+    shape: tuple[int, int] = (2, 3)
+
+
+def test_digest_tells_values_apart_and_equal_ones_not() -> None:
+    different: list[object] = [
+        1, 1.0, "1", True, None, b"1", [1], [[1]], {"1": 1}, [1, 2], ["1", 2], [[1], 2], [1, [2]], float("nan"),
+        np.zeros(4), np.zeros((2, 2)), np.zeros(4, np.float32), np.zeros(2), _Config(), _Other(), _Config(rate=0.2),
+    ]  # fmt: skip
+    assert len({digest(value) for value in different}) == len(different)
+    assert digest("ab", "c") != digest("a", "bc")
+    same = [
+        ((1, 2), [1, 2]), ({"a": 1, "b": 2}, {"b": 2, "a": 1}), (np.float64(0.5), 0.5),
+        (np.arange(6.0).reshape(2, 3).T, np.ascontiguousarray(np.arange(6.0).reshape(2, 3).T)), (_Config(), _Config(0.1)),
+    ]  # fmt: skip
+    assert all(digest(a) == digest(b) for a, b in same)
+    with pytest.raises(TypeError, match="got object"):
+        digest(object())
+
+
+def _slow(folder: str) -> None:
+    def make(attempt: Attempt) -> dict[str, int]:
+        for step in range(1000):
+            time.sleep(0.02)
+            attempt.progress("slow", step, 1000)
+        return {}
+
+    module.HEARTBEAT_S = 0.05
+    with Steps(folder) as steps:
+        steps.run("slow", make, version=1, inputs=[1])
+
+
+def test_a_killed_attempt_is_continued_and_its_time_counted(tmp_path: Path) -> None:
+    process = multiprocessing.get_context("spawn").Process(target=_slow, args=(str(tmp_path),))
+    process.start()
+    state = tmp_path / ".steps/slow.json"
+    deadline = time.monotonic() + 60
+    recorded = 0.0
+    while recorded < 0.2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+        recorded = json.loads(state.read_text())["seconds"] if state.exists() else 0.0
+    assert process.pid is not None
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    told: list[tuple[str, int, int]] = []
+    with Steps(tmp_path, progress=lambda *news: told.append(news)) as steps:
+
+        def make(attempt: Attempt) -> dict[str, int]:
+            attempt.progress("slow", 1000, 1000)
+            return {}
+
+        steps.run("slow", make, version=1, inputs=[1])
+        assert steps.attempts("slow") == 2
+        assert steps.seconds() >= recorded >= 0.2
+        assert steps.stages("slow")["slow"] >= 0.1
+        assert len(steps.key("slow")) == 64
+    assert told == [("slow", 1000, 1000)]
+
+
+def test_two_jobs_do_not_share_a_folder_unless_told_to(tmp_path: Path) -> None:
+    with Steps(tmp_path), pytest.raises(ValueError, match="another process is at work"), Steps(tmp_path):
+        pass
+    with Steps(tmp_path, shared=True), Steps(tmp_path, shared=True):
+        pass
+
+
+def test_json_has_no_nan() -> None:
+    assert plain({"a": np.array([1.0, np.nan]), "b": np.float32(2), "c": float("inf")}) == {
+        "a": [1.0, None],
+        "b": 2.0,
+        "c": None,
+    }
+    with pytest.raises(TypeError):
+        plain(object())

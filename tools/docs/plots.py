@@ -1,0 +1,140 @@
+"""Plots of the documentation, drawn from the files in ``benchmarks/results``, as SVG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import results  # noqa: E402
+
+STYLE = {
+    "svg.fonttype": "none", "svg.hashsalt": "warprrf", "font.family": "sans-serif", "font.size": 9, "axes.grid": True,
+    "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False, "figure.constrained_layout.use": True,
+}  # fmt: skip
+COLOURS = {
+    "bistatic": "#0b6e99", "bistatic-quick": "#5aa9c9", "rf3dgs+": "#c4570f", "rf3dgs": "#e0a458", "nearest": "#777777",
+    "idw": "#aaaaaa", "sionna-calibrated": "#4b7f52", "nerf2": "#8a4f7d", "cgan": "#b794b4", "sionna": "#7bb17f",
+}  # fmt: skip
+CAPTIONS: dict[str, str] = {}
+_DRAWN: dict[str, Callable[[], Any]] = {}
+
+
+def figures() -> dict[str, str]:
+    """Path below ``docs/`` to SVG."""
+    found = {}
+    with plt.rc_context(STYLE):
+        for name, draw in _DRAWN.items():
+            figure, text = draw(), io.StringIO()
+            figure.savefig(text, format="svg", metadata={"Date": None})
+            plt.close(figure)
+            found[f"figures/{name}.svg"] = text.getvalue()
+    return found
+
+
+def entry(name: str, caption: str) -> Callable[[Callable[[], Any]], Callable[[], Any]]:
+    """Enters a figure under its name."""
+
+    def enter(function: Callable[[], Any]) -> Callable[[], Any]:
+        _DRAWN[name], CAPTIONS[name] = function, caption
+        return function
+
+    return enter
+
+
+def _name(method: str) -> str:
+    return results.NAMES[method].replace("*", "")
+
+
+@entry("psnr", "PSNR of held-out receivers over the number of training spectra")
+def _psnr() -> Any:
+    rows = results.read("sparsity")["rows"]
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
+    for ax, (truth, name) in zip(axes, results.TRUTHS.items(), strict=True):
+        for method, colour in COLOURS.items():
+            chosen = sorted(
+                (r["count"], r["psnr_db"])
+                for r in rows
+                if r["truth"] == truth and r["method"] == method and r["split"] == "random" and r["count"]
+            )
+            if chosen:
+                ax.semilogx(*zip(*chosen, strict=True), "o-", ms=3.5, color=colour, label=_name(method))
+        ax.set(xlabel="training spectra", title=f"truth: {name}")
+        ax.set_xticks([10, 50, 100, 400], ["10", "50", "100", "400"])
+        ax.minorticks_off()
+    axes[0].set_ylabel("PSNR [dB]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7)
+    return figure
+
+
+@entry("speed", "Error over the time of one spectrum and over training time, 50 spectra of the exact engine")
+def _speed() -> Any:
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
+    rows = [
+        r
+        for r in results.read("table1")["rows"]
+        if (r["truth"], r["split"], r["count"]) == ("exact", "random", 50)
+    ]
+    for ax, key, words in (
+        (axes[0], "seconds_per_spectrum", "seconds a spectrum"),
+        (axes[1], "train_s", "training [s]"),
+    ):
+        for r in rows:
+            if r.get(key):
+                ax.loglog(r[key], r["rmse_db"], "o", color=COLOURS.get(r["method"], "#444444"))
+                ax.annotate(
+                    _name(r["method"]),
+                    (r[key], r["rmse_db"]),
+                    fontsize=6.5,
+                    xytext=(4, 3),
+                    textcoords="offset points",
+                )
+        ax.set_xlabel(words)
+        ax.margins(x=0.25)
+    axes[0].set_ylabel("rms error of the dB image [dB]")
+    return figure
+
+
+@entry("knobs", "Error and time of each setting of the renderer")
+def _knobs() -> Any:
+    engine = results.read("engine")
+    words = {"alpha_min": "least alpha that counts", "top_k": "Gaussians kept a pixel"}
+    figure, axes = plt.subplots(1, 3, figsize=(9, 3.2))
+    for ax, (knob, title) in zip(axes, words.items(), strict=False):
+        rows = engine[knob]
+        ax.loglog([r["value"] for r in rows], [r["error_rms_db"] for r in rows], "o-", ms=3, color="#0b6e99")
+        ax.set(title=title, ylabel="rms error [dB]")
+        twin = ax.twinx()
+        twin.plot(
+            [r["value"] for r in rows], [1e3 * r["seconds"] for r in rows], "s--", ms=3, color="#c4570f"
+        )
+        twin.set_ylim(0)
+        twin.set_ylabel("ms a receiver", color="#c4570f")
+        twin.grid(False)
+    axes[2].loglog(
+        [r["gaussians"] for r in engine["growth"]], [1e3 * r["seconds"] for r in engine["growth"]], "o-", ms=3,
+        color="#0b6e99",
+    )  # fmt: skip
+    axes[2].set(title="growth", xlabel="Gaussians", ylabel="ms a panorama")
+    return figure
+
+
+@entry("ablation", "What each part of the bistatic model is worth, ten spectra")
+def _ablation() -> Any:
+    rows = results.read("bistatic")["ablation"]
+    names = [n for n in dict.fromkeys(r["model"] for r in rows) if not n.startswith("RF-3DGS")]
+    figure, ax = plt.subplots(figsize=(8, 3.4))
+    for shift, (truth, name), colour in zip(
+        (-0.2, 0.2), results.TRUTHS.items(), ("#0b6e99", "#c4570f"), strict=True
+    ):
+        found = [next(r["psnr_db"] for r in rows if r["model"] == n and r["truth"] == truth) for n in names]
+        ax.barh([i + shift for i in range(len(names))], found, 0.38, color=colour, label=name)
+    ax.set_yticks(range(len(names)), names)
+    ax.invert_yaxis()
+    ax.set_xlabel("PSNR [dB]")
+    ax.legend(fontsize=7, loc="lower right")
+    return figure

@@ -1,0 +1,562 @@
+"""Tables of the documentation and of the README, from the files in ``benchmarks/results``.
+
+``python tools/docs/results.py readme`` writes README's table anew, ``python tools/docs/results.py keep FOLDER`` keeps
+the result of a finished ``make lobby`` (``FOLDER/report.json``), without the figures of single receivers.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "benchmarks" / "results"
+README = ROOT / "README.md"
+MARKERS = ("<!-- results: made by tools/docs/results.py -->", "<!-- /results -->")
+
+NAMES = {
+    "bistatic": "**bistatic**",
+    "bistatic-quick": "**bistatic, quick fit**",
+    "rf3dgs+": "RF-3DGS+",
+    "rf3dgs+los": "RF-3DGS+ with line of sight",
+    "rf3dgs": "RF-3DGS",
+    "rf3dgs+alpha": "RF-3DGS+, opacity trained",
+    "rf3dgs-alpha": "RF-3DGS, opacity trained",
+    "nerf2": "NeRF2",
+    "cgan": "conditional GAN",
+    "sionna-calibrated": "Sionna RT, calibrated materials",
+    "sionna": "Sionna RT, true mesh, assumed materials",
+    "nearest": "nearest receiver's spectrum",
+    "idw": "inverse-distance average",
+    "mean": "mean image",
+    "constant": "constant image",
+    "zero": "our geometry, no spectra",
+    "transmitter": "point at the transmitter",
+}
+TRUTHS = {"exact": "exact engine", "sionna": "Sionna RT, depth 3"}
+Row = dict[str, Any]
+TABLES: dict[str, Callable[[], str]] = {}
+
+
+def table(name: str) -> str:
+    """The Markdown of a table.
+
+    Raises:
+        KeyError: for a name that no table has.
+    """
+    if name.startswith("machine-"):
+        return _machine(name.removeprefix("machine-"))
+    return TABLES[name]()
+
+
+@cache
+def read(name: str) -> Row:
+    """A result file."""
+    found: Row = json.loads((FOLDER / f"{name}.json").read_text())
+    return found
+
+
+def entry(name: str) -> Callable[[Callable[[], str]], Callable[[], str]]:
+    """Enters a table under its name."""
+
+    def enter(function: Callable[[], str]) -> Callable[[], str]:
+        TABLES[name] = function
+        return function
+
+    return enter
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Rows of cells under a head; all but the first column set right."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def show(value: Any, form: str = "{:.1f}") -> str:
+    """A value in a format, or nothing for None."""
+    return "" if value is None else form.format(value)
+
+
+def _machine(name: str) -> str:
+    found = read(name)
+    m = found["machine"]
+    device = "" if m["device"] == "cpu" else f", {m['device']}"
+    versions = m["versions"]
+    return (
+        f"Measured on {m['processor']}, {m['cores']} cores{device}, Python {m['python']}, Warp {versions['warp-lang']}; "
+        f"every figure is in `benchmarks/results/{name}.json`."
+    )
+
+
+# ------------------------------------------------------------------------------------------------- the lobby
+
+
+@entry("lobby-geometry")
+def _lobby_geometry() -> str:
+    r = read("lobby")
+    g = r["geometry"]
+    rows = [
+        ("photos posed", f"{g['posed']} of {g['photos']}"),
+        ("PSNR of photos held out", f"{r['photo_psnr_db']:.1f} dB"),
+        ("the same of two renderings of one photo with other noise", f"{r['photo_noise_psnr_db']:.1f} dB"),
+        (
+            f"camera positions, rms error, scale from {g['surveyed']} surveyed ones",
+            f"{1e3 * r['camera_rms_m']:.1f} mm",
+        ),
+        (
+            "mesh to the true surface where a photo sees it, median",
+            f"{1e3 * r['mesh_distance_median_m']:.1f} mm",
+        ),
+        ("the same, 90th percentile", f"{1e3 * r['mesh_distance_p90_m']:.1f} mm"),
+        ("direction of the mesh's normals, median error", f"{r['mesh_normal_median_deg']:.2f}°"),
+        ("Gaussians, triangles, planar patches", f"{g['gaussians']}, {g['triangles']}, {g['patches']}"),
+    ]
+    return markdown(("figure", "value"), rows)
+
+
+SCORES = (
+    ("psnr_db", "PSNR [dB]", "{:.1f}"),
+    ("psnr_db_blocked", "blocked", "{:.1f}"),
+    ("ssim", "SSIM", "{:.2f}"),
+    ("rmse_db", "RMSE [dB]", "{:.1f}"),
+    ("direction_within_3deg", "within 3°", "{:.0%}"),
+    ("direction_within_3deg_blocked", "blocked", "{:.0%}"),
+    ("beam_gain_loss_db", "beam loss [dB]", "{:.1f}"),
+    ("tof_error_median_ns", "delay [ns]", "{:.2g}"),
+)
+
+
+def _scored(found: dict[str, Row]) -> str:
+    rows = [
+        [
+            NAMES[m],
+            *(show(row[k], f) for k, _, f in SCORES),
+            show(1e3 * row["seconds_per_spectrum"], "{:.2g}"),
+        ]
+        for m, row in found.items()
+    ]
+    return markdown(("model", *(h for _, h, _ in SCORES), "a spectrum [ms]"), rows)
+
+
+@entry("lobby-exact")
+def _lobby_exact() -> str:
+    return _scored(read("lobby")["methods"])
+
+
+@entry("lobby-sionna")
+def _lobby_sionna() -> str:
+    return _scored(read("lobby")["methods_sionna"])
+
+
+@entry("lobby-stages")
+def _lobby_stages() -> str:
+    r = read("lobby")
+    rows = [(name, f"{stage['seconds']:.0f}") for name, stage in r["stages"].items()]
+    return markdown(("step", "seconds"), [*rows, ("**all**", f"**{r['pipeline_time_s']:.0f}**")])
+
+
+# ---------------------------------------------------------------------------------------- the bistatic field
+
+
+def _find(rows: list[Row], **wanted: Any) -> Row | None:
+    return next((r for r in rows if all(r.get(k) == v for k, v in wanted.items())), None)
+
+
+@entry("fields")
+def _fields() -> str:
+    rows, head = read("bistatic")["rows"], ["spectra"]
+    shown = ("bistatic", "rf3dgs+", "rf3dgs+los", "nearest")
+    for name in TRUTHS.values():
+        head += [f"{name}: {NAMES[m].strip('*')}" for m in shown[:1]] + [NAMES[m] for m in shown[1:]]
+    lines = []
+    for count in sorted({r["n_train"] for r in rows if r["n_train"]}):
+        cells = [str(count)]
+        for truth in TRUTHS:
+            for method in shown:
+                found = _find(rows, truth=truth, n_train=count, method=method)
+                value = show(found and found["psnr_db"])
+                cells.append(f"**{value}**" if method == "bistatic" else value)
+        lines.append(cells)
+    return markdown(head, lines)
+
+
+@entry("fields-blocked")
+def _fields_blocked() -> str:
+    rows = read("bistatic")["rows"]
+    lines = []
+    for truth, name in TRUTHS.items():
+        for r in (r for r in rows if r["truth"] == truth and r["method"] == "bistatic"):
+            lines.append([
+                f"{name}, {r['n_train']}", show(r["psnr_db"]), show(r["psnr_db_blocked"]),
+                show(r["direction_within_3deg"], "{:.0%}"), show(r["direction_within_3deg_blocked"], "{:.0%}"),
+                show(r["beam_gain_loss_db"]), show(r["beam_gain_loss_db_blocked"]),
+                show(r["tof_error_median_ns_blocked"], "{:.2f}"),
+            ])  # fmt: skip
+    head = (
+        "truth, training receivers", "PSNR [dB]", "blocked", "within 3°", "blocked", "beam loss [dB]", "blocked",
+        "delay, blocked [ns]",
+    )  # fmt: skip
+    return markdown(head, lines)
+
+
+@entry("ablation")
+def _ablation() -> str:
+    rows = read("bistatic")["ablation"]
+    words = {
+        "everything": "everything",
+        "zero spectra": "the same geometry, no spectra at all",
+        "RF-3DGS+ with line of sight": "RF-3DGS+ with an explicit line of sight",
+        "no residual per element": "no correction per surface element",
+        "true mesh, its materials as groups": "everything, on the true mesh with its materials as groups",
+    }
+    lines = []
+    for model in dict.fromkeys(r["model"] for r in rows):
+        lines.append([
+            words.get(model, model),
+            *(show((found := _find(rows, truth=t, model=model)) and found["psnr_db"]) for t in TRUTHS),
+        ])  # fmt: skip
+    return markdown(("model, ten spectra", *(f"{n} [dB]" for n in TRUTHS.values())), lines)
+
+
+@entry("uncertainty")
+def _uncertainty() -> str:
+    lines = [
+        [
+            f"{TRUTHS[r['truth']]}, {r['n_train']}", show(r["rms_error_db"]),
+            show(r["within_1_sigma"], "{:.0%}"), show(r["within_2_sigma"], "{:.0%}"),
+        ]
+        for r in read("bistatic")["calibration"]
+    ]  # fmt: skip
+    return markdown(
+        ("truth, training receivers", "rms error [dB]", "within one standard deviation", "within two"), lines
+    )
+
+
+@entry("delays")
+def _delays() -> str:
+    lines = [
+        [
+            f"{TRUTHS[r['truth']]}, {r['n_train']}", show(r["mirror"]["found"], "{:.0%}"),
+            show(r["mirror"]["median_ns"], "{:.4f}"), show(r["scattering"]["median_by_power_ns"], "{:.3f}"),
+        ]
+        for r in read("bistatic")["delays"]
+    ]  # fmt: skip
+    head = ("truth, training receivers", "mirror paths found", "their delay error [ns]", "scattering's [ns]")
+    return markdown(head, lines)
+
+
+@entry("transmitter")
+def _transmitter() -> str:
+    lines = [
+        [
+            NAMES[r["method"]], show(r["seen"]["psnr_db"]), show(r["psnr_db"]),
+            show(r["direction_within_3deg"], "{:.0%}"), show(r["direction_within_3deg_blocked"], "{:.0%}"),
+        ]
+        for r in read("bistatic")["second"]
+    ]  # fmt: skip
+    head = ("model, ten spectra", "fitted transmitter [dB]", "another one [dB]", "within 3°", "blocked")
+    return markdown(head, lines)
+
+
+# ------------------------------------------------------------------------------------------- other methods
+
+SUBSETS = (
+    ("exact", "random", 10), ("exact", "random", 50), ("exact", "random", 400), ("sionna", "random", 10),
+    ("sionna", "random", 50), ("sionna", "random", 400), ("exact", "region", 50),
+)  # fmt: skip
+
+
+def _methods() -> list[str]:
+    found = {r["method"] for r in read("table1")["rows"]}
+    return [m for m in NAMES if m in found]
+
+
+def _table1(method: str, truth: str, split: str, count: int) -> Row | None:
+    rows = read("table1")["rows"]
+    same = {"method": method, "truth": truth, "split": split}
+    return _find(rows, **same, count=count) or _find(rows, **same, count=0)
+
+
+@entry("methods-psnr")
+def _methods_psnr() -> str:
+    lines = []
+    for method in _methods():
+        cells = [NAMES[method]]
+        for subset in SUBSETS:
+            r = _table1(method, *subset)
+            cells.append("" if r is None else f"{r['psnr_db']:.1f} / {r['psnr_db_blocked']:.1f}")
+        lines.append(cells)
+    head = [f"{t}, {'region held out' if s == 'region' else c}" for t, s, c in SUBSETS]
+    return markdown(("PSNR [dB], all / blocked", *head), lines)
+
+
+@entry("methods-detail")
+def _methods_detail() -> str:
+    lines = []
+    for method in _methods():
+        r = _table1(method, "exact", "random", 50)
+        if r is None:
+            continue
+        lines.append([
+            NAMES[method], show(r["ssim"], "{:.2f}"), show(r["rmse_db"]),
+            f"{r['direction_within_3deg']:.0%} / {r['direction_within_3deg_blocked']:.0%}",
+            f"{r['beam_gain_loss_db']:.1f} / {r['beam_gain_loss_db_blocked']:.1f}",
+            show(r["tof_error_median_ns"], "{:.2g}"), show(r.get("train_s"), "{:.3g}"),
+            show(1e3 * r["seconds_per_spectrum"], "{:.3g}"), show(r.get("peak_memory_gib"), "{:.1f}"),
+            show(r.get("model_mib"), "{:.2g}"),
+        ])  # fmt: skip
+    head = (
+        "exact, 50 spectra", "SSIM", "RMSE [dB]", "within 3°, all / blocked", "beam loss [dB], all / blocked",
+        "delay [ns]", "training [s]", "a spectrum [ms]", "memory [GiB]", "model [MiB]",
+    )  # fmt: skip
+    return markdown(head, lines)
+
+
+@entry("published")
+def _published() -> str:
+    lines = [
+        [
+            NAMES[r["method"]], show(r["psnr_db"], "{:.2f}"), show(r["ssim"], "{:.3f}"), show(r["train_s"], "{:.0f}"),
+            show(1e3 * r["seconds_per_spectrum"], "{:.3g}"),
+        ]
+        for r in read("table1")["published"]
+    ]  # fmt: skip
+    return markdown(("as published", "PSNR [dB]", "SSIM", "training [s]", "a spectrum [ms]"), lines)
+
+
+@entry("law")
+def _law() -> str:
+    words = {"exact": "power that scatters as it does", "paper-law": "given the paper's factor, path by path"}
+    found = [r for r in read("table1")["finding"] if r["split"] == "random" and not r["opacity"]]
+    lines = [
+        [
+            words.get(r["truth"], TRUTHS.get(r["truth"], r["truth"])), str(r["count"]),
+            show(r["psnr_db"]["rf3dgs+"]), show(r["psnr_db"]["rf3dgs"]), show(r["psnr_db"]["difference"], "{:+.1f}"),
+        ]
+        for r in found
+    ]  # fmt: skip
+    return markdown(("truth", "spectra", "RF-3DGS+ [dB]", "RF-3DGS [dB]", "difference [dB]"), lines)
+
+
+# ------------------------------------------------------------------------------------------------ the engine
+
+
+@entry("engine-responses")
+def _engine_responses() -> str:
+    lines = [
+        [
+            r["regime"], r["form"], show(r["error_mean"], "{:.1e}"), show(r["error_max"], "{:.1e}"),
+            show(r["negative"], "{:.1%}"), show(r["ns_per_pair"]),
+        ]
+        for r in read("engine")["responses"]
+    ]  # fmt: skip
+    head = ("Gaussians", "form", "mean error", "largest", "negative squared distances", "ns a pair")
+    return markdown(head, lines)
+
+
+@entry("engine-points")
+def _engine_points() -> str:
+    lines = [
+        [
+            r["interaction_point"], show(1e3 * r["length_error_median_m"], "{:.3g}"),
+            show(1e3 * r["length_error_p90_m"], "{:.3g}"), show(r["delay_error_median_ns"], "{:.2g}"),
+            show(r["milliseconds_per_receiver"]),
+        ]
+        for r in read("engine")["points"]
+    ]  # fmt: skip
+    head = (
+        "`interaction_point=`", "length error, median [mm]", "90th percentile [mm]", "delay [ns]", "ms a receiver",
+    )  # fmt: skip
+    return markdown(head, lines)
+
+
+@entry("engine-knobs")
+def _engine_knobs() -> str:
+    words = {
+        "alpha_min": "least alpha that counts", "alpha_max": "largest alpha", "top_k": "Gaussians kept a pixel",
+        "precision": "precision", "resolution": "grid, rows x columns",
+    }  # fmt: skip
+    lines = []
+    for knob, name in words.items():
+        for r in read("engine")[knob]:
+            value = " x ".join(map(str, r["value"])) if isinstance(r["value"], list) else _short(r["value"])
+            lines.append([
+                name, value, show(r["error_rms_db"], "{:.2g}"), show(r["error_worst_db"], "{:.2g}"),
+                show(1e3 * r["seconds"]),
+            ])  # fmt: skip
+            name = ""
+    return markdown(("setting", "value", "rms error [dB]", "worst pixel [dB]", "ms a receiver"), lines)
+
+
+def _short(value: Any) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"
+
+
+@entry("engine-times")
+def _engine_times() -> str:
+    e = read("engine")
+    b, t = e["blend"], e["transport"]
+    lines = []
+    for run in b["runs"]:
+        threads = "one thread" if run["threads"] == 1 else f"{run['threads']} threads"
+        for peer, ratio in run["speedup"].items():
+            other = {"torch": "a vectorised torch renderer", "opensplat": "OpenSplat's CPU rasteriser"}[peer]
+            lines.append([
+                f"forward and backward, {b['gaussians']} Gaussians, {b['shape'][1]} x {b['shape'][0]}, {threads}: "
+                f"speed over {other}", f"{ratio:.1f} times",
+            ])  # fmt: skip
+    s = b["spectrum"]
+    lines += [
+        [
+            f"panorama of {s['shape'][0]} x {s['shape'][1]} from {s['gaussians']} Gaussians",
+            f"{1e3 * s['render_s']:.0f} ms",
+        ],
+        ["blending weights of the same view", f"{1e3 * s['weights_s']:.0f} ms"],
+        ["one launch on two cores over two processes of half the work", f"{b['cores']['throughput']:.2f}"],
+        [
+            f"blending weights of {t['receivers']} receivers, {t['gaussians']} Gaussians, on disk: memory",
+            f"{t['store_peak_gb']:.1f} GB",
+        ],
+        ["the same: files", f"{t['disk_gb']:.1f} GB"],
+    ]
+    return markdown(("figure", "value"), lines)
+
+
+# ---------------------------------------------------------------------------------------- beams, maps, effects
+
+
+EFFECTS = {
+    "line_of_sight": "line of sight",
+    "mirror_1": "mirror reflections, one",
+    "mirror_2": "mirror reflections, two",
+    "diffuse_1": "scattering, one bounce",
+    "mirror_scatter": "surfaces lit by mirrors",
+    "scatter_mirror": "lit surfaces seen in mirrors",
+    "diffuse_2": "scattering, two bounces and more",
+    "lobe_0": "the widest scattering lobe",
+    "lobe_4": "scattering lobe of exponent 4",
+    "lobe_10": "scattering lobe of exponent 10",
+    "unseen": "surfaces that no receiver sees",
+    "gas": "absorption by the air (ITU-R P.676)",
+    "diffraction": "diffraction (knife edge, ITU-R P.526)",
+    "transmission": "transmission through walls (ITU-R P.2040)",
+}
+
+
+@entry("relevance")
+def _relevance() -> str:
+    cases = read("relevance")["cases"]
+    lines = []
+    for effect, words in EFFECTS.items():
+        worth = [_find(c["effects"], name=effect) for c in cases]
+        if any(worth):
+            lines.append([words, *(show(w and w["worth_db"], "{:.2g}") for w in worth)])
+    head = [f"{c['frequency_hz'] / 1e9:.0f} GHz, {c['roughness']}" for c in cases]
+    return markdown(("effect left out [dB]", *head), lines)
+
+
+@entry("map")
+def _map() -> str:
+    found = read("map")
+    lines = []
+    for r in found["ours"]:
+        mean = ", mean of four places a cell" if r["average"] > 1 else ""
+        lines.append([f"field, {r['rays']} rays a cell, up to {r['mirrors']} mirrors{mean}", *_map_errors(r)])
+    for r in found["sionna"]:
+        lines.append([f"RadioMapSolver, {r['samples']:.0e} samples", *_map_errors(r)])
+    return markdown(("map", "rms [dB]", "median [dB]", "line of sight", "blocked", "core seconds"), lines)
+
+
+def _map_errors(r: Row) -> list[str]:
+    keys = ("rms_db", "median_db", "rms_seen_db", "rms_blocked_db")
+    return [*(show(r[k], "{:.2f}") for k in keys), show(r["core_s"])]
+
+
+@entry("channel")
+def _channel() -> str:
+    found = read("channel")
+    names = {
+        "friis": "one path over 100 m",
+        "two_ray": "two rays over a slab, V and H",
+        "images": "four images in a corner",
+    }
+    lines = [
+        [f"closed form: {names[k]}", f"gain {v['gain']:.1e}, phase {v['phase_rad']:.1e} rad"]
+        for k, v in found["closed_forms"].items()
+    ]
+    r, s = found["lobby"], found["small"]
+    lines += [
+        [
+            f"{r['paths']} paths of {r['receivers']} receivers beside Sionna RT's",
+            f"gain {r['gain_db']:.3f} dB, delay {r['tau_s']:.1e} s, angles {r['departure_rad']:.0e} rad",
+        ],
+        [
+            "the same, paths with a leg shorter than 0.2 m included (Sionna RT's points are float32)",
+            f"gain {r['gain_db_all']:.3f} dB",
+        ],
+        ["paths that only Sionna RT has / only we have", f"{r['sionna_only']} / {r['ours_only']}"],
+        [
+            f"response of {s['paths']} paths, 64 x 4 elements, 256 frequencies",
+            f"{1e3 * s['grid_seconds']:.0f} ms, error {s['grid_error']:.0e}",
+        ],
+        ["the same by Sionna RT", f"{1e3 * s['sionna_seconds']:.0f} ms, error {s['sionna_error']:.0e}"],
+        [
+            "the same, dense sum in float64",
+            f"{1e3 * s['dense_seconds']:.0f} ms, error {s['dense_error']:.0e}",
+        ],
+    ]
+    return markdown(("figure", "value"), lines)
+
+
+@entry("plane-wave")
+def _plane_wave() -> str:
+    rows = read("channel")["plane_wave"]
+    away = sorted({r["distance_m"] for r in rows})
+    lines = []
+    for elements in sorted({r["elements"] for r in rows}):
+        side = round(elements**0.5)
+        losses = (_find(rows, elements=elements, distance_m=d) for d in away)
+        lines.append([f"{side} x {side}", *(show(r and r["beam_loss_db"], "{:.2g}") for r in losses)])
+    return markdown(("elements", *(f"{d:g} m" for d in away)), lines)
+
+
+# ------------------------------------------------------------------------------------------------- the README
+
+
+def readme() -> str:
+    """README's table between its markers."""
+    rows = read("bistatic")["rows"]
+    lines = []
+    for method in ("bistatic", "rf3dgs+", "nearest", "mean"):
+        cells = [NAMES[method] + (" (ours)" if method == "bistatic" else "")]
+        for truth in TRUTHS:
+            for count in (10, 50, 400):
+                found = _find(rows, truth=truth, n_train=count, method=method)
+                cells.append(show(found and found["psnr_db"]))
+        lines.append(cells)
+    head = ["PSNR [dB]", *(f"{t}, {c} spectra" for t in TRUTHS.values() for c in (10, 50, 400))]
+    return f"{MARKERS[0]}\n{markdown(head, lines)}\n{MARKERS[1]}"
+
+
+def main(arguments: list[str]) -> None:
+    """``readme``, or ``keep FOLDER``."""
+    if arguments[:1] == ["readme"]:
+        between = re.compile(f"{re.escape(MARKERS[0])}.*{re.escape(MARKERS[1])}", re.DOTALL)
+        README.write_text(between.sub(readme(), README.read_text()))
+    elif arguments[:1] == ["keep"] and len(arguments) == 2:
+        report = json.loads((Path(arguments[1]) / "report.json").read_text())
+        for part in ("methods", "methods_sionna"):
+            for row in report[part].values():
+                row.pop("per_receiver", None)
+        (FOLDER / "lobby.json").write_text(json.dumps(report, indent=1) + "\n")
+    else:
+        raise SystemExit(__doc__)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

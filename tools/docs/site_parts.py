@@ -1,0 +1,76 @@
+"""What Sphinx does not do alone: reference pages, tables and plots from result files, equations as MathML.
+
+A page names a table by ``<!-- table: NAME -->`` and a figure by ``<!-- figure: NAME -->``; see :mod:`results` and
+:mod:`plots`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import plots
+import reference
+import results
+from docutils import nodes
+from latex2mathml.converter import convert
+from sphinx.domains.python import PyObject
+
+MADE = re.compile(r"<!-- (table|figure): ([\w-]+) -->")
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Called by Sphinx."""
+    next(field for field in PyObject.doc_field_types if field.name == "variable").label = "Attributes"
+    app.connect("builder-inited", make_files)
+    app.connect("source-read", put_tables)
+    app.connect("autodoc-process-docstring", escape_bars)
+    app.add_html_math_renderer(
+        "mathml", inline_renderers=(inline_math, None), block_renderers=(block_math, None)
+    )
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def make_files(app: Any) -> None:
+    """Write the reference's pages and the figures below ``docs/`` (not kept in the repository)."""
+    os.environ["COLUMNS"] = "96"  # argparse's help is as wide on every machine
+    for path, text in {**reference.pages(), **plots.figures()}.items():
+        file = Path(app.srcdir) / path
+        file.parent.mkdir(exist_ok=True)
+        if not file.is_file() or file.read_text() != text:
+            file.write_text(text)
+
+
+def put_tables(app: Any, name: str, source: list[str]) -> None:
+    """Put tables and figures where a page names them."""
+    up = "../" * name.count("/")
+
+    def put(found: re.Match[str]) -> str:
+        kind, what = found.groups()
+        return (
+            results.table(what) if kind == "table" else f"![{plots.CAPTIONS[what]}]({up}figures/{what}.svg)"
+        )
+
+    source[0] = MADE.sub(put, source[0])
+
+
+def escape_bars(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
+    """Absolute values in docstrings are no substitutions of reStructuredText."""
+    for i, line in enumerate(lines):
+        parts = line.split("``")
+        parts[::2] = [re.sub(r"(?<!\\)\|", r"\\|", part) for part in parts[::2]]
+        lines[i] = "``".join(parts)
+
+
+def inline_math(writer: Any, node: Any) -> None:
+    """An equation within a sentence."""
+    writer.body.append(convert(node.astext()))
+    raise nodes.SkipNode
+
+
+def block_math(writer: Any, node: Any) -> None:
+    """An equation on a line of its own."""
+    writer.body.append(convert(node.astext(), display="block"))
+    raise nodes.SkipNode

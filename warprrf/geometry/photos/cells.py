@@ -1,0 +1,133 @@
+"""Which cells of a plane hold a surface: where its points lie, where nobody looks through, where photos were taken of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.config import PlaneConfig
+from warprrf.geometry.photos.planes import Plane, dilate
+from warprrf.geometry.splats.camera import Camera
+
+PARALLEL = np.cos(np.radians(10.0))  # planes that face alike
+
+
+def occupancy(
+    planes: Sequence[Plane],
+    points: np.ndarray,
+    eyes: np.ndarray,
+    targets: np.ndarray,
+    *,
+    config: PlaneConfig | None = None,
+) -> list[Plane]:
+    """``planes`` with the cells where a surface may be.
+
+    A cell is a candidate inside the convex hull of the plane's own points, widened by a margin, and empty where a
+    line of sight passes through it to a point that lies well behind.
+
+    Args:
+        points: the points that the planes' ``inliers`` index, shape ``(P, 3)`` [m].
+        eyes, targets: lines of sight, from a camera to a point it sees, shape ``(L, 3)`` each [m].
+        config: size of the cells, margin, and what "well behind" means.
+    """
+    config = config or PlaneConfig()
+    result = []
+    for plane in planes:
+        uv = plane.to_plane(points[plane.inliers])
+        rim = config.margin_m + config.cell_m
+        corner = uv.min(axis=0) - rim
+        shape = np.ceil((uv.max(axis=0) + rim - corner) / config.cell_m).astype(int)
+        grid = replace(plane, corner=corner, cell_m=config.cell_m, occupied=np.ones(shape, dtype=bool))
+        inside = _in_hull(grid.to_plane(grid.cells()), uv, config.margin_m).reshape(shape)
+        supported = grid.count(points[plane.inliers]) > 0
+        lines = grid.seen_through(eyes, targets, config.behind_m)
+        empty = dilate(lines > 0, 2) & ~dilate(supported, 1)
+        empty |= (lines > 2) & ~supported
+        result.append(replace(grid, occupied=inside & ~empty))
+    return [_uncontested(k, result, points, config.contested_m) for k in range(len(result))]
+
+
+def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray, contested_m: float) -> Plane:
+    """Plane ``k`` without the cells that belong to a parallel plane close by, such as the wall behind a sign.
+
+    Lines of sight cannot tell the two apart; of two planes the one with the nearest point of its own has the cell.
+    """
+    plane = planes[k]
+    cells = plane.cells()
+    uv = plane.to_plane(cells)
+    own = cKDTree(plane.to_plane(points[plane.inliers])).query(uv)[0] if len(uv) else np.zeros(0)
+    lost = np.zeros(len(cells), dtype=bool)
+    for other in [*planes[:k], *planes[k + 1 :]]:
+        if other.normal @ plane.normal < PARALLEL:
+            continue
+        contested = (np.abs(other.distance(cells)) < contested_m) & other.covers(cells)
+        if contested.any():
+            theirs = cKDTree(plane.to_plane(points[other.inliers])).query(uv[contested])[0]
+            lost[contested] |= theirs < own[contested]
+    occupied = plane.occupied.copy()
+    occupied[plane.occupied] = ~lost
+    return replace(plane, occupied=occupied)
+
+
+def _in_hull(queries: np.ndarray, points: np.ndarray, margin: float) -> np.ndarray:
+    """Whether 2D ``queries`` lie within ``margin`` of the convex hull of ``points``."""
+    try:
+        sides = ConvexHull(points).equations
+    except (QhullError, ValueError):  # points on one line
+        return np.asarray(cKDTree(points).query(queries)[0] <= margin)
+    return np.asarray((queries @ sides[:, :2].T + sides[:, 2] <= margin).all(axis=1))
+
+
+def plane_mesh(planes: Sequence[Plane]) -> Mesh | None:
+    """The occupied cells of all planes as one mesh of squares; None when there are none."""
+    corners = []
+    for plane in planes:
+        cells = np.argwhere(plane.occupied)
+        square = cells[:, None, :] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        corners.append(plane.to_world(plane.corner + square.reshape(-1, 2) * plane.cell_m))
+    vertices = np.concatenate(corners) if corners else np.zeros((0, 3))
+    first = np.arange(0, len(vertices), 4)[:, None]
+    return Mesh(vertices, np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])) if len(vertices) else None
+
+
+def visible_from(
+    surface: Mesh | None,
+    points: np.ndarray,
+    normal: np.ndarray,
+    cameras: Sequence[Camera],
+    *,
+    clearance_m: float = 0.05,
+) -> np.ndarray:
+    """Which cameras see which points, shape ``(P, cameras)`` bool: in the frame, from the front, nothing between.
+
+    The line of sight starts ``clearance_m`` above the surface, along ``normal`` (of all, shape ``(3,)``, or of each
+    point, ``(P, 3)``).
+    """
+    normals = np.broadcast_to(normal, points.shape)
+    seen = np.zeros((len(points), len(cameras)), dtype=bool)
+    for c, camera in enumerate(cameras):
+        uv, depth = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = (depth > 0.05) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+        seen[:, c] = inside & (((camera.position - points) * normals).sum(axis=1) > 0)
+    if surface is not None and seen.any():
+        positions = np.array([camera.position for camera in cameras])
+        point, eye = np.nonzero(seen)
+        seen[point, eye] = surface.visible(points[point] + clearance_m * normals[point], positions[eye])
+    return seen
+
+
+def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera], *, min_views: int = 2) -> list[Plane]:
+    """``planes`` with only those occupied cells that at least ``min_views`` cameras see past all the others."""
+    surface = plane_mesh(planes)
+    result = []
+    for plane in planes:
+        occupied = plane.occupied.copy()
+        seen = visible_from(surface, plane.cells(), plane.normal, cameras)
+        occupied[plane.occupied] = seen.sum(axis=1) >= min_views
+        result.append(replace(plane, occupied=occupied))
+    return result

@@ -1,0 +1,203 @@
+"""Planes across three perpendicular directions of a room, and the faces of a mesh that lie on each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh_topology import smoothed_normals
+from warprrf.geometry.photos.config import CompletionConfig
+from warprrf.geometry.photos.planes import Plane
+from warprrf.geometry.planar_patches import PlanarPatches
+
+
+class Level(NamedTuple):
+    """Where a plane crosses one of the directions: ``height`` [m] along direction ``axis``, seen from the side of
+    ``sign`` times it. Its exact equation is ``normal . x = offset``, the normal nearly the direction itself."""
+
+    axis: int
+    sign: int
+    height: float
+    normal: np.ndarray
+    offset: float
+
+
+@dataclass(frozen=True)
+class FaceLevels:
+    """The level that each face lies on: direction 0 to 2 or -1 for none, seen side, height [m]; shapes ``(F,)``."""
+
+    axis: np.ndarray
+    sign: np.ndarray
+    height: np.ndarray
+
+    def set(self, faces: np.ndarray, level: Level) -> None:
+        """Faces of these indices lie on ``level``."""
+        self.axis[faces], self.sign[faces], self.height[faces] = level[:3]
+
+
+def directions(patches: PlanarPatches, config: CompletionConfig) -> np.ndarray | None:
+    """Three perpendicular unit rows along which most of the mesh is planar; None when there are none."""
+    if not len(patches):
+        return None
+    parallel = np.cos(np.radians(config.aligned_deg))
+    normals, areas = patches.normal, patches.area
+    alike = (np.abs(normals @ normals.T) > parallel) @ areas
+    first = normals[alike.argmax()]
+    across = np.where(np.abs(normals @ first) < np.sqrt(1 - parallel**2), alike, 0.0)
+    if across.max() == 0:
+        return None
+    second = normals[across.argmax()]
+    second = second - (second @ first) * first
+    second /= np.linalg.norm(second)
+    axes = np.stack([first, second, np.cross(first, second)])
+    for _ in range(3):
+        # The mean of what is parallel to each direction (large planes are fitted best), and the nearest rotation.
+        fit = normals @ axes.T
+        weight = np.where(np.abs(fit) > parallel, np.sign(fit), 0.0) * areas[:, None] ** 2
+        mean = weight.T @ normals
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        mean = np.where(length > 0, mean / np.where(length > 0, length, 1.0), axes)
+        u, _, vt = np.linalg.svd(mean)
+        axes = u @ vt
+    on = areas[(np.abs(normals @ axes.T) > parallel).any(axis=1)].sum()
+    if on < config.least_share * patches.mesh.areas.sum():
+        return None
+    main = np.abs(axes).argmax(axis=1)
+    if len(set(main)) == 3:  # in the order and sense of the world axes
+        axes = axes[np.argsort(main)]
+        axes = axes * np.sign(np.diag(axes))[:, None]
+    elif np.linalg.det(axes) < 0:
+        axes = -axes
+    return axes
+
+
+def known_levels(
+    patches: PlanarPatches, planes: Sequence[Plane], axes: np.ndarray, config: CompletionConfig
+) -> tuple[list[Level], FaceLevels]:
+    """Levels of the patches that are parallel to the directions, the best supported first, and of the faces on them;
+    then those on which other faces gather.
+
+    Args:
+        patches: of the mesh; patch k lies on ``planes[k]`` as far as there are so many.
+    """
+    mesh, count = patches.mesh, len(patches.mesh.faces)
+    centres = mesh.triangles.mean(axis=1)
+    candidates: list[tuple[float, Level, np.ndarray]] = []
+    for k in np.flatnonzero(patches.area > 0).tolist():
+        axis, sign = _parallel_to(patches.normal[k], axes, config)
+        if axis < 0:
+            continue
+        faces = patches.faces(k)
+        centre = mesh.areas[faces] @ centres[faces] / patches.area[k]
+        fit = float(axes[axis] @ patches.normal[k])
+        height = float((patches.offset[k] - patches.normal[k] @ centre) / fit + axes[axis] @ centre)
+        # The area that photos proved counts in full; of a plane fitted to the mesh alone, a third.
+        proven = planes[k].area() if k < len(planes) else 0.0
+        strength = proven or patches.area[k] / 3
+        level = Level(axis, sign, height, axes[axis], height)
+        if abs(fit) > np.cos(np.radians(config.exact_deg)) and strength > config.strong_m2:
+            level = level._replace(normal=sign * patches.normal[k], offset=sign * patches.offset[k])
+        candidates.append((strength, level, faces))
+    chosen: list[Level] = []
+    found = FaceLevels(np.full(count, -1), np.zeros(count, dtype=np.int64), np.zeros(count))
+    for _, level, faces in sorted(candidates, key=lambda c: -c[0]):
+        twin = _twin(level, chosen, config)
+        if twin is None:
+            chosen.append(level)
+        found.set(faces, (twin or level)._replace(sign=level.sign))
+    for level, faces in _gatherings(mesh, found, axes, list(chosen), config):
+        found.set(faces, level)
+        if _twin(level, chosen, config) is None:
+            chosen.append(level)
+    return chosen, found
+
+
+def _parallel_to(normal: np.ndarray, axes: np.ndarray, config: CompletionConfig) -> tuple[int, int]:
+    """The direction that a plane crosses, -1 for none, and the sign of its seen side."""
+    fit = axes @ normal
+    axis = int(np.abs(fit).argmax())
+    if abs(fit[axis]) < np.cos(np.radians(config.aligned_deg)):
+        return -1, 0
+    return axis, 1 if fit[axis] > 0 else -1
+
+
+def _twin(level: Level, others: Sequence[Level], config: CompletionConfig) -> Level | None:
+    """The first of ``others`` that is the same surface."""
+    for other in others:
+        gap = config.same_side_m if other.sign == level.sign else config.board_m
+        if other.axis == level.axis and abs(other.height - level.height) < gap:
+            return other
+    return None
+
+
+def _gatherings(
+    mesh: Mesh, found: FaceLevels, axes: np.ndarray, known: Sequence[Level], config: CompletionConfig
+) -> Iterator[tuple[Level, np.ndarray]]:
+    """Levels on which the faces that no patch took gather, and their faces; known levels take theirs first."""
+    facing = smoothed_normals(mesh, 3) @ axes.T
+    heights = mesh.triangles.mean(axis=1) @ axes.T
+    for axis in range(3):
+        for sign in (1, -1):
+            own = np.flatnonzero((found.axis < 0) & (sign * facing[:, axis] > np.cos(np.radians(25.0))))
+            for level in [d for d in known if (d.axis, d.sign) == (axis, sign)]:
+                near = np.abs(heights[own, axis] - level.height) < config.same_side_m
+                yield level, own[near]
+                own = own[~near]
+            own = own[np.argsort(heights[own, axis], kind="stable")]
+            x, area = heights[own, axis], mesh.areas[own]
+            last = np.searchsorted(x, x + config.gather_m, side="right")
+            while len(own):
+                total = np.concatenate([[0.0], np.cumsum(area)])
+                gathered = total[last] - total[:-1]
+                k = int(gathered.argmax())
+                if gathered[k] < config.gather_m2:
+                    break
+                height = float(x[k : last[k]] @ area[k : last[k]] / gathered[k])
+                gap = np.abs(x - height)
+                yield (
+                    Level(axis, sign, height, axes[axis], height),
+                    own[(gap < config.same_side_m) & (area > 0)],
+                )
+                area = np.where(gap < 2 * config.same_side_m, 0.0, area)
+
+
+def proven_levels(
+    planes: Sequence[Plane], axes: np.ndarray, levels: Sequence[Level], config: CompletionConfig
+) -> list[tuple[Plane, Level]]:
+    """Planes with occupied cells, each with the level that it became."""
+    result = []
+    for plane in planes:
+        axis, sign = _parallel_to(plane.normal, axes, config)
+        if axis < 0 or not plane.occupied.any():
+            continue
+        height = float(plane.cells().mean(axis=0) @ axes[axis])
+        near = [level for level in levels if level[:2] == (axis, sign)]
+        gaps = [abs(level.height - height) for level in near]
+        if gaps and min(gaps) < config.same_side_m:
+            result.append((plane, near[int(np.argmin(gaps))]))
+    return result
+
+
+def claim_proven(
+    mesh: Mesh,
+    found: FaceLevels,
+    axes: np.ndarray,
+    proven: Sequence[tuple[Plane, Level]],
+    config: CompletionConfig,
+) -> None:
+    """Faces near occupied cells go to their plane, whichever plane they were snapped to."""
+    facing = smoothed_normals(mesh, 3) @ axes.T
+    centres = mesh.triangles.mean(axis=1)
+    heights = centres @ axes.T
+    least = np.full(len(centres), config.reach_m)
+    for plane, level in proven:
+        gap = np.abs(heights[:, level.axis] - level.height)
+        towards = level.sign * facing[:, level.axis] > np.cos(np.radians(35.0))
+        own = np.flatnonzero((gap < least) & towards)
+        own = own[plane.covers(centres[own])]
+        found.set(own, level)
+        least[own] = gap[own]

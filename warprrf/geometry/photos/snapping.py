@@ -1,0 +1,154 @@
+"""A mesh fused from depth maps snapped to planes: faces find their plane, vertices move onto it, flat parts go coarse.
+
+Rooms are mostly planar, and a plane fitted to thousands of points is far better than any depth map. Sharp edges come
+out where two planes meet. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh_topology import connected_pieces, face_neighbours, smoothed_normals
+from warprrf.geometry.photos.config import PlaneConfig, SurfaceConfig
+from warprrf.geometry.photos.planes import Plane, detect_planes
+from warprrf.geometry.planar_patches import PlanarPatches
+
+FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
+
+
+def find_patches(
+    mesh: Mesh, planes: Sequence[Plane] = (), config: SurfaceConfig | None = None
+) -> PlanarPatches:
+    """Which faces of ``mesh`` lie on which of the given planes, or where none are given, on planes found among its faces.
+
+    A patch gathers the faces near its plane that face its way; islands too small to matter are left out. Patch k lies
+    on ``planes[k]``.
+    """
+    config = config or SurfaceConfig()
+    normals, areas = smoothed_normals(mesh, 3), mesh.areas
+    centres = mesh.triangles.mean(axis=1)
+    if not planes:
+        among_faces = PlaneConfig(
+            distance_m=0.4 * config.patch_distance_m,
+            angle_deg=config.patch_angle_deg,
+            min_points=2 * config.min_patch_m2,
+            max_planes=40,
+        )
+        planes = detect_planes(centres, normals, weights=areas, config=among_faces)
+    label = np.full(len(centres), -1, dtype=np.int64)
+    best = np.full(len(centres), config.patch_distance_m)
+    for k, plane in enumerate(planes):
+        gap = np.abs(plane.distance(centres))
+        better = (gap < best) & (normals @ plane.normal > np.cos(np.radians(config.patch_angle_deg)))
+        label[better], best[better] = k, gap[better]
+    piece = connected_pieces(mesh, label)
+    label[np.bincount(piece, weights=areas)[piece] < 0.2 * config.min_patch_m2] = -1
+    return PlanarPatches.from_planes(
+        mesh, label, [p.normal for p in planes], [p.offset for p in planes], tolerance_m=FLAT_M
+    )
+
+
+def flattened(patches: PlanarPatches, *, limit_m: float = 0.15) -> PlanarPatches:
+    """``patches`` of their mesh with the vertices of each moved onto its plane; where patches meet, onto their common
+    edge or corner. A move longer than ``limit_m`` is cut back to the nearest plane alone, or left undone."""
+    mesh, own = patches.mesh, np.flatnonzero(patches.face_patch >= 0)
+    vertices = mesh.vertices.copy()
+    corners = np.stack([mesh.faces[own].ravel(), np.repeat(patches.face_patch[own], 3)], axis=1)
+    pairs = np.unique(corners.astype(np.int64), axis=0)  # of a vertex and a patch
+    start = np.searchsorted(pairs[:, 0], np.arange(len(vertices) + 1))
+    count = np.diff(start)
+    for size in range(1, int(count.max(initial=0)) + 1):
+        which = np.flatnonzero(count == size)
+        if not len(which):
+            continue
+        planes = pairs[start[which][:, None] + np.arange(size), 1]
+        n, x = patches.normal[planes], vertices[which]
+        residual = patches.offset[planes] - np.einsum("vki,vi->vk", n, x)
+        # Least move that meets every plane; nearly parallel planes must not send a vertex far away.
+        move = np.einsum("vik,vk->vi", np.linalg.pinv(n, rcond=0.2), residual)
+        nearest, rows = np.abs(residual).argmin(axis=1), np.arange(len(which))
+        single = residual[rows, nearest][:, None] * n[rows, nearest]
+        for cut in (single, np.zeros_like(single)):
+            far = np.linalg.norm(move, axis=1) > limit_m
+            move[far] = cut[far]
+        vertices[which] = x + move
+    return replace(patches, mesh=Mesh(vertices, mesh.faces))
+
+
+def simplified(patches: PlanarPatches, *, cell_m: float = 0.25) -> PlanarPatches:
+    """``patches`` of their mesh with their insides, and the straight edges between two of them, made coarse.
+
+    Vertices inside a flattened patch are gathered by cells of ``cell_m`` into one of their number, those on an edge of
+    two patches by stretches of that length. A continuous map of a plane piece onto itself that keeps its border leaves
+    no hole, and no vertex leaves its plane: the surface stays the same. Elsewhere nothing changes.
+    """
+    mesh, label = patches.mesh, patches.face_patch.astype(np.int64)
+    target = _gathered(patches, cell_m)
+    faces = target[mesh.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    used, faces = np.unique(faces[whole], return_inverse=True)
+    coarse, label = Mesh(mesh.vertices[used], faces.reshape(-1, 3)), label[whole]
+    faces = coarse.faces.copy()
+    normal = np.vstack([patches.normal, np.zeros(3)])[label]
+    turned = (coarse.face_normals * normal).sum(axis=1) < 0  # folded over within the plane
+    faces[turned] = faces[turned][:, ::-1]
+    solid = coarse.areas > 1e-10
+    return PlanarPatches.from_planes(
+        Mesh(coarse.vertices, faces[solid]), label[solid], patches.normal, patches.offset, tolerance_m=FLAT_M
+    )
+
+
+def _gathered(patches: PlanarPatches, cell_m: float) -> np.ndarray:
+    """The vertex that each vertex moves to: itself, or the one nearest to the middle of its group, shape ``(V,)``."""
+    mesh, label = patches.mesh, patches.face_patch.astype(np.int64)
+    count = len(mesh.vertices)
+    low, high, third = np.full(count, len(patches)), np.full(count, -2), np.zeros(count, dtype=bool)
+    for vertex in mesh.faces.T:
+        np.minimum.at(low, vertex, label)
+        np.maximum.at(high, vertex, label)
+    for vertex in mesh.faces.T:
+        third[vertex[(label != low[vertex]) & (label != high[vertex])]] = True
+    border = np.zeros(count, dtype=bool)
+    face, side = np.nonzero(face_neighbours(mesh.faces) < 0)
+    border[mesh.faces[face, side]] = border[mesh.faces[face, (side + 1) % 3]] = True
+    movable = (low >= 0) & (high >= 0) & ~third & ~border
+    key = np.concatenate([np.stack([low, high], axis=1), np.zeros((count, 3), dtype=np.int64)], axis=1)
+    inside = np.flatnonzero(movable & (low == high))
+    # Cells within the plane: the world axis nearest to the normal takes no part.
+    flat = np.arange(3) != np.abs(patches.normal[low[inside]]).argmax(axis=1)[:, None]
+    key[inside, 2:] = np.floor((mesh.vertices[inside] - mesh.bounds[0]) / cell_m) * flat
+    edge = np.flatnonzero(movable & (low != high))
+    along = np.cross(patches.normal[low[edge]], patches.normal[high[edge]])
+    size = np.linalg.norm(along, axis=1)
+    movable[edge[size <= 0.2]] = False  # of planes so alike that their edge is not straight
+    stretch = (mesh.vertices[edge] * along).sum(axis=1) / np.maximum(size, 1e-30) / cell_m
+    key[edge, 2] = np.floor(stretch)
+    target, chosen = np.arange(count), np.flatnonzero(movable)
+    _, group, members = np.unique(key[chosen], axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    sums = [np.bincount(group, mesh.vertices[chosen, a], len(members)) for a in range(3)]
+    centre = np.stack(sums, axis=1) / members[:, None]
+    gap = np.linalg.norm(mesh.vertices[chosen] - centre[group], axis=1)
+    first = np.lexsort((gap, group))[np.cumsum(members) - members]
+    target[chosen] = chosen[first][group]
+    return target
+
+
+def largest_first(patches: PlanarPatches, min_area_m2: float) -> PlanarPatches:
+    """``patches`` in the order of their area, without those that are smaller."""
+    order = np.argsort(-patches.area, kind="stable")
+    order = order[patches.area[order] >= min_area_m2]
+    number = np.full(len(patches) + 1, -1)
+    number[order] = np.arange(len(order))
+    return PlanarPatches.from_planes(
+        patches.mesh,
+        number[patches.face_patch],
+        patches.normal[order],
+        patches.offset[order],
+        tolerance_m=patches.tolerance_m,
+        two_sided=patches.two_sided,
+    )

@@ -1,0 +1,462 @@
+"""Planar patches of a mesh: the flat pieces that mirror, found whatever exporters and scanners did to the faces.
+
+A patch is a connected set of faces of one group (a material, say) that lie in one plane. The plane is fitted: least
+squares over the faces, weighted by area. What must not matter does not: which way faces are wound, a face that is there
+twice, an order or a finer subdivision of faces, coordinates rounded to float32, and small errors of vertices. A curved
+surface is not flat at any such error: its facets stay patches of their own. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from warprrf.geometry.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class PatchConfig:
+    """When faces share a plane.
+
+    Attributes:
+        noise_m: Standard deviation of the vertices' position errors [m]. None: estimated from the mesh, see
+            :func:`vertex_noise`; it is never taken below the spacing of float32 numbers at its coordinates.
+        flat_m: Corners may lie this far from their patch's plane [m], and six standard deviations more.
+        flat_rad: Faces may be turned this much against their patch [rad], and by three standard deviations over the
+            faces' heights more.
+    """
+
+    noise_m: float | None = None
+    flat_m: float = 1e-5
+    flat_rad: float = 1.4e-3
+
+    def __post_init__(self) -> None:
+        for name in ("flat_m", "flat_rad"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected a positive number")
+        if self.noise_m is not None and not (np.isfinite(self.noise_m) and self.noise_m >= 0):
+            raise ValueError(f"noise_m: got {self.noise_m!r}, expected a length of at least 0, or None")
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarPatches:
+    """P planar patches of a mesh of F faces.
+
+    Attributes:
+        mesh: The mesh that they are of.
+        face_patch: Patch of each face, -1 for none, shape ``(F,)``, int32. A repeated face has the patch of the first.
+        normal: Unit normal, shape ``(P, 3)``; its sign is that of the patch's largest face and means a side only where
+            ``two_sided`` is False.
+        offset: The plane is ``normal . x = offset`` [m], shape ``(P,)``.
+        area: Area, repeated faces counted once [m^2], shape ``(P,)``.
+        group: What :func:`planar_patches` was told to keep apart, shape ``(P,)``, int32; -1 where nothing was.
+        once: Faces of a patch that repeat no other, shape ``(F,)``, bool.
+        tolerance_m: Corners of a patch lie this near to its plane [m]; rays that end on it ignore what is nearer.
+        two_sided: Whether both sides are surfaces. False: only the side that ``normal`` points to.
+    """
+
+    mesh: Mesh
+    face_patch: np.ndarray
+    normal: np.ndarray
+    offset: np.ndarray
+    area: np.ndarray
+    group: np.ndarray
+    once: np.ndarray
+    tolerance_m: float
+    two_sided: bool = True
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+    @classmethod
+    def from_planes(
+        cls,
+        mesh: Mesh,
+        face_patch: Any,
+        normal: Any,
+        offset: Any,
+        *,
+        tolerance_m: float,
+        two_sided: bool = False,
+    ) -> PlanarPatches:
+        """Patches whose planes are known, of a reconstruction, say: its normals point to the side that photos saw.
+
+        Args:
+            mesh: The mesh, F faces.
+            face_patch: Patch of each face, -1 for none, shape ``(F,)``.
+            normal, offset: Planes ``normal . x = offset`` [m], shapes ``(P, 3)`` and ``(P,)``.
+            tolerance_m, two_sided: As the attributes.
+        """
+        label = np.asarray(face_patch, np.int32)
+        planes = np.asarray(normal, float).reshape(-1, 3), np.asarray(offset, float).reshape(-1)
+        if label.shape != (len(mesh.faces),) or label.max(initial=-1) >= len(planes[1]):
+            raise ValueError(
+                f"face_patch: got shape {label.shape} and patches up to {label.max(initial=-1)}, expected "
+                f"({len(mesh.faces)},) and less than {len(planes[1])}"
+            )
+        own = label >= 0
+        area = np.bincount(label[own], mesh.areas[own], minlength=len(planes[1]))
+        group = np.full(len(planes[1]), -1, np.int32)
+        return cls(mesh, label, *planes, area, group, np.ones(len(label), bool), tolerance_m, two_sided)
+
+    @cached_property
+    def _faces_and_ends(self) -> tuple[np.ndarray, np.ndarray]:
+        own = np.flatnonzero((self.face_patch >= 0) & self.once)
+        order = own[np.argsort(self.face_patch[own], kind="stable")]
+        return order, np.searchsorted(self.face_patch[order], np.arange(len(self) + 1))
+
+    def faces(self, patch: int) -> np.ndarray:
+        """Faces of one patch, repeated ones once, shape ``(K,)``, int64."""
+        order, ends = self._faces_and_ends
+        return order[ends[patch] : ends[patch + 1]]
+
+    @cached_property
+    def boxes(self) -> np.ndarray:
+        """Lowest and highest corner of each patch [m], shape ``(P, 2, 3)``."""
+        boxes = np.empty((len(self), 2, 3))
+        boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
+        own = self.face_patch >= 0
+        corners = self.mesh.triangles[own]
+        np.minimum.at(boxes[:, 0], self.face_patch[own], corners.min(axis=1))
+        np.maximum.at(boxes[:, 1], self.face_patch[own], corners.max(axis=1))
+        return boxes
+
+    def contains(self, patch: np.ndarray, points: np.ndarray, slack_m: float = 1e-9) -> np.ndarray:
+        """Whether point k, on the plane of ``patch[k]``, lies in that patch or ``slack_m`` beside it, shape ``(N,)``.
+
+        Args:
+            patch: Indices, shape ``(N,)``.
+            points: Positions [m], shape ``(N, 3)``.
+            slack_m: Width added to every face [m]: faces leave no seam between them.
+        """
+        box = self.boxes[patch]
+        reach = slack_m + self.tolerance_m
+        inside = ((points >= box[:, 0] - reach) & (points <= box[:, 1] + reach)).all(axis=1)
+        near = np.flatnonzero(inside)
+        order, ends = self._faces_and_ends
+        first, count = ends[patch[near]], np.diff(ends)[patch[near]]
+        row = np.repeat(np.arange(len(near)), count)
+        face = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + first[row]]
+        met = _in_triangles(
+            points[near][row], self.mesh.triangles[face], self.normal[patch[near]][row], slack_m
+        )
+        inside[near] = np.bincount(row, weights=met, minlength=len(near)) > 0
+        return inside
+
+
+def planar_patches(mesh: Mesh, groups: Any = None, config: PatchConfig | None = None) -> PlanarPatches:
+    """The planar patches of ``mesh``.
+
+    Args:
+        mesh: Any triangle mesh; faces that share an edge at one place are neighbours, whatever their vertices' indices.
+        groups: Index of what must not share a patch, for each face, shape ``(F,)``; materials, say.
+        config: When faces share a plane.
+
+    Returns:
+        Patches, largest first. Faces with hardly any area that fit no neighbour have none.
+
+    Raises:
+        ValueError: on groups of another shape.
+
+    Warns:
+        UserWarning: if faces at one place are of different groups: the first is taken.
+    """
+    config = config or PatchConfig()
+    count = len(mesh.faces)
+    group = np.full(count, -1, np.int32) if groups is None else np.asarray(groups, np.int32)
+    if group.shape != (count,):
+        raise ValueError(f"groups: got shape {group.shape}, expected ({count},), one index a face")
+    rounding = float(np.spacing(np.float32(np.abs(mesh.bounds).max())))
+    corner = _welded(mesh, 2.0 * rounding)
+    first = _first_at_place(corner, group)
+    once = first == np.arange(count)
+    longest = np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, 1, axis=1), axis=2).max(axis=1)
+    height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
+    once &= ~_is_sliver(corner, height, rounding)
+    pairs = _neighbours(corner, np.flatnonzero(once))
+    noise = vertex_noise(mesh, pairs, rounding) if config.noise_m is None else max(config.noise_m, rounding)
+    faces = _Faces(mesh, group, height, config.flat_m + 6.0 * noise, config.flat_rad, 3.0 * noise)
+    piece = _pieces(faces, once, pairs)
+    return _assembled(faces, piece, first)
+
+
+def vertex_noise(mesh: Mesh, pairs: np.ndarray, rounding_m: float) -> float:
+    """Standard deviation of vertices' errors [m], from neighbours that are nearly coplanar; at least ``rounding_m``.
+
+    On a flat piece errors bend a face towards one neighbour and away from another; on a smooth curved one all bend the
+    same way. Only if most faces with three neighbours are bent both ways is that noise.
+
+    Args:
+        pairs: Neighbouring faces, shape ``(N, 2)``.
+    """
+    a, b = np.concatenate([pairs, pairs[:, ::-1]]).T
+    n, x = mesh.face_normals, mesh.triangles
+    flat = np.abs(np.einsum("ni,ni->n", n[a], n[b])) > np.cos(0.15)
+    a, b = a[flat], b[flat]
+    rise = np.einsum("nki,ni->nk", x[b] - x[a][:, :1], n[a])
+    rise = rise[np.arange(len(a)), np.abs(rise).argmax(axis=1)] if len(a) else np.zeros(0)
+    count = len(mesh.faces)
+    low, high = np.zeros(count), np.zeros(count)
+    np.minimum.at(low, a, rise)
+    np.maximum.at(high, a, rise)
+    whole = np.bincount(a, minlength=count) >= 3
+    # Bent as much, within a factor of ten, one way as the other: facets of a pipe with errors are not.
+    both = whole & (np.minimum(high, -low) > np.maximum(rounding_m, 0.1 * np.maximum(high, -low)))
+    if both.sum() <= 0.55 * whole.sum():
+        return rounding_m
+    # The corner across an edge lies off the neighbour's plane by twice a vertex's error (of a parallelogram).
+    return max(rounding_m, float(np.median(np.abs(rise)) / 0.6745 / 2.0))
+
+
+@dataclass(frozen=True)
+class _Faces:
+    """Faces and the tolerances that decide what is coplanar."""
+
+    mesh: Mesh
+    group: np.ndarray
+    height: np.ndarray
+    distance_m: float
+    angle_rad: float
+    sway_m: float
+
+    def turn_limit(self, height: np.ndarray) -> np.ndarray:
+        """Greatest angle to a patch of a face of this height [rad]."""
+        return self.angle_rad + self.sway_m / np.maximum(height, 1e-300)
+
+    def gap(self, face: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Largest distance of the corners of each face from its plane [m], shape ``(N,)``."""
+        return np.abs(np.einsum("nki,ni->nk", self.mesh.triangles[face], normal) - offset[:, None]).max(
+            axis=1, initial=0.0
+        )
+
+
+def _welded(mesh: Mesh, distance_m: float) -> np.ndarray:
+    """Faces with vertices of one place given one index, shape ``(F, 3)``."""
+    point, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    near = cKDTree(point).query_pairs(distance_m, output_type="ndarray")
+    link = coo_array((np.ones(len(near), bool), near.T), shape=(len(point), len(point)))
+    return connected_components(link, directed=False)[1][index.reshape(-1)][mesh.faces]
+
+
+def _first_at_place(corner: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """The first face with the same three corners, shape ``(F,)``."""
+    _, first, index = np.unique(np.sort(corner, axis=1), axis=0, return_index=True, return_inverse=True)
+    first = first[index.reshape(-1)]
+    differ = int((group[first] != group).sum())
+    if differ:
+        warnings.warn(
+            f"mesh: {differ} faces lie on another of a different material or group; the first of each is taken",
+            UserWarning,
+            stacklevel=3,
+        )
+    return first
+
+
+def _is_sliver(corner: np.ndarray, height: np.ndarray, rounding: float) -> np.ndarray:
+    """Faces without a plane of their own: corners that fall together, or a height that rounding alone makes."""
+    a, b, c = corner.T
+    return (a == b) | (b == c) | (c == a) | (height <= 4.0 * rounding)
+
+
+def _neighbours(corner: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Pairs of the faces ``face`` that share an edge, shape ``(N, 2)``."""
+    edge = np.sort(corner[face][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    owner = np.repeat(face, 3)
+    order = np.lexsort((owner, edge[:, 1], edge[:, 0]))
+    edge, owner = edge[order], owner[order]
+    # Where more than two faces share an edge, neighbours in sorted order are not all pairs: look three ahead.
+    pairs = [np.zeros((0, 2), int)]
+    for step in (1, 2, 3):
+        same = (edge[step:] == edge[:-step]).all(axis=1)
+        pairs.append(np.column_stack([owner[:-step][same], owner[step:][same]]))
+    return np.concatenate(pairs)
+
+
+def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Piece of each face, -1 where not ``once``, shape ``(F,)``."""
+    mesh, n = faces.mesh, faces.mesh.face_normals
+    pairs = pairs[faces.group[pairs[:, 0]] == faces.group[pairs[:, 1]]]
+    big, small = np.where(
+        (mesh.areas[pairs[:, 0]] >= mesh.areas[pairs[:, 1]])[:, None], pairs, pairs[:, ::-1]
+    ).T
+    turn = _angle(n[big], n[small])
+    offset = np.einsum("ni,ni->n", n, mesh.triangles[:, 0])
+    flat = turn <= np.hypot(faces.turn_limit(faces.height[big]), faces.turn_limit(faces.height[small]))
+    # A face so slim that its normal says nothing joins its neighbours later, when it has a plane to be judged by.
+    flat &= np.minimum(faces.height[big], faces.height[small]) > 8.0 * faces.sway_m
+    flat &= faces.gap(small, n[big], offset[big]) <= faces.distance_m
+    piece = _components(len(mesh.faces), pairs[flat])
+    piece = np.where(once, piece, -1)
+    piece = _numbered(piece)
+    own = np.flatnonzero(piece >= 0)
+    normal, offset = _fit(mesh, own, piece[own])
+    bad = np.unique(piece[own][faces.gap(own, normal[piece[own]], offset[piece[own]]) > faces.distance_m])
+    if len(bad):
+        piece = _numbered(_grown(faces, piece, np.isin(piece, bad), pairs))
+    for _ in range(6):
+        joined = _joined(faces, piece, pairs)
+        if joined is None:
+            break
+        piece = joined
+    return piece
+
+
+def _grown(faces: _Faces, piece: np.ndarray, again: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Pieces with the faces ``again`` divided anew: each grows from its largest face while its own plane fits."""
+    mesh, piece = faces.mesh, piece.copy()
+    inside = again[pairs[:, 0]] & again[pairs[:, 1]]
+    both = np.concatenate([pairs[inside], pairs[inside][:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    first = np.searchsorted(both[:, 0], np.arange(len(piece) + 1))
+    free, label = again.copy(), int(piece.max(initial=-1)) + 1
+    limit = faces.turn_limit(faces.height)
+    for seed in np.flatnonzero(again)[np.argsort(-mesh.areas[again], kind="stable")]:
+        if not free[seed]:
+            continue
+        members = new = np.array([seed])
+        free[seed] = False
+        normal = mesh.face_normals[seed]
+        offset = float(normal @ mesh.triangles[seed, 0])
+        while len(new):
+            ring = np.unique(np.concatenate([both[first[f] : first[f + 1], 1] for f in new]))
+            ring = ring[free[ring]]
+            planes = np.broadcast_to(normal, (len(ring), 3)), np.full(len(ring), offset)
+            new = ring[
+                (faces.gap(ring, *planes) <= faces.distance_m)
+                & (_angle(mesh.face_normals[ring], planes[0]) <= limit[ring])
+            ]
+            free[new] = False
+            members = np.concatenate([members, new])
+            if len(new):
+                fitted = _fit(mesh, members, np.zeros(len(members), int))
+                normal, offset = fitted[0][0], float(fitted[1][0])
+        piece[members] = label
+        label += 1
+    return piece
+
+
+def _joined(faces: _Faces, piece: np.ndarray, pairs: np.ndarray) -> np.ndarray | None:
+    """Pieces after each joined the largest neighbour in whose plane it lies; None if none did."""
+    mesh = faces.mesh
+    own = piece >= 0
+    normal, offset = _fit(mesh, np.flatnonzero(own), piece[own])
+    area = np.bincount(piece[own], mesh.areas[own])
+    both = np.unique(np.concatenate([piece[pairs], piece[pairs][:, ::-1]]), axis=0)
+    small, big = both[(both[:, 0] != both[:, 1]) & (both >= 0).all(axis=1)].T
+    less = (area[small] < area[big]) | ((area[small] == area[big]) & (small > big))
+    small, big = small[less], big[less]
+    height = np.zeros(len(area))
+    np.maximum.at(height, piece[own], faces.height[own])
+    fits = _angle(normal[small], normal[big]) <= faces.turn_limit(height[small])
+    small, big = small[fits], big[fits]
+    order = np.argsort(piece, kind="stable")
+    ends = np.searchsorted(piece[order], np.arange(len(area) + 1))
+    count = np.diff(ends)[small]
+    row = np.repeat(np.arange(len(small)), count)
+    face = order[np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count) + ends[small][row]]
+    gap = np.zeros(len(small))
+    np.maximum.at(gap, row, faces.gap(face, normal[big][row], offset[big][row]))
+    fits = gap <= faces.distance_m
+    small, big = small[fits], big[fits]
+    if len(small) == 0:
+        return None
+    target = np.arange(len(area))
+    order = np.argsort(area[big], kind="stable")  # the largest is written last
+    target[small[order]] = big[order]
+    # What others join stays itself this time, so that planes are judged before they are merged on.
+    moved = target != np.arange(len(area))
+    moved &= ~np.isin(np.arange(len(area)), target[moved])
+    if not moved.any():
+        return None
+    return _numbered(np.where(own, np.where(moved, target, np.arange(len(area)))[piece], -1))
+
+
+def _assembled(faces: _Faces, piece: np.ndarray, first: np.ndarray) -> PlanarPatches:
+    mesh = faces.mesh
+    once = piece >= 0
+    area = np.bincount(piece[once], mesh.areas[once])
+    rank = np.empty(len(area), int)
+    rank[np.argsort(-area, kind="stable")] = np.arange(len(area))
+    piece = np.where(once, rank[piece], -1) if len(area) else piece
+    normal, offset = _fit(mesh, np.flatnonzero(once), piece[once])
+    group = np.full(len(area), -1, np.int32)
+    group[piece[once]] = faces.group[once]
+    return PlanarPatches(
+        mesh=mesh,
+        face_patch=piece[first].astype(np.int32),
+        normal=normal,
+        offset=offset,
+        area=np.sort(area)[::-1],
+        group=group,
+        once=once,
+        tolerance_m=faces.distance_m,
+    )
+
+
+def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Planes ``(P, 3)``, ``(P,)`` [m] of the pieces ``p`` of the faces ``own``: least squares, weighted by area.
+
+    Found as a correction of the plane of the piece's largest face, so that flat pieces keep that to rounding.
+    """
+    order = np.lexsort((mesh.areas[own], p))
+    own, p, count = own[order], p[order], int(p.max(initial=-1)) + 1
+    largest = own[np.searchsorted(p, np.arange(count), side="right") - 1]
+    normal = mesh.face_normals[largest]
+    middle: np.ndarray = np.stack(
+        [np.bincount(p, mesh.areas[own] * mesh.triangles[own, :, k].mean(axis=1)) for k in range(3)], 1
+    )
+    middle = middle / np.maximum(np.bincount(p, mesh.areas[own]), 1e-300)[:, None]
+    x = 0.5 * (mesh.triangles[own] + np.roll(mesh.triangles[own], 1, axis=1)) - middle[p][:, None]
+    for _ in range(2):
+        across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+        u = across / np.linalg.norm(across, axis=1, keepdims=True)
+        frame = np.stack([u, np.cross(normal, u), normal], axis=1)
+        # Midpoints of edges integrate squares over a triangle exactly.
+        a, b, r = np.moveaxis(np.einsum("nij,nkj->nki", frame[p], x), 2, 0)
+        weight = mesh.areas[own][:, None] / 3.0
+        aa, ab, bb, ar, br = (
+            np.bincount(p, (weight * s * t).sum(axis=1), minlength=count)
+            for s, t in ((a, a), (a, b), (b, b), (a, r), (b, r))
+        )
+        det = np.maximum(aa * bb - ab**2, 1e-300)
+        slope = np.stack([(bb * ar - ab * br) / det, (aa * br - ab * ar) / det], axis=1)
+        normal = normal - np.einsum("pi,pij->pj", slope, frame[:, :2])
+        normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return normal, np.einsum("pi,pi->p", normal, middle)
+
+
+def _components(count: int, pairs: np.ndarray) -> np.ndarray:
+    link = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
+    return connected_components(link, directed=False)[1]
+
+
+def _numbered(label: np.ndarray) -> np.ndarray:
+    """Labels from 0 without gaps; negative ones stay -1."""
+    own = label >= 0
+    result = np.full(len(label), -1)
+    result[own] = np.unique(label[own], return_inverse=True)[1].reshape(-1)
+    return result
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle between lines along unit vectors [rad], in [0, pi / 2]; exact for small ones."""
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.arctan2(sine, np.abs(np.einsum("ni,ni->n", a, b)))
+
+
+def _in_triangles(p: np.ndarray, corner: np.ndarray, normal: np.ndarray, slack_m: float) -> np.ndarray:
+    """Whether point k lies in triangle k, seen along ``normal``, or no further than ``slack_m`` from each of its sides."""
+    inside = [np.zeros(len(p))] * 3
+    for k in range(3):
+        start, edge = corner[:, k], corner[:, (k + 1) % 3] - corner[:, k]
+        length = np.maximum(np.linalg.norm(edge, axis=1), 1e-300)
+        inside[k] = np.einsum("ni,ni->n", np.cross(normal, edge), p - start) / length
+    depth = np.stack(inside)
+    return np.asarray((depth >= -slack_m).all(axis=0) | (depth <= slack_m).all(axis=0))

@@ -1,0 +1,292 @@
+"""Arrays of propagation paths, of one receiver or several: what channels are computed from.
+
+Angles: arrival points from the receiver to the last interaction, departure from the transmitter to the first.
+
+Polarisation. ``gain`` is one complex number a path, |gain|^2 being the path gain averaged over vertical and horizontal
+transmit polarisation and summed over both receive polarisations: its power is defined, its phase is that of the delay
+(and, where materials are known, of the TE reflections). A polarised amplitude needs ``jones``: the 2x2 matrix from the
+transmitted field along (zenith unit vector, azimuth unit vector) of the departure to the received field along those of
+the arrival, Friis and exp(-j 2 pi f tau) included, so that ``|gain|^2`` is half its squared Frobenius norm. Only paths
+traced in a scene with materials, or taken from a solver, have it; spectra and fields hold powers alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+
+from warprrf.rf.em.absorption import Air, air_of
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
+from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
+
+_PADDING: dict[str, Any] = {
+    "gain": 0.0, "tau": np.nan, "theta_r": np.nan, "phi_r": np.nan, "theta_t": np.nan, "phi_t": np.nan,
+    "vertices": np.nan, "kind": "", "valid": False, "jones": 0.0,
+}  # fmt: skip
+"""Arrays with an entry for each path, and what they hold where there is none."""
+
+
+@dataclass(frozen=True)
+class PathArrays:
+    """Paths of one receiver, arrays ``(L,)``, or of several, arrays ``(R, L)`` padded where ``valid`` is False.
+
+    Attributes:
+        gain: Complex gain between isotropic antennas, exp(-j 2 pi f tau) included; |gain|^2 is path gain averaged over
+            vertical and horizontal transmit polarisation and summed over both receive polarisations. 0 where padded.
+        tau: Delay [s]; NaN where padded, as the angles are.
+        theta_r: Zenith of arrival [rad].
+        phi_r: Azimuth of arrival [rad].
+        theta_t: Zenith of departure [rad].
+        phi_t: Azimuth of departure [rad].
+        vertices: Interaction points from the transmitter on [m], shape ``(..., depth, 3)``; NaN past the last.
+        kind: "los", "mirror" or "diffuse"; "" where padded.
+        valid: Whether there is a path.
+        jones: Polarised complex gain, shape ``(..., 2, 2)``: received over transmitted, both along zenith and azimuth
+            unit vectors; NaN for paths without, None if no path has it. 0 where padded.
+        frequency_hz: Carrier that ``gain`` and ``jones`` hold at [Hz]; None if not known.
+        transmitter: Position [m], shape ``(3,)``; None if not known.
+        receiver: Position ``(3,)`` or positions ``(R, 3)`` [m]; None if not known.
+        air: The air whose absorption (ITU-R P.676) is in ``gain`` and ``jones``; None for none.
+    """
+
+    gain: np.ndarray
+    tau: np.ndarray
+    theta_r: np.ndarray
+    phi_r: np.ndarray
+    theta_t: np.ndarray
+    phi_t: np.ndarray
+    vertices: np.ndarray
+    kind: np.ndarray
+    valid: np.ndarray
+    jones: np.ndarray | None = None
+    frequency_hz: float | None = None
+    transmitter: np.ndarray | None = None
+    receiver: np.ndarray | None = None
+    air: Air | None = None
+
+    @property
+    def power(self) -> np.ndarray:
+        """Path gain |gain|^2 [linear], shape as ``gain``; 0 where padded."""
+        return np.abs(self.gain) ** 2
+
+    @property
+    def length_m(self) -> np.ndarray:
+        """Unfolded length [m]; NaN where padded."""
+        return self.tau * SPEED_OF_LIGHT
+
+    @property
+    def arrival(self) -> np.ndarray:
+        """Unit vectors from the receiver to the last interaction, shape ``(..., 3)``."""
+        return directions_from_angles(self.theta_r, self.phi_r)
+
+    @property
+    def departure(self) -> np.ndarray:
+        """Unit vectors from the transmitter to the first interaction, shape ``(..., 3)``."""
+        return directions_from_angles(self.theta_t, self.phi_t)
+
+    @property
+    def batched(self) -> bool:
+        """Whether the arrays are those of several receivers, ``(R, L)``."""
+        return self.gain.ndim == 2
+
+    def __getitem__(self, receiver: int) -> Self:
+        """The paths of one of several receivers, without padding.
+
+        Raises:
+            TypeError: for paths of one receiver.
+        """
+        one = self.row(receiver)
+        return one.select(np.flatnonzero(one.valid))
+
+    def row(self, receiver: int) -> Self:
+        """The paths of one of several receivers, padded as they are.
+
+        Raises:
+            TypeError: for paths of one receiver.
+        """
+        if not self.batched:
+            raise TypeError("paths of one receiver cannot be indexed by receiver; expected paths of several")
+        point = None if self.receiver is None else self.receiver[receiver]
+        return replace(self._taken(receiver), receiver=point)
+
+    def _taken(self, index: Any) -> Self:
+        """Every array at ``index``."""
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _PADDING}
+        taken: dict[str, Any] = {name: None if v is None else v[index] for name, v in arrays.items()}
+        return replace(self, **taken)
+
+    def as_several(self) -> Self:
+        """Paths of several receivers: one receiver's as a list of one."""
+        return self if self.batched else self.stack([self])
+
+    def each(self) -> Iterator[Self]:
+        """The paths of one receiver after another, without padding."""
+        if self.batched:
+            yield from (self[k] for k in range(len(self.gain)))
+        else:
+            yield self.select(np.flatnonzero(self.valid))
+
+    def select(self, chosen: Any) -> Self:
+        """Paths ``chosen`` of one receiver: indices in any order, or a mask ``(L,)``.
+
+        Raises:
+            TypeError: for paths of several receivers.
+        """
+        if self.batched:
+            raise TypeError(
+                "paths of several receivers cannot be selected from at once; index a receiver first"
+            )
+        return self._taken(chosen)
+
+    def with_gas(self, gas: Any = True) -> Self:
+        """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
+
+        Args:
+            gas: False for none, True for the standard atmosphere, :class:`Air`, or a :class:`Relevance`, which says
+                whether the absorption is worth its tolerance.
+
+        Raises:
+            ValueError: if the carrier or a path's delay is not known, or the carrier is outside ITU-R P.676.
+        """
+        air = air_of(gas)
+        if air == self.air:
+            return self
+        self.check_delays()
+        carrier = self.carrier_hz
+        change = 0.0 if air is None else air.attenuation_db_per_m(carrier)
+        change -= 0.0 if self.air is None else self.air.attenuation_db_per_m(carrier)
+        loss = 10.0 ** (-change * np.nan_to_num(self.length_m) / 20.0)
+        jones = None if self.jones is None else self.jones * loss[..., None, None]
+        return replace(self, gain=self.gain * loss, jones=jones, air=air)
+
+    @property
+    def carrier_hz(self) -> float:
+        """Carrier [Hz].
+
+        Raises:
+            ValueError: if it is not known.
+        """
+        if self.frequency_hz is None:
+            raise ValueError(
+                "paths: got ones without frequency_hz, expected the carrier that their gains hold at "
+                "(dataclasses.replace(paths, frequency_hz=...))"
+            )
+        return self.frequency_hz
+
+    def check_delays(self) -> None:
+        """Raises ValueError if a path has no delay."""
+        unknown = int((self.valid & ~np.isfinite(self.tau)).sum())
+        if unknown:
+            raise ValueError(f"paths: got {unknown} without a delay, expected tau for every path")
+
+    @classmethod
+    def from_points(
+        cls,
+        transmitter: np.ndarray,
+        receiver: np.ndarray,
+        vertices: np.ndarray,
+        amplitude: np.ndarray,
+        kind: np.ndarray,
+        frequency_hz: float,
+        jones: np.ndarray | None = None,
+    ) -> Self:
+        """Paths of one receiver from their interaction points ``(L, depth, 3)``, NaN past the last.
+
+        Args:
+            amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
+            jones: Polarised gain before exp(-j 2 pi f tau), complex, shape ``(L, 2, 2)``.
+        """
+        count, depth = vertices.shape[:2]
+        bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
+        points = points_along(transmitter, vertices, receiver)
+        each = np.arange(count)
+        steps = np.linalg.norm(np.diff(points, axis=1), axis=2)
+        tau = np.where(np.arange(depth + 1) <= bounces[:, None], steps, 0.0).sum(axis=1) / SPEED_OF_LIGHT
+        theta_r, phi_r = angles_from_directions(points[each, bounces] - receiver)
+        theta_t, phi_t = angles_from_directions(points[:, 1] - transmitter)
+        turned = carrier_phase(frequency_hz, tau)
+        return cls(
+            gain=amplitude * turned,
+            tau=tau,
+            theta_r=theta_r,
+            phi_r=phi_r,
+            theta_t=theta_t,
+            phi_t=phi_t,
+            vertices=vertices,
+            kind=kind,
+            valid=np.ones(count, dtype=bool),
+            jones=None if jones is None else jones * turned[:, None, None],
+            frequency_hz=float(frequency_hz),
+            transmitter=np.array(transmitter, dtype=np.float64),
+            receiver=np.array(receiver, dtype=np.float64),
+        )
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """All paths of one receiver."""
+        joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in _columns(parts).items()}
+        return cls(**joined, **_common(parts), receiver=parts[0].receiver)
+
+    @classmethod
+    def stack(cls, parts: Sequence[Self]) -> Self:
+        """Paths of several receivers, padded to the longest list: arrays ``(R, L)``."""
+        length = max((len(p.gain) for p in parts), default=0)
+        stacked: dict[str, Any] = {
+            name: np.stack([_padded(a, 0, length, _PADDING[name]) for a in arrays])
+            for name, arrays in _columns(parts).items()
+        }
+        receiver = None
+        if all(p.receiver is not None for p in parts):
+            receiver = np.stack([np.asarray(p.receiver) for p in parts])
+        return cls(**stacked, **_common(parts), receiver=receiver)
+
+
+def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.ndarray) -> np.ndarray:
+    """Paths from end to end [m], shape ``(L, depth + 2, 3)``: the receiver follows the last point, then NaN or zero."""
+    count = len(vertices)
+    start = np.broadcast_to(transmitter, (count, 1, 3))
+    points = np.concatenate([start, vertices, np.zeros((count, 1, 3))], axis=1)
+    points[np.arange(count), np.isfinite(vertices[..., 0]).sum(axis=1) + 1] = receiver
+    return points
+
+
+def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
+    """The arrays of all parts by name, equally deep; without ``jones`` if no part has it, NaN for those that lack it."""
+    columns = {name: [getattr(p, name) for p in parts] for name in _PADDING}
+    depth = max((v.shape[1] for v in columns["vertices"]), default=1)
+    columns["vertices"] = [_padded(v, 1, depth, np.nan) for v in columns["vertices"]]
+    known = columns.pop("jones")
+    if any(jones is not None for jones in known):
+        columns["jones"] = [
+            np.full((len(p.gain), 2, 2), np.nan + 0j) if jones is None else jones
+            for p, jones in zip(parts, known, strict=True)
+        ]
+    return columns
+
+
+def _padded(array: np.ndarray, axis: int, length: int, fill: Any) -> np.ndarray:
+    widths = [(0, length - n if k == axis else 0) for k, n in enumerate(array.shape)]
+    return np.pad(array, widths, constant_values=fill)
+
+
+def _common(parts: Sequence[PathArrays]) -> dict[str, Any]:
+    """What all parts share.
+
+    Raises:
+        ValueError: if they differ in carrier, transmitter or air.
+    """
+    if not parts:
+        return {}
+    first = parts[0]
+    for p in parts[1:]:
+        same = p.frequency_hz == first.frequency_hz and p.air == first.air
+        if p.transmitter is not None and first.transmitter is not None:
+            same &= bool(np.array_equal(p.transmitter, first.transmitter))
+        if not same:
+            raise ValueError(
+                "parts: got paths of another carrier, transmitter or air, expected the same for all"
+            )
+    return {"frequency_hz": first.frequency_hz, "transmitter": first.transmitter, "air": first.air}

@@ -1,0 +1,280 @@
+"""Paths in the shapes and conventions of Sionna RT 2.2, and back.
+
+Sionna's ``a`` holds passband coefficients without exp(-j 2 pi f tau), array and pattern factors included, shape ``(rx,
+rx_ant, tx, tx_ant, path)``; ``tau`` and angles are ``(rx, tx, path)`` for synthetic arrays, delays -1 where there is no
+path; ``cir`` adds the phase of the delay, by default counted from the first path. Ports are numbered alike here and
+there: polarisation by polarisation, then element by element. There is one transmitter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase, check_frequency
+from warprrf.rf.spectra.spectrum import directions_from_angles
+
+SPECULAR, DIFFUSE = 1, 2
+"""``sionna.rt.InteractionType``."""
+SAME_LENGTH_M = (
+    5e-3  # paths nearer than this in length and direction are one: Sionna takes planes 1 cm apart for one
+)
+SAME_DIRECTION_RAD = 1e-3
+
+
+@dataclass(frozen=True)
+class SionnaPaths:
+    """What ``sionna.rt.Paths`` holds for synthetic arrays and one transmitter, as NumPy arrays.
+
+    Attributes:
+        a: Passband coefficients, shape ``(R, M, 1, N, L)``, complex128; 0 where there is no path.
+        tau: Delays [s], shape ``(R, 1, L)``; -1 where there is no path.
+        theta_t, phi_t, theta_r, phi_r: Angles of departure and arrival [rad], shape ``(R, 1, L)``; 0 where none.
+        valid: Shape ``(R, 1, L)``, bool.
+        interactions: ``sionna.rt.InteractionType`` (1 specular, 2 diffuse, 0 none), shape ``(depth, R, 1, L)``.
+        vertices: Interaction points [m], shape ``(depth, R, 1, L, 3)``; 0 where none.
+        synthetic_array: True.
+    """
+
+    a: np.ndarray
+    tau: np.ndarray
+    theta_t: np.ndarray
+    phi_t: np.ndarray
+    theta_r: np.ndarray
+    phi_r: np.ndarray
+    valid: np.ndarray
+    interactions: np.ndarray
+    vertices: np.ndarray
+    synthetic_array: bool
+    _paths: PathArrays
+    _options: dict[str, Any]
+
+    def cir(
+        self, *, num_time_steps: int = 1, normalize_delays: bool = True, out_type: str = "numpy"
+    ) -> tuple[Any, Any]:
+        """Baseband coefficients ``(R, M, 1, N, L, T)`` and delays ``(R, 1, L)``, as ``sionna.rt.Paths.cir``.
+
+        Nothing moves: all ``num_time_steps`` T are alike. ``out_type`` "torch" gives complex64 and float32 tensors.
+        """
+        a, tau = impulse_response(self._paths, normalize_delays=normalize_delays, **self._options)
+        a = _one_transmitter(a)[..., None]
+        a = np.broadcast_to(a, (*a.shape[:-1], num_time_steps)).copy()
+        return _as(a, out_type), _as(np.where(self.valid, tau[:, None], -1.0), out_type)
+
+    def cfr(
+        self,
+        frequencies: Any,
+        *,
+        num_time_steps: int = 1,
+        normalize_delays: bool = True,
+        normalize: bool = False,
+        out_type: str = "numpy",
+        method: str = "auto",
+    ) -> Any:
+        """Frequency response ``(R, M, 1, N, T, F)`` at baseband ``frequencies`` (F,) [Hz], as ``sionna.rt.Paths.cfr``.
+
+        ``normalize`` scales each link to unit mean energy; ``method`` is that of
+        :func:`~warprrf.rf.channel.response.frequency_response`.
+        """
+        f = self._paths.carrier_hz + _device.check_array("frequencies", frequencies, (None,))
+        h = frequency_response(
+            self._paths,
+            f,
+            squint=False,
+            normalize_delays=normalize_delays,
+            method=method,
+            **self._options,
+        )
+        return _as(_time_steps(h, num_time_steps, normalize, mean=True), out_type)
+
+    def taps(
+        self,
+        bandwidth: float,
+        l_min: int,
+        l_max: int,
+        *,
+        num_time_steps: int = 1,
+        normalize: bool = False,
+        normalize_delays: bool = True,
+        out_type: str = "numpy",
+    ) -> Any:
+        """Taps ``(R, M, 1, N, T, l_max - l_min + 1)``, as ``sionna.rt.Paths.taps``."""
+        h = channel_taps(
+            self._paths,
+            bandwidth,
+            l_min,
+            l_max,
+            squint=False,
+            normalize_delays=normalize_delays,
+            **self._options,
+        )
+        return _as(_time_steps(h, num_time_steps, normalize, mean=False), out_type)
+
+
+def to_sionna(
+    paths: PathArrays,
+    tx_array: PlanarArray | None = None,
+    rx_array: PlanarArray | None = None,
+    *,
+    diffuse: str | None = None,
+    seed: int = 0,
+) -> SionnaPaths:
+    """``paths`` in Sionna RT's shapes: plane waves, carrier phases across arrays.
+
+    Args:
+        tx_array, rx_array: One isotropic element without polarisation by default.
+        diffuse, seed: see :func:`~warprrf.rf.channel.response.frequency_response`.
+
+    Raises:
+        ValueError: as there.
+    """
+    several = paths.as_several()
+    options: dict[str, Any] = {"tx_array": tx_array, "rx_array": rx_array, "diffuse": diffuse, "seed": seed}
+    coefficient, tau = impulse_response(several, **options)
+    valid = several.valid & np.isfinite(tau)
+    if diffuse == "power":
+        valid &= several.kind != "diffuse"
+    passband = coefficient * carrier_phase(-several.carrier_hz, np.where(valid, tau, 0.0))[:, None, None]
+    there = np.isfinite(several.vertices[..., 0]) & valid[..., None]
+    depth = np.arange(several.vertices.shape[-2])
+    last = depth == there.sum(axis=-1, keepdims=True) - 1
+    kinds = np.where(last & (several.kind == "diffuse")[..., None], DIFFUSE, SPECULAR)
+
+    def angle(values: np.ndarray) -> np.ndarray:
+        return np.where(valid, values, 0.0)[:, None]
+
+    return SionnaPaths(
+        a=_one_transmitter(passband),
+        tau=np.where(valid, tau, -1.0)[:, None],
+        theta_t=angle(several.theta_t),
+        phi_t=angle(several.phi_t),
+        theta_r=angle(several.theta_r),
+        phi_r=angle(several.phi_r),
+        valid=valid[:, None],
+        interactions=np.moveaxis(np.where(there, kinds, 0), -1, 0)[:, :, None],
+        vertices=np.moveaxis(np.where(there[..., None], several.vertices, 0.0), -2, 0)[:, :, None],
+        synthetic_array=True,
+        _paths=several,
+        _options=options,
+    )
+
+
+def from_sionna(
+    paths: Any, frequency_hz: float, transmitter: int, drop_repeated: bool
+) -> list[dict[str, Any]]:
+    """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
+    carrier = check_frequency(frequency_hz)
+    real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
+    if not paths.synthetic_array or real.shape[1] != 2 or real.shape[3] != 2:
+        raise ValueError(
+            f"paths: got coefficients of shape {real.shape}, expected synthetic arrays of one 'VH' element each"
+        )
+    a = (real + 1j * imag)[:, :, transmitter]  # (R, 2, 2, L)
+
+    def field(values: Any) -> np.ndarray:
+        return np.asarray(values.numpy(), dtype=np.float64)[:, transmitter]
+
+    valid = np.asarray(paths.valid.numpy())[:, transmitter]
+    kinds = np.asarray(paths.interactions.numpy())[:, :, transmitter]
+    others = set(np.unique(kinds[:, valid]).tolist()) - {0, SPECULAR, DIFFUSE}
+    if others:
+        raise ValueError(
+            f"paths: got interactions of types {sorted(others)}, expected specular and diffuse ones alone; solve with "
+            "refraction=False and diffraction=False"
+        )
+    points = np.moveaxis(np.asarray(paths.vertices.numpy(), dtype=np.float64)[:, :, transmitter], 0, -2)
+    sources, targets = (np.asarray(p.numpy(), dtype=np.float64).T for p in (paths.sources, paths.targets))
+    tau, angles = (
+        field(paths.tau),
+        [field(v) for v in (paths.theta_r, paths.phi_r, paths.theta_t, paths.phi_t)],
+    )
+    found = []
+    for r in range(len(a)):
+        here = np.flatnonzero(valid[r])
+        bounce = np.moveaxis(kinds[:, r, here], 0, -1)  # (L, depth)
+        diffuse = (bounce == DIFFUSE).any(axis=1)
+        count = (bounce != 0).sum(axis=1)
+        if drop_repeated:
+            sharp = np.flatnonzero(~diffuse)
+            copy = repeated(
+                tau[r, here[sharp]],
+                directions_from_angles(angles[0][r, here[sharp]], angles[1][r, here[sharp]]),
+                np.column_stack([angles[2][r, here[sharp]], angles[3][r, here[sharp]]]),
+                count[sharp],
+            )
+            kept = np.setdiff1d(np.arange(len(here)), sharp[copy])
+            here, bounce, diffuse, count = here[kept], bounce[kept], diffuse[kept], count[kept]
+        turned = carrier_phase(carrier, tau[r, here])
+        jones = np.moveaxis(a[r][:, :, here], -1, 0) * turned[:, None, None]
+        gain = np.sqrt(0.5 * (np.abs(jones) ** 2).sum(axis=(1, 2))) * turned
+        order = np.argsort(-np.abs(gain), kind="stable")
+        arrays = {
+            "gain": gain,
+            "tau": tau[r, here],
+            "theta_r": angles[0][r, here],
+            "phi_r": angles[1][r, here],
+            "theta_t": angles[2][r, here],
+            "phi_t": angles[3][r, here],
+            "vertices": np.where((bounce != 0)[..., None], points[r, here], np.nan),
+            "kind": np.where(count == 0, "los", np.where(diffuse, "diffuse", "mirror")).astype("<U7"),
+            "valid": np.ones(len(here), dtype=bool),
+            "jones": jones,
+        }
+        found.append(
+            {name: values[order] for name, values in arrays.items()}
+            | {"frequency_hz": carrier, "transmitter": sources[transmitter], "receiver": targets[r]}
+        )
+    return found
+
+
+def repeated(tau: np.ndarray, arrival: np.ndarray, aod: np.ndarray, bounces: np.ndarray) -> np.ndarray:
+    """Which specular paths repeat an earlier one, shape ``(L,)`` bool.
+
+    Sionna tells mirrors apart by the rounded plane of the triangle met. Small triangles of one surface have planes that
+    differ by rounding, and each is then taken for a mirror of its own: one reflection is counted several times.
+
+    Args:
+        tau: delays [s], shape ``(L,)``.
+        arrival: unit directions of arrival, shape ``(L, 3)``.
+        aod: zenith and azimuth of departure [rad], shape ``(L, 2)``.
+        bounces: interactions, shape ``(L,)``.
+    """
+    departure = directions_from_angles(aod[:, 0], aod[:, 1])
+    same = (
+        (np.abs(tau[:, None] - tau) * SPEED_OF_LIGHT < SAME_LENGTH_M)
+        & (np.linalg.norm(arrival[:, None] - arrival, axis=-1) < SAME_DIRECTION_RAD)
+        & (np.linalg.norm(departure[:, None] - departure, axis=-1) < SAME_DIRECTION_RAD)
+        & (bounces[:, None] == bounces)
+    )
+    return np.asarray(np.tril(same, -1).any(axis=1))
+
+
+def _one_transmitter(h: np.ndarray) -> np.ndarray:
+    """``(R, M, N, ...)`` as ``(R, M, 1, N, ...)``."""
+    return h[:, :, None]
+
+
+def _time_steps(h: np.ndarray, count: int, normalize: bool, *, mean: bool) -> np.ndarray:
+    """``(R, M, N, F)`` as ``(R, M, 1, N, T, F)``; normalised over a link's mean energy, or its energy in all taps."""
+    if normalize:
+        energy = np.abs(h) ** 2
+        energy = energy.mean(axis=-1) if mean else energy.sum(axis=-1)
+        energy = energy.mean(axis=(1, 2))[:, None, None, None]
+        h = np.divide(h, np.sqrt(energy), out=np.zeros_like(h), where=energy > 0)
+    several = _one_transmitter(h)[..., None, :]
+    return np.broadcast_to(several, (*several.shape[:-2], count, several.shape[-1])).copy()
+
+
+def _as(values: np.ndarray, out_type: str) -> Any:
+    if out_type == "numpy":
+        return values
+    if out_type == "torch":
+        torch = _device.require("torch", extra="baselines")
+        return torch.from_numpy(values.astype(np.complex64 if np.iscomplexobj(values) else np.float32))
+    raise ValueError(f"out_type: got {out_type!r}, expected 'numpy' or 'torch'")
