@@ -24,9 +24,9 @@ from warprrf.files import write_atomically, write_text
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.arrays import PlanarArray, plane_wave_error
 from warprrf.rf.channel.band_plan import thz_channel
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, slab_reflection
+from warprrf.rf.em.fresnel import slab_reflection
 from warprrf.rf.em.materials import Material
-from warprrf.rf.em.waves import carrier_phase
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.interop.sionna_engine import load_sionna_scene, sionna_rt
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import MirrorTracer, trace_paths

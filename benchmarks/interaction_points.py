@@ -13,7 +13,7 @@ import numpy as np
 
 from warprrf.device import Progress, check_array
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.harmonic.interaction import INTERACTION_POINTS, interaction_points, path_lengths
 from warprrf.rf.fields.harmonic.transport import transport
 from warprrf.rf.spectra.spectrum import pixel_directions

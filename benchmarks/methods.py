@@ -19,7 +19,7 @@ from benchmarks.setting import Geometry
 from benchmarks.stages import fingerprint
 from warprrf.device import Progress
 from warprrf.marks import code_mark
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.training import TrainingViews
 from warprrf.rf.fields.bistatic.transport import ReceiverView

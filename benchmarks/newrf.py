@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from benchmarks.stages import write_json
 from warprrf.device import Progress
 from warprrf.files import write_text
 from warprrf.rf.interop.newrf import NewrfRays, load_newrf, match_rays
-from warprrf.rf.paths.mirror_chains import MirrorChains, mirror_chains
+from warprrf.rf.paths.mirror_paths import MirrorPaths
 from warprrf.rf.paths.reflections import fit_reflections
 from warprrf.rf.paths.trace import MirrorTracer
 
@@ -80,7 +81,7 @@ def run(
         rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=device
     )
     start = time.perf_counter()
-    chains = mirror_chains(tracer, rays.receivers, 2)
+    chains = tracer.find(rays.receivers, 2)
     trace_s = time.perf_counter() - start
     tick("rays", 2, 2)
     summary = match.summary()
@@ -111,7 +112,7 @@ def run(
 
 
 def _predictions(
-    rays: NewrfRays, chains: MirrorChains, counts: tuple[int, ...], other: np.ndarray, tick: Progress
+    rays: NewrfRays, chains: MirrorPaths, counts: tuple[int, ...], other: np.ndarray, tick: Progress
 ) -> list[dict[str, Any]]:
     """Rows of the table; every method predicts the same held-out receivers."""
     held_out = rays.split()[1]
@@ -168,18 +169,12 @@ def _predictions(
     return rows
 
 
-def _of(chains: MirrorChains, chosen: np.ndarray, count: int) -> MirrorChains:
+def _of(chains: MirrorPaths, chosen: np.ndarray, count: int) -> MirrorPaths:
     """The chains of some receivers, numbered anew."""
     number = np.full(count, -1)
     number[chosen] = np.arange(len(chosen))
-    keep = number[chains.receiver] >= 0
-    return MirrorChains(
-        number[chains.receiver[keep]],
-        chains.patch[keep],
-        chains.vertices[keep],
-        chains.length_m[keep],
-        chains.last_point[keep],
-    )
+    kept = chains.subset(np.flatnonzero(number[chains.receiver] >= 0))
+    return replace(kept, receiver=number[kept.receiver])
 
 
 def summary_text(report: dict[str, Any]) -> str:

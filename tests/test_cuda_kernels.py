@@ -14,21 +14,26 @@ import warp as wp
 import warprrf.kernels
 
 ARCHITECTURE = 75  # the oldest that Warp compiles for
-CHOICES = {"real": (wp.float32, wp.float64), "rule": (0, 1)}  # what builders of kernels are asked for
+CHOICES = {
+    "real": (wp.float32, wp.float64),
+    "rule": (0, 1),
+    "width": (1, 4),
+}  # what builders of kernels are asked for
 MODULES = sorted(
     m.name for m in pkgutil.walk_packages(warprrf.kernels.__path__, "warprrf.kernels.") if not m.ispkg
 )
 
 
 def kernels_of(name):
-    """Kernels of one module, those that its builders make for both precisions and rules included."""
+    """Kernels of one module, those that its builders make for both precisions and all rules included."""
     module = importlib.import_module(name)
     found = [*vars(module).values()]
     for builder in (f for key, f in vars(module).items() if key.startswith("build")):
         needed = [p.name for p in inspect.signature(builder).parameters.values() if p.default is p.empty]
         if set(needed) <= set(CHOICES):  # others make functions, which the kernels call
             for arguments in itertools.product(*(CHOICES[p] for p in needed)):
-                found += vars(builder(*arguments)).values()
+                made = builder(*arguments)
+                found += [made] if isinstance(made, wp.Kernel) else vars(made).values()
     return [k for k in found if isinstance(k, wp.Kernel) and k.func.__module__ == name]
 
 
@@ -43,5 +48,13 @@ def test_kernels_compile_for_cuda(name, tmp_path):
 
 def test_no_kernel_is_missed():
     names = {k.func.__name__ for name in MODULES for k in kernels_of(name)}
-    assert {"project", "cast_rays", "transmit_adjoint", "light_surface"} <= names
+    assert {
+        "project",
+        "blend",
+        "blend_adjoint",
+        "strongest",
+        "cast_rays",
+        "transmit_adjoint",
+        "light_surface",
+    } <= names
     assert len(names) > 50

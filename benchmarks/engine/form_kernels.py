@@ -5,6 +5,10 @@ from typing import Any
 
 import warp as wp
 
+from warprrf.kernels.raster.project import splat_of
+from warprrf.kernels.raster.reference import behind, meet
+from warprrf.kernels.raster.view import Rules, View, pixel_of, pixel_ray
+
 TEXTBOOK, OFFSET_FIRST, GRAM, TURNED, QUADRATIC = range(5)
 COEFFICIENTS = 24  # room for a Gaussian's coefficients in any form
 STRIP = 16  # values that the rasteriser exponentiates at once
@@ -153,3 +157,30 @@ def exponential_kernel(function: Any) -> Any:
             out[i, k] = total[k]
 
     return exponentiate
+
+
+@wp.kernel(enable_backward=False)
+def count_passing(
+    offset: int,
+    splats: wp.array(dtype=splat_of(wp.float32)),
+    ids: wp.array(dtype=int),
+    starts: wp.array(dtype=int),
+    view: View,
+    rules: Rules,
+    count: wp.array(dtype=int, ndim=2),
+):
+    """How many Gaussians contribute to each pixel."""
+    tile, x, y = pixel_of(offset + wp.tid(), view)
+    if x >= view.width or y >= view.height:
+        return
+    ray = wp.vec3(pixel_ray(view, x, y))
+    transmittance = float(1.0)  # noqa: UP018  (Warp's way to declare a variable)
+    for j in range(starts[tile], starts[tile + 1]):
+        if transmittance <= float(rules.transmittance_min):
+            break
+        splat = splats[ids[j]]
+        g0, _g1, _g2, _inverse, q = meet(splat, ray, 1.0e-30)
+        if g0 > 0.0 and q < splat.cut:
+            count[y, x] = count[y, x] + 1
+            alpha = wp.min(splat.opacity * wp.exp(-0.5 * q), float(rules.alpha_max))
+            transmittance = behind(transmittance, alpha, rules.rule)

@@ -17,14 +17,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from benchmarks.engine.form_kernels import count_passing
 from benchmarks.engine.scenes import gaussians, panorama, photo, room
 from warprrf.device import launch, threads
-from warprrf.geometry.splats.camera import Camera
-from warprrf.geometry.splats.rasterizer import RADIO, TILE_GRAIN, Prepared, Rasterizer
+from warprrf.geometry.splats.rasterizer import GRAIN, RADIO, Prepared, Rasterizer
 from warprrf.geometry.splats.render import blend_weights, render
-from warprrf.kernels.raster import weights
-from warprrf.kernels.raster.lanes import LANES
-from warprrf.kernels.raster.project import PRODUCT
+from warprrf.kernels.raster import blocks
 
 PAIR_NS = {"dense": 4.0, "sparse": 2.0}
 """Asked: nanoseconds of one core per pair of pixel and Gaussian that reaches alpha_min, forward."""
@@ -58,7 +56,7 @@ def pair_costs(
         passing = passing_pairs(prepared)
         times = {
             "forward_ns": _least(partial(raster.blend, prepared, features), repeats),
-            "prepare_ns": _least(partial(_prepare, raster, inputs, cam), repeats),
+            "prepare_ns": _least(partial(raster.prepare, *inputs, cam), repeats),
             "backward_ns": _least(adjoint, repeats),
         }
         found[name] = {
@@ -157,17 +155,14 @@ def cores(
 
 def passing_pairs(prepared: Prepared) -> int:
     """Pairs of pixel and Gaussian that contribute with photos' cutoffs: those in front of where the light is spent."""
-    raster = Rasterizer(device="cpu")
-    shape = (prepared.camera.height, prepared.camera.width)
-    count = wp.zeros(shape, dtype=int, device="cpu")
+    rules = Rasterizer(device="cpu", per_pixel=True).blending.rules
+    count = wp.zeros((prepared.camera.height, prepared.camera.width), dtype=int, device="cpu")
     launch(
-        weights.build(wp.float32, PRODUCT).count_passing,
-        len(prepared.blocks.starts) - 1,
-        [prepared.rows, prepared.blocks.ids, prepared.blocks.starts, prepared.rays, prepared.view, raster.rules,
-         count.flatten()],
+        count_passing,
+        prepared.tiles * prepared.view.tile**2,
+        [prepared.splats, prepared.ids, prepared.starts, prepared.view, rules, count],
         device="cpu",
-        grain=TILE_GRAIN,
-    )  # fmt: skip
+    )
     return int(count.numpy().sum(dtype=np.int64))
 
 
@@ -179,34 +174,23 @@ def _scene(n: int, seed: int) -> tuple[Rasterizer, tuple[wp.array, wp.array, wp.
     return raster, inputs, wp.array(room(n, seed)[4], dtype=wp.float32, device="cpu", requires_grad=True)
 
 
-def _prepare(raster: Rasterizer, inputs: tuple[wp.array, ...], cam: Camera) -> Prepared:
-    """Project and list, down to blocks of pixels."""
-    means, quaternions, scales, opacities = inputs
-    prepared = raster.prepare(means, quaternions, scales, opacities, cam)
-    _ = prepared.blocks
-    return prepared
-
-
 def _forward(n: int, width: int, height: int, seed: int) -> tuple[Callable[..., None], np.ndarray]:
     """The bare launch of the forward kernel, and the work up to each tile."""
     raster, inputs, features = _scene(n, seed)
     prepared = raster.prepare(*inputs, photo(width, height))
-    pixels = width * height
-    out = [wp.empty(size, dtype=wp.float32, device="cpu") for size in (3 * pixels, *[pixels] * 3)]
-    out += [
-        wp.empty(pixels, dtype=int, device="cpu"),
-        wp.empty(pixels, dtype=wp.float32, device="cpu"),
-    ]
+    shape = (height, width)
+    out = [wp.empty(s, dtype=wp.float32, device="cpu") for s in ((*shape, 3), shape, shape, shape)]
+    out += [wp.empty(shape, dtype=kind, device="cpu") for kind in (int, wp.float32)]
     arguments = [
-        prepared.rows, features.flatten(), 3, 0, wp.zeros(3, dtype=wp.float32, device="cpu"), prepared.blocks.ids,
-        prepared.blocks.starts, prepared.rays, prepared.view, raster.rules, *out,
+        prepared.splats, prepared.ids, prepared.starts, prepared.view, raster.blending.rules, features, 0,
+        wp.zeros(3, dtype=wp.float32, device="cpu"), *out,
     ]  # fmt: skip
+    kernel = blocks.build_blend(wp.float32, 3)
 
     def run(cuts: list[int] | None = None) -> None:
-        blocks = len(prepared.blocks.starts) - 1
-        launch(raster.kernels_for(3).blend, blocks, arguments, device="cpu", grain=TILE_GRAIN, cuts=cuts)
+        launch(kernel, prepared.tiles, arguments, device="cpu", grain=GRAIN, cuts=cuts)
 
-    return run, prepared.blocks.work
+    return run, prepared.starts.numpy() + np.arange(prepared.tiles + 1)
 
 
 def _share(
@@ -215,7 +199,7 @@ def _share(
     """A process: part ``k`` of ``count`` of the launch, as often as asked; then the digest of the whole pass."""
     run, work = _forward(*settings)
     tiles = np.searchsorted(work, work[-1] * np.array([k, k + 1]) / count)
-    share = [int(t) * LANES for t in tiles]  # blocks
+    share = [int(t) for t in tiles]
     run(share)
     for _ in range(repeats):
         barrier.wait(600)

@@ -18,7 +18,7 @@ from benchmarks import bistatic, setting
 from benchmarks.bistatic import checks, report, table
 from benchmarks.bistatic.methods import HARMONIC, UNTAUGHT, VARIANTS, point_at_transmitter
 from warprrf import cli
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra import lookups
 from warprrf.rf.spectra.metrics import angle_deg, strongest_direction
 

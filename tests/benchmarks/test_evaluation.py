@@ -29,7 +29,7 @@ from benchmarks.evaluation.protocol import Run, Setting
 from benchmarks.evaluation.runs import Store, sweep
 from warprrf import cli, marks
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.metrics import angle_deg
 from warprrf.rf.spectra.spectrum import pixel_directions
 

@@ -13,7 +13,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField

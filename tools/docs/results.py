@@ -61,6 +61,16 @@ def read(name: str) -> Row:
     return found
 
 
+def measured(name: str) -> Row | None:
+    """A result file that a checkout may lack; :func:`missing` is then what a page says."""
+    return read(name) if (FOLDER / f"{name}.json").is_file() else None
+
+
+def missing(command: str) -> str:
+    """What a page says in the place of a table without a result file."""
+    return f"*Not measured here yet: `{command}` makes these figures.*"
+
+
 def entry(name: str) -> Callable[[Callable[[], str]], Callable[[], str]]:
     """Enters a table under its name."""
 
@@ -158,6 +168,23 @@ def _lobby_stages() -> str:
     r = read("lobby")
     rows = [(name, f"{stage['seconds']:.0f}") for name, stage in r["stages"].items()]
     return markdown(("step", "seconds"), [*rows, ("**all**", f"**{r['pipeline_time_s']:.0f}**")])
+
+
+@entry("lobby-seeds")
+def _lobby_seeds() -> str:
+    found = measured("lobby_seeds")
+    if found is None:
+        return missing("python -m benchmarks lobby-seeds")
+    lines = [
+        [r["figure"], *(show(r[k], "{:.4g}") for k in ("mean", "spread", "least", "most"))]
+        for r in found["rows"]
+        if not r["key"].startswith("methods")
+        or ("bistatic" in r["key"] or "rf3dgs+" in r["key"])
+        and "psnr" in r["key"]
+    ]
+    return markdown(
+        (f"seeds {', '.join(map(str, found['seeds']))}", "mean", "spread", "least", "most"), lines
+    )
 
 
 # ---------------------------------------------------------------------------------------- the bistatic field
@@ -383,7 +410,7 @@ def _engine_knobs() -> str:
     }  # fmt: skip
     lines = []
     for knob, name in words.items():
-        for r in read("engine")[knob]:
+        for r in read("engine").get(knob, ()):
             value = " x ".join(map(str, r["value"])) if isinstance(r["value"], list) else _short(r["value"])
             lines.append([
                 name, value, show(r["error_rms_db"], "{:.2g}"), show(r["error_worst_db"], "{:.2g}"),
@@ -400,31 +427,65 @@ def _short(value: Any) -> str:
 @entry("engine-times")
 def _engine_times() -> str:
     e = read("engine")
-    b, t = e["blend"], e["transport"]
+    b = e["blend"]
+    names = {"torch": "a vectorised torch renderer", "opensplat": "OpenSplat's CPU rasteriser"}
+    size = f"{b['gaussians']} Gaussians, {b['shape'][1]} x {b['shape'][0]}"
     lines = []
     for run in b["runs"]:
         threads = "one thread" if run["threads"] == 1 else f"{run['threads']} threads"
-        for peer, ratio in run["speedup"].items():
-            other = {"torch": "a vectorised torch renderer", "opensplat": "OpenSplat's CPU rasteriser"}[peer]
-            lines.append([
-                f"forward and backward, {b['gaussians']} Gaussians, {b['shape'][1]} x {b['shape'][0]}, {threads}: "
-                f"speed over {other}", f"{ratio:.1f} times",
-            ])  # fmt: skip
-    s = b["spectrum"]
+        ratios = run["speedup"] if isinstance(run["speedup"], dict) else {"torch": run["speedup"]}
+        lines += [[f"forward and backward, {size}, {threads}", f"{1e3 * run['ours']['seconds']:.0f} ms"]]
+        lines += [
+            [f"the same, speed over {names[peer]}", f"{ratio:.1f} times"] for peer, ratio in ratios.items()
+        ]
     lines += [
-        [
-            f"panorama of {s['shape'][0]} x {s['shape'][1]} from {s['gaussians']} Gaussians",
-            f"{1e3 * s['render_s']:.0f} ms",
-        ],
-        ["blending weights of the same view", f"{1e3 * s['weights_s']:.0f} ms"],
-        ["one launch on two cores over two processes of half the work", f"{b['cores']['throughput']:.2f}"],
-        [
-            f"blending weights of {t['receivers']} receivers, {t['gaussians']} Gaussians, on disk: memory",
-            f"{t['store_peak_gb']:.1f} GB",
-        ],
-        ["the same: files", f"{t['disk_gb']:.1f} GB"],
+        ["largest difference of the images", f"{b['image_difference']['largest']:.0e}"],
+        ["largest relative difference of the gradients", f"{max(b['gradient_difference'].values()):.0e}"],
+    ]
+    grid = " x ".join(map(str, e["sizes"]["shape"]))
+    lines += [
+        [f"panorama of {grid} from {r['gaussians']} Gaussians", f"{1e3 * r['seconds']:.0f} ms"]
+        for r in e["growth"]
+        if r["gaussians"] >= 10_000
     ]
     return markdown(("figure", "value"), lines)
+
+
+@entry("engine-rays")
+def _engine_rays() -> str:
+    lines = [
+        [
+            "the lobby" if r["mesh"] == "scene" else r["mesh"], str(r["faces"]), r["kind"],
+            show(r["chosen"]["rays_per_s"] / 1e6), show(r["warp"]["rays_per_s"] / 1e6),
+            show(r["chosen"]["over_bare"], "{:.2f}"),
+        ]
+        for r in read("engine")["rays"]
+        if "over_bare" in r["chosen"]
+    ]  # fmt: skip
+    head = ("mesh", "faces", "rays", "million a second", "by Warp's hierarchy", "over bare Embree")
+    return markdown(head, lines)
+
+
+@entry("gpu")
+def _gpu() -> str:
+    files = sorted(FOLDER.glob("gpu-*.json"))
+    if not files:
+        return missing("make gpu")
+    parts = []
+    for file in files:
+        found = json.loads(file.read_text())
+        lines = [[name, f"{value:.4g}"] for name, value in _leaves(found) if "kernels" not in name]
+        parts += [f"**{found['machine']['device']}**", markdown(("figure", "value"), lines)]
+    return "\n\n".join(parts)
+
+
+def _leaves(found: Row, prefix: str = "") -> Iterable[tuple[str, float]]:
+    for key, value in found.items():
+        name = f"{prefix}{key}".replace("_", " ")
+        if isinstance(value, dict) and key not in ("machine", "sizes", "asked", "tests"):
+            yield from _leaves(value, f"{name}: ")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield name, value
 
 
 # ---------------------------------------------------------------------------------------- beams, maps, effects
@@ -458,6 +519,61 @@ def _relevance() -> str:
             lines.append([words, *(show(w and w["worth_db"], "{:.2g}") for w in worth)])
     head = [f"{c['frequency_hz'] / 1e9:.0f} GHz, {c['roughness']}" for c in cases]
     return markdown(("effect left out [dB]", *head), lines)
+
+
+BEAMS = {
+    "exhaustive": "exhaustive search, its pilots counted",
+    "powers": "true power of every path, no phases",
+    "bistatic": "**bistatic field**",
+    "zero": "our geometry, no spectra",
+    "rf3dgs+": "RF-3DGS+",
+    "nearest": "nearest receiver's beam",
+    "transmitter": "point at the transmitter",
+    "hierarchical": "hierarchical search",
+    "random": "random",
+}
+
+
+@entry("beams")
+def _beams() -> str:
+    found = measured("beams")
+    if found is None:
+        return missing("python -m benchmarks beams")
+    rows = found["truths"]["exact"]["links"]
+    ends = [e for e in ("rx 16", "rx 256", "rx 4096", "tx 256", "tx 64, rx 64") if _find(rows, ends=e)]
+    last = "rx 4096" if "rx 4096" in ends else ends[-1]
+    lines = []
+    for method, count in dict.fromkeys((r["method"], r["n_train"]) for r in rows):
+        own = [_find(rows, ends=e, method=method, n_train=count) for e in ends]
+        best = _find(rows, ends=last, method=method, n_train=count)
+        lines.append([
+            BEAMS[method], str(count or ""),
+            *(show(r and 100 * r["within"], "{:.0f}") + show(r and 100 * r["within_blocked"], " / {:.0f} %") for r in own),
+            show(best and best["efficiency_los"], "{:.2f}") + show(best and best["efficiency_blocked"], " / {:.2f}"),
+        ])  # fmt: skip
+    lines.sort(key=lambda line: list(BEAMS.values()).index(line[0]))
+    return markdown(("within 1 dB, all / blocked", "spectra", *ends, f"bit/s/Hz, {last}"), lines)
+
+
+@entry("beams-users")
+def _beams_users() -> str:
+    found = measured("beams")
+    rows = found["truths"]["exact"].get("users", []) if found else []
+    if not rows:
+        return missing("python -m benchmarks beams")
+    choices = list(dict.fromkeys(r["choice"] for r in rows))
+    words = {
+        "alone": "own best beams", "together": "beams minding interference", "mr": "maximum ratio", "zf": "zero forcing",
+        "slnr": "SLNR",
+    }  # fmt: skip
+    lines = []
+    for users, method, count in dict.fromkeys((r["users"], r["method"], r["n_train"]) for r in rows):
+        cells = [_find(rows, users=users, method=method, n_train=count, choice=c) for c in choices]
+        if any(cells):
+            name = BEAMS.get(method, "true channel of every element")
+            values = (show(c and c["efficiency"], "{:.2f}") for c in cells)
+            lines.append([f"{users} users: {name}", str(count or ""), *values])
+    return markdown(("sum, bit/s/Hz", "spectra", *(words.get(c, c) for c in choices)), lines)
 
 
 @entry("map")

@@ -1,4 +1,5 @@
-"""How the rasteriser gets through its work changes nothing about the result: lists of blocks, threads, shared tiles."""
+"""How the rasteriser gets through its work changes nothing about the result: lists of tiles, threads, blocks of pixels
+or one pixel at a time."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,13 +9,11 @@ import warp as wp
 
 from benchmarks.engine.scenes import gaussians, panorama, photo, room
 from warprrf import device
-from warprrf.geometry.splats import rasterizer
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
-from warprrf.geometry.splats.render import blend_weights, render
-from warprrf.kernels.raster.lanes import BLOCK, LANES
-from warprrf.kernels.raster.lanes import build as lane_functions
+from warprrf.geometry.splats.render import render
+from warprrf.kernels.raster.blocks import BLOCK
 
 CAMERAS = {
     "pinhole": photo(70, 45),
@@ -46,50 +45,36 @@ def alphas(g, cam, blending):
     return out
 
 
-def block_lists(raster, g, cam):
-    """Gaussians of every block of pixels (column, row), in the order of blending."""
+def lists_of_tiles(raster, g, cam):
+    """Gaussians of every tile (column, row), in the order of blending."""
     prepared = raster.prepare(*raster.upload(g), cam)
-    ids, starts = prepared.blocks.ids.numpy(), prepared.blocks.starts.numpy()
-    lists = {}
-    for block in range(len(starts) - 1):
-        tile, b = divmod(block, LANES)
-        row, column = divmod(tile, prepared.view.tiles_x)
-        lists[4 * column + b % 4, 4 * row + b // 4] = ids[starts[block] : starts[block + 1]]
-    return lists
+    ids, starts = prepared.ids.numpy(), prepared.starts.numpy()
+    return {
+        (tile % prepared.view.tiles_x, tile // prepared.view.tiles_x): ids[starts[tile] : starts[tile + 1]]
+        for tile in range(prepared.tiles)
+    }
 
 
 @pytest.mark.parametrize("blending", [Blending(), RADIO], ids=["photos", "radio"])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+@pytest.mark.parametrize("per_pixel", [False, True], ids=["blocks", "reference"])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_block_lists_every_gaussian_that_its_pixels_see(seed, camera, blending):
+def test_a_tile_lists_every_gaussian_that_its_pixels_see(seed, per_pixel, camera, blending):
     g = mixed(seed)
-    lists = block_lists(Rasterizer(device="cpu", blending=blending, real=wp.float64), g, camera)
+    raster = Rasterizer(device="cpu", blending=blending, real=wp.float64, per_pixel=per_pixel)
     seen = alphas(g, camera, blending) > 0
     assert seen.any()
     ranges = np.linalg.norm(g.means.astype(np.float64) - camera.position, axis=1)
-    for (column, row), listed in lists.items():
-        pixels = seen[row * BLOCK : (row + 1) * BLOCK, column * BLOCK : (column + 1) * BLOCK]
-        assert set(np.flatnonzero(pixels.any(axis=(0, 1)))) <= set(listed.tolist())
+    for (column, row), listed in lists_of_tiles(raster, g, camera).items():
+        rows, columns = (slice(k * raster.tile, (k + 1) * raster.tile) for k in (row, column))
+        assert set(np.flatnonzero(seen[rows, columns].any(axis=(0, 1)))) <= set(listed.tolist())
         assert len(set(listed.tolist())) == len(listed)
         assert (np.diff(ranges[listed].astype(np.float32)) >= 0).all()  # near to far
 
 
-def test_few_blocks_are_listed_in_vain():
-    g, cam, blending = gaussians(3000), photo(160, 120), Blending()
-    lists = block_lists(Rasterizer(device="cpu"), g, cam)
-    seen = alphas(g, cam, blending) > 0
-    useful = sum(
-        int(
-            seen[r * BLOCK : (r + 1) * BLOCK, c * BLOCK : (c + 1) * BLOCK][..., listed].any(axis=(0, 1)).sum()
-        )
-        for (c, r), listed in lists.items()
-        if len(listed)
-    )
-    assert useful > 0.8 * sum(map(len, lists.values()))
-
-
-def image_and_gradients(g, cam, *, channels=3, real=wp.float32, blending=None, device="cpu"):
-    raster = Rasterizer(device=device, real=real, blending=blending)
+def image_and_gradients(g, cam, *, channels=3, device="cpu", **options):
+    raster = Rasterizer(device=device, **options)
+    real = raster.real
     inputs = raster.upload(g)
     rng = np.random.default_rng(5)
     features = wp.array(rng.random((len(g), channels)), dtype=real, device=device)
@@ -112,8 +97,7 @@ def test_the_number_of_threads_changes_no_bit(camera, monkeypatch):
     results = []
     for count in (1, 2, 5):
         with ThreadPoolExecutor(5) as pool:
-            for module in (device, rasterizer):
-                monkeypatch.setattr(module, "threads", lambda count=count: count)
+            monkeypatch.setattr(device, "threads", lambda count=count: count)
             monkeypatch.setattr(device, "_pool", lambda pool=pool: pool)
             results.append(image_and_gradients(g, CAMERAS[camera], channels=5))
     assert np.abs(results[0][6]).max() > 0
@@ -141,25 +125,6 @@ def test_the_exponential_of_float32_errs_by_less_than_1e_6():
     q = (x / 0.01) ** 2 / (1 + x * x)
     assert q.max() > 80
     assert np.abs(found - np.exp(-q / 2)).max() < 1e-6
-
-
-@pytest.mark.parametrize("real", [wp.float32, wp.float64])
-def test_sixteen_vectors_are_summed_each(real):
-    of = lane_functions(real)
-    lanes = wp.types.vector(LANES, real)
-    sums = of.sums
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def run(source: wp.array(dtype=lanes), target: wp.array(dtype=lanes)):
-        target[0] = sums(
-            source[0], source[1], source[2], source[3], source[4], source[5], source[6], source[7],
-            source[8], source[9], source[10], source[11], source[12], source[13], source[14], source[15],
-        )  # fmt: skip
-
-    values = np.random.default_rng(0).integers(-9, 9, (LANES, LANES))
-    target = wp.zeros(1, dtype=lanes, device="cpu")
-    wp.launch(run, dim=1, inputs=[wp.array(values, dtype=lanes, device="cpu"), target], device="cpu")
-    assert np.array_equal(target.numpy()[0], values.sum(axis=1))
 
 
 @wp.kernel(enable_backward=False)
@@ -202,18 +167,21 @@ def test_features_need_not_be_contiguous():
     assert straight.features.numpy().max() > 0.3
 
 
-@pytest.mark.cuda
+OTHERS = [{"per_pixel": True}, pytest.param({"device": "cuda:0"}, marks=pytest.mark.cuda)]
+
+
+@pytest.mark.parametrize("other", OTHERS, ids=["reference", "cuda"])
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 @pytest.mark.parametrize(
     ("real", "rule", "channels"),
-    [(wp.float32, "product", 5), (wp.float64, "exp", 3)],
-    ids=["float32", "float64"],
+    [(wp.float32, "product", 5), (wp.float64, "exp", 3), (wp.float64, "product", 1)],
+    ids=["float32", "float64", "one channel"],
 )
-def test_a_gpu_blends_what_a_cpu_does(real, rule, channels, camera):
+def test_blocks_blend_what_the_reference_does(real, rule, channels, camera, other):
     """Image, ranges, owners, seen weights and every gradient; five channels take two launches."""
     g, how = mixed(7, 400), {"channels": channels, "real": real, "blending": Blending(rule=rule)}
     expected = image_and_gradients(g, camera, **how)
-    found = image_and_gradients(g, camera, **how, device="cuda:0")
+    found = image_and_gradients(g, camera, **how, **other)
     tolerance = 2e-5 if real is wp.float32 else 1e-12
     for k, (a, b) in enumerate(zip(expected, found, strict=True)):
         assert np.abs(a).max() > 0
@@ -222,29 +190,16 @@ def test_a_gpu_blends_what_a_cpu_does(real, rule, channels, camera):
         assert np.abs(a - b).max() <= tolerance * np.abs(a).max()
 
 
-@pytest.mark.cuda
-def test_a_gpu_lists_the_blocks_that_a_cpu_lists():
-    for camera in CAMERAS.values():
-        raster = Rasterizer(device="cpu", blending=RADIO, real=wp.float64)
-        expected = raster.prepare(*raster.upload(mixed(3, 300)), camera)
-        raster = Rasterizer(device="cuda:0", blending=RADIO, real=wp.float64)
-        found = raster.prepare(*raster.upload(mixed(3, 300)), camera)
-        with pytest.raises(RuntimeError, match="without lists of blocks"):
-            _ = found.blocks
-        for name in ("ids", "masks", "starts"):
-            assert np.array_equal(getattr(expected, name).numpy(), getattr(found, name).numpy())
-        assert np.bitwise_count(found.masks.numpy()).sum() > 300
-
-
-@pytest.mark.cuda
+@pytest.mark.parametrize("other", OTHERS, ids=["reference", "cuda"])
 @pytest.mark.parametrize("top_k", [1, 3, 16])
-def test_a_gpu_finds_the_strongest_weights_that_a_cpu_finds(top_k):
-    for camera in CAMERAS.values():
-        expected = blend_weights(mixed(7, 400), camera, top_k=top_k, device="cpu")
-        found = blend_weights(mixed(7, 400), camera, top_k=top_k, device="cuda:0")
-        assert np.array_equal(expected.index, found.index)
-        assert np.array_equal(expected.dominant, found.dominant)
-        for name in ("weight", "range", "alpha", "dropped"):
-            a, b = getattr(expected, name), getattr(found, name)
-            assert np.abs(a - b).max() <= 3e-6 * max(1, np.abs(a).max())
-        assert expected.weight.max() > 0.1
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
+def test_blocks_find_the_strongest_weights_that_the_reference_finds(camera, top_k, other):
+    found = []
+    for options in ({}, other):
+        raster = Rasterizer(blending=RADIO, **{"device": "cpu", **options})
+        arrays = raster.strongest(raster.prepare(*raster.upload(mixed(7, 400)), camera), top_k)
+        found.append([a.numpy() for a in arrays])
+    assert np.array_equal(found[0][0], found[1][0])  # which Gaussians
+    for a, b in zip(found[0][1:], found[1][1:], strict=True):
+        assert np.abs(a).max() > 0.1
+        assert np.abs(a - b).max() <= 3e-6 * max(1, np.abs(a).max())

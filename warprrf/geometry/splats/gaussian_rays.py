@@ -20,9 +20,9 @@ import numpy as np
 import warp as wp
 
 from warprrf.device import check_array, launch, resolve
+from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.rasterizer import RADIO, RULES, Blending
-from warprrf.geometry.splats.tape import active_tape, gradient, with_gradients
+from warprrf.geometry.splats.tape import active_tape, gradient, record
 from warprrf.kernels.rays import gaussians as kernels
 
 CPU_PIECES = 4  # gradient sums on a CPU, one writer each: the result does not depend on the thread count
@@ -108,11 +108,7 @@ class GaussianRays:
                 f"gaussians: got {type(gaussians).__name__}, expected warprrf.Gaussians or four Warp arrays"
             )
         self._kernels = kernels.build(self.inputs[3].dtype)
-        self._rules = kernels.Rules()
-        self._rules.alpha_min = self.blending.alpha_min
-        self._rules.alpha_max = self.blending.alpha_max
-        self._rules.transmittance_min = self.blending.transmittance_min
-        self._rules.rule = RULES[self.blending.rule]
+        self._rules = self.blending.rules
         self._build()
 
     def __len__(self) -> int:
@@ -175,7 +171,7 @@ class GaussianRays:
         tape = active_tape()
         found, adjoint = self._trace(origins, directions, k, order, requires_grad=tape is not None)
         if tape is not None:
-            self._record(tape, adjoint, found.outputs)
+            record(tape, adjoint, self.inputs, found.outputs)
         return found
 
     def transmit(self, a: Any, b: Any) -> wp.array:
@@ -183,7 +179,7 @@ class GaussianRays:
         tape = active_tape()
         values, adjoint = self._transmit(a, b, requires_grad=tape is not None)
         if tape is not None:
-            self._record(tape, adjoint, (values,))
+            record(tape, adjoint, self.inputs, (values,))
         return values
 
     def trace_with_adjoint(
@@ -195,15 +191,6 @@ class GaussianRays:
     def transmit_with_adjoint(self, a: Any, b: Any) -> tuple[wp.array, Callable[[], None]]:
         """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients."""
         return self._transmit(a, b, requires_grad=True)
-
-    def _record(self, tape: wp.Tape, adjoint: Callable[[], None], outputs: tuple[wp.array, ...]) -> None:
-        def backward() -> None:
-            adjoint()
-            for array in outputs:  # as Warp's own adjoints do: a second backward adds the same again
-                if not array.retain_grad:
-                    array.grad.zero_()
-
-        tape.record_func(backward, with_gradients(*self.inputs, *outputs))
 
     def _trace(
         self, origins: Any, directions: Any, k: int, order: str, *, requires_grad: bool

@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.device import check_array, launch, resolve
+from warprrf.device import check_array, resolve
+from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.rasterizer import RADIO, RULES, TILE_GRAIN, Blending, Rasterizer
-from warprrf.kernels.raster import pixel_weights
-from warprrf.kernels.raster import weights as weight_kernels
-from warprrf.kernels.raster.project import LANES
-from warprrf.kernels.raster.warps import PIXELS
+from warprrf.geometry.splats.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
@@ -113,37 +110,12 @@ def blend_weights(
     if not isinstance(top_k, int | np.integer) or top_k < 1:
         raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
     raster = Rasterizer(device=device, blending=blending)
-    view = raster.prepare(*raster.upload(g), cam)
-    shape = (cam.height, cam.width, int(top_k))
-    index = wp.full(shape, -1, dtype=int, device=raster.device)
-    weight = wp.zeros(shape, dtype=wp.float32, device=raster.device)
-    range_ = wp.zeros(shape, dtype=wp.float32, device=raster.device)
-    total = wp.zeros(shape[:2], dtype=wp.float32, device=raster.device)
-    rule = RULES[blending.rule]
-    out = [a.flatten() for a in (index, weight, range_, total)]
-    if raster.on_gpu:
-        nothing = wp.empty(0, dtype=wp.float32, device=raster.device)
-        launch(
-            pixel_weights.build(wp.float32, rule),
-            (len(view.starts) - 1) * PIXELS,
-            [view.rows, nothing, view.ids, view.masks, view.starts, view.rays, view.view, raster.rules, shape[2],
-             *out],
-            device=raster.device,
-        )  # fmt: skip
-    else:
-        launch(
-            weight_kernels.build(wp.float32, rule).strongest,
-            len(view.blocks.starts) - 1,
-            [view.rows, view.blocks.ids, view.blocks.starts, view.rays, view.view, raster.rules, shape[2], LANES,
-             *out],
-            device=raster.device,
-            grain=TILE_GRAIN,
-        )  # fmt: skip
-    weights, indices, alpha = weight.numpy(), index.numpy(), total.numpy()
+    found = raster.strongest(raster.prepare(*raster.upload(g), cam), int(top_k))
+    indices, weights, ranges, alpha = (array.numpy() for array in found)
     best = np.argmax(weights, axis=2)
     dominant = np.take_along_axis(indices, best[..., None], axis=2)[..., 0]
     dropped = np.maximum(alpha - weights.sum(axis=2), 0)
-    return BlendWeights(indices, weights, range_.numpy(), dominant, alpha, dropped)
+    return BlendWeights(indices, weights, ranges, dominant, alpha, dropped)
 
 
 def _check(g: Any, cam: Any) -> None:

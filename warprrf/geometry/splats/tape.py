@@ -1,6 +1,8 @@
-"""Hand-written adjoints on Warp's tape: which tape is active, which arrays it keeps, where gradients go."""
+"""Hand-written adjoints on Warp's tape: which tape is active, what it keeps, where gradients go."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 
 import warp as wp
 
@@ -10,9 +12,19 @@ def active_tape() -> wp.Tape | None:
     return wp._src.context.runtime.tape
 
 
-def with_gradients(*arrays: wp.array) -> list[wp.array]:
-    """Those whose gradients the tape keeps; it refuses arrays that want none or are empty."""
-    return [array for array in arrays if array.requires_grad and array.size]
+def record(
+    tape: wp.Tape, adjoint: Callable[[], object], inputs: Sequence[wp.array], outputs: Sequence[wp.array]
+) -> None:
+    """Let ``adjoint`` run in the tape's backward pass: it reads the gradients of ``outputs`` and adds to those of
+    ``inputs``. Empty arrays and those without a gradient are left out, which the tape would refuse."""
+
+    def backward() -> None:
+        adjoint()
+        for array in outputs:  # as Warp's own adjoints do: a second backward adds the same again, not more
+            if not array.retain_grad:
+                array.grad.zero_()
+
+    tape.record_func(backward, [a for a in (*inputs, *outputs) if a.requires_grad and a.size])
 
 
 def gradient(array: wp.array) -> wp.array:

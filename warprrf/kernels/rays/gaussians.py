@@ -6,8 +6,8 @@ For a ray ``o + t d`` (unit ``d``) and a Gaussian with mean ``c`` and whitening 
     g = M d,   h = M p,   t = m.d - (h.g)/|g|^2,   y = h - (h.g)/|g|^2 g,   q = |y|^2,
 
 the peak of the response at range ``t`` and ``alpha = min(opacity exp(-q/2), alpha_max)`` there: the definition of
-:mod:`warprrf.kernels.raster.project` for one ray origin, here for any. All of it in float64; the hierarchy of boxes around the
-ellipsoids ``q < cut`` is in float32 and only proposes candidates.
+:mod:`warprrf.kernels.raster.project` for one ray origin, here for any. All of it in float64; the hierarchy of boxes
+around the ellipsoids ``q < cut`` is in float32 and only proposes candidates.
 
 Adjoint: with ``A = dM M^-1``, ``dq = 2 (y.A y - y.M dc)`` and ``dt = -(g.A y + y.A g - g.M dc)/|g|^2``, so that
 every pair adds to a 3-vector and a symmetric 3x3 per Gaussian, which :func:`chain` turns into gradients of mean, scale
@@ -20,23 +20,14 @@ from typing import Any
 
 import warp as wp
 
-from warprrf.kernels.raster.project import PRODUCT, rotation_matrix
+from warprrf.kernels.raster.project import quaternion_gradient
+from warprrf.kernels.raster.view import PRODUCT, Rules, rotation_matrix
 
 SUMS = 10  # numbers per Gaussian that the adjoints sum: Y1 3, Y2 6, opacity
 BY_PEAK, BY_RANGE = 0, 1  # order of hits: peak along the ray, or distance of the mean from the ray's origin
 
 # What float32 may err in placing a ray or a box, over the largest length in the scene: about 20 roundings of 2^-24.
 ROUNDING = 1.5e-6
-
-
-@wp.struct
-class Rules:
-    """How alphas along a ray become transmittance: cutoff, clamp, early exit, rule."""
-
-    alpha_min: wp.float64
-    alpha_max: wp.float64
-    transmittance_min: wp.float64
-    rule: int
 
 
 @wp.struct
@@ -398,40 +389,20 @@ def build(real: Any) -> SimpleNamespace:
         scales_grad: wp.array(dtype=vec3),
         opacities_grad: wp.array(dtype=real),
     ):
-        """Sum the pieces and add the gradients of mean, quaternion, scale and opacity.
-
-        dL/dmean = -2 M^T Y1, dL/ds_i = -2 Y2_ii / s_i, dL/dw_3 = 2 Y2_12 (s_2/s_1 - s_1/s_2) and cyclic for a local
-        rotation w, and a quaternion turns by q (0, w/2).
-        """
+        """Add up the parts of ``sums``, then the gradients of mean, quaternion, scale and opacity:
+        dL/dmean = -2 M^T Y1, dL/ds_i = -2 Y2_ii / s_i."""
         i = offset + wp.tid()
         y = total()
         for p in range(sums.shape[0]):
             for k in range(wp.static(SUMS)):
                 y[k] += sums[p, i, k]
         two = wp.float64(2.0)
-        dm = two * (wp.transpose(whitening[i]) * wp.vec3d(y[0], y[1], y[2]))
-        means_grad[i] = means_grad[i] - vec3(real(dm[0]), real(dm[1]), real(dm[2]))
-        s0 = wp.float64(scales[i][0])
-        s1 = wp.float64(scales[i][1])
-        s2 = wp.float64(scales[i][2])
-        scales_grad[i] = scales_grad[i] - vec3(
-            real(two * y[3] / s0), real(two * y[6] / s1), real(two * y[8] / s2)
-        )
-        wx = two * y[7] * (s2 / s1 - s1 / s2)
-        wy = -two * y[5] * (s2 / s0 - s0 / s2)
-        wz = two * y[4] * (s1 / s0 - s0 / s1)
-        q = quaternions[i]
-        qw = wp.float64(q[0])
-        qx = wp.float64(q[1])
-        qy = wp.float64(q[2])
-        qz = wp.float64(q[3])
-        f = two / (qw * qw + qx * qx + qy * qy + qz * qz)
-        quaternions_grad[i] = quaternions_grad[i] + vec4(
-            real(f * (-qx * wx - qy * wy - qz * wz)),
-            real(f * (qw * wx + qy * wz - qz * wy)),
-            real(f * (qw * wy + qz * wx - qx * wz)),
-            real(f * (qw * wz + qx * wy - qy * wx)),
-        )
+        s = wp.vec3d(scales[i])
+        y1 = wp.vec3d(y[0], y[1], y[2])
+        y2 = wp.mat33d(y[3], y[4], y[5], y[4], y[6], y[7], y[5], y[7], y[8])
+        means_grad[i] = means_grad[i] - vec3(two * (wp.transpose(whitening[i]) * y1))
+        scales_grad[i] = scales_grad[i] - vec3(wp.cw_div(two * wp.get_diag(y2), s))
+        quaternions_grad[i] = quaternions_grad[i] + vec4(quaternion_gradient(wp.vec4d(quaternions[i]), y2, s))
         opacities_grad[i] = opacities_grad[i] + real(y[9])
 
     return SimpleNamespace(whiten=whiten, chain=chain)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import regroup

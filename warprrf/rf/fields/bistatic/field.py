@@ -25,7 +25,7 @@ from warprrf.cache import Cache
 from warprrf.device import Progress, check_array
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air, air_of
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import LinkTracer

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.materials import Materials
 from warprrf.rf.fields.bistatic.render import PathPowers, path_powers
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.render import Rendered
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.paths.path_set import Paths

@@ -19,11 +19,10 @@ from warprrf import device as _device
 from warprrf.cache import Cache
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
-from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import bounce
 from warprrf.rf.fields.bistatic.colours import colour_groups
-from warprrf.rf.paths.trace import planar_patches as exact_patches
 
 ELEMENT_M = 0.5  # width of an element
 CELLS = 3  # along an element
@@ -110,13 +109,17 @@ class Surface:
             group, sort, colour = colour_groups(mesh, patch, gaussians)
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
-            patches = exact_patches(mesh, material)
+            patches = planar_patches(mesh, material)
             large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
             order = np.full(len(patches) + 1, -1)
             order[large] = np.arange(len(large))
             patch = order[patches.face_patch].astype(np.int32)
             planes = patches.normal[large], patches.offset[large]
-            normal, skin = mesh.face_normals, TRUE_SKIN_M
+            # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
+            normal, skin = mesh.face_normals.copy(), max(TRUE_SKIN_M, patches.tolerance_m)
+            flat = patches.face_patch >= 0
+            whole = patches.normal[patches.face_patch[flat]]
+            normal[flat] = np.where((whole * normal[flat]).sum(axis=1, keepdims=True) < 0, -whole, whole)
             if material is None:
                 group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
             else:

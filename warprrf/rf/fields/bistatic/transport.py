@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.cache import Cache
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.elements import LIFT_M, ElementLinks
 from warprrf.rf.fields.bistatic.mirror_light import MirrorLight, MirrorLit
 from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree

@@ -30,7 +30,7 @@ from warprrf.geometry.splats.discs import discs_on_mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, air_of
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields import files as field_files
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.harmonic import transport as _transport

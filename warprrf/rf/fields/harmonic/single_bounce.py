@@ -16,7 +16,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.harmonic import interaction as _interaction
 from warprrf.rf.fields.harmonic import transport as _transport
 from warprrf.rf.fields.harmonic.interaction import Lengths

@@ -1,0 +1,306 @@
+"""Blending, its adjoint and the strongest weights, a thread per pixel: what blending means, in plain loops.
+
+A GPU runs these. On a CPU :mod:`.blocks` computes the same 16 pixels at a time, and tests compare the two. Threads go
+tile by tile; a tile's entries ``ids[starts[tile]:starts[tile + 1]]`` are the Gaussians that it may see, near to far.
+"""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, SUMS, splat_of
+from warprrf.kernels.raster.view import PRODUCT, Rules, View, pixel_of, pixel_ray
+
+
+@wp.func
+def meet(splat: Any, ray: Any, least: Any):
+    """How a ray passes a Gaussian: its forms g0, g1, g2, the reciprocal of |g|^2 (of ``least`` at least, so that it
+    stays finite) and the squared distance q in standard deviations."""
+    g0 = wp.dot(splat.g0, ray)
+    g1 = wp.dot(splat.g1, ray)
+    g2 = wp.dot(splat.g2, ray)
+    n = g1 * g1 + g2 * g2
+    inverse = type(least)(1.0) / wp.max(g0 * g0 + splat.flat * n, least)
+    return g0, g1, g2, inverse, n * inverse
+
+
+@wp.func
+def behind(transmittance: Any, alpha: Any, rule: int):
+    """The transmittance behind a layer."""
+    if rule == wp.static(PRODUCT):
+        return transmittance * (type(alpha)(1.0) - alpha)
+    return transmittance * wp.exp(-alpha)
+
+
+@cache
+def build_blend(real: Any, width: int) -> Any:
+    """The kernel that blends ``width`` channels (1 to 4) at once, for ``wp.float32`` or ``wp.float64``."""
+    vec3 = wp.types.vector(3, real)
+    values = wp.types.vector(width, real)
+    Splat = splat_of(real)
+    least = 1.0e-30 if real is wp.float32 else 1.0e-250
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blend(
+        offset: int,
+        splats: wp.array(dtype=Splat),
+        ids: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        view: View,
+        rules: Rules,
+        features: wp.array(dtype=real, ndim=2),
+        first: int,
+        background: wp.array(dtype=real),
+        image: wp.array(dtype=real, ndim=3),
+        alpha_out: wp.array(dtype=real, ndim=2),
+        depth_out: wp.array(dtype=real, ndim=2),
+        left_out: wp.array(dtype=real, ndim=2),
+        dominant_out: wp.array(dtype=int, ndim=2),
+        peak_out: wp.array(dtype=real, ndim=2),
+    ):
+        """Blend channels from ``first`` front to back: features, sum of weights, mean range (0 where nothing is seen,
+        so that a loss on it stays finite), transmittance left, Gaussian of largest weight and the range of its peak."""
+        tile, x, y = pixel_of(offset + wp.tid(), view)
+        if x >= view.width or y >= view.height:
+            return
+        ray = vec3(pixel_ray(view, x, y))
+        transmittance = real(1.0)
+        color = values()
+        total = real(0.0)
+        depth = real(0.0)
+        best = real(0.0)
+        peak = real(0.0)
+        owner = int(-1)
+        for j in range(starts[tile], starts[tile + 1]):
+            if transmittance <= real(rules.transmittance_min):
+                break
+            k = ids[j]
+            splat = splats[k]
+            g0, g1, g2, inverse, q = meet(splat, ray, real(wp.static(least)))
+            if g0 > real(0.0) and q < splat.cut:
+                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * q), real(rules.alpha_max))
+                weight = alpha * transmittance
+                transmittance = behind(transmittance, alpha, rules.rule)
+                t = splat.reach * g0 * inverse
+                for c in range(wp.static(width)):
+                    color[c] += features[k, first + c] * weight
+                total += weight
+                depth += weight * t
+                if weight > best:
+                    best = weight
+                    peak = t
+                    owner = k
+        for c in range(wp.static(width)):
+            image[y, x, first + c] = color[c] + background[first + c] * transmittance
+        if first == 0:
+            length = wp.length(ray)
+            alpha_out[y, x] = total
+            depth_out[y, x] = wp.where(total > real(0.0), depth * length / total, real(0.0))
+            left_out[y, x] = transmittance
+            dominant_out[y, x] = owner
+            peak_out[y, x] = peak * length
+
+    return blend
+
+
+@cache
+def build_adjoint(real: Any, width: int) -> Any:
+    """The adjoint of ``blend``, as :func:`build_blend` makes it."""
+    vec3 = wp.types.vector(3, real)
+    values = wp.types.vector(width, real)
+    sums_of_one = wp.types.vector(SUMS, real)
+    Splat = splat_of(real)
+    least = 1.0e-30 if real is wp.float32 else 1.0e-250
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def blend_adjoint(
+        offset: int,
+        splats: wp.array(dtype=Splat),
+        ids: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        view: View,
+        rules: Rules,
+        parts: wp.array(dtype=int),
+        features: wp.array(dtype=real, ndim=2),
+        first: int,
+        image: wp.array(dtype=real, ndim=3),
+        alphas: wp.array(dtype=real, ndim=2),
+        ranges: wp.array(dtype=real, ndim=2),
+        image_grad: wp.array(dtype=real, ndim=3),
+        alpha_grad: wp.array(dtype=real, ndim=2),
+        depth_grad: wp.array(dtype=real, ndim=2),
+        sums: wp.array(dtype=sums_of_one, ndim=2),
+    ):
+        """Same walk as ``blend``; adds what every pair means for its Gaussian to ``sums``, see :mod:`.project`.
+
+        dL/da_i = T_i x_i - (R - sum_{j<=i} w_j x_j) / (1 - a_i), x the gradient dotted with the pair's features, R the
+        same dotted with the finished pixel; without the division for the exponential rule.
+        """
+        tile, x, y = pixel_of(offset + wp.tid(), view)
+        if x >= view.width or y >= view.height:
+            return
+        part = parts[tile]
+        ray = vec3(pixel_ray(view, x, y))
+        of_features = values()  # gradients: of features, of the sums of weight and of weight times range
+        of_weight = real(0.0)
+        of_range = real(0.0)
+        rest = real(0.0)  # what gradients make of all that lies behind
+        if first == 0 and alphas[y, x] > real(0.0):
+            of_range = depth_grad[y, x] / alphas[y, x]
+            of_weight = alpha_grad[y, x] - of_range * ranges[y, x]
+            of_range *= wp.length(ray)
+            rest = alphas[y, x] * alpha_grad[y, x]
+        for c in range(wp.static(width)):
+            of_features[c] = image_grad[y, x, first + c]
+            rest += of_features[c] * image[y, x, first + c]
+        transmittance = real(1.0)
+        for j in range(starts[tile], starts[tile + 1]):
+            if transmittance <= real(rules.transmittance_min):
+                break
+            k = ids[j]
+            splat = splats[k]
+            g0, g1, g2, inverse, q = meet(splat, ray, real(wp.static(least)))
+            if g0 > real(0.0) and q < splat.cut:
+                response = wp.exp(real(-0.5) * q)
+                raw = splat.opacity * response
+                alpha = wp.min(raw, real(rules.alpha_max))
+                weight = alpha * transmittance
+                lever = g0 * inverse
+                value = of_weight + splat.reach * lever * of_range
+                s = sums_of_one()
+                for c in range(wp.static(width)):
+                    value += of_features[c] * features[k, first + c]
+                    s[wp.static(OF_FEATURES) + c] = of_features[c] * weight
+                rest -= weight * value
+                slope = real(0.0)  # dL/d(opacity): none where alpha is clamped
+                if raw <= real(rules.alpha_max):
+                    hidden = rest
+                    if rules.rule == wp.static(PRODUCT):
+                        hidden = rest / wp.max(real(1.0) - alpha, real(wp.static(least)))
+                    slope = (transmittance * value - hidden) * response
+                y1 = lever * g1
+                y2 = lever * g2
+                pull = weight * of_range * inverse
+                h0 = splat.lift * pull * g0
+                h1 = splat.tilt * pull * g1
+                h2 = splat.tilt * pull * g2
+                s[0] = slope * q
+                s[1] = slope * y1 - h1
+                s[2] = slope * y2 - h2
+                s[3] = slope * q * q - real(2.0) * h0 * q
+                s[4] = slope * q * y1 - h0 * y1 - h1 * q
+                s[5] = slope * q * y2 - h0 * y2 - h2 * q
+                s[6] = slope * y1 * y1 - real(2.0) * h1 * y1
+                s[7] = slope * y1 * y2 - h1 * y2 - h2 * y1
+                s[8] = h0
+                s[wp.static(OF_OPACITY)] = slope
+                s[wp.static(OF_WEIGHT)] = weight
+                wp.atomic_add(sums, part, k, s)
+                transmittance = behind(transmittance, alpha, rules.rule)
+
+    return blend_adjoint
+
+
+@cache
+def build_background(real: Any) -> Any:
+    """The adjoint of ``blend`` with respect to the background, for ``wp.float32`` or ``wp.float64``."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def background_adjoint(
+        offset: int,
+        left: wp.array(dtype=real, ndim=2),
+        image_grad: wp.array(dtype=real, ndim=3),
+        background_grad: wp.array(dtype=real),
+    ):
+        """Add to the gradient of a channel the transmittance left times what each pixel wants."""
+        c = offset + wp.tid()
+        total = wp.float64(0.0)
+        for y in range(left.shape[0]):
+            for x in range(left.shape[1]):
+                total += wp.float64(left[y, x]) * wp.float64(image_grad[y, x, c])
+        background_grad[c] = background_grad[c] + real(total)
+
+    return background_adjoint
+
+
+@cache
+def build_strongest(real: Any) -> Any:
+    """The kernel that finds each pixel's largest blending weights, for ``wp.float32`` or ``wp.float64``."""
+    vec3 = wp.types.vector(3, real)
+    Splat = splat_of(real)
+    least = 1.0e-30 if real is wp.float32 else 1.0e-250
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def strongest(
+        offset: int,
+        splats: wp.array(dtype=Splat),
+        ids: wp.array(dtype=int),
+        starts: wp.array(dtype=int),
+        view: View,
+        rules: Rules,
+        index: wp.array(dtype=int, ndim=3),
+        weight_out: wp.array(dtype=real, ndim=3),
+        range_out: wp.array(dtype=real, ndim=3),
+        total_out: wp.array(dtype=real, ndim=2),
+    ):
+        """The largest weights of each pixel, as many as ``index`` (H, W, K) has places, in front-to-back order; their
+        Gaussians, the ranges of their peaks, and the sum of all weights."""
+        tile, x, y = pixel_of(offset + wp.tid(), view)
+        if x >= view.width or y >= view.height:
+            return
+        ray = vec3(pixel_ray(view, x, y))
+        length = wp.length(ray)
+        transmittance = real(1.0)
+        total = real(0.0)
+        kept = int(0)
+        for j in range(starts[tile], starts[tile + 1]):
+            if transmittance <= real(rules.transmittance_min):
+                break
+            k = ids[j]
+            splat = splats[k]
+            g0, g1, g2, inverse, q = meet(splat, ray, real(wp.static(least)))
+            if g0 > real(0.0) and q < splat.cut:
+                alpha = wp.min(splat.opacity * wp.exp(real(-0.5) * q), real(rules.alpha_max))
+                weight = alpha * transmittance
+                transmittance = behind(transmittance, alpha, rules.rule)
+                total += weight
+                kept = keep_weight(
+                    index, weight_out, range_out, y, x, kept, k, weight, splat.reach * g0 * inverse * length
+                )
+        total_out[y, x] = total
+
+    return strongest
+
+
+@wp.func
+def keep_weight(
+    index: wp.array3d(dtype=int),
+    weights: wp.array3d(dtype=Any),
+    ranges: wp.array3d(dtype=Any),
+    y: int,
+    x: int,
+    kept: int,
+    k: int,
+    weight: Any,
+    range_: Any,
+):
+    """Append Gaussian ``k`` to the list of a pixel that holds ``kept``; the smallest weight of a full list makes room,
+    unless the new one is no larger. Returns how many it holds now."""
+    capacity = index.shape[2]
+    if kept == capacity:
+        least = int(0)
+        for c in range(1, capacity):
+            if weights[y, x, c] < weights[y, x, least]:
+                least = c
+        if weight <= weights[y, x, least]:
+            return kept
+        for c in range(least, capacity - 1):  # close the gap: the order along the ray stays
+            index[y, x, c] = index[y, x, c + 1]
+            weights[y, x, c] = weights[y, x, c + 1]
+            ranges[y, x, c] = ranges[y, x, c + 1]
+        kept = capacity - 1
+    index[y, x, kept] = k
+    weights[y, x, kept] = weight
+    ranges[y, x, kept] = range_
+    return kept + 1
