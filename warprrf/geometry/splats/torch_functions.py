@@ -64,7 +64,7 @@ def rasterize(
     if background is None:
         background = torch.zeros(features.shape[1], dtype=means.dtype, device=means.device)
     _check("background", background, (features.shape[1],), means)
-    return Rasterize.apply(cam, blending, means, quaternions, scales, opacities, features, background)
+    return _Rasterize.apply(cam, blending, means, quaternions, scales, opacities, features, background)
 
 
 def colors(means: torch.Tensor, sh: torch.Tensor, cam: Camera) -> torch.Tensor:
@@ -79,7 +79,7 @@ def colors(means: torch.Tensor, sh: torch.Tensor, cam: Camera) -> torch.Tensor:
     _check("sh", sh, (len(means), None, None), means)
     if sh.shape[1] not in COEFFICIENTS.values():
         raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
-    return Colors.apply(cam, means, sh)
+    return _Colors.apply(cam, means, sh)
 
 
 def ray_transmittance(
@@ -100,7 +100,7 @@ def ray_transmittance(
     """
     _check_gaussians(means, quaternions, scales, opacities)
     query: Any = ("transmit_with_adjoint", (a, b), {}, blending)
-    return Rays.apply(query, means, quaternions, scales, opacities)[0]
+    return _Rays.apply(query, means, quaternions, scales, opacities)[0]
 
 
 def ray_hits(
@@ -123,7 +123,7 @@ def ray_hits(
     """
     _check_gaussians(means, quaternions, scales, opacities)
     query: Any = ("trace_with_adjoint", (origins, directions, k), {"order": order}, blending)
-    t, alpha, weight, left, index = Rays.apply(query, means, quaternions, scales, opacities)
+    t, alpha, weight, left, index = _Rays.apply(query, means, quaternions, scales, opacities)
     return index, t, alpha, weight, left
 
 
@@ -218,7 +218,7 @@ def _in_stream(static: Function) -> Function:
     return cast("Function", run)
 
 
-class Rasterize(torch.autograd.Function):
+class _Rasterize(torch.autograd.Function):
     @staticmethod
     @_in_stream
     def forward(ctx: Any, cam: Camera, blending: Blending | None, *tensors: torch.Tensor) -> Any:
@@ -246,7 +246,7 @@ class Rasterize(torch.autograd.Function):
         return None, None, *_gradients(ctx.inputs, ctx.needs_input_grad[2:], ctx.adjoint)
 
 
-class Colors(torch.autograd.Function):
+class _Colors(torch.autograd.Function):
     @staticmethod
     @_in_stream
     def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
@@ -268,7 +268,7 @@ class Colors(torch.autograd.Function):
         return None, *_gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
 
 
-class Rays(torch.autograd.Function):
+class _Rays(torch.autograd.Function):
     @staticmethod
     @_in_stream
     def forward(ctx: Any, query: tuple[str, tuple[Any, ...], Any, Any], *tensors: torch.Tensor) -> Any:
