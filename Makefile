@@ -71,13 +71,13 @@ lint: $(VENV)/.test
 	PYTHONPATH=. $(BIN)/lint-imports --no-cache
 
 docs: $(VENV)/.test
-	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/site
+	$(BIN)/sphinx-build -q -W --keep-going -b html -d build/doctrees docs build/site
 
 test: lint docs
 	$(RUN) -m pytest $(ARGS)
 
 gpu: $(VENV)/.test
-	@$(RUN) -m benchmarks.gpu $(ARGS)
+	@$(RUN) -m benchmarks gpu $(ARGS)
 
 notebooks: $(VENV)/.test
 	$(RUN) tools/run_notebooks.py

@@ -18,8 +18,7 @@ import numpy as np
 
 from warprrf.rf.channel.arrays import PlanarArray, orientation_towards
 from warprrf.rf.channel.beams import Codebook, dft_codebook
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import carrier_phase
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import MirrorTracer

@@ -5,7 +5,8 @@ import pytest
 from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection
+from warprrf.rf.em.fresnel import lobe, slab_reflection
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.spectra.spectrum import pixel_of, pixel_solid_angles
 

@@ -23,8 +23,10 @@ from warprrf import device as _device
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.radio.scatter import scatter_to_receiver
 from warprrf.rf.em.absorption import air_of
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, SurfaceTable
-from warprrf.rf.paths.trace import MirrorTracer, Paths
+from warprrf.rf.em.fresnel import SurfaceTable
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     angles_from_directions,

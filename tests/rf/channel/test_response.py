@@ -13,7 +13,8 @@ from warprrf.rf.channel import sums
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.band_plan import thz_channel
 from warprrf.rf.em.absorption import Air, gas_attenuation_db_per_m
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, slab_reflection
+from warprrf.rf.em.fresnel import slab_reflection
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 

@@ -8,8 +8,8 @@ from path_makers import random_paths
 from radio_scenes import box_mesh
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
 from warprrf.rf.em.materials import Material
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.interop.deepmimo import write_deepmimo
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths

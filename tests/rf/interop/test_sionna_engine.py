@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sionna_room import sionna_or_skip, write_scene
 
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.interop import llvm
 from warprrf.rf.interop.sionna_engine import Sampling

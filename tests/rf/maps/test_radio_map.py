@@ -9,7 +9,7 @@ import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree

@@ -10,8 +10,10 @@ from places import ROOT
 from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT, lobe, slab_reflection
-from warprrf.rf.paths.trace import planar_patches, trace_paths
+from warprrf.geometry.planar_patches import planar_patches
+from warprrf.rf.em.fresnel import lobe, slab_reflection
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.trace import trace_paths
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F
@@ -191,7 +193,7 @@ def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="receivers.*NaN"):
         trace_paths(room(), transmitter=TX, receivers=[np.nan, 0, 0], frequency_hz=F)
     with pytest.raises(ValueError, match="mirror_order"):
-        trace_paths(room(), transmitter=TX, receivers=[0, 0, 1], frequency_hz=F, mirror_order=3)
+        trace_paths(room(), transmitter=TX, receivers=[0, 0, 1], frequency_hz=F, mirror_order=-1)
     with pytest.raises(ValueError, match="frequency_hz"):
         trace_paths(room(), transmitter=TX, receivers=[0, 0, 1], frequency_hz=-1)
     with pytest.raises(TypeError, match="mesh_or_scene"):

@@ -17,9 +17,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.em.waves import check_frequency
-from warprrf.rf.paths.mirror_chains import mirror_chains
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.paths.trace import MirrorTracer
 
 RAYS_FILE = "newrf_conference.npz"
@@ -247,7 +245,7 @@ def match_rays(
 
     Args:
         rays: What :func:`load_newrf` read.
-        order: Most reflections to compare: 0, 1 or 2.
+        order: Most reflections to compare: 0, 1 or 2 (theirs have no more).
         tolerance_m: Distance of last points plus difference of lengths below which rays are the same [m].
 
     Raises:
@@ -258,7 +256,7 @@ def match_rays(
     tracer = MirrorTracer(
         rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=device
     )
-    ours = mirror_chains(tracer, rays.receivers, order)
+    ours = tracer.find(rays.receivers, order)
     our_gain = ours.gain(rays.wavelength_m)
     their_order, their_length = rays.order, rays.length_m
     receiver, column = np.nonzero((their_order >= 0) & (their_order <= order))

@@ -12,12 +12,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh, as_mesh
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
-from warprrf.rf.paths.mirror_chains import MirrorChains, mirror_chains
-from warprrf.rf.paths.trace import MirrorTracer, PlanarPatches, _connected
+from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.paths.mirror_paths import MirrorPaths
+from warprrf.rf.paths.trace import MirrorTracer
 
 REGULARISATION = 1e-4
 """Default weight of the prior; see :func:`fit_reflections`."""
@@ -58,11 +61,11 @@ class Reflections:
             ValueError: on another shape, NaN, or a receiver at the transmitter's place.
         """
         points = np.atleast_2d(_device.check_array("receivers", receivers))
-        return self.channel(mirror_chains(self._tracer, points, self.order), len(points))
+        return self.channel(self._tracer.find(points, self.order), len(points))
 
-    def channel(self, chains: MirrorChains, count: int) -> np.ndarray:
-        """Complex channel ``(count,)`` of chains that are already traced."""
-        return _Model(chains, self.patch_group, count, self._tracer.wavelength_m).channel(self.coefficient)
+    def channel(self, paths: MirrorPaths, count: int) -> np.ndarray:
+        """Complex channel ``(count,)`` of paths that are already traced."""
+        return _Model(paths, self.patch_group, count, self._tracer.wavelength_m).channel(self.coefficient)
 
 
 def fit_reflections(
@@ -76,7 +79,7 @@ def fit_reflections(
     groups: Any = "patch",
     prior: complex = 1.0,
     regularisation: float = REGULARISATION,
-    chains: MirrorChains | None = None,
+    chains: MirrorPaths | None = None,
     device: Any = None,
 ) -> Reflections:
     """Fit one complex reflection coefficient a surface to complex channels.
@@ -90,12 +93,12 @@ def fit_reflections(
         receivers: Positions of the measurements [m], shape ``(R, 3)``; R may be 0: then all stays at the prior.
         csi: Complex channels between isotropic antennas, phase -2 pi f tau, shape ``(R,)``.
         frequency_hz: Carrier frequency [Hz].
-        order: Most reflections on a chain: 0, 1 or 2.
+        order: Most reflections on a chain: 0 and up.
         groups: What shares a coefficient: ``"patch"``, each planar patch has its own; ``"part"``, connected faces share
             one; or an index from 0 for each face, shape ``(F,)`` (a material index, say).
         prior: Coefficient of surfaces that nothing is known of; 1 reflects perfectly, without a sign change.
         regularisation: Weight of the prior, positive.
-        chains: What :func:`mirror_chains` returned for the same mesh, transmitter, receivers and order, to save time.
+        chains: What :meth:`MirrorTracer.find` returned for the same mesh, transmitter, receivers and order, to save time.
         device: Where rays are cast.
 
     Raises:
@@ -117,7 +120,7 @@ def fit_reflections(
     tracer = MirrorTracer(surface, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
     patch_group, count = _patch_groups(surface, tracer.patches, groups)
     if chains is None:
-        chains = mirror_chains(tracer, points, order)
+        chains = tracer.find(points, order)
     elif len(chains.receiver) and chains.receiver.max() >= len(points):
         raise ValueError(
             f"chains: got receiver {chains.receiver.max()}, expected those of {len(points)} receivers"
@@ -145,11 +148,9 @@ def fit_reflections(
 
 
 class _Model:
-    """The channel as a polynomial in the coefficients: ``gain`` times one factor for each of ``group`` (N, 2)."""
+    """The channel as a polynomial in the coefficients: ``gain`` times one factor for each of ``group`` (N, K)."""
 
-    def __init__(
-        self, chains: MirrorChains, patch_group: np.ndarray, count: int, wavelength_m: float
-    ) -> None:
+    def __init__(self, chains: MirrorPaths, patch_group: np.ndarray, count: int, wavelength_m: float) -> None:
         self.receiver, self.count = chains.receiver, count
         self.gain = chains.gain(wavelength_m)
         self.group = np.where(chains.patch >= 0, patch_group[chains.patch], -1)
@@ -168,10 +169,11 @@ class _Model:
         column = np.full(len(coefficient), -1)
         column[unknown] = np.arange(len(unknown))
         jacobian = np.zeros((self.count, len(unknown)), dtype=complex)
-        for k in range(2):
+        for k in range(factors.shape[1]):
             there = np.flatnonzero(self.group[:, k] >= 0)
             place = self.receiver[there], column[self.group[there, k]]
-            np.add.at(jacobian, place, self.gain[there] * factors[there, 1 - k])
+            others = np.delete(factors[there], k, axis=1).prod(axis=1)
+            np.add.at(jacobian, place, self.gain[there] * others)
         return jacobian
 
 
@@ -211,33 +213,29 @@ def _patch_groups(mesh: Mesh, patches: PlanarPatches, groups: Any) -> tuple[np.n
     if isinstance(groups, str):
         if groups == "patch":
             return np.arange(len(patches)), len(patches)
-        if groups == "part":
-            face = mesh_parts(mesh)
-            return face[patches.order[patches.start[:-1]]], int(face.max(initial=-1)) + 1
-        raise ValueError(f"groups: got {groups!r}, expected 'patch', 'part' or an index for each face")
-    face = _device.check_array("groups", groups, (len(mesh.faces),), dtype=np.int64)
+        if groups != "part":
+            raise ValueError(f"groups: got {groups!r}, expected 'patch', 'part' or an index for each face")
+        face = mesh_parts(mesh)
+    else:
+        face = _device.check_array("groups", groups, (len(mesh.faces),), dtype=np.int64)
     if (face < 0).any():
         raise ValueError("groups: got negative indices, expected whole numbers from 0")
-    by_patch = face[patches.order]
-    owner = np.repeat(np.arange(len(patches)), np.diff(patches.start))
-    low = np.full(len(patches), np.iinfo(np.int64).max)
-    high = np.full(len(patches), -1)
-    np.minimum.at(low, owner, by_patch)
-    np.maximum.at(high, owner, by_patch)
-    if (low != high).any():
+    own = np.flatnonzero((patches.face_patch >= 0) & patches.once)
+    group = np.zeros(len(patches), np.int64)
+    group[patches.face_patch[own[::-1]]] = face[own[::-1]]
+    mixed = len(np.unique(patches.face_patch[own][group[patches.face_patch[own]] != face[own]]))
+    if mixed:
         raise ValueError(
-            f"groups: {int((low != high).sum())} planar patches hold faces of several groups, expected one group a "
-            "planar patch"
+            f"groups: {mixed} planar patches hold faces of several groups, expected one group a planar patch"
         )
-    return low, int(face.max(initial=-1)) + 1
+    return group, int(face.max(initial=-1)) + 1
 
 
 def mesh_parts(mesh: Mesh) -> np.ndarray:
     """Index of the connected part that each face belongs to, shape ``(F,)``: a room's shell, a table, a chair."""
     corner = mesh.welded_faces
-    label = _connected(
-        int(corner.max(initial=-1)) + 1,
-        np.concatenate([corner[:, 0], corner[:, 1]]),
-        np.concatenate([corner[:, 1], corner[:, 2]]),
-    )
-    return np.unique(label[corner[:, 0]], return_inverse=True)[1].reshape(-1)
+    ends = corner[:, [0, 1, 1, 2]].reshape(-1, 2)
+    count = int(corner.max(initial=-1)) + 1
+    link = coo_array((np.ones(len(ends), bool), ends.T), shape=(count, count))
+    label = connected_components(link, directed=False)[1][corner[:, 0]]
+    return np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1))

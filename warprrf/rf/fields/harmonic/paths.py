@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from warprrf.rf.em.fresnel import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, pixel_directions, pixel_of
 

@@ -1,0 +1,242 @@
+"""Which patches can mirror a transmitter one after the other, and where: images of images, pruned by what is in view.
+
+An image shines through its patch as through a window. A further patch can follow only if the two face each other and
+the beam from the image through the window meets it; beams are tried against a tree of boxes, so that a city does not
+try all pairs. Nothing that could be a path is left out, to rounding. Source: J. B. Allen and D. A. Berkley,
+"Image method for efficiently simulating small-room acoustics", J. Acoust. Soc. Am. 65 (1979).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warprrf import device as _device
+from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.kernels.radio import images as kernels
+
+ALL_SPACE = 2.0  # a sine that stands for no cone
+MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
+BLOCK = 500_000  # chains that are unfolded at once
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Chains of k reflections.
+
+    Attributes:
+        patch: Patches in the order in which the wave meets them, shape ``(C, k)``, int32.
+        image: Image of the transmitter in the last patch [m], shape ``(C, 3)``.
+        axis: Unit axes of cones from there that hold all ways on, shape ``(C, 3)``.
+        sine: Sines of their half-angles, shape ``(C,)``; above 1 for all space.
+    """
+
+    patch: np.ndarray
+    image: np.ndarray
+    axis: np.ndarray
+    sine: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.sine)
+
+    def __getitem__(self, rows: slice) -> Chains:
+        return Chains(self.patch[rows], self.image[rows], self.axis[rows], self.sine[rows])
+
+
+class MirrorImages:
+    """Images of one transmitter in the patches of a mesh, to any order.
+
+    Args:
+        patches: What mirrors.
+        transmitter: Position [m], shape ``(3,)``.
+        slack_m: Boxes of patches are widened by it [m]: their tolerance by default.
+        device: Where chains are tried.
+    """
+
+    def __init__(
+        self, patches: PlanarPatches, transmitter: Any, *, slack_m: float | None = None, device: Any = None
+    ) -> None:
+        self.patches = patches
+        self.transmitter = np.asarray(transmitter, float)
+        self.device = _device.resolve(device)
+        self._on_device = _patches_on_device(
+            patches, patches.tolerance_m if slack_m is None else slack_m, self.device
+        )
+        root = Chains(
+            np.zeros((1, 0), np.int32), self.transmitter[None], np.zeros((1, 3)), np.array([ALL_SPACE])
+        )
+        self._kept = [root]
+
+    def candidates(self, points: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Chains of ``order`` reflections whose points lie in the boxes of their patches; nothing is cast.
+
+        Args:
+            points: Where the chains end [m], shape ``(N, 3)``.
+            order: Reflections, at least 1.
+
+        Returns:
+            Index of the point ``(L,)``, patches ``(L, order)`` and mirror points [m] ``(L, order, 3)``, both from the
+            transmitter on.
+        """
+        points = np.asarray(points, float).reshape(-1, 3)
+        parts = [(np.zeros(0, int), np.zeros((0, order), np.int32), np.zeros((0, order, 3)))]
+        if len(points) and len(self.patches):
+            ends = _Ends(points, self.device)
+            for chains in self._blocks(order, ends.middle, ends.radius):
+                parts.append(self._unfolded(chains, ends))
+        row, patch, found = (np.concatenate(p) for p in zip(*parts, strict=True))
+        by_row = np.argsort(row, kind="stable")
+        return row[by_row], patch[by_row], found[by_row]
+
+    def _blocks(self, order: int, middle: np.ndarray, reach: float) -> Iterator[Chains]:
+        """All chains of ``order`` reflections; only those that may reach the ball of the points if they are many."""
+        while len(self._kept) <= order and len(self._kept[-1]) * len(self.patches) <= MOST_KEPT:
+            one = list(self._extended(self._kept[-1], np.zeros(3), -1.0, 2**31 - 1))
+            empty = Chains(
+                np.zeros((0, len(self._kept)), np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+            )
+            self._kept.append(one[0] if one else empty)
+        known = min(order, len(self._kept) - 1)
+        yield from self._descendants(self._kept[known], order - known, middle, reach)
+
+    def _descendants(self, chains: Chains, steps: int, middle: np.ndarray, reach: float) -> Iterator[Chains]:
+        if steps == 0:
+            yield from (chains[k : k + BLOCK] for k in range(0, len(chains), BLOCK))
+            return
+        for block in self._extended(chains, middle, reach if steps == 1 else -1.0, BLOCK):
+            yield from self._descendants(block, steps - 1, middle, reach)
+
+    def _extended(self, chains: Chains, middle: np.ndarray, reach: float, most: int) -> Iterator[Chains]:
+        """Chains of one reflection more, about ``most`` at a time."""
+        if len(chains) == 0:
+            return
+        last = chains.patch[:, -1] if chains.patch.shape[1] else np.full(len(chains), -1)
+        count = self._extend(chains, last, middle, reach, None)[0]
+        ends = np.cumsum(count, dtype=np.int64)
+        first = 0
+        while first < len(chains):
+            before = ends[first - 1] if first else 0
+            stop = max(first + 1, int(np.searchsorted(ends, before + most, side="right")))
+            some = slice(first, stop)
+            if ends[stop - 1] > before:
+                _, parent, patch, image, axis, sine = self._extend(
+                    chains[some], last[some], middle, reach, count[some]
+                )
+                longer = np.column_stack([chains.patch[some][parent], patch])
+                yield Chains(longer.astype(np.int32, copy=False), image, axis, sine)
+            first = stop
+
+    def _extend(
+        self, chains: Chains, last: np.ndarray, middle: np.ndarray, reach: float, count: np.ndarray | None
+    ) -> tuple[np.ndarray, ...]:
+        """How many chains follow each of ``chains``; and, where ``count`` says so already, which."""
+        where, size = self.device, 0 if count is None else int(count.sum())
+        start = np.zeros(len(chains), np.int32)
+        if count is not None:
+            start = (np.cumsum(count) - count).astype(np.int32)
+        counted = wp.zeros(len(chains), dtype=wp.int32, device=where)
+        parent, patch = (wp.zeros(size, dtype=wp.int32, device=where) for _ in range(2))
+        children = kernels.Cones()
+        children.apex, children.axis = (wp.zeros(size, dtype=wp.vec3d, device=where) for _ in range(2))
+        children.sine = wp.zeros(size, dtype=wp.float64, device=where)
+        inputs = [
+            self._on_device,
+            wp.array(last, dtype=wp.int32, device=where),
+            _cones(chains, where),
+            wp.vec3d(*middle),
+            wp.float64(reach),
+            wp.array(start, dtype=wp.int32, device=where),
+            counted,
+            parent,
+            patch,
+            children,
+        ]
+        _device.launch(kernels.extend_chains, len(chains), inputs, device=where, grain=16)
+        arrays = (counted, parent, patch, children.apex, children.axis, children.sine)
+        return tuple(a.numpy() for a in arrays)
+
+    def _unfolded(self, chains: Chains, ends: _Ends) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        where, cones = self.device, _cones(chains, self.device)
+        patch = wp.array(chains.patch, dtype=wp.int32, device=where)
+        words = wp.zeros((len(chains), len(ends.leaf_radius)), dtype=wp.uint32, device=where)
+        inputs = [self._on_device, patch, cones, ends.points, ends.leaf_middle, ends.leaf_radius, words]
+        _device.launch(kernels.find_chains, words.size, inputs, device=where)
+        words_ = words.numpy()
+        chain, leaf = np.nonzero(words_)
+        octets = words_[chain, leaf].astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)
+        some, bit = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
+        chain, row = chain[some], ends.order[32 * leaf[some] + bit]
+        met = chains.patch[chain]
+        point = wp.zeros(met.shape, dtype=wp.vec3d, device=where)
+        inputs = [
+            self._on_device,
+            wp.array(met, dtype=wp.int32, device=where),
+            wp.array(chains.image[chain], dtype=wp.vec3d, device=where),
+            wp.array(ends.positions[row], dtype=wp.vec3d, device=where),
+            point,
+        ]
+        _device.launch(kernels.unfold_chains, len(row), inputs, device=where)
+        return row, met, point.numpy().reshape(*met.shape, 3)
+
+
+class _Ends:
+    """Points where chains end, in leaves of 32 neighbours with a ball around each, and one around all."""
+
+    def __init__(self, points: np.ndarray, where: Any) -> None:
+        self.positions, self.order = points, _along_curve(points)
+        first = np.arange(0, len(points), 32)
+        low, high = (f.reduceat(points[self.order], first) for f in (np.minimum, np.maximum))
+        self.points = wp.array(points[self.order], dtype=wp.vec3d, device=where)
+        self.leaf_middle = wp.array(0.5 * (low + high), dtype=wp.vec3d, device=where)
+        self.leaf_radius = wp.array(
+            1e-6 + 0.5 * np.linalg.norm(high - low, axis=1), dtype=wp.float64, device=where
+        )
+        low, high = low.min(axis=0), high.max(axis=0)
+        self.middle, self.radius = 0.5 * (low + high), 1e-6 + 0.5 * float(np.linalg.norm(high - low))
+
+
+def _cones(chains: Chains, where: Any) -> Any:
+    cones = kernels.Cones()
+    cones.apex = wp.array(chains.image, dtype=wp.vec3d, device=where)
+    cones.axis = wp.array(chains.axis, dtype=wp.vec3d, device=where)
+    cones.sine = wp.array(chains.sine, dtype=wp.float64, device=where)
+    return cones
+
+
+def _patches_on_device(patches: PlanarPatches, slack_m: float, where: Any) -> Any:
+    """The kernels' view of patches: boxes and balls ``slack_m`` too large, and a binary tree of the boxes."""
+    low, high = patches.boxes[:, 0] - slack_m, patches.boxes[:, 1] + slack_m
+    order = _along_curve(0.5 * (low + high))
+    levels = [(low[order], high[order])]
+    while len(levels[-1][0]) > 1:
+        low_, high_ = levels[-1]
+        pairs = np.arange(0, len(low_), 2)
+        levels.append((np.minimum.reduceat(low_, pairs), np.maximum.reduceat(high_, pairs)))
+    tree_low, tree_high = (np.concatenate(a) for a in zip(*levels, strict=True))
+    result = kernels.Patches()
+
+    def put(array: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(array, dtype=dtype, device=where)
+
+    result.normal = put(patches.normal, wp.vec3d)
+    result.plane_offset = put(patches.offset, wp.float64)
+    result.radius = put(0.5 * np.linalg.norm(high - low, axis=1), wp.float64)
+    result.box_middle, result.box_half = put(0.5 * (low + high), wp.vec3d), put(0.5 * (high - low), wp.vec3d)
+    result.order = put(order, wp.int32)
+    result.node_middle = put(0.5 * (tree_low + tree_high), wp.vec3d)
+    result.node_half = put(0.5 * (tree_high - tree_low), wp.vec3d)
+    result.level = put(np.cumsum([0, *(len(a) for a, _ in levels[:-1])]), wp.int32)
+    result.two_sided = patches.two_sided
+    return result
+
+
+def _along_curve(points: np.ndarray) -> np.ndarray:
+    """Indices that sort ``points`` (N, 3) along Morton's curve: neighbours in space are near each other in order."""
+    span = np.maximum(np.ptp(points, axis=0), 1e-30) if len(points) else np.ones(3)
+    cell = ((points - points.min(axis=0, initial=np.inf)) / span * 1023).astype(np.int64)
+    key = sum(((cell[:, a] >> bit) & 1) << (3 * bit + a) for a in range(3) for bit in range(10))
+    return np.argsort(key, kind="stable")

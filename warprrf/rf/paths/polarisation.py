@@ -1,0 +1,134 @@
+"""What chains of mirrors do to polarisation: Jones matrices, and the power that they reflect of unpolarised light.
+
+After one mirror light is polarised, so that the next one reflects more or less than its own mean, 7 dB less where a wall
+follows a floor met at Brewster's angle: what lies across the plane of incidence of the one lies in that of the other.
+Between two mirrors (TE, TM) turn by the angle between their planes. Along (TE, TM) before the first and behind the last
+
+    J = D_n R_n ... D_2 R_2 D_1,    power = 1/2 ||J||^2 (Frobenius),    D = diag(TE, TM), R the rotation by that angle:
+
+the mean over both transmitted, the sum over both received polarisations.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warprrf.rf.spectra.spectrum import transverse_basis
+
+_PARALLEL = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
+_EXCESS = (0.05, 200.0)  # of epsilon_r - 1, the range of :func:`warprrf.rf.em.half_spaces.fresnel_curves`
+
+
+def turns(stops: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Angle from the plane of incidence of each mirror of a chain to that of the next [rad], shape ``(L, k)``.
+
+    Args:
+        stops: transmitter, mirror points and receiver of each chain [m], shape ``(L, k + 2, 3)``.
+        normal: of the mirrors, shape ``(L, k, 3)``; either sign.
+
+    Returns:
+        0 for the first mirror, before which light has no polarisation.
+    """
+    along, across = _frames(stops, normal)
+    after = np.cross(across, along[:, 1:])
+    found = np.zeros(normal.shape[:2])
+    for k in range(1, normal.shape[1]):
+        own = across[:, k]
+        found[:, k] = np.arctan2((own * after[:, k - 1]).sum(axis=1), (own * across[:, k - 1]).sum(axis=1))
+    return found
+
+
+def jones_matrices(
+    stops: np.ndarray, normal: np.ndarray, turn: np.ndarray, te: np.ndarray, tm: np.ndarray
+) -> np.ndarray:
+    """Jones matrices ``(L, 2, 2)`` of chains, along zenith and azimuth unit vectors of departure and arrival.
+
+    Args:
+        stops, normal: As :func:`turns` takes them.
+        turn: What it returns, shape ``(L, k)``.
+        te, tm: Reflection coefficients of each mirror, complex, shape ``(L, k)``.
+    """
+    leg = np.diff(stops, axis=1)
+    departure, arrival = leg[:, 0], -leg[:, -1]
+    jones = np.broadcast_to(np.eye(2, dtype=complex), (len(stops), 2, 2))
+    if te.shape[1] == 0:
+        return transverse_basis(arrival) @ np.swapaxes(transverse_basis(departure), 1, 2) + 0j
+    rotation, reflected = _rotations(turn), np.stack([te, tm], axis=-1)
+    for k in range(te.shape[1]):
+        jones = reflected[:, k, :, None] * (rotation[:, k] @ jones)
+    along, across = _frames(stops, normal)
+    first, last = across[:, 0], across[:, -1]
+    before = np.stack([first, np.cross(first, along[:, 0])], axis=1)
+    behind = np.stack([last, np.cross(last, along[:, -1])], axis=1)
+    into = before @ np.swapaxes(transverse_basis(departure), 1, 2)
+    return (transverse_basis(arrival) @ np.swapaxes(behind, 1, 2)) @ jones @ into
+
+
+def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions of the legs ``(L, k + 1, 3)`` and, across each plane of incidence, of TE fields ``(L, k, 3)``.
+
+    A mirror met head on keeps the plane of the one before.
+    """
+    leg = np.diff(stops, axis=1)
+    along = leg / np.maximum(np.linalg.norm(leg, axis=2, keepdims=True), 1e-12)
+    across = np.cross(along[:, :-1], normal)
+    sine = np.linalg.norm(across, axis=2, keepdims=True)
+    for k in range(normal.shape[1]):
+        if k:
+            other = across[:, k - 1]
+        else:
+            other = np.cross(along[:, 0], np.eye(3)[np.abs(along[:, 0]).argmin(axis=1)])
+            other = other / np.linalg.norm(other, axis=1, keepdims=True)
+        own = across[:, k] / np.maximum(sine[:, k], _PARALLEL)
+        across[:, k] = np.where(sine[:, k] > _PARALLEL, own, other)
+    return along, across
+
+
+def _rotations(turn: np.ndarray) -> np.ndarray:
+    c, s = np.cos(turn), np.sin(turn)
+    return np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=-2)
+
+
+def chain_reflection(
+    log_excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray, met: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Share of unpolarised power that chains of half-spaces of real permittivity reflect.
+
+    Source: ITU-R P.2040-4, eqs. (37a) and (37b).
+
+    Args:
+        log_excess: ln(epsilon_r - 1) of each mirror of each chain, shape ``(L, k)``.
+        cosine: of incidence, shape ``(L, k)``.
+        turn: as :func:`turns` gives them, shape ``(L, k)``.
+        met: which mirrors there are, shape ``(L, k)``; the others let everything pass.
+
+    Returns:
+        The share, shape ``(L,)``, and its logarithmic derivatives to ``log_excess``, shape ``(L, k)``.
+    """
+    amplitude, rise = _half_space(log_excess, cosine)
+    amplitude = np.where(met[..., None], amplitude, 1.0)
+    rise = np.where(met[..., None], rise, 0.0)
+    rotation = _rotations(np.where(met, turn, 0.0))
+    count, mirrors = cosine.shape
+    whole = np.broadcast_to(np.eye(2), (count, 2, 2))
+    slopes = np.zeros((mirrors, count, 2, 2))
+    for k in range(mirrors):
+        turned = rotation[:, k] @ whole
+        whole = amplitude[:, k, :, None] * turned
+        slopes[:k] = amplitude[:, k, :, None] * (rotation[:, k] @ slopes[:k])
+        slopes[k] = rise[:, k, :, None] * turned
+    share = 0.5 * (whole**2).sum(axis=(1, 2))
+    return share, (whole * slopes).sum(axis=(2, 3)).T / np.maximum(share, 1e-12)[:, None]
+
+
+def _half_space(log_excess: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitudes (TE, TM) that a half-space reflects, shape ``(..., 2)``, and their derivatives to ``log_excess``."""
+    excess = np.clip(np.exp(log_excess), *_EXCESS)
+    cos = np.clip(cosine, 0.0, 1.0)
+    root = np.maximum(np.sqrt(excess + cos**2), 1e-12)
+    dense = (1.0 + excess) * cos
+    te, tm = (cos - root) / (cos + root), (dense - root) / (dense + root)
+    bend = 0.5 * excess / root  # of the root to ln(excess)
+    rise_te = -2.0 * cos * bend / (cos + root) ** 2
+    rise_tm = 2.0 * (excess * cos * root - dense * bend) / (dense + root) ** 2
+    return np.stack([te, tm], axis=-1), np.stack([rise_te, rise_tm], axis=-1)
