@@ -71,7 +71,7 @@ lint: $(VENV)/.test
 	PYTHONPATH=. $(BIN)/lint-imports --no-cache
 
 docs: $(VENV)/.test
-	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/site
+	$(BIN)/sphinx-build -q -W --keep-going -b html -d build/doctrees docs build/site
 
 test: lint docs
 	$(RUN) -m pytest $(ARGS)

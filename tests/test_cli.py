@@ -186,6 +186,23 @@ def test_look_at_puts_the_target_in_the_middle_with_z_up() -> None:
     assert camera.fx == pytest.approx(320.0)  # half the width over tan(45 degrees)
 
 
+def test_fit_takes_receivers_for_training_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import warprrf as wr
+
+    seen: list[wr.SpectrumDataset] = []
+
+    def fit(geometry: object, dataset: wr.SpectrumDataset, **options: object) -> None:
+        seen.append(dataset)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(wr.RadioField, "fit", fit)
+    spectra = str(ROOT / "data" / "lobby" / "spectra.nc")
+    assert cli.main(["fit", str(SCENE), spectra, "-o", str(tmp_path / "f.safetensors"), "--quiet"]) == 2
+    whole = wr.SpectrumDataset.load(spectra)
+    assert (seen[0].role == "train").all()
+    assert 0 < len(seen[0]) == (whole.role == "train").sum() < len(whole)
+
+
 def test_simulate_fit_evaluate_and_render_round_trip(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

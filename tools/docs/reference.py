@@ -21,7 +21,7 @@ GROUPS = {
     "rf.spectra": ("Spectra", "One spectrum, data sets of many, and how predictions are scored."),
     "rf.fields": (
         "Radio fields",
-        "Stage 2: fitted models of a place, asked for spectra, paths, links and maps.",
+        "Stage 2: fitted models of a place, which give spectra, paths, links and maps.",
     ),
 }
 WITH = {

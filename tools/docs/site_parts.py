@@ -18,6 +18,8 @@ from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.domains.python import PyObject
 
+FIELD = re.compile(r"^:(?:param|ivar) \w+(?:, \w+)+:")
+MARK = "(no type)"
 MADE = re.compile(r"<!-- (table|figure): ([\w-]+) -->")
 
 
@@ -26,6 +28,7 @@ def setup(app: Any) -> dict[str, bool]:
     next(field for field in PyObject.doc_field_types if field.name == "variable").label = "Attributes"
     app.connect("builder-inited", make_files)
     app.connect("source-read", put_tables)
+    app.connect("autodoc-process-docstring", whole_sentences, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", escape_bars)
     app.add_html_math_renderer(
         "mathml", inline_renderers=(inline_math, None), block_renderers=(block_math, None)
@@ -36,8 +39,10 @@ def setup(app: Any) -> dict[str, bool]:
 def make_files(app: Any) -> None:
     """Write the reference's pages and the figures below ``docs/`` (not kept in the repository)."""
     os.environ["COLUMNS"] = "92"  # argparse's help is as wide on every machine
-    for path, text in {**reference.pages(), **plots.figures()}.items():
-        file = Path(app.srcdir) / path
+    made = {Path(app.srcdir) / path: text for path, text in {**reference.pages(), **plots.figures()}.items()}
+    for old in (f for folder in {file.parent for file in made} for f in folder.glob("*") if f not in made):
+        old.unlink()
+    for file, text in made.items():
         file.parent.mkdir(exist_ok=True)
         if not file.is_file() or file.read_text() != text:
             file.write_text(text)
@@ -56,9 +61,17 @@ def put_tables(app: Any, name: str, source: list[str]) -> None:
     source[0] = MADE.sub(put, source[0])
 
 
+def whole_sentences(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
+    """A colon in the docstring of a property ends no type."""
+    if what in ("attribute", "property", "data"):
+        lines.insert(0, MARK)
+
+
 def escape_bars(app: Any, what: str, name: str, found: Any, options: Any, lines: list[str]) -> None:
-    """Absolute values in docstrings are no substitutions of reStructuredText."""
+    """Absolute values are no substitutions of reStructuredText, and several names of one field no type and name."""
+    lines[:] = [line for line in lines if line.strip() != MARK]
     for i, line in enumerate(lines):
+        line = FIELD.sub(lambda m: m[0].replace(", ", ","), line)
         parts = line.split("``")
         parts[::2] = [re.sub(r"(?<!\\)\|", r"\\|", part) for part in parts[::2]]
         lines[i] = "``".join(parts)

@@ -7,6 +7,7 @@ line on standard error and status 2 (`--debug` shows the traceback instead), an 
 from __future__ import annotations
 
 import argparse
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -45,7 +46,7 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; what is finished is kept", file=sys.stderr)
         return 130
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:
         if args.debug:
             raise
         print(f"{parser.prog}: error: {_one_line(error)}", file=sys.stderr)
@@ -71,7 +72,10 @@ def _parser() -> argparse.ArgumentParser:
 def make_parser(
     prog: str, description: str, epilog: str, definitions: Sequence[Callable[[Add], None]]
 ) -> argparse.ArgumentParser:
-    """A parser of commands, each with the common options; every one of ``definitions`` adds some."""
+    """A parser of commands, each with the common options; every one of ``definitions`` adds some.
+
+    A command is explained by the docstring of the function that runs it, unless a line and a text are given.
+    """
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--seed", type=int, default=0, help="every random choice follows from it (default 0)")
     common.add_argument("--device", default=None, help="cpu or cuda:0 (default: the GPU where there is one)")
@@ -88,13 +92,20 @@ def make_parser(
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
     def add(
-        name: str, run: Callable[..., None], line: str, text: str, to: Any = commands, options: bool = True
+        name: str,
+        run: Callable[..., None],
+        line: str | None = None,
+        text: str | None = None,
+        to: Any = commands,
+        options: bool = True,
     ) -> argparse.ArgumentParser:
+        summary, _, explained = inspect.cleandoc(run.__doc__ or "").partition("\n\n")
+        line = summary.removesuffix(".") if line is None else line
         one: argparse.ArgumentParser = to.add_parser(
             name,
             help=line,
             description=f"{line[0].upper()}{line[1:]}.",
-            epilog=text,
+            epilog=explained if text is None else text,
             parents=[common] if options else [],
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )

@@ -15,7 +15,12 @@ import numpy as np
 import warprrf as wr
 
 Add = Callable[..., argparse.ArgumentParser]
-"""Defines one command: name, what runs it, a line and a text of help."""
+"""Defines one command: name and what runs it, whose docstring is its help (or a line and a text of help)."""
+
+
+def add_point(parser: argparse.ArgumentParser, flag: str, text: str, required: bool = False) -> None:
+    """Define an option of three coordinates [m]."""
+    parser.add_argument(flag, nargs=3, type=float, metavar=("X", "Y", "Z"), help=text, required=required)
 
 
 def existing(path: str | os.PathLike[str]) -> Path:
@@ -59,16 +64,15 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
         if found.ndim != 2 or found.shape[1] != 3:
             raise ValueError(f"{path}: got shape {found.shape}, expected (R, 3): rows x,y,z in metres")
         return np.asarray(found, dtype=np.float64)
-    rows = [word.split(",") for word in values]
-    for word, row in zip(values, rows, strict=True):
-        if len(row) != 3:
-            raise ValueError(f"--receivers: got {word!r}, expected x,y,z in metres or one CSV/NPY file")
     try:
-        return np.array(rows, dtype=np.float64)
+        rows = np.array([word.split(",") for word in values], dtype=np.float64)
     except ValueError as error:
         raise ValueError(
-            f"--receivers: got {' '.join(values)!r}, expected numbers x,y,z in metres"
+            f"--receivers: got {' '.join(values)!r}, expected numbers x,y,z in metres or one CSV/NPY file"
         ) from error
+    if rows.shape[1] != 3:
+        raise ValueError(f"--receivers: got {values[0]!r}, expected x,y,z in metres or one CSV/NPY file")
+    return rows
 
 
 def load_geometry(path: str, mesh: str | None) -> Any:

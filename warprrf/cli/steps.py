@@ -11,69 +11,14 @@ import numpy as np
 
 import warprrf as wr
 from warprrf.cli.bars import Bars
-from warprrf.cli.inputs import Add, existing, load_geometry, read_positions, read_receivers
+from warprrf.cli.inputs import Add, add_point, existing, load_geometry, read_positions, read_receivers
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
-
-HELP_RECONSTRUCT = """\
-The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
-their depth is fused into a mesh. Photos know no scale: name the measured positions of at least three cameras.
-
-examples:
-  warprrf reconstruct photos/ -o room --known-positions surveyed.json
-  where surveyed.json holds {"view_000.jpg": [1.20, 0.85, 1.60], ...} in metres
-Overlap matters most: every surface in five photos or more, loops that look across the room.
-"""
-
-HELP_SIMULATE = """\
-`exact` evaluates line of sight, mirror reflections and one diffuse bounce without sampling noise, on Warp's mesh rays.
-`sionna` asks Sionna RT's PathSolver (extra: sionna) for line of sight, mirror and diffuse paths up to --depth.
-A killed run continues: finished receivers wait in OUT.receivers/. An eighth of the receivers is marked for test.
-A spectrum is path gain per pixel over the full sphere, spread by the receiver beam; its sum is the total path gain.
-
-examples:
-  warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5
-  warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
-"""
-
-HELP_FIT = """\
-Geometry stays frozen; blending weights are computed once per receiver, then the radio part is fitted on them.
-
-  bistatic  line of sight, mirrors and scattering lobes of material groups; holds for other transmitters too
-  rf3dgs+   directional gain per Gaussian times the path-length law; delay and departure angle from geometry
-  rf3dgs    directional gain without lengths; delay and departure angle as trained channels of their own
-
-examples:
-  warprrf fit room spectra.nc -o field.safetensors
-  warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
-"""
-
-HELP_EVALUATE = """\
-Whole receivers are held out, the same for every method; beside the field stand lookups that know no geometry (nearest
-measurement, inverse distance, a constant, the mean image). `blocked` counts receivers without line of sight alone.
-
-examples:
-  warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
-"""
-
-HELP_RELEVANCE = """\
-Each effect is left out of the full model in turn: line of sight, mirrors, diffuse bounces, lobes, what no receiver
-sees, and, as estimates, the air, diffraction and transmission. What it is worth is the larger of the changes of the dB
-image and of the total path gain, rms over receivers. The smallest model within the tolerance follows; a fit can use it.
-
-examples:
-  warprrf relevance data/lobby/scene.xml --spectra data/lobby/spectra.nc -o relevance.json
-  warprrf relevance data/lobby/scene.xml --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5 --frequency 140e9
-  warprrf relevance field.safetensors --receivers receivers.csv --tolerance 0.5
-  warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
-"""
 
 
 def add_reconstruct(add: Add) -> None:
     """Define `reconstruct`."""
-    rec = add(
-        "reconstruct", _reconstruct, "photos -> cameras, Gaussians, mesh and planar patches", HELP_RECONSTRUCT
-    )
+    rec = add("reconstruct", _reconstruct)
     rec.add_argument("photos", help="folder of JPEG or PNG photos of one static room")
     rec.add_argument("-o", "--out", required=True, help="folder of the result")
     rec.add_argument(
@@ -83,6 +28,16 @@ def add_reconstruct(add: Add) -> None:
 
 
 def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
+    """Photos -> cameras, Gaussians, mesh and planar patches.
+
+    The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
+    their depth is fused into a mesh. Photos know no scale: name the measured positions of at least three cameras.
+
+    examples:
+      warprrf reconstruct photos/ -o room --known-positions surveyed.json
+      where surveyed.json holds {"view_000.jpg": [1.20, 0.85, 1.60], ...} in metres
+    Overlap matters most: every surface in five photos or more, loops that look across the room.
+    """
     known = read_positions(args.known_positions) if args.known_positions else None
     photos = existing(args.photos)
     workspace = args.workspace or Path(args.out) / "workspace"
@@ -98,12 +53,10 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
 
 def add_simulate(add: Add) -> None:
     """Define `simulate`."""
-    sim = add("simulate", _simulate, "radio spectra of a scene at given receivers", HELP_SIMULATE)
+    sim = add("simulate", _simulate)
     sim.add_argument("scene", help="scene XML (Mitsuba/Sionna RT), with materials.json beside it")
     sim.add_argument("-o", "--out", required=True, help="NetCDF file")
-    sim.add_argument(
-        "--transmitter", nargs=3, type=float, required=True, metavar=("X", "Y", "Z"), help="metres"
-    )
+    add_point(sim, "--transmitter", "metres", required=True)
     sim.add_argument(
         "--receivers", nargs="+", required=True, help="CSV or NPY file of x,y,z rows, or x,y,z words"
     )
@@ -124,6 +77,17 @@ def add_simulate(add: Add) -> None:
 
 
 def _simulate(args: argparse.Namespace, bars: Bars) -> None:
+    """Radio spectra of a scene at given receivers.
+
+    `exact` evaluates line of sight, mirror reflections and one diffuse bounce without sampling noise, on Warp's mesh rays.
+    `sionna` asks Sionna RT's PathSolver (extra: sionna) for line of sight, mirror and diffuse paths up to --depth.
+    A killed run continues: finished receivers wait in OUT.receivers/. An eighth of the receivers is marked for test.
+    A spectrum is path gain per pixel over the full sphere, spread by the receiver beam; its sum is the total path gain.
+
+    examples:
+      warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5
+      warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
+    """
     unfinished = Path(f"{args.out}.receivers")
     dataset = wr.simulate(
         wr.Scene.load(existing(args.scene)),
@@ -149,7 +113,7 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
 
 def add_fit(add: Add) -> None:
     """Define `fit`."""
-    fit = add("fit", _fit, "a radio field from geometry and measured spectra", HELP_FIT)
+    fit = add("fit", _fit)
     fit.add_argument("geometry", help="a reconstruction's folder, splats (.ply) or a scene (.xml)")
     fit.add_argument("spectra", help="NetCDF file of spectra")
     fit.add_argument("-o", "--out", required=True, help="field file (.safetensors)")
@@ -157,7 +121,10 @@ def add_fit(add: Add) -> None:
         "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
     )
     fit.add_argument(
-        "--train", type=int, metavar="N", help="receivers of the nested training subset (default: all)"
+        "--train",
+        type=int,
+        metavar="N",
+        help="receivers of the nested training subset (default: all for training)",
     )
     fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is a .ply")
     fit.add_argument(
@@ -172,18 +139,35 @@ def add_fit(add: Add) -> None:
 
 
 def _fit(args: argparse.Namespace, bars: Bars) -> None:
+    """A radio field from geometry and measured spectra.
+
+    Geometry stays frozen; blending weights are computed once per receiver, then the radio part is fitted on them.
+
+      bistatic  line of sight, mirrors and scattering lobes of material groups; holds for other transmitters too
+      rf3dgs+   directional gain per Gaussian times the path-length law; delay and departure angle from geometry
+      rf3dgs    directional gain without lengths; delay and departure angle as trained channels of their own
+
+    examples:
+      warprrf fit room spectra.nc -o field.safetensors
+      warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
+    """
     geometry = load_geometry(args.geometry, args.mesh)
     dataset = wr.SpectrumDataset.load(existing(args.spectra))
+    training = dataset.role == "train"
     if args.train is not None:
         dataset = dataset.split(args.train, seed=args.seed)[0]
-    ruled: dict[str, Any] = (
-        {} if args.relevance is None else {"relevance": wr.Relevance.load(existing(args.relevance))}
-    )
+    elif training.any():
+        dataset = dataset.subset(training)
+    options: dict[str, Any] = {}
+    if args.relevance is not None:
+        options["relevance"] = wr.Relevance.load(existing(args.relevance))
     if args.quick:
-        ruled["quick"] = True
-    for option in ruled:
+        options["quick"] = True
+    for option in options:
         if args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
+    if args.iterations is not None:
+        options["iterations"] = args.iterations
     field = wr.RadioField.fit(
         geometry,
         dataset,
@@ -191,8 +175,7 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
         seed=args.seed,
         progress=bars,
         device=args.device,
-        **({} if args.iterations is None else {"iterations": args.iterations}),
-        **ruled,
+        **options,
     )
     field.save(args.out)
     print(f"{args.out}: {args.model} fitted on {len(dataset.receivers)} receivers")
@@ -200,7 +183,7 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
 
 def add_evaluate(add: Add) -> None:
     """Define `evaluate`."""
-    eva = add("evaluate", _evaluate, "a field's errors on receivers it was not fitted on", HELP_EVALUATE)
+    eva = add("evaluate", _evaluate)
     eva.add_argument("field", help="field file (.safetensors)")
     eva.add_argument("spectra", help="NetCDF file of spectra with held-out receivers")
     eva.add_argument(
@@ -211,6 +194,14 @@ def add_evaluate(add: Add) -> None:
 
 
 def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
+    """A field's errors on receivers it was not fitted on.
+
+    Whole receivers are held out, the same for every method; beside the field stand lookups that know no geometry (nearest
+    measurement, inverse distance, a constant, the mean image). `blocked` counts receivers without line of sight alone.
+
+    examples:
+      warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
+    """
     from warprrf.rf.spectra import lookups, metrics
 
     field = wr.RadioField.load(existing(args.field))
@@ -233,18 +224,13 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
 
 def add_relevance(add: Add) -> None:
     """Define `relevance`."""
-    rel = add(
-        "relevance",
-        _relevance,
-        "what each effect is worth in a scene, and the smallest model",
-        HELP_RELEVANCE,
-    )
+    rel = add("relevance", _relevance)
     rel.add_argument(
         "source", help="scene (.xml), reconstruction's folder, splats (.ply) or field (.safetensors)"
     )
     rel.add_argument("-o", "--out", help="JSON file; the table goes beside it as Markdown")
     rel.add_argument("--spectra", help="NetCDF file whose transmitter, carrier and receivers are used")
-    rel.add_argument("--transmitter", nargs=3, type=float, metavar=("X", "Y", "Z"), help="metres")
+    add_point(rel, "--transmitter", "metres")
     rel.add_argument("--receivers", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")
     rel.add_argument("--frequency", type=float, metavar="HZ", help="carrier (a field's own)")
     rel.add_argument("--tolerance", type=float, default=0.1, metavar="DB", help="default 0.1")
@@ -255,6 +241,18 @@ def add_relevance(add: Add) -> None:
 
 
 def _relevance(args: argparse.Namespace, bars: Bars) -> None:
+    """What each effect is worth in a scene, and the smallest model.
+
+    Each effect is left out of the full model in turn: line of sight, mirrors, diffuse bounces, lobes, what no receiver
+    sees, and, as estimates, the air, diffraction and transmission. What it is worth is the larger of the changes of the dB
+    image and of the total path gain, rms over receivers. The smallest model within the tolerance follows; a fit can use it.
+
+    examples:
+      warprrf relevance data/lobby/scene.xml --spectra data/lobby/spectra.nc -o relevance.json
+      warprrf relevance data/lobby/scene.xml --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5 --frequency 140e9
+      warprrf relevance field.safetensors --receivers receivers.csv --tolerance 0.5
+      warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
+    """
     source = existing(args.source)
     given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
     receivers = None if args.receivers is None else read_receivers(args.receivers)

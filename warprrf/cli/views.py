@@ -11,50 +11,20 @@ import numpy as np
 
 import warprrf as wr
 from warprrf.cli.bars import Bars
-from warprrf.cli.inputs import Add, existing
+from warprrf.cli.inputs import Add, add_point, existing
 from warprrf.cli.tables import aligned
 from warprrf.device import require
 from warprrf.files import write_arrays, write_atomically
 
-HELP_RENDER = """\
-examples:
-  warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
-  warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.npz       path_gain, delay_s, aod as arrays
-  warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
-"""
-
-HELP_MAP = """\
-Total path gain, the strongest path's gain, delay spread and the SNR of the receiver's best beam, at the centres of
-cells; NaN inside solids and outside the room, as the field's mesh has them. A NetCDF file gets a picture beside it.
-
-examples:
-  warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
-  warprrf map field.safetensors -o corner.png --bounds 0 0 5 4 --cell 0.1 --transmitter 2 3 3.2
-"""
-
-HELP_TWIN = """\
-Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
-opens the scene as it is, all lobes Lambertian; `warprrf.load_sionna_scene` sets the scattering patterns too, and
-`warprrf simulate` takes it as any scene. A material has one curve and one lobe: what the projection misses is printed.
-
-examples:
-  warprrf twin field.safetensors -o twin
-  warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
-"""
-
 
 def add_render(add: Add) -> None:
     """Define `render`."""
-    ren = add("render", _render, "a picture from Gaussians, or a spectrum from a radio field", HELP_RENDER)
+    ren = add("render", _render)
     ren.add_argument("source", help="Gaussians (.ply) or a radio field (.safetensors)")
     ren.add_argument("-o", "--out", required=True, help="picture (.png), or for a spectrum also .npz")
-    ren.add_argument(
-        "--receiver", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where the spectrum is taken"
-    )
-    ren.add_argument(
-        "--position", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where the camera stands"
-    )
-    ren.add_argument("--look-at", nargs=3, type=float, metavar=("X", "Y", "Z"), help="a point it looks at")
+    add_point(ren, "--receiver", "where the spectrum is taken")
+    add_point(ren, "--position", "where the camera stands")
+    add_point(ren, "--look-at", "a point it looks at")
     ren.add_argument(
         "--size", nargs=2, type=int, default=(640, 480), metavar=("W", "H"), help="pixels (640 480)"
     )
@@ -62,6 +32,13 @@ def add_render(add: Add) -> None:
 
 
 def _render(args: argparse.Namespace, bars: Bars) -> None:
+    """A picture from Gaussians, or a spectrum from a radio field.
+
+    examples:
+      warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
+      warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.npz       path_gain, delay_s, aod as arrays
+      warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
+    """
     source = existing(args.source)
     if source.suffix == ".safetensors":
         if args.receiver is None:
@@ -118,14 +95,12 @@ def _look_at(
 
 def add_map(add: Add) -> None:
     """Define `map`."""
-    plan = add("map", _map, "a field's radio map over the floor plan", HELP_MAP)
+    plan = add("map", _map)
     plan.add_argument("field", help="field file (.safetensors)")
     plan.add_argument("-o", "--out", required=True, help="NetCDF file (.nc), or the picture alone (.png)")
     plan.add_argument("--height", type=float, default=1.5, metavar="M", help="of receivers (default 1.5)")
     plan.add_argument("--cell", type=float, default=0.25, metavar="M", help="width of a cell (default 0.25)")
-    plan.add_argument(
-        "--transmitter", nargs=3, type=float, metavar=("X", "Y", "Z"), help="if another than the fitted one"
-    )
+    add_point(plan, "--transmitter", "if another than the fitted one")
     plan.add_argument(
         "--bounds", nargs=4, type=float, metavar=("X0", "Y0", "X1", "Y1"), help="part of the plan, metres"
     )
@@ -143,6 +118,15 @@ def add_map(add: Add) -> None:
 
 
 def _map(args: argparse.Namespace, bars: Bars) -> None:
+    """A field's radio map over the floor plan.
+
+    Total path gain, the strongest path's gain, delay spread and the SNR of the receiver's best beam, at the centres of
+    cells; NaN inside solids and outside the room, as the field's mesh has them. A NetCDF file gets a picture beside it.
+
+    examples:
+      warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
+      warprrf map field.safetensors -o corner.png --bounds 0 0 5 4 --cell 0.1 --transmitter 2 3 3.2
+    """
     path = Path(args.out)
     if path.suffix not in (".nc", ".png"):
         raise ValueError(f"{path}: expected .nc (NetCDF, a picture beside it) or .png (the picture alone)")
@@ -172,7 +156,7 @@ def _map(args: argparse.Namespace, bars: Bars) -> None:
 
 def add_twin(add: Add) -> None:
     """Define `twin`."""
-    twin = add("twin", _twin, "a field's digital twin: a scene for Sionna RT", HELP_TWIN)
+    twin = add("twin", _twin)
     twin.add_argument("field", help="field file (.safetensors) of model bistatic")
     twin.add_argument(
         "-o", "--out", required=True, help="folder of the twin: new, empty or an earlier twin's"
@@ -180,6 +164,16 @@ def add_twin(add: Add) -> None:
 
 
 def _twin(args: argparse.Namespace, bars: Bars) -> None:
+    """A field's digital twin: a scene for Sionna RT.
+
+    Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
+    opens the scene as it is, all lobes Lambertian; `warprrf.load_sionna_scene` sets the scattering patterns too, and
+    `warprrf simulate` takes it as any scene. A material has one curve and one lobe: what the projection misses is printed.
+
+    examples:
+      warprrf twin field.safetensors -o twin
+      warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
+    """
     twin = wr.write_twin(wr.RadioField.load(existing(args.field)), args.out)
     rows = [["surface", "area m2", "permittivity", "S", "lobe", "lobe error dB"]]
     for group in twin.groups:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warprrf as wr
-from warprrf.rf.spectra.antenna import deembed_scanned, respond, scanned_kernel
+from warprrf.rf.spectra.antenna import deembed, respond, scanned_kernel
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions, pixel_solid_angles, spread
 
 SHAPE = (90, 180)
@@ -94,7 +94,7 @@ def test_the_total_does_not_depend_on_the_horn_or_how_its_gain_is_stated():
 
         for peak_dbi, stated in ((0.0, None), (17.0, 17.0), (0.0, 0.0)):
             measured = 10 ** (peak_dbi / 10) * scan(d, POWERS, pattern)
-            out = deembed_scanned(measured[None], pattern, SIGMA, boresight_gain_dbi=stated, iterations=60)
+            out = deembed(measured[None], pattern, SIGMA, boresight_gain_dbi=stated, iterations=60)
             assert db(out.path_gain.sum() / truth) == pytest.approx(0.0, abs=0.1)
 
 
@@ -107,7 +107,7 @@ def test_deembedding_comes_closer_to_the_true_spectrum_than_the_measurement():
     measured = scan(d, powers)
     naive = measured * pixel_solid_angles(SHAPE)[:, None]
     naive *= truth.sum() / naive.sum()
-    out = deembed_scanned(measured[None], horn, SIGMA)
+    out = deembed(measured[None], horn, SIGMA)
     error, before = (np.abs(x - truth).sum() / truth.sum() for x in (out.path_gain[0], naive))
     assert error < 0.2 and error < 0.2 * before
 
@@ -129,7 +129,7 @@ def test_the_kernel_is_the_scan_of_pixels():
 def test_a_needle_leaves_the_spectrum_as_it_is_but_for_the_beam():
     image = np.zeros((2, 30, 60))
     image[0, 10, 20], image[0, 0, 5], image[1, 29, 59] = 1e-8, 3e-9, 2e-9
-    out = deembed_scanned(image, lambda angle: (angle < 1e-6).astype(float), SIGMA)
+    out = deembed(image, lambda angle: (angle < 1e-6).astype(float), SIGMA)
     for k in range(2):
         lit = image[k] > 0
         expected = spread(pixel_directions((30, 60))[lit], image[k][lit], (30, 60), SIGMA)
@@ -167,7 +167,7 @@ def test_noise_neither_adds_power_nor_grows_with_steps(below_db):
     # The power of complex noise, averaged over 8 snapshots.
     measured = clean + noise * np.random.default_rng(below_db).gamma(8, 1 / 8, SHAPE)
     short, long = (
-        deembed_scanned(measured[None], horn, SIGMA, noise=noise, snapshots=8, iterations=n).path_gain[0]
+        deembed(measured[None], horn, SIGMA, noise=noise, snapshots=8, iterations=n).path_gain[0]
         for n in (100, 2000)
     )
     truth = spread(d, POWERS, SHAPE, SIGMA)
@@ -183,7 +183,7 @@ def test_noise_neither_adds_power_nor_grows_with_steps(below_db):
 
 def test_noise_that_outweighs_the_signal_leaves_nothing():
     measured = np.full((1, 18, 36), 1e-9)
-    out = deembed_scanned(measured, horn, SIGMA, noise=2e-9)
+    out = deembed(measured, horn, SIGMA, noise=2e-9)
     assert not out.path_gain.any() and (out.source == -1).all()
 
 

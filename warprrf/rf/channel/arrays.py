@@ -25,7 +25,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.spectra.antenna import _sampled
+from warprrf.rf.spectra.antenna import sample_pattern
 from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
 
 PATTERNS = ("isotropic", "dipole", "half_wave_dipole", "tr38901")
@@ -255,7 +255,7 @@ def _pattern_gain(pattern: Any, local: np.ndarray) -> np.ndarray:
     """Power gain [linear] of ``pattern`` towards ``local`` unit directions (..., 3)."""
     if not isinstance(pattern, str):
         angle = np.arctan2(np.hypot(local[..., 1], local[..., 2]), local[..., 0])
-        gain = _sampled(pattern, angle)
+        gain = sample_pattern(pattern, angle)
         if not np.isfinite(gain).all() or (gain < 0).any():
             raise ValueError("pattern: got negative, NaN or infinite gains, expected linear power gains")
         return gain

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from warprrf.rf.em.materials import Material
-from warprrf.rf.em.waves import SPEED_OF_LIGHT as SPEED_OF_LIGHT
 
 LAMBERTIAN = 0
 """Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""

@@ -21,12 +21,13 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import minimize
 
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import LAMBERTIAN, lobe, slab_reflection
@@ -220,43 +221,35 @@ def project_reflection(log_excess: float, scattered: float, mirrored: float) -> 
 
     def errors(x: np.ndarray, odds: np.ndarray) -> np.ndarray:
         """Mean square errors [dB^2] of scattered and mirrored power, ``(2, ...)``; ``odds`` is the logit of S^2."""
-        split = -NEPER * np.logaddexp(0.0, np.stack([-odds, odds]))  # S^2 and 1 - S^2 in dB
-        miss = split - wanted.reshape(2, *np.ones(odds.ndim, int)) + np.interp(x, excess, level)
-        return np.asarray(miss**2 + np.interp(x, excess, shape))
+        split = [-NEPER * np.logaddexp(0.0, sign * odds) for sign in (-1.0, 1.0)]  # S^2 and 1 - S^2 in dB
+        gaps = [a - b + np.interp(x, excess, level) for a, b in zip(split, wanted, strict=True)]
+        return np.stack([gap**2 + np.interp(x, excess, shape) for gap in gaps])
 
-    def best_odds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Logit of the S^2 that suits each ``x`` (N,) best, and what is left of the error."""
-        if mirrored <= 0 or scattered <= 0:
-            odds = np.full(len(x), CERTAIN if mirrored <= 0 else -CERTAIN)
-        else:
-            odds = _refined(
-                lambda trial: np.tensordot(share, errors(x[:, None], trial), axes=1), np.zeros(len(x)), 14.0
-            )
-        return odds, share @ errors(x, odds)
+    # Where one of the powers is none, S^2 is one or zero for certain.
+    certain = CERTAIN if mirrored <= 0 else -CERTAIN if scattered <= 0 else None
+    trials = np.linspace(-14.0, 14.0, 113) if certain is None else np.array([certain])
+    coarse = np.tensordot(share, errors(excess[:, None], trials), axes=1)
+    row, column = np.unravel_index(coarse.argmin(), coarse.shape)
+    start = np.array([excess[row], trials[column]])[: 2 if certain is None else 1]
 
-    coarse = best_odds(excess)[1]
-    start = np.array([excess[coarse.argmin()]])
-    x = _refined(
-        lambda trial: best_odds(np.clip(trial[0], *excess[[0, -1]]))[1][None], start, excess[1] - excess[0]
-    )
-    x = np.clip(x, *excess[[0, -1]])
-    odds = best_odds(x)[0]
-    rms = np.sqrt(errors(x, odds)[:, 0])
+    def parts(found: np.ndarray) -> np.ndarray:
+        odds = found[1] if certain is None else certain
+        return errors(np.clip(found[0], *excess[[0, -1]]), np.asarray(odds))
+
+    best = minimize(
+        lambda trial: share @ parts(trial),
+        start,
+        method="Nelder-Mead",
+        options={"xatol": 1e-9, "fatol": 1e-14},
+    ).x
+    rms = np.sqrt(parts(best))
+    odds = best[1] if certain is None else certain
     return Reflection(
-        relative_permittivity=1.0 + float(np.exp(x[0])),
-        scattering=float(np.exp(-0.5 * np.logaddexp(0.0, -odds[0]))),
+        relative_permittivity=1.0 + float(np.exp(np.clip(best[0], *excess[[0, -1]]))),
+        scattering=float(np.exp(-0.5 * np.logaddexp(0.0, -odds))),
         scattering_error_db=float(rms[0]) if scattered > 0 else 0.0,
         mirror_error_db=float(rms[1]) if mirrored > 0 else 0.0,
     )
-
-
-def _refined(cost: Callable[[np.ndarray], np.ndarray], centre: np.ndarray, reach: float) -> np.ndarray:
-    """Where ``cost``, of trials ``(N, T)``, is least within ``reach`` of each ``centre`` (N,): grids that close in."""
-    for _ in range(9):
-        trial = centre[:, None] + np.linspace(-reach, reach, 29)
-        centre = np.take_along_axis(trial, cost(trial).argmin(axis=1)[:, None], axis=1)[:, 0]
-        reach /= 7.0
-    return centre
 
 
 def project_lobes(exponents: Sequence[int], weight: np.ndarray) -> tuple[int, float]:

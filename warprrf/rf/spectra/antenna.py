@@ -10,8 +10,8 @@ does not turn and directions were told apart by other means; its pattern over ab
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 
@@ -24,19 +24,10 @@ from warprrf.rf.spectra.spectrum import (
     spread_paths,
 )
 
-ITERATIONS = 2000
-"""Most Richardson-Lucy steps."""
-
-TOLERANCE = 1e-3
-"""Relative misfit at which steps stop; paths between pixel centres leave a few percent, so that stalling ends most."""
-
 STALL = 0.01
-"""Steps stop too when the misfit fell by less than this share over the last :data:`STALL_STEPS`."""
+"""Steps stop when the misfit fell by less than this share over the last :data:`STALL_STEPS`."""
 
 STALL_STEPS = 50
-
-LIMIT_DB = 20.0
-"""A fixed antenna that far below its peak tells nothing of a direction [dB]."""
 
 DYNAMIC_RANGE_DB = 60.0
 """What an estimate holds that far below its strongest direction is dropped [dB]."""
@@ -46,6 +37,48 @@ FIXED = "fixed antenna: divided by its gain in each direction"
 
 _TOGETHER = 32  # receivers whose estimates are refined at once
 _FLAT_DB = 0.1  # a pattern that varies less cannot tell directions apart
+
+
+class DeembedOptions(TypedDict, total=False):
+    """Options by the kind of antenna: ``limit_db`` for a fixed one, the others (:class:`Scan`) for a scanned one."""
+
+    snapshots: int
+    iterations: int
+    tolerance: float
+    device: Any
+    limit_db: float
+
+
+@dataclass(frozen=True)
+class Scan:
+    """How a scanned antenna is taken out.
+
+    Attributes:
+        noise: Mean noise power in every measured value [linear, over transmitted power].
+        snapshots: Over how many independent ones each value was averaged: noise power scatters by ``noise`` over the
+            root of it.
+        iterations: Most Richardson-Lucy steps for one receiver.
+        tolerance: Steps stop when the misfit is this small against the measurement, both weighted by solid angle,
+            after the first :data:`STALL_STEPS` when it is as small as the noise's scatter, or when it no longer falls
+            (:data:`STALL`); paths between pixel centres leave a few percent, so that stalling ends most.
+        device: Where estimates are spread by the beam.
+    """
+
+    noise: float = 0.0
+    snapshots: int = 1
+    iterations: int = 2000
+    tolerance: float = 1e-3
+    device: Any = None
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.noise) and self.noise >= 0):
+            raise ValueError(f"noise: got {self.noise!r}, expected a linear power of at least 0")
+        for name in ("iterations", "snapshots"):
+            value = getattr(self, name)
+            if value != int(value) or value < 1:
+                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least 1")
+        if not (np.isfinite(self.tolerance) and self.tolerance > 0):
+            raise ValueError(f"tolerance: got {self.tolerance!r}, expected a positive number")
 
 
 class Deembedded(NamedTuple):
@@ -70,46 +103,33 @@ class Deembedded(NamedTuple):
 
 
 def deembed(
-    path_gain: np.ndarray,
+    path_gain: Any,
     pattern: Any,
     beam_sigma_rad: float,
     *,
     boresight_gain_dbi: float | None = None,
     noise: float = 0.0,
     progress: _device.Progress | None = None,
-    **options: Any,
+    **options: Unpack[DeembedOptions],
 ) -> Deembedded:
     """``path_gain`` (R, H, W) without the antenna; see :meth:`warprrf.SpectrumDataset.deembed`.
 
-    A pattern ``(H, W)`` is a fixed antenna's, any other a scanned one's; ``options`` go to :func:`deembed_scanned` or
-    :func:`deembed_fixed`.
+    A pattern ``(H, W)`` is a fixed antenna's, any other a scanned one's.
 
     Raises:
         TypeError: for an option of the other kind of antenna.
-        ValueError: for noise with a fixed antenna, or as these two raise it.
+        ValueError: for noise with a fixed antenna, or naming another argument.
     """
-    fixed = not callable(pattern) and np.ndim(pattern) == 2
-    allowed = {"limit_db"} if fixed else {"snapshots", "iterations", "tolerance", "device"}
-    if wrong := sorted(set(options) - allowed):
-        raise TypeError(
-            f"{wrong[0]}: no option for a {'fixed' if fixed else 'scanned'} antenna, expected "
-            f"{', '.join(sorted(allowed))}"
-        )
-    if fixed:
-        if noise != 0.0:
-            raise ValueError(
-                "noise: a fixed antenna's spectra are divided as they are; take the noise off first"
-            )
-        return deembed_fixed(path_gain, pattern, boresight_gain_dbi=boresight_gain_dbi, **options)
-    return deembed_scanned(
-        path_gain,
-        pattern,
-        beam_sigma_rad,
-        boresight_gain_dbi=boresight_gain_dbi,
-        noise=noise,
-        progress=progress,
-        **options,
-    )
+    power = _device.check_array("path_gain", path_gain, (None, None, None))
+    if (power < 0).any():
+        raise ValueError(f"path_gain: got {int((power < 0).sum())} negative values, expected linear power")
+    if callable(pattern) or np.ndim(pattern) != 2:
+        kernel = scanned_kernel(pattern, check_shape(power.shape[1:]), boresight_gain_dbi)
+        return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)  # type: ignore[misc]
+    if noise != 0.0:
+        raise ValueError("noise: a fixed antenna's spectra are divided as they are; take the noise off first")
+    gain = _gains(_device.check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
+    return _deembed_fixed(power, gain, **options)  # type: ignore[misc]
 
 
 def scanned_kernel(
@@ -127,6 +147,17 @@ def scanned_kernel(
         TypeError: if ``pattern`` is neither.
         ValueError: if gains are negative, NaN, infinite, all zero or the same in all directions.
     """
+    gain = _gains(sample_pattern(pattern, _angles_between(shape)), boresight_gain_dbi)
+    if gain.min() > gain.max() * 10.0 ** (-_FLAT_DB / 10.0):
+        raise ValueError(
+            "pattern: got the same gain in all directions; scanning it tells nothing of directions, expected a "
+            "directive antenna (a fixed isotropic one is an array of ones over the pixels)"
+        )
+    return np.fft.rfft(gain, axis=-1).real.transpose(2, 0, 1).copy()
+
+
+def _angles_between(shape: tuple[int, int]) -> np.ndarray:
+    """Angle [rad] between the pixels of column 0 and all others, shape ``(H, H, W)``."""
     rows, columns = check_shape(shape)
     zenith = pixel_angles(shape)[0]
     azimuth = np.arange(columns) * 2.0 * np.pi / columns
@@ -135,14 +166,7 @@ def scanned_kernel(
         np.sin(0.5 * (zenith[:, None] - zenith[None, :]))[..., None] ** 2
         + np.sin(zenith)[:, None, None] * np.sin(zenith)[None, :, None] * np.sin(0.5 * azimuth) ** 2
     )
-    angle = 2.0 * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0)))
-    gain = _gains(_sampled(pattern, angle), boresight_gain_dbi)
-    if gain.min() > gain.max() * 10.0 ** (-_FLAT_DB / 10.0):
-        raise ValueError(
-            "pattern: got the same gain in all directions; scanning it tells nothing of directions, expected a "
-            "directive antenna (a fixed isotropic one is an array of ones over the pixels)"
-        )
-    return np.fft.rfft(gain, axis=-1).real.transpose(2, 0, 1).copy()
+    return 2.0 * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0)))
 
 
 def respond(path_gain: Any, kernel: np.ndarray) -> np.ndarray:
@@ -158,64 +182,27 @@ def respond(path_gain: Any, kernel: np.ndarray) -> np.ndarray:
     return np.fft.irfft(turned.transpose(2, 1, 0), n=columns, axis=-1).reshape(image.shape)
 
 
-def deembed_scanned(
-    measured: Any,
-    pattern: Any,
+def _deembed_scanned(
+    power: np.ndarray,
+    kernel: np.ndarray,
     beam_sigma_rad: float,
-    *,
-    boresight_gain_dbi: float | None = None,
-    noise: float = 0.0,
-    snapshots: int = 1,
-    iterations: int = ITERATIONS,
-    tolerance: float = TOLERANCE,
-    device: Any = None,
-    progress: _device.Progress | None = None,
+    scan: Scan,
+    progress: _device.Progress | None,
 ) -> Deembedded:
-    """Spectra by this package's conventions from the powers that a steered antenna measured.
-
-    Args:
-        measured: Received over transmitted power [linear] with the antenna steered to each pixel centre, the antenna's
-            gain included in so far as the pattern includes it, shape ``(R, H, W)``.
-        pattern: See :func:`scanned_kernel`.
-        beam_sigma_rad: Width of the beam that spreads the estimate [rad].
-        boresight_gain_dbi: Gain that is in the measurement along boresight: 0 if it was divided out. None takes the
-            pattern as absolute gain over isotropic.
-        noise: Mean noise power in every measured value [linear, over transmitted power].
-        snapshots: Over how many independent ones each value was averaged: noise power scatters by ``noise`` over the
-            root of it.
-        iterations: Most steps for one receiver.
-        tolerance: Steps stop when the misfit is this small against the measurement, both weighted by solid angle,
-            after the first :data:`STALL_STEPS` when it is as small as the noise's scatter, or when it no longer falls
-            (:data:`STALL`).
-
-    Raises:
-        TypeError, ValueError: naming the argument.
-    """
-    power = _spectra("measured", measured)
-    if not (np.isfinite(noise) and noise >= 0):
-        raise ValueError(f"noise: got {noise!r}, expected a linear power of at least 0")
-    if iterations != int(iterations) or iterations < 1:
-        raise ValueError(f"iterations: got {iterations!r}, expected a whole number of at least 1")
-    if snapshots != int(snapshots) or snapshots < 1:
-        raise ValueError(f"snapshots: got {snapshots!r}, expected a whole number of at least 1")
-    if not (np.isfinite(tolerance) and tolerance > 0):
-        raise ValueError(f"tolerance: got {tolerance!r}, expected a positive number")
+    """Spectra by this package's conventions from the powers that a steered antenna measured, ``(R, H, W)``."""
     count, shape = len(power), check_shape(power.shape[1:])
-    kernel = scanned_kernel(pattern, shape, boresight_gain_dbi)
     directions = pixel_directions(shape).reshape(-1, 3)
     path_gain, source = np.zeros(power.shape), np.full(power.shape, -1)
     steps, misfit = np.zeros(count, dtype=int), np.zeros(count)
     for first in range(0, count, _TOGETHER):
         part = slice(first, min(first + _TOGETHER, count))
-        estimate, steps[part], misfit[part] = _richardson_lucy(
-            power[part], kernel, float(noise), noise / np.sqrt(snapshots), int(iterations), tolerance
-        )
+        estimate, steps[part], misfit[part] = _richardson_lucy(power[part], kernel, scan)
         for k, one in enumerate(estimate, start=first):
             kept = np.where(one > one.max() * 10.0 ** (-DYNAMIC_RANGE_DB / 10.0), one, 0.0)
             if kept.any():
                 kept *= one.sum() / kept.sum()
                 path_gain[k], source[k] = spread_paths(
-                    directions, kept.reshape(-1), shape, beam_sigma_rad, device=device
+                    directions, kept.reshape(-1), shape, beam_sigma_rad, device=scan.device
                 )
             if progress is not None:
                 progress("deembed", k + 1, count)
@@ -223,23 +210,23 @@ def deembed_scanned(
 
 
 def _richardson_lucy(
-    measured: np.ndarray, kernel: np.ndarray, noise: float, scatter: float, iterations: int, tolerance: float
+    measured: np.ndarray, kernel: np.ndarray, scan: Scan
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Path gain per direction ``(R, H, W)``, steps ``(R,)`` and relative misfit ``(R,)``."""
     weight = np.broadcast_to(pixel_solid_angles(measured.shape[1:])[:, None], measured.shape[1:])
     back = respond(weight, kernel)  # what a path of unit gain adds to the weighted sum of the measurement
-    signed = (weight * (measured - noise)).sum(axis=(1, 2))
+    signed = (weight * (measured - scan.noise)).sum(axis=(1, 2))
     # Uniform per solid angle to begin with: a pole's small pixels start with little.
     estimate = weight / (weight * back).sum() * np.maximum(signed, 0.0)[:, None, None]
     size = np.sqrt((weight * measured**2).sum(axis=(1, 2)))
-    goal = tolerance * size
+    goal = scan.tolerance * size
     # The first steps only gather power where it is: they are safe whatever the noise, and never left out.
-    noisy_goal = np.maximum(goal, scatter * np.sqrt(weight.sum()))
+    noisy_goal = np.maximum(goal, scan.noise / np.sqrt(scan.snapshots) * np.sqrt(weight.sum()))
     steps, misfit = np.zeros(len(measured), dtype=int), np.where(size > 0, 1.0, 0.0)
     before = np.full(len(measured), np.inf)
     going = np.flatnonzero(signed > 0)
-    for step in range(iterations):
-        expected = np.maximum(respond(estimate[going], kernel), 0.0) + noise
+    for step in range(scan.iterations):
+        expected = np.maximum(respond(estimate[going], kernel), 0.0) + scan.noise
         error = np.sqrt((weight * (measured[going] - expected) ** 2).sum(axis=(1, 2)))
         misfit[going] = error / size[going]
         left = error > (goal if step < STALL_STEPS else noisy_goal)[going]
@@ -251,33 +238,21 @@ def _richardson_lucy(
             break
         ratio = np.divide(measured[going], expected, out=np.zeros(expected.shape), where=expected > 0)
         estimate[going] *= np.maximum(respond(weight * ratio, kernel), 0.0) / back
-        if noise > 0:  # the noise takes its share of each value only on average: hold the total
+        if scan.noise > 0:  # the noise takes its share of each value only on average: hold the total
             scale = signed[going] / (estimate[going] * back).sum(axis=(1, 2))
             estimate[going] *= scale[:, None, None]
         steps[going] = step + 1
     return estimate, steps, misfit
 
 
-def deembed_fixed(
-    measured: Any, pattern: Any, *, boresight_gain_dbi: float | None = None, limit_db: float = LIMIT_DB
-) -> Deembedded:
+def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) -> Deembedded:
     """Spectra divided by the gain of an antenna that does not turn.
 
     Directions in which the antenna is more than ``limit_db`` below its peak come out empty: dividing there would only
     blow up noise and leakage. The total path gain is then that of the directions that are left.
-
-    Args:
-        measured: Path gain times antenna gain per pixel [linear], shape ``(R, H, W)``.
-        pattern: Power gain [linear] in each pixel's direction, shape ``(H, W)``.
-        boresight_gain_dbi: Scales the pattern to this gain at its strongest; None takes it as it is.
-
-    Raises:
-        TypeError, ValueError: naming the argument.
     """
-    power = _spectra("measured", measured)
     if not (np.isfinite(limit_db) and limit_db > 0):
         raise ValueError(f"limit_db: got {limit_db!r}, expected a positive number of decibels")
-    gain = _gains(_device.check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
     told = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
     path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=told)
     source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)
@@ -287,18 +262,10 @@ def deembed_fixed(
     return Deembedded(path_gain, source, none.astype(int), none, covered, FIXED)
 
 
-def _spectra(name: str, value: Any) -> np.ndarray:
-    power = _device.check_array(name, value, (None, None, None))
-    if (power < 0).any():
-        raise ValueError(f"{name}: got {int((power < 0).sum())} negative values, expected linear power")
-    return power
-
-
-def _sampled(pattern: Any, angle: np.ndarray) -> np.ndarray:
+def sample_pattern(pattern: Any, angle: np.ndarray) -> np.ndarray:
     """The pattern at ``angle`` [rad], shape as ``angle``."""
     if callable(pattern):
-        function: Callable[[np.ndarray], Any] = pattern
-        gain = _device.check_array("pattern", function(angle), finite=False)
+        gain = _device.check_array("pattern", pattern(angle), finite=False)
         if gain.shape not in ((), angle.shape):
             raise ValueError(
                 f"pattern: got shape {gain.shape} for angles {angle.shape}, expected one gain for each angle"

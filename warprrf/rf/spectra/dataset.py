@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from warprrf import device as _device
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
-from warprrf.rf.spectra.antenna import deembed
+from warprrf.rf.spectra.antenna import DeembedOptions, deembed
 from warprrf.rf.spectra.spectrum import Spectrum, check_shape, default_floor, to_db
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
@@ -212,7 +212,7 @@ class SpectrumDataset:
         boresight_gain_dbi: float | None = None,
         noise: float = 0.0,
         progress: _device.Progress | None = None,
-        **options: Any,
+        **options: Unpack[DeembedOptions],
     ) -> SpectrumDataset:
         """These spectra without the antenna that measured them.
 

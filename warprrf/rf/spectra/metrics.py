@@ -13,11 +13,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from warprrf.device import Progress
+from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import (
     Spectrum,
@@ -59,12 +62,17 @@ def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
             f"prediction, truth: got shapes {a.shape} and {b.shape}, expected two equal (height, width) images of at "
             f"least {SSIM_WINDOW} x {SSIM_WINDOW} pixels"
         )
-    count = SSIM_WINDOW**2
+    count, border = SSIM_WINDOW**2, SSIM_WINDOW // 2
+    inner = slice(border, -border)
+
+    def mean(image: np.ndarray) -> np.ndarray:
+        return uniform_filter(image, SSIM_WINDOW)[inner, inner]
+
     sample = count / (count - 1)
-    mean_a, mean_b = _window_mean(a), _window_mean(b)
-    var_a = sample * (_window_mean(a * a) - mean_a**2)
-    var_b = sample * (_window_mean(b * b) - mean_b**2)
-    covariance = sample * (_window_mean(a * b) - mean_a * mean_b)
+    mean_a, mean_b = mean(a), mean(b)
+    var_a = sample * (mean(a * a) - mean_a**2)
+    var_b = sample * (mean(b * b) - mean_b**2)
+    covariance = sample * (mean(a * b) - mean_a * mean_b)
     c1, c2 = 0.01**2, 0.03**2
     score = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
     return float(np.mean(score / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
@@ -105,17 +113,12 @@ def beam_response(path_gain: np.ndarray, width_rad: float) -> np.ndarray:
     The beam's power pattern is ``exp(kappa (cos(angle) - 1))``, one on its axis, with :func:`beam_kappa`. The sum over
     the sphere is exact on the grid: rows are convolved in azimuth by FFT.
     """
-    height, width = path_gain.shape
-    kappa = beam_kappa(width_rad)
-    zenith = (np.arange(height) + 0.5) * np.pi / height
-    azimuth = np.arange(width) * 2 * np.pi / width
-    cosine = (
-        np.sin(zenith)[:, None, None] * np.sin(zenith)[None, :, None] * np.cos(azimuth)
-        + np.cos(zenith)[:, None, None] * np.cos(zenith)[None, :, None]
-    )
-    kernel = np.fft.rfft(np.exp(kappa * (cosine - 1.0)), axis=-1)
-    image = np.fft.rfft(np.asarray(path_gain, np.float64), axis=-1)
-    return np.fft.irfft(np.einsum("abm,bm->am", kernel, image), n=width, axis=-1)
+    return respond(path_gain, _beam_kernel(path_gain.shape, beam_kappa(width_rad)))
+
+
+@lru_cache(maxsize=2)
+def _beam_kernel(shape: tuple[int, int], kappa: float) -> np.ndarray:
+    return scanned_kernel(lambda angle: np.exp(-2.0 * kappa * np.sin(0.5 * angle) ** 2), shape)
 
 
 def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: float) -> float:
@@ -140,14 +143,6 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     order = np.argsort(values, kind="stable")
     cumulated = np.cumsum(weights[order], dtype=np.float64)
     return float(values[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
-
-
-def lpips_weights() -> str | None:
-    """Path of LPIPS' AlexNet weights if they are already on this machine, else None; nothing is ever downloaded."""
-    from pathlib import Path
-
-    found = sorted(Path.home().glob(".cache/torch/hub/checkpoints/alexnet-*.pth"))
-    return str(found[0]) if found else None
 
 
 def evaluate(
@@ -220,14 +215,9 @@ def evaluate(
     line_of_sight = np.asarray(test.line_of_sight, dtype=bool)
     report: dict[str, Any] = _summary(rows, np.ones(count, dtype=bool), "")
     report.update(_summary(rows, ~line_of_sight, "_blocked"))
-    reason = (
-        "needs the lpips package, which is no dependency"
-        if lpips_weights()
-        else "its network weights are not on this machine, and nothing is downloaded"
-    )
     report.update(
         lpips=None,
-        lpips_reason=reason,
+        lpips_reason="needs the lpips package and its weights, which are no dependency",
         seconds_per_spectrum=float(np.median(seconds)),
         receivers=count,
         receivers_blocked=int(np.count_nonzero(~line_of_sight)),
@@ -273,10 +263,3 @@ def _summary(rows: dict[str, np.ndarray], where: np.ndarray, suffix: str) -> dic
         f"tof_error_median_ns{suffix}": over("tof_error_ns", np.median),
         f"aod_error_median_deg{suffix}": over("aod_error_deg", np.median),
     }
-
-
-def _window_mean(image: np.ndarray) -> np.ndarray:
-    """Mean over every full window, shape ``(height - 6, width - 6)``."""
-    window = np.lib.stride_tricks.sliding_window_view
-    rows = window(image, SSIM_WINDOW, axis=0).mean(axis=-1)
-    return window(rows, SSIM_WINDOW, axis=1).mean(axis=-1)
