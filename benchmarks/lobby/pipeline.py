@@ -27,9 +27,9 @@ from benchmarks.methods import Fitted, fit_bistatic, fit_harmonic
 from benchmarks.report import Report
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.files import write_arrays, write_atomically, write_json
+from warprrf.geometry import pipeline as stage_1
 from warprrf.geometry.floor_plan import section
 from warprrf.geometry.mesh_files import write_mesh
-from warprrf.geometry.photos import pipeline as stage_1
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import read_photo
 from warprrf.rf.spectra import lookups, metrics
