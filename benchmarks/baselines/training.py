@@ -22,6 +22,7 @@ from benchmarks.baselines.images import SpectrumImages, path_gain_of
 from warprrf.device import Progress, check_array, require
 from warprrf.rf.fields import files as field_files
 from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.steps import digest
 
 FORMAT = "warprrf baseline 1"
 CHECKPOINT_FORMAT = "warprrf baseline checkpoint 1"
@@ -88,7 +89,7 @@ def train(
         networks, optimisers: torch modules and Adam optimisers by name: all that changes.
         step: does iteration ``i`` and returns its loss.
         iterations: how many.
-        identity: fingerprint of everything that the result depends on.
+        identity: digest of everything that the result depends on.
         checkpoint: file to save progress to every 20 s and go on from; removed when training is done.
         progress: called with the stage ``"fit"``.
 
@@ -297,7 +298,7 @@ class ImageModel(ABC):
             optimisers,
             step,
             iterations=iterations,
-            identity=field_files.fingerprint(cls.__name__, options, iterations, *about.values(), seed, known),
+            identity=digest(cls.__name__, options, iterations, about, seed, known),
             checkpoint=checkpoint,
             progress=progress,
         )
