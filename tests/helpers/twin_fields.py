@@ -4,7 +4,7 @@ import numpy as np
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Parameters
+from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 
@@ -45,6 +45,6 @@ def known_field(**changes) -> BistaticField:
             weight, np.log([2.0, 5.0, 1.0]), np.log([0.75, 0.36, 0.99]), np.full(3, -np.inf)
         ),
         "material": surface.material,
-        "residual": np.zeros((2, surface.texels)),
+        "residual": np.zeros((2, surface.cells)),
     }
     return BistaticField(**(given | changes))

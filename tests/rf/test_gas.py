@@ -17,14 +17,16 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Parameters
-from warprrf.rf.fields.bistatic.second_bounce import mirrored_scene
+from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.render import further_bounces, mirror_shown
+from warprrf.rf.fields.bistatic.response import SpectrumPixels, respond
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.relevance.model import full_field
 from warprrf.rf.simulate import simulate
+from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import to_db
@@ -167,13 +169,13 @@ def test_a_field_of_line_of_sight_is_friis_times_gas(scene: RadioScene, humid: S
 def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dry: SpectrumDataset) -> None:
     field = BistaticField.prior(scene, dry, terms=Terms(mirror_order=2))
     humid = field.with_gas()
-    sight = field.see(BLOCKED)
-    before, after = field.compose(sight), humid.compose(humid.see(BLOCKED))
-    lit = before.rays > 0
-    point = BLOCKED + sight.met.range_m.numpy()[lit, None] * field.tracer.directions[lit]
+    view = field.view(BLOCKED)
+    before, after = field.render(view).powers, humid.render(humid.view(BLOCKED)).powers
+    lit = before.single > 0
+    point = view.hits.points(np.flatnonzero(lit))
     length = np.linalg.norm(point - TX, axis=1) + np.linalg.norm(point - BLOCKED, axis=1)
-    np.testing.assert_allclose(after.rays[lit], before.rays[lit] * passed(length), rtol=1e-5)
-    np.testing.assert_allclose(after.specular, before.specular * passed(sight.paths.length_m), rtol=1e-12)
+    np.testing.assert_allclose(after.single[lit], before.single[lit] * passed(length), rtol=1e-5)
+    np.testing.assert_allclose(after.mirror, before.mirror * passed(view.paths.length_m), rtol=1e-12)
     # off again, nothing is left of it
     np.testing.assert_array_equal(
         humid.with_gas(False).spectrum(BLOCKED).path_gain, field.spectrum(BLOCKED).path_gain
@@ -181,13 +183,15 @@ def test_single_bounces_of_a_field_have_their_rays_lengths(scene: RadioScene, dr
 
 
 def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, dry: SpectrumDataset) -> None:
-    field = BistaticField.prior(scene, dry)
-    mesh, shape = field.surface.mesh, (12, 24)
-    images = []
-    for one in (field, field.with_gas()):
-        tracer = one.tracer_of(shape, 1)
-        images.append(mirrored_scene(tracer, SEEN, TX, one.parameters, WAVELENGTH, None).ravel())
-    d = tracer.directions
+    field = BistaticField.prior(scene, dry, terms=Terms(scatter_mirror=True))
+    mesh, images = field.surface.mesh, []
+    views = [
+        one.transport().on_grid((12, 24), 1, 1).view(SEEN, one.terms) for one in (field, field.with_gas())
+    ]
+    for view in views:
+        ray, power = mirror_shown(view, field.materials, None)
+        images.append(np.bincount(ray, power, minlength=12 * 24))
+    d = view.transport.grid.directions
     first = mesh.cast(SEEN, d)
     normal = mesh.face_normals[first.face]
     turned = d - 2.0 * (d * normal).sum(axis=1, keepdims=True) * normal
@@ -201,10 +205,10 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
     # elements that send on evenly: two legs from them
     sent = np.ones(len(field.surface.element_area))
     dark = replace(field.parameters, log_weight=np.full_like(field.parameters.log_weight, -np.inf))
-    glow = [
-        mirrored_scene(one.tracer_of(shape, 1), SEEN, TX, dark, WAVELENGTH, sent).ravel()
-        for one in (field, field.with_gas())
-    ]
+    glow = []
+    for view in views:
+        ray, power = mirror_shown(view, replace(field.materials, parameters=dark), sent)
+        glow.append(np.bincount(ray, power, minlength=12 * 24))
     lit = glow[0] > 0
     ratio = glow[1][lit] / (glow[0][lit] * passed(first.t + second.t)[lit])
     assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
@@ -212,17 +216,17 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
 
 def test_light_that_mirrors_throw_has_its_images_length(scene: RadioScene, dry: SpectrumDataset) -> None:
     field = BistaticField.prior(scene, dry, terms=Terms(mirror_scatter=True))
-    surface, found = field.surface, []
-    for one in (field, field.with_gas()):
-        tracer = one.tracer_of((16, 32), 1)  # one ray a pixel, each of which looks for mirrored light
-        met = tracer.meet(SEEN)
-        found.append(one.element_light(TX).mirrors.sight(SEEN, met, tracer))
-    before, after = found
-    point = SEEN + met.range_m.numpy()[before.pixel, None] * tracer.directions[before.pixel]
+    surface = field.surface
+    # one ray a pixel, each of which looks for mirrored light
+    views = [
+        one.transport().on_grid((16, 32), 1, 1).view(SEEN, one.terms) for one in (field, field.with_gas())
+    ]
+    before, after = (view.mirror_lit for view in views)
+    point = views[0].hits.points(before.ray)
     normal, offset = surface.plane_normal[before.patch], surface.plane_offset[before.patch]
     image = TX - 2.0 * (normal @ TX - offset)[:, None] * normal
     length = np.linalg.norm(point - image, axis=1) + np.linalg.norm(point - SEEN, axis=1)
-    strength = before.lit.strength.numpy(), after.lit.strength.numpy()
+    strength = before.light.strength.numpy(), after.light.strength.numpy()
     assert (strength[0] > 0).sum() > 500
     np.testing.assert_allclose(strength[1], strength[0] * passed(length), rtol=1e-5)
 
@@ -236,7 +240,7 @@ def test_irradiance_by_a_mirror_has_its_images_length(dry: SpectrumDataset) -> N
     mesh, part = joined(sheet(0.0, True), sheet(4.0, False))
     field = BistaticField.prior(RadioScene(mesh, part, [SlabMaterial("floor"), SlabMaterial("lid")]), dry)
     before, after = (
-        one.element_light(TX).mirrors.irradiance(field.parameters) for one in (field, field.with_gas())
+        one.transport().mirror_light.irradiance(field.parameters) for one in (field, field.with_gas())
     )
     centre = field.surface.element_centre
     lid = (centre[:, 2] > 3.9) & (before > 0)
@@ -259,14 +263,14 @@ def test_two_and_three_bounces_in_a_sphere_have_the_chords_lengths() -> None:
     field = BistaticField(
         surface=surface, transmitter=np.array([0.02, 0.0, 0.0]), frequency_hz=F, shape=SHAPE, floor=1e-20,
         range_db=(-200.0, -80.0), beam_sigma_rad=np.radians(5.0), parameters=parameters, material=np.zeros(groups, int),
-        residual=np.zeros((2, surface.texels)),
+        residual=np.zeros((2, surface.cells)),
         terms=Terms(line_of_sight=False, mirror_order=0, lobes=(0,), diffuse_order=2),
     )  # fmt: skip
     thrice = replace(field, terms=replace(field.terms, diffuse_order=3))
     receiver = np.array([-0.02, 0.0, 0.0])
 
     def further(one: BistaticField) -> float:
-        return float(one.further(one.see(receiver)).sum())
+        return float(one.render(one.view(receiver)).further.sum())
 
     two = further(field.with_gas()) / further(field)
     three = (further(thrice.with_gas()) - further(field.with_gas())) / (further(thrice) - further(field))
@@ -283,12 +287,15 @@ def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: Spec
     field = BistaticField.prior(scene, dry, terms=terms)
     field = replace(field, parameters=replace(field.parameters, log_indirect=np.zeros(field.surface.groups)))
     humid = field.with_gas()
-    sight = field.see(SEEN)
-    rays = field.tracer.solid_angle * passed(sight.met.range_m.numpy())
+    view = field.view(SEEN)
+    rays = view.transport.grid.solid_angle * passed(view.hits.range_m.numpy())
     expected = (WAVELENGTH / (4.0 * np.pi)) ** 2 * rays.sum()
-    assert humid.further(humid.see(SEEN)).sum() == pytest.approx(expected, rel=1e-9)
-    view = humid.view(humid.see(SEEN), np.arange(SHAPE[0] * SHAPE[1]))  # what a fit of it is made on
-    assert view.dark.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
+    view = humid.view(SEEN)
+    found = further_bounces(view, humid.materials, humid.sent_radiance(view.transport))
+    assert found.by_ray().sum() == pytest.approx(expected, rel=1e-9)
+    measured = SpectrumPixels(BeamOperator(SHAPE, humid.beam_sigma_rad), np.arange(SHAPE[0] * SHAPE[1]))
+    response = respond(view, measured, humid.terms.lobes, humid.floor)  # what a fit of it is made on
+    assert response.indirect.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
 
 
 def test_links_with_gas_are_the_spectrums_sums(scene: RadioScene, humid: SpectrumDataset) -> None:
@@ -325,7 +332,7 @@ def test_what_was_traced_in_other_air_is_refused(
     scene: RadioScene, dry: SpectrumDataset, humid: SpectrumDataset
 ) -> None:
     seen = trace(scene, dry.subset([0, 1]), mirror_order=1)
-    with pytest.raises(ValueError, match="air, lobes and rays of this fit"):
+    with pytest.raises(ValueError, match="air and rays of this fit"):
         RadioField.fit(scene, humid.subset([0, 1]), transport=seen)
 
 

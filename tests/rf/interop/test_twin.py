@@ -212,7 +212,7 @@ def test_what_no_material_can_hold_is_said(field, tmp_path):
     parameters = replace(
         field.parameters, log_gain=np.log(10**0.35), log_indirect=np.array([-9.0, -9.0, -9.0])
     )
-    residual = np.full((2, field.surface.texels), np.log(10**0.1))
+    residual = np.full((2, field.surface.cells), np.log(10**0.1))
     rich = replace(
         field,
         parameters=parameters,

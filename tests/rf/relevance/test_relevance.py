@@ -149,7 +149,7 @@ def test_the_choice_stays_within_its_tolerance(furnished: RadioScene, several: l
         assert max(found.image_db, found.total_db) <= found.tolerance_db
         reduced, change = found.reduce(full), []
         for receiver in RECEIVERS:
-            then, now = (10 * np.log10(f.compose(f.see(receiver)).image.sum()) for f in (full, reduced))
+            then, now = (10 * np.log10(f.render(f.view(receiver)).image.sum()) for f in (full, reduced))
             change.append(now - then)
         assert np.sqrt(np.mean(np.square(change))) <= found.tolerance_db + several[1]["gas"].total_db
 
@@ -169,13 +169,14 @@ def test_elements_that_no_receiver_sees_matter_to_further_bounces_alone(furnishe
         furnished, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA
     )
     single = replace(full, terms=Terms(lobes=full.terms.lobes, mirror_order=2))
-    sight = single.see(RECEIVERS[0])
-    face = sight.met.face.numpy()
+    view = single.view(RECEIVERS[0])
+    face = view.hits.face.numpy()
     unseen = np.ones(len(full.surface.element_area), bool)
     unseen[full.surface.element[face[face >= 0]]] = False
     assert unseen.any()
     dropped = without_elements(single, unseen)
-    assert np.array_equal(dropped.compose(sight).image, single.compose(sight).image)
+    seen = replace(view, transport=dropped.transport())
+    assert np.array_equal(dropped.render(seen).image, single.render(view).image)
     assert source == "scene"
     assert not walls.assumed
 

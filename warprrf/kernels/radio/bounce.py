@@ -1,12 +1,9 @@
-"""Diffuse bounces seen from a receiver, in three steps: what its rays meet, how a source lights that, what it sends on.
+"""Diffuse bounces seen from a receiver: how a transmitter illuminates what rays hit, and what materials make of it.
 
-The first step knows no transmitter, the second no materials, the third no rays: each is kept and reused. A source is
-the transmitter or its image behind a mirror patch. Hierarchy and angles are float32, ranges float64.
+Illumination knows no materials, scattering no rays: each is kept and reused. Angles are float32, ranges float64.
 """
 
 import warp as wp
-
-from warprrf.kernels.radio.scatter import local
 
 INV_PI = wp.constant(0.3183098861837907)
 MOMENTS = 3
@@ -15,30 +12,11 @@ MOMENTS = 3
 
 @wp.struct
 class Surface:
-    """Faces of a mesh and what they belong to.
+    """Faces of a mesh: their unit normals, those that scattering uses (which may be smoother), and their groups."""
 
-    ``normal`` may be smoother than the faces; ``patch`` is -1 off all planar patches; ``clearance`` [m] is the depth
-    of the skin in which a shadow ray ignores the surface that it ends on.
-    """
-
-    mesh: wp.uint64
-    center: wp.vec3d
-    corner: wp.array(dtype=wp.vec3d)
     flat_normal: wp.array(dtype=wp.vec3d)
     normal: wp.array(dtype=wp.vec3)
-    patch: wp.array(dtype=wp.int32)
     group: wp.array(dtype=wp.int32)
-    element: wp.array(dtype=wp.int32)
-    clearance: wp.float32
-
-
-@wp.struct
-class Source:
-    """A transmitter, or its image in the plane of ``patch`` (-1: none): then ``real`` is the transmitter itself."""
-
-    position: wp.vec3d
-    real: wp.vec3d
-    patch: wp.int32
 
 
 @wp.func
@@ -47,62 +25,11 @@ def narrow(v: wp.vec3d):
     return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 
-@wp.func
-def widen(v: wp.vec3):
-    """A vector in double precision."""
-    return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
-
-
-@wp.func
-def clear(surface: Surface, a: wp.vec3d, b: wp.vec3d, skin: float):
-    """Whether nothing lies between ``a`` and ``b``, but within ``skin`` [m] of either end."""
-    way = b - a
-    length = wp.float32(wp.length(way))
-    free = bool(True)
-    if length > 2.0 * skin:
-        toward = narrow(way) / length
-        query = wp.mesh_query_ray(
-            surface.mesh, local(a, surface.center) + skin * toward, toward, length - 2.0 * skin
-        )
-        free = not query.result
-    return free
-
-
-@wp.kernel
-def meet_surface(
-    offset: int,
-    surface: Surface,
-    origins: wp.array(dtype=wp.vec3d),
-    per_origin: int,
-    directions: wp.array(dtype=wp.vec3d),
-    face: wp.array(dtype=wp.int32),
-    range_m: wp.array(dtype=wp.float64),
-):
-    """Face and range that each ray meets; -1 and infinity where it escapes.
-
-    Ray k starts at origin k / per_origin; ``directions`` holds one for each ray, or one set for every origin.
-    """
-    k = offset + wp.tid()
-    receiver = origins[k / per_origin]
-    d = directions[k % directions.shape[0]]
-    face[k] = -1
-    range_m[k] = wp.float64(wp.inf)
-    query = wp.mesh_query_ray(surface.mesh, local(receiver, surface.center), narrow(d), 1.0e30)
-    if query.result:
-        face[k] = query.face
-        t = wp.float64(query.t)
-        n = surface.flat_normal[query.face]
-        slope = wp.dot(n, d)
-        if wp.abs(slope) > wp.float64(1.0e-7):
-            t = wp.dot(n, surface.corner[query.face] - receiver) / slope
-        range_m[k] = wp.max(t, wp.float64(1.0e-6))
-
-
 @wp.kernel
 def light_surface(
     offset: int,
     surface: Surface,
-    source: Source,
+    source: wp.vec3d,
     origins: wp.array(dtype=wp.vec3d),
     per_origin: int,
     directions: wp.array(dtype=wp.vec3d),
@@ -111,26 +38,26 @@ def light_surface(
     solid_angle: wp.array(dtype=wp.float32),
     half_width: float,
     nearest: float,
-    shadows: int,
+    loss: float,
     strength: wp.array(dtype=wp.float32),
     cos_in: wp.array(dtype=wp.float32),
     cos_mirror: wp.array(dtype=wp.float32),
     grazing: wp.array(dtype=wp.float32),
 ):
-    """How ``source`` lights what each ray met.
+    """How a transmitter at ``source`` illuminates what each ray hits, shadows apart.
 
-    Writes ``strength`` = Omega cos(theta_i) / (4 pi d1)^2 times visibility [sr/m^2], the cosine of incidence, of the
-    angle between the scattered and the mirror direction, and the mean of 1 / cos(theta_s) over +-``half_width`` (what
-    lies below the horizon left out). ``nearest`` [m] bounds d1 from below: an element at the source spans directions.
-    Without ``shadows`` whoever launches this finds out what the transmitter itself does not see.
+    Ray k starts at origin k / per_origin; ``directions`` holds one for each ray, or one set for every origin. Writes
+    ``strength`` = Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] less what air of ``loss`` [neper/m] absorbs from the source
+    over the hit to the ray's origin, the cosine of incidence, that of the angle between the scattered and the mirror
+    direction, and the mean of 1 / cos(theta_s) over +-``half_width`` (what lies below the horizon left out).
+    ``nearest`` [m] bounds d1 from below: an element at the source spans directions.
     """
     k = offset + wp.tid()
     strength[k] = 0.0
     f = face[k]
     if f >= 0:
         d = directions[k % directions.shape[0]]
-        point = origins[k / per_origin] + range_m[k] * d
-        way = source.position - point
+        way = source - (origins[k / per_origin] + range_m[k] * d)
         d1 = wp.float32(wp.length(way))
         toward = narrow(way) / wp.max(d1, 1.0e-9)
         look = -narrow(d)
@@ -142,48 +69,16 @@ def light_surface(
         cos_s = wp.max(cos_s, 0.0)  # a smoothed normal may turn away from who sees the face
         cos_i = wp.dot(n, toward)
         if cos_i > 0.0 and d1 > 0.0:
-            lit = bool(True)
-            if source.patch < 0 and shadows != 0:
-                lit = clear(surface, source.position, point, surface.clearance)
-            elif source.patch >= 0:
-                # The ray towards the image must meet its patch first, and see the transmitter from there.
-                lit = False
-                start = local(point, surface.center) + surface.clearance * toward
-                query = wp.mesh_query_ray(surface.mesh, start, toward, d1)
-                if query.result:
-                    if surface.patch[query.face] == source.patch and surface.patch[f] != source.patch:
-                        turn = point + wp.float64(query.t + surface.clearance) * widen(toward)
-                        lit = clear(surface, turn, source.real, surface.clearance)
-            if lit:
-                reach = wp.max(d1, nearest)
-                strength[k] = (
-                    solid_angle[k % solid_angle.shape[0]] * cos_i / (157.91367041742973 * reach * reach)
-                )
-                cos_in[k] = wp.min(cos_i, 1.0)
-                cos_mirror[k] = wp.clamp(2.0 * cos_i * cos_s - wp.dot(toward, look), -1.0, 1.0)
-                high = cos_s + half_width
-                low = wp.max(cos_s - half_width, 0.01 * half_width)
-                grazing[k] = wp.log(high / low) / (high - low)
-
-
-@wp.kernel
-def absorb(
-    offset: int,
-    source: wp.vec3d,
-    loss: float,
-    origins: wp.array(dtype=wp.vec3d),
-    per_origin: int,
-    directions: wp.array(dtype=wp.vec3d),
-    face: wp.array(dtype=wp.int32),
-    range_m: wp.array(dtype=wp.float64),
-    strength: wp.array(dtype=wp.float32),
-):
-    """Take from ``strength`` what air of ``loss`` [neper/m] keeps between source, what the ray met and its origin."""
-    k = offset + wp.tid()
-    if strength[k] > 0.0:
-        point = origins[k / per_origin] + range_m[k] * directions[k % directions.shape[0]]
-        length = wp.float32(wp.length(source - point) + range_m[k])
-        strength[k] = strength[k] * wp.exp(-loss * length)
+            reach = wp.max(d1, nearest)
+            air = wp.exp(-loss * (d1 + wp.float32(range_m[k])))
+            strength[k] = (
+                air * solid_angle[k % solid_angle.shape[0]] * cos_i / (157.91367041742973 * reach * reach)
+            )
+            cos_in[k] = wp.min(cos_i, 1.0)
+            cos_mirror[k] = wp.clamp(2.0 * cos_i * cos_s - wp.dot(toward, look), -1.0, 1.0)
+            high = cos_s + half_width
+            low = wp.max(cos_s - half_width, 0.01 * half_width)
+            grazing[k] = wp.log(high / low) / (high - low)
 
 
 @wp.func
@@ -215,7 +110,8 @@ def lobe_value(
 @wp.kernel
 def resolve_bounces(
     offset: int,
-    per_pixel: int,
+    first: wp.array(dtype=wp.int32),
+    order: wp.array(dtype=wp.int32),
     surface: Surface,
     place: wp.array(dtype=wp.int32),
     face: wp.array(dtype=wp.int32),
@@ -228,11 +124,14 @@ def resolve_bounces(
     moments: wp.array2d(dtype=wp.float32),
     out: wp.array2d(dtype=wp.float32),
 ):
-    """Per pixel, what each group, lobe and Fresnel component would send on: column (group's place, lobe, component)."""
+    """Per row of rays, what each group, lobe and Fresnel component scatters: column (group's place, lobe, component).
+
+    The rays of row p are ``order[first[p]]`` to ``order[first[p + 1] - 1]``.
+    """
     p = offset + wp.tid()
     lobes = exponent.shape[0]
-    for s in range(per_pixel):
-        k = p * per_pixel + s
+    for s in range(first[p], first[p + 1]):
+        k = order[s]
         if strength[k] > 0.0:
             base = place[surface.group[face[k]]] * lobes * MOMENTS
             for j in range(lobes):

@@ -1,39 +1,27 @@
 """Radio fields: one way to fit, ask, save and load, whatever the model.
 
 ``bistatic`` obeys scattering physics (:mod:`warprrf.rf.fields.bistatic`); ``rf3dgs+`` and ``rf3dgs`` hold spherical harmonics
-per Gaussian as published (:mod:`warprrf.rf.fields.harmonic`). A model's package is loaded when its name is first asked for.
+per Gaussian as published (:mod:`warprrf.rf.fields.harmonic`).
 """
 
 from __future__ import annotations
 
-import importlib
 import os
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import Progress, check_array
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields import files as field_files
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD
-
-if TYPE_CHECKING:
-    from typing import Self
-
-    from warprrf.rf.em.absorption import Air
-    from warprrf.rf.maps.links import Links
-    from warprrf.rf.maps.radio_map import RadioMap
-    from warprrf.rf.paths.trace import Paths
-    from warprrf.rf.spectra.dataset import SpectrumDataset
-    from warprrf.rf.spectra.spectrum import Spectrum
-
-_HOMES = {
-    "bistatic": ("bistatic.field", "BistaticField"),
-    "rf3dgs+": ("harmonic.field", "HarmonicField"),
-    "rf3dgs": ("harmonic.field", "HarmonicField"),
-}
-MODELS = tuple(_HOMES)
+from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
+from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.receivers import check_receiver
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
 
 class RadioField(ABC):
@@ -47,6 +35,7 @@ class RadioField(ABC):
         air: absorption in its path gains, that of the data set it was fitted to; None for none.
         device: where it computes.
         report: how the fit went.
+        models: the class that fits and reads each model, by the model's name.
     """
 
     transmitter: np.ndarray
@@ -56,6 +45,7 @@ class RadioField(ABC):
     air: Air | None
     device: Any
     report: dict[str, Any]
+    models: ClassVar[dict[str, type[RadioField]]] = {}
 
     @property
     @abstractmethod
@@ -70,15 +60,15 @@ class RadioField(ABC):
             geometry: a Reconstruction (anything with ``.gaussians`` and ``.mesh``), a Scene or a Mesh.
             ds: training set.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
-            options: of the model: see :meth:`BistaticField.fit` and :meth:`HarmonicField.fit`.
+            options: keyword arguments of :meth:`BistaticField.fit` or :meth:`HarmonicField.fit`, which name and check
+                them.
 
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.
         """
-        if model not in MODELS:
-            raise ValueError(f"model: got {model!r}, expected one of {', '.join(MODELS)}")
-        chosen = {} if model == "bistatic" else {"model": model}
-        return _class_of(model).fit(geometry, ds, **chosen, **options)
+        if model not in cls.models:
+            raise ValueError(f"model: got {model!r}, expected one of {', '.join(cls.models)}")
+        return cls.models[model].fit(geometry, ds, model, **options)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> RadioField:
@@ -88,9 +78,9 @@ class RadioField(ABC):
             FileNotFoundError: if there is no such file.
             ValueError: if it is corrupt, or no radio field.
         """
-        header = field_files.read(path)[1]
-        model = "bistatic" if header.get("model") == "bistatic" else "rf3dgs+"  # which reads rf3dgs too
-        return _class_of(model).load(path, device=device)
+        model = field_files.read(path)[1].get("model")
+        found = cls.models["bistatic" if model == "bistatic" else "rf3dgs+"]  # which reads rf3dgs too
+        return found.load(path, device=device)
 
     @abstractmethod
     def with_gas(self, gas: Any = True) -> Self:
@@ -139,26 +129,42 @@ class RadioField(ABC):
         Raises:
             ValueError: as for :meth:`spectrum`, and for a beam width that is not positive.
         """
-        from warprrf.rf.maps.tracing import find_links
+        receivers = check_receiver("rx", check_array("rx", rx, (None, 3)), self.mesh)
+        source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
+        if (np.linalg.norm(receivers - source, axis=1) == 0).any():
+            raise ValueError("rx: got the transmitter's own position; expected them apart")
+        return self._links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
 
-        return find_links(self, rx, transmitter, beam_sigma_rad, shape, mirror_order, progress)
+    def _links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+        """:meth:`links` at positions that were checked: from paths, one receiver at a time."""
+        if options.mirror_order is not None:
+            raise ValueError(
+                f"mirror_order: got {options.mirror_order!r}, but a field of model {self.model!r} has no mirrors"
+            )
+        search = BeamSearch(
+            check_shape(options.shape or self.shape), options.beam_sigma_rad, device=self.device
+        )
+        return options.in_batches(
+            receivers, 1, lambda some: links_of([self.paths(r, transmitter) for r in some], search)
+        )
 
     def radio_map(
         self, height: float, cell: float = 0.25, transmitter: Any = None, **options: Any
     ) -> RadioMap:
-        """Links over a floor plan, at ``height`` [m] in cells of ``cell`` [m]; see
-        :func:`warprrf.rf.maps.radio_map.radio_map`."""
-        from warprrf.rf.maps.radio_map import radio_map
+        """Links over a floor plan, at ``height`` [m] in cells of ``cell`` [m].
 
-        return radio_map(self, height, cell, transmitter, **options)
+        Args:
+            height: of all cells' centres.
+            cell: width of a cell.
+            transmitter: position (3,) [m] if another than the fitted one.
+            options: attributes of :class:`warprrf.rf.maps.radio_map.MapOptions`.
+
+        Raises:
+            ValueError: as :func:`warprrf.rf.maps.radio_map.radio_map`.
+            TypeError: for an unknown option.
+        """
+        return radio_map(self, height, cell, transmitter, MapOptions(**options))
 
     @abstractmethod
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one safetensors file, in one go."""
-
-
-def _class_of(model: str) -> type[RadioField]:
-    """The class that fits and reads ``model``."""
-    module, name = _HOMES[model]
-    found: type[RadioField] = getattr(importlib.import_module(f"warprrf.rf.fields.{module}"), name)
-    return found

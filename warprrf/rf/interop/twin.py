@@ -316,7 +316,7 @@ def _left_out(field: BistaticField) -> tuple[str, ...]:
     if p.log_gain != 0.0:
         found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
     if field.terms.residual:
-        squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.texel, s.mesh.areas))
+        squares = np.average(field.residual[0] ** 2, weights=np.bincount(s.cell, s.mesh.areas))
         found.append(f"residuals within groups, {NEPER * np.sqrt(squares):.2f} dB rms over area")
     if field.terms.indirect:
         found.append("indirect radiance of each group: further bounces are the ray tracer's")

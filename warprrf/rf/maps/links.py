@@ -8,18 +8,17 @@ pixels of a grid for what is diffuse.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
+from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_of, pixel_solid_angles
-
-if TYPE_CHECKING:
-    from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, directions_from_angles, pixel_of, pixel_solid_angles
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,43 @@ class Links:
     def joined(cls, parts: Sequence[Links]) -> Links:
         """One after another."""
         return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True)
+class LinkOptions:
+    """How links are found.
+
+    Attributes:
+        beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
+        shape: rows and columns of the grid that rays fill; None for the model's default.
+        mirror_order: most reflections on a mirror path, 0 to 3; None for the field's own.
+        progress: called as ``progress("links", done, total)``.
+    """
+
+    beam_sigma_rad: float = BEAM_SIGMA_RAD
+    shape: tuple[int, int] | None = None
+    mirror_order: int | None = None
+    progress: Progress | None = None
+
+    def __post_init__(self) -> None:
+        sigma = self.beam_sigma_rad
+        if not (np.isfinite(sigma) and sigma > 0):
+            raise ValueError(f"beam_sigma_rad: got {sigma!r}, expected a positive beam width in radians")
+        if self.mirror_order not in (None, 0, 1, 2, 3):
+            raise ValueError(
+                f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None for the field's own"
+            )
+
+    def in_batches(self, receivers: np.ndarray, batch: int, trace: Callable[[np.ndarray], Links]) -> Links:
+        """Links of ``receivers`` (R, 3), at most ``batch`` of them at a time."""
+        parts = []
+        for first in range(0, len(receivers), batch):
+            if self.progress is not None:
+                self.progress("links", first, len(receivers))
+            parts.append(trace(receivers[first : first + batch]))
+        if self.progress is not None:
+            self.progress("links", len(receivers), len(receivers))
+        return Links.joined(parts)
 
 
 def directivity(sigma: float, cosine: Any = 1.0) -> np.ndarray:

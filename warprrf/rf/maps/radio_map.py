@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,11 +20,9 @@ from warprrf.device import Progress
 from warprrf.files import write_atomically
 from warprrf.geometry.floor_plan import section
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fields.receivers import ON_A_WALL_M
+from warprrf.rf.maps.links import Links
+from warprrf.rf.receivers import ON_A_WALL_M
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD
-
-if TYPE_CHECKING:
-    from warprrf.rf.fields.base import RadioField
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
 ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
@@ -211,20 +209,79 @@ _PLAIN = ("height_m", "cell_m", "frequency_hz", "beam_sigma_rad", "transmit_powe
 _ARRAYS = ("x", "y", "transmitter", "outline")
 
 
+@dataclass(frozen=True)
+class MapOptions:
+    """How a radio map is made.
+
+    Attributes:
+        bounds: lowest x and y, highest x and y [m]; the mesh's by default. The grid starts at the lowest.
+        beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
+            array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
+        transmit_power_dbm: of the isotropic transmitter.
+        bandwidth_hz: of the noise, k T B at 290 K; one channel of IEEE 802.15.3d by default.
+        noise_figure_db: of the receiver.
+        shape: rows and columns of the grid of rays; see :meth:`RadioField.links`.
+        mirror_order: most reflections on a mirror path; see there.
+        progress: called as ``progress("links", done, total)``, cells in the air.
+    """
+
+    bounds: Any = None
+    beam_sigma_rad: float = BEAM_SIGMA_RAD
+    transmit_power_dbm: float = 20.0
+    bandwidth_hz: float = 2.16e9
+    noise_figure_db: float = 10.0
+    shape: tuple[int, int] | None = None
+    mirror_order: int | None = None
+    progress: Progress | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("bandwidth_hz", "beam_sigma_rad"):
+            _check_number(name, getattr(self, name), positive=True)
+        for name in ("transmit_power_dbm", "noise_figure_db"):
+            _check_number(name, getattr(self, name))
+
+    @property
+    def noise_power_dbm(self) -> float:
+        """Of the receiver, k T B F [dBm]."""
+        noise_w = BOLTZMANN * ROOM_TEMPERATURE_K * self.bandwidth_hz
+        return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
+
+
+class LinkField(Protocol):
+    """What maps are made of: see :class:`warprrf.RadioField`."""
+
+    transmitter: np.ndarray
+    frequency_hz: float
+    device: Any
+
+    @property
+    def mesh(self) -> Mesh | None:
+        """What blocks."""
+
+    def links(
+        self,
+        rx: Any,
+        transmitter: Any = None,
+        *,
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        shape: tuple[int, int] | None = None,
+        mirror_order: int | None = None,
+        progress: Progress | None = None,
+    ) -> Links:
+        """Links at ``rx`` (R, 3) [m]."""
+
+
+def _check_number(name: str, value: float, *, positive: bool = False) -> None:
+    if not np.isfinite(value) or (positive and value <= 0):
+        raise ValueError(f"{name}: got {value!r}, expected a {'positive' if positive else 'finite'} number")
+
+
 def radio_map(
-    field: RadioField,
+    field: LinkField,
     height: float,
     cell: float = 0.25,
     transmitter: Any = None,
-    *,
-    bounds: Any = None,
-    beam_sigma_rad: float = BEAM_SIGMA_RAD,
-    transmit_power_dbm: float = 20.0,
-    bandwidth_hz: float = 2.16e9,
-    noise_figure_db: float = 10.0,
-    shape: tuple[int, int] | None = None,
-    mirror_order: int | None = None,
-    progress: Progress | None = None,
+    options: MapOptions | None = None,
 ) -> RadioMap:
     """Links at the centres of cells over a floor plan.
 
@@ -235,43 +292,26 @@ def radio_map(
         height: of the receivers [m].
         cell: width of a cell [m].
         transmitter: position (3,) [m] if another than the fitted one.
-        bounds: lowest x and y, highest x and y [m]; the mesh's by default. The grid starts at the lowest.
-        beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
-            array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
-        transmit_power_dbm: of the isotropic transmitter.
-        bandwidth_hz: of the noise, k T B at 290 K; one channel of IEEE 802.15.3d by default.
-        noise_figure_db: of the receiver.
-        shape: rows and columns of the grid of rays; see :meth:`RadioField.links`.
-        mirror_order: most reflections on a mirror path; see there.
-        progress: called as ``progress("links", done, total)``, cells in the air.
+        options: bounds, beam, budget and rays.
 
     Raises:
         ValueError: for a height outside the mesh, a cell that is not positive or makes more than two million, a field
             without a mesh, bounds without a cell in the air, a beam, power or bandwidth out of range, or a transmitter
             that is outside the scene or on a surface.
     """
-    mesh = field.mesh
+    mesh, o = field.mesh, options or MapOptions()
     if not isinstance(mesh, Mesh):
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
     source = _device.check_array("transmitter", source, (3,))
-    for name, value, positive in (
-        ("height", height, False),
-        ("cell", cell, True),
-        ("bandwidth_hz", bandwidth_hz, True),
-        ("beam_sigma_rad", beam_sigma_rad, True),
-        ("transmit_power_dbm", transmit_power_dbm, False),
-        ("noise_figure_db", noise_figure_db, False),
-    ):
-        if not np.isfinite(value) or (positive and value <= 0):
-            wanted = "a positive number" if positive else "a finite number"
-            raise ValueError(f"{name}: got {value!r}, expected {wanted}")
+    _check_number("height", height)
+    _check_number("cell", cell, positive=True)
     low, high = mesh.bounds
     if not low[2] < height < high[2]:
         raise ValueError(
             f"height: got {height!r} m, expected one inside the scene, {low[2]:.3g} to {high[2]:.3g} m"
         )
-    x, y = _centres(mesh, cell, bounds)
+    x, y = _centres(mesh, cell, o.bounds)
     across, along = np.meshgrid(x, y)
     places = np.stack([across, along, np.full_like(across, float(height))], axis=-1)
     free = in_the_air(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
@@ -281,16 +321,15 @@ def radio_map(
     links = field.links(
         places[free],
         transmitter,
-        beam_sigma_rad=beam_sigma_rad,
-        shape=shape,
-        mirror_order=mirror_order,
-        progress=progress,
+        beam_sigma_rad=o.beam_sigma_rad,
+        shape=o.shape,
+        mirror_order=o.mirror_order,
+        progress=o.progress,
     )
     layers = {}
     for name in _LAYERS:
         layers[name] = np.full(free.shape, np.nan)
         layers[name][free] = getattr(links, name)
-    noise_w = BOLTZMANN * ROOM_TEMPERATURE_K * bandwidth_hz
     return RadioMap(
         x=x,
         y=y,
@@ -298,9 +337,9 @@ def radio_map(
         cell_m=float(cell),
         transmitter=source,
         frequency_hz=float(field.frequency_hz),
-        beam_sigma_rad=float(beam_sigma_rad),
-        transmit_power_dbm=float(transmit_power_dbm),
-        noise_power_dbm=float(10.0 * np.log10(noise_w) + 30.0 + noise_figure_db),
+        beam_sigma_rad=float(o.beam_sigma_rad),
+        transmit_power_dbm=float(o.transmit_power_dbm),
+        noise_power_dbm=o.noise_power_dbm,
         outline=section(mesh.vertices, mesh.faces, float(height)),
         **layers,
     )

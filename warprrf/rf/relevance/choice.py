@@ -12,11 +12,10 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
 from warprrf.rf.fields.harmonic.transport import transport
-from warprrf.rf.relevance.model import FullModel
+from warprrf.rf.relevance.model import FURTHER, FullModel
 
 ALL_LAYERS = 128  # Gaussians that may share a pixel and count as seen: more have no weight left
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
-FURTHER = ("mirror_scatter", "scatter_mirror", "diffuse_2")
 NEEDS = {"mirror_1": ("mirror_2",), "diffuse_1": (*FURTHER, "residual")}
 """What goes with an effect, because it rests on it."""
 COSTLY = (
@@ -138,7 +137,7 @@ def _percent(share: float) -> str:
 def _gas(model: FullModel) -> str:
     longest = max(
         [float(np.max(x, initial=0.0)) for x in model.bounce_length_m]
-        + [float(np.max(s.paths.length_m, initial=0.0)) for s in model.sights]
+        + [float(np.max(v.paths.length_m, initial=0.0)) for v in model.views]
     )
     rate = model.gas_db_per_m
     return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"

@@ -15,19 +15,20 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.fresnel import lobe, slab_reflection, surface_table
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.bounces import LOBES
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Parameters
-from warprrf.rf.fields.bistatic.sight import Sight
-from warprrf.rf.fields.bistatic.specular import specular_paths
+from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.render import further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.terms import LOBES, Terms
+from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.paths.blockage import LIFT_M, SidePaths, diffracted, transmitted
+from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, spread, to_db
 
 ASSUMED_PERMITTIVITY = 4.0 * (1.0 - 0.06j)
@@ -40,6 +41,8 @@ ONE_BOUNCE: dict[str, Any] = {
     "indirect": False,
 }
 """Terms without anything after a first bounce."""
+MIRRORS = ("line_of_sight", "mirror_1", "mirror_2")
+FURTHER = ("mirror_scatter", "scatter_mirror", "diffuse_2")
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def full_field(
         terms=Terms(lobes=lobes, **further),
         parameters=parameters,
         material=surface.material,
-        residual=np.zeros(len(surface.element_area)),
+        residual=np.zeros((2, surface.cells)),
         device=device,
     )
     return field, walls, "scene" if known else "assumed"
@@ -143,14 +146,6 @@ def full_field(
 def _unknown_walls(mesh: Mesh) -> Walls:
     faces = len(mesh.faces)
     return Walls(mesh, np.full(faces, ASSUMED_PERMITTIVITY), np.full(faces, ASSUMED_THICKNESS_M), True)
-
-
-def variant(field: BistaticField, **changes: Any) -> BistaticField:
-    """``field`` with changes that leave its geometry and lobes as they are: what was traced is kept."""
-    other = replace(field, **changes)
-    for name in ("tracer", "beam", "_mirror_tracer", "_element_light"):
-        other.__dict__[name] = getattr(field, name)
-    return other
 
 
 def with_lobes(p: Parameters, lobes: tuple[int, ...], kept: tuple[int, ...]) -> Parameters:
@@ -192,7 +187,7 @@ def without_elements(field: BistaticField, dropped: np.ndarray) -> BistaticField
         group=np.where(dropped[s.element], none, s.group).astype(np.int32),
         element_group=np.where(dropped, none, s.element_group).astype(np.int32),
         material=np.append(s.material, s.material.max() + 1),
-        look=np.vstack([s.look, np.full(s.look.shape[1], np.nan)]),
+        colour=np.vstack([s.colour, np.full(s.colour.shape[1], np.nan)]),
         group_names=(*s.group_names, "unseen"),
     )
     parameters = replace(
@@ -215,12 +210,16 @@ class FullModel:
         receivers: positions [m], shape ``(R, 3)``.
         floor: N0; None for the default of the full model's spectra.
         gas_db_per_m: attenuation of air; None for that of standard air.
+        progress: called with the stage ``"relevance"``.
 
     Attributes:
         effects: names of all parts, in the order of the table.
         blocked: whether each receiver has no line of sight, shape ``(R,)``.
         seconds: what an effect takes by itself [s] per spectrum, for those that take a time of their own.
         spectrum_s: what a spectrum with every term takes [s].
+
+    Raises:
+        ValueError: if most receivers get no power at all.
     """
 
     def __init__(
@@ -229,38 +228,37 @@ class FullModel:
         walls: Walls,
         receivers: np.ndarray,
         *,
-        floor: float | None = None,
-        gas_db_per_m: float | None = None,
-        progress: Callable[[str, int, int], None],
+        floor: float | None,
+        gas_db_per_m: float | None,
+        progress: Progress,
     ) -> None:
         self.field, self.walls, self.receivers = field, walls, receivers
         self.gas_db_per_m = (
             gas_attenuation_db_per_m(field.frequency_hz) if gas_db_per_m is None else gas_db_per_m
         )
+        self.beam = beam_operator(field.shape, field.beam_sigma_rad, field.device)
         self._parts: dict[tuple[Any, ...], np.ndarray] = {}
         self.seconds: dict[str, float] = {}
-        field.see(receivers[0])  # compile and set up outside the clock
-        start = time.perf_counter()
-        field.element_light(field.transmitter)
-        setup_s = (time.perf_counter() - start) / len(receivers)
-        self.sights: list[Sight] = []
-        composed, seconds = [], []
+        field.render(
+            replace(field, terms=replace(field.terms, **ONE_BOUNCE)).view(receivers[0])
+        )  # compile first
+        setup_s = clock(lambda: field.sent_radiance(field.transport())) / len(receivers)
+        self.views: list[ReceiverView] = []
+        self._mirror_power, seconds = [], []
         for r, receiver in enumerate(receivers):
             start = time.perf_counter()
-            self.sights.append(field.see(receiver))
-            composed.append(field.compose(self.sights[-1]))
+            self.views.append(field.view(receiver))
+            self._mirror_power.append(field.render(self.views[-1]).powers.mirror)
             seconds.append(time.perf_counter() - start)
             progress("relevance", r, len(receivers) + 1)
         self.spectrum_s = float(np.median(seconds))
-        self._specular_power = [c.specular for c in composed]
-        self.blocked = np.array([not (s.paths.order == 0).any() for s in self.sights])
+        self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
         self._time(setup_s)
         self.side = {"diffraction": self._diffracted(), "transmission": self._transmitted()}
         self.effects = self._names()
         self.all = frozenset(self.effects)
-        self._weight = (
-            pixel_solid_angles(field.shape)[:, None] / pixel_solid_angles(field.shape).sum() / field.shape[1]
-        )
+        solid_angle = pixel_solid_angles(field.shape)
+        self._weight = solid_angle[:, None] / solid_angle.sum() / field.shape[1]
         full = self.image(self.all)
         if floor is None and not np.median(full.max(axis=(1, 2))) > 0:
             raise ValueError(
@@ -271,27 +269,27 @@ class FullModel:
 
     def _names(self) -> tuple[str, ...]:
         t = self.field.terms
-        names = [
-            "line_of_sight",
-            "mirror_1",
-            "mirror_2",
+        learned = [name for name in ("indirect", "residual") if getattr(t, name)]
+        lobes = [f"lobe_{n}" for n in t.lobes]
+        return (
+            *MIRRORS,
             "diffuse_1",
-            "mirror_scatter",
-            "scatter_mirror",
-            "diffuse_2",
-        ]
-        names += [name for name in ("indirect", "residual") if getattr(t, name)]
-        names += [f"lobe_{n}" for n in t.lobes]
-        return (*names, "unseen", "gas", "diffraction", "transmission")
+            *FURTHER,
+            *learned,
+            *lobes,
+            "unseen",
+            "gas",
+            "diffraction",
+            "transmission",
+        )
 
     # -------------------------------------------------------------------------------------- images and losses
 
     def image(self, kept: frozenset[str]) -> np.ndarray:
         """Spectra (R, H, W) of the model with the effects ``kept``, path gain."""
         gas = "gas" in kept
-        names = ("line_of_sight", "mirror_1", "mirror_2")
         total = np.zeros((len(self.receivers), *self.field.shape))
-        for order, name in enumerate(names):
+        for order, name in enumerate(MIRRORS):
             if name in kept:
                 total += self._part("specular", order, gas)
         for name in self.side:
@@ -301,7 +299,7 @@ class FullModel:
         if diffuse:
             lobes = tuple(n for n in self.field.terms.lobes if f"lobe_{n}" in kept)
             total += self._part("diffuse", lobes, "residual" in kept, gas)
-        more = tuple(diffuse and name in kept for name in ("mirror_scatter", "scatter_mirror", "diffuse_2"))
+        more = tuple(diffuse and name in kept for name in FURTHER)
         if any(more) or "indirect" in kept:
             further = self._part("further", diffuse, *more, "indirect" in kept, "unseen" in kept)
             # No length of its own is known of this light: it counts as the longest single bounce.
@@ -341,9 +339,10 @@ class FullModel:
 
     def _specular(self, order: int, gas: bool) -> np.ndarray:
         images = []
-        for sight, power in zip(self.sights, self._specular_power, strict=True):
-            strength = np.where(sight.paths.order == order, power * self._air(sight.paths.length_m, gas), 0.0)
-            images.append(np.tensordot(strength, sight.beams.astype(np.float64), axes=1))
+        for view, power in zip(self.views, self._mirror_power, strict=True):
+            beams = np.zeros(0) if view.beams is None else view.beams
+            own, air = view.paths.order == order, self._air(view.paths.length_m, gas)
+            images.append(np.tensordot(np.where(own, power * air, 0.0), beams, axes=1))
         return np.stack(images)
 
     def _side(self, name: str, gas: bool) -> np.ndarray:
@@ -357,15 +356,15 @@ class FullModel:
 
     def _diffuse(self, lobes: tuple[int, ...], residual: bool, gas: bool) -> np.ndarray:
         f = self.field
-        reduced = variant(
+        reduced = replace(
             f,
             terms=replace(f.terms, **ONE_BOUNCE, residual=residual and f.terms.residual),
             parameters=with_lobes(f.parameters, f.terms.lobes, lobes),
         )
         images = []
-        for sight, length in zip(self.sights, self.bounce_length_m, strict=True):
-            rays = reduced.compose(sight).rays * self._air(length, gas)
-            images.append(np.maximum(f.beam(rays.reshape(*f.shape, -1).sum(axis=-1)), 0.0))
+        for view, length in zip(self.views, self.bounce_length_m, strict=True):
+            rays = reduced.render(view).powers.single * self._air(length, gas)
+            images.append(np.maximum(self.beam(rays.reshape(*f.shape, -1).sum(axis=-1)), 0.0))
         return np.stack(images)
 
     def _further(
@@ -382,18 +381,19 @@ class FullModel:
             base.terms, diffuse=diffuse, mirror_scatter=mirror_scatter, scatter_mirror=scatter_mirror,
             diffuse_order=3 if diffuse_2 else 1, indirect=indirect,
         )  # fmt: skip
-        field, gain = variant(base, terms=terms), np.exp(base.parameters.log_gain)
-        return np.stack([np.maximum(field.beam(gain * field.further(sight)), 0.0) for sight in self.sights])
+        field = replace(base, terms=terms)
+        return np.stack([np.maximum(self.beam(_further_image(field, view)), 0.0) for view in self.views])
 
     @cached_property
     def bounce_length_m(self) -> list[np.ndarray]:
-        """Length transmitter-surface-receiver of each ray of each receiver [m]; 0 where it meets nothing or is dark."""
+        """Length transmitter-surface-receiver of each ray of each receiver [m]; 0 where it hits nothing or is dark."""
         lengths = []
-        for sight in self.sights:
-            t = sight.met.range_m.numpy()
-            lit = (sight.lit.strength.numpy() > 0) & np.isfinite(t)
-            point = sight.receiver + np.where(lit, t, 0.0)[:, None] * self.field.tracer.directions
-            lengths.append(np.where(lit, t + np.linalg.norm(point - sight.transmitter, axis=1), 0.0))
+        for view in self.views:
+            length = np.zeros(len(view.hits.face))
+            lit = np.flatnonzero((view.light.strength.numpy() > 0) & (view.hits.face.numpy() >= 0))
+            way = view.hits.points(lit) - view.transport.transmitter
+            length[lit] = view.hits.range_m.numpy()[lit] + np.linalg.norm(way, axis=1)
+            lengths.append(length)
         return lengths
 
     @cached_property
@@ -401,8 +401,8 @@ class FullModel:
         """Elements that no ray of any receiver meets, shape ``(E,)``, bool."""
         s = self.field.surface
         seen = np.zeros(len(s.element_area), bool)
-        for sight in self.sights:
-            face = sight.met.face.numpy()
+        for view in self.views:
+            face = view.hits.face.numpy()
             seen[s.element[face[face >= 0]]] = True
         return ~seen
 
@@ -437,28 +437,18 @@ class FullModel:
 
     def _time(self, setup_s: float) -> None:
         """Seconds per spectrum of the terms, each by itself; ``setup_s`` is a receiver's share of lighting elements."""
-        f, count = self.field, len(self.receivers)
-
-        def clock(work: Callable[[], Any]) -> float:
-            start = time.perf_counter()
-            work()
-            return time.perf_counter() - start
-
-        trace = partial(
-            specular_paths, f.surface, f.transmitter, self.receivers, f.wavelength_m, device=f.device
-        )
-        orders = [clock(partial(trace, order=order)) / count for order in (0, 1, 2)]
-        self.seconds |= {
-            "line_of_sight": orders[0],
-            "mirror_1": max(orders[1] - orders[0], 0.0),
-            "mirror_2": max(orders[2] - orders[1], 0.0),
-        }
-        sight = self.sights[0]
-        single = variant(f, terms=replace(f.terms, **ONE_BOUNCE))
+        f, transport, view = self.field, self.field.transport(), self.views[0]
+        orders = [
+            clock(partial(transport.paths, self.receivers, order)) / len(self.receivers)
+            for order in (0, 1, 2)
+        ]
+        differences = np.maximum(np.diff(orders, prepend=0.0), 0.0)
+        self.seconds |= dict(zip(MIRRORS, map(float, differences), strict=True))
+        single = replace(f, terms=replace(f.terms, **ONE_BOUNCE))
 
         def bounce() -> None:
-            f.tracer.light(f.tracer.meet(sight.receiver), sight.transmitter)
-            single.compose(sight)
+            transport.grid.light(transport.grid.hit(view.receivers), transport.transmitter)
+            single.render(view)
 
         self.seconds["diffuse_1"] = clock(bounce)
         for name, share, terms in (
@@ -466,5 +456,22 @@ class FullModel:
             ("scatter_mirror", 0.0, {"scatter_mirror": True}),
             ("diffuse_2", setup_s, {"diffuse_order": 3}),
         ):
-            alone = variant(f, terms=replace(f.terms, **{**ONE_BOUNCE, **terms}))
-            self.seconds[name] = share + clock(partial(alone.further, sight))
+            alone = replace(f, terms=replace(f.terms, **{**ONE_BOUNCE, **terms}))
+            bare = replace(view, mirror_lit=None, mirror_shown=None)
+            self.seconds[name] = share + clock(partial(_further_image, alone, bare))
+
+
+def _further_image(field: BistaticField, view: ReceiverView) -> np.ndarray:
+    """Path gain per pixel (H, W) of what comes after a first bounce, before the beam; ``view`` may be of another
+    division of the same mesh into groups."""
+    transport = field.transport()
+    own = transport.complete(replace(view, transport=transport), field.terms)
+    found = further_bounces(own, field.materials, field.sent_radiance(transport))
+    return found.by_ray().reshape(*field.shape, -1).sum(axis=-1)
+
+
+def clock(work: Callable[[], Any]) -> float:
+    """Seconds that ``work`` takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start

@@ -29,9 +29,9 @@ from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.fields.receivers import check_receiver
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.relevance.choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
-from warprrf.rf.relevance.model import FullModel, full_field, variant, with_lobes
+from warprrf.rf.relevance.model import FullModel, full_field, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 
 SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds
@@ -137,10 +137,8 @@ class Relevance:
 
     def reduce(self, full: BistaticField) -> BistaticField:
         """``full``, a field with the terms that this was made of, cut down to the smallest model."""
-        p, lobes = full.parameters, self.terms.lobes
-        if lobes == full.terms.lobes:
-            return variant(full, terms=self.terms, errors=None)
-        p = with_lobes(p, full.terms.lobes, lobes)
+        lobes = self.terms.lobes
+        p = with_lobes(full.parameters, full.terms.lobes, lobes)
         p = replace(p, log_weight=p.log_weight[:, [full.terms.lobes.index(n) for n in lobes]])
         return replace(full, terms=self.terms, parameters=p, errors=None)
 
@@ -208,19 +206,64 @@ def title(name: str) -> str:
     return TITLES.get(name) or f"scattering lobe of exponent {name.removeprefix('lobe_')}"
 
 
+@dataclass(frozen=True)
+class Setting:
+    """What relevance is judged for.
+
+    Attributes:
+        transmitter: position [m], shape ``(3,)``; a field's own by default.
+        frequency_hz: carrier [Hz]; a field's own by default.
+        floor: N0 of the dB images; by default a field's own, else 60 dB below the median peak of the full model.
+        shape, beam_sigma_rad: of the spectra; a field's own if it is one.
+        gas_db_per_m: attenuation of the air; None for that of a field's own air, else of standard air
+            (:func:`gas_attenuation_db_per_m`).
+    """
+
+    transmitter: Any = None
+    frequency_hz: float | None = None
+    floor: float | None = None
+    shape: tuple[int, int] = (60, 120)
+    beam_sigma_rad: float = BEAM_SIGMA_RAD
+    gas_db_per_m: float | None = None
+
+    def of(self, geometry: Any) -> Setting:
+        """The same with what a fitted field knows itself.
+
+        Raises:
+            TypeError: for a field of another model.
+            ValueError: for a carrier that is not the field's, a bad floor, a missing transmitter or carrier.
+        """
+        found = self
+        if isinstance(geometry, BistaticField):
+            own, gas = geometry.frequency_hz, self.gas_db_per_m
+            if self.frequency_hz not in (None, own):
+                raise ValueError(
+                    f"frequency_hz: got {self.frequency_hz!r}, but the field was fitted at {own!r}"
+                )
+            if gas is None and geometry.air is not None:
+                gas = geometry.air.attenuation_db_per_m(own)
+            found = Setting(
+                geometry.transmitter if self.transmitter is None else self.transmitter, own,
+                geometry.floor if self.floor is None else self.floor, geometry.shape, geometry.beam_sigma_rad, gas,
+            )  # fmt: skip
+        elif isinstance(geometry, RadioField):
+            raise TypeError(f"geometry: got a field of model {geometry.model!r}, expected a bistatic one")
+        if found.floor is not None and not (np.isfinite(found.floor) and found.floor > 0):
+            raise ValueError(f"floor: got {found.floor!r}, expected a path gain of more than 0")
+        for name in ("transmitter", "frequency_hz"):
+            if getattr(found, name) is None:
+                raise ValueError(f"{name}: got None, expected it for anything but a fitted field")
+        return found
+
+
 def relevance(
     geometry: Any,
     *,
     receivers: Any,
-    transmitter: Any = None,
-    frequency_hz: float | None = None,
     tolerance_db: float = 0.1,
-    floor: float | None = None,
-    shape: tuple[int, int] = (60, 120),
-    beam_sigma_rad: float = BEAM_SIGMA_RAD,
-    gas_db_per_m: float | None = None,
     device: Any = None,
     progress: Progress | None = None,
+    **setting: Any,
 ) -> Relevance:
     """What each effect is worth in a scene and a band, and the smallest model within a tolerance.
 
@@ -229,26 +272,20 @@ def relevance(
             fit left out), or a Reconstruction or Mesh (materials are assumed, and the table says so).
         receivers: some positions [m], shape ``(R, 3)``, blocked ones among them: a dozen or more, since a mirror may
             matter much to few.
-        transmitter: position [m], shape ``(3,)``; a field's own by default.
-        frequency_hz: carrier [Hz]; a field's own by default.
         tolerance_db: what all that is left out may change together [dB].
-        floor: N0 of the dB images; by default a field's own, else 60 dB below the median peak of the full model.
-        shape, beam_sigma_rad: of the spectra; a field's own if it is one.
-        gas_db_per_m: attenuation of the air; None for that of a field's own air, else of standard air
-            (:func:`gas_attenuation_db_per_m`).
         device: where rays are cast.
         progress: called with the stage ``"relevance"``.
+        setting: attributes of :class:`Setting`: ``transmitter``, ``frequency_hz`` (both needed for anything but a
+            field), ``floor``, ``shape``, ``beam_sigma_rad``, ``gas_db_per_m``.
 
     Raises:
         ValueError: for a missing transmitter or carrier, one outside a material's band or another than a field's own,
             receivers on a surface or outside the scene, or a tolerance that is not positive.
-        TypeError: for a geometry without a mesh, or a field of another model.
+        TypeError: for a geometry without a mesh, a field of another model, or an unknown setting.
     """
     return relevances(
-        geometry, (tolerance_db,), receivers=receivers, transmitter=transmitter, frequency_hz=frequency_hz,
-        floor=floor, shape=shape, beam_sigma_rad=beam_sigma_rad, gas_db_per_m=gas_db_per_m, device=device,
-        progress=progress,
-    )[0]  # fmt: skip
+        geometry, (tolerance_db,), receivers=receivers, device=device, progress=progress, **setting
+    )[0]
 
 
 def relevances(
@@ -256,47 +293,26 @@ def relevances(
     tolerances_db: Sequence[float],
     *,
     receivers: Any,
-    transmitter: Any = None,
-    frequency_hz: float | None = None,
-    floor: float | None = None,
-    shape: tuple[int, int] = (60, 120),
-    beam_sigma_rad: float = BEAM_SIGMA_RAD,
-    gas_db_per_m: float | None = None,
     device: Any = None,
     progress: Progress | None = None,
+    **setting: Any,
 ) -> list[Relevance]:
     """:func:`relevance` at several tolerances, for little more than the time of one; arguments and errors as there."""
-    fitted = isinstance(geometry, BistaticField)
-    if isinstance(geometry, RadioField) and not fitted:
-        raise TypeError(f"geometry: got a field of model {geometry.model!r}, expected a bistatic one")
     for tolerance in tolerances_db:
         if not (np.isfinite(tolerance) and tolerance > 0):
             raise ValueError(f"tolerance_db: got {tolerance!r}, expected more than 0")
-    if floor is not None and not (np.isfinite(floor) and floor > 0):
-        raise ValueError(f"floor: got {floor!r}, expected a path gain of more than 0")
-    if fitted:
-        own = geometry.frequency_hz
-        if frequency_hz is not None and frequency_hz != own:
-            raise ValueError(f"frequency_hz: got {frequency_hz!r}, but the field was fitted at {own!r}")
-        frequency_hz, shape, beam_sigma_rad = own, geometry.shape, geometry.beam_sigma_rad
-        transmitter = geometry.transmitter if transmitter is None else transmitter
-        floor = geometry.floor if floor is None else floor
-        if gas_db_per_m is None and geometry.air is not None:
-            gas_db_per_m = geometry.air.attenuation_db_per_m(own)
-    for name, value in (("transmitter", transmitter), ("frequency_hz", frequency_hz)):
-        if value is None:
-            raise ValueError(f"{name}: got None, expected it for anything but a fitted field")
+    asked = Setting(**setting).of(geometry)
     full, walls, source = full_field(
         geometry,
-        transmitter=check_array("transmitter", transmitter, (3,)),
-        frequency_hz=check_frequency(frequency_hz),
-        shape=check_shape(shape),
-        beam_sigma_rad=beam_sigma_rad,
+        transmitter=check_array("transmitter", asked.transmitter, (3,)),
+        frequency_hz=check_frequency(asked.frequency_hz),
+        shape=check_shape(asked.shape),
+        beam_sigma_rad=asked.beam_sigma_rad,
         device=device,
     )
     places = np.atleast_2d(check_receiver("receivers", receivers, full.surface.mesh))
-    tick = progress or (lambda stage, done, total: None)
-    model = FullModel(full, walls, places, floor=floor, gas_db_per_m=gas_db_per_m, progress=tick)
+    tick: Progress = progress or (lambda stage, done, total: None)
+    model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
     gaussians = getattr(geometry, "gaussians", None)
     found = []
     for tolerance in tolerances_db:
@@ -349,15 +365,16 @@ def _terms(full: Terms, kept: frozenset[str]) -> Terms:
         diffuse_order=full.diffuse_order if "diffuse_2" in kept else 1,
         indirect="indirect" in kept,
         residual="residual" in kept,
+        sub_pixels=full.sub_pixels,
     )
 
 
 def _spectra(field: BistaticField, receivers: np.ndarray) -> tuple[np.ndarray, float]:
     """Spectra (R, H, W), and the median time of one [s], set-up apart."""
-    field.compose(field.see(receivers[0]))  # tables and, where needed, the light on elements
+    field.render(field.view(receivers[0]))  # tables and, where needed, the light on elements
     images, seconds = [], []
     for receiver in receivers:
         start = time.perf_counter()
-        images.append(field.compose(field.see(receiver)).image)
+        images.append(field.render(field.view(receiver)).image)
         seconds.append(time.perf_counter() - start)
     return np.stack(images), float(np.median(seconds))

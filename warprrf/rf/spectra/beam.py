@@ -9,6 +9,7 @@ import numpy as np
 from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
+from warprrf.cache import Cache
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions
 
 EVEN_SUB_PIXELS = 4  # square root of the directions that stand for a whole pixel's even power
@@ -75,3 +76,12 @@ class BeamOperator:
     def at(self, pixels: np.ndarray, images: np.ndarray) -> np.ndarray:
         """``images`` (H W, C) spread, at ``pixels`` (N,) alone, in single precision, shape ``(N, C)``."""
         return self._matrix[pixels] @ images.astype(np.float32, copy=False)
+
+
+_OPERATORS = Cache(8)
+
+
+def beam_operator(shape: tuple[int, int], sigma: float, device: Any = None) -> BeamOperator:
+    """The beam of width ``sigma`` [rad] on a grid of ``shape``; the last few are kept."""
+    key = shape, sigma, str(device)
+    return _OPERATORS.get(key, lambda: BeamOperator(shape, sigma, device=device))

@@ -55,9 +55,10 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     mirrored = 1.0 - np.array([m.scattering for m in room]) ** 2
     p = replace(field.parameters, log_excess=np.log(permittivity - 1.0), log_mirror=np.log(mirrored))
     field = replace(field, parameters=p)
-    found = specular_paths(field.surface, TX, RX[None], field.wavelength_m, order=2)
+    view = field.view(RX)
+    found = view.paths
     true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
-    power = field.path_power(found)
+    power = field.render(view).powers.mirror
     means = []
     for path in np.flatnonzero(found.order == 2):
         same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (

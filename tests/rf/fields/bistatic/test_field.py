@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
-from warprrf.geometry import o3d
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
-from warprrf.rf.fields.bistatic.bounces import BounceTracer
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.materials import Layout, Parameters
+from warprrf.rf.fields.bistatic.rays import RayGrid
+from warprrf.rf.fields.bistatic.response import Response, SpectrumPixels, jacobian, predict, respond
+from warprrf.rf.fields.bistatic.scattering import scatter
 from warprrf.rf.fields.bistatic.specular import specular_paths
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -131,19 +133,20 @@ def test_fitting_twice_gives_the_same_numbers(scene: RadioScene, data: SpectrumD
 
 def test_jacobian_against_differences(scene: RadioScene, data: SpectrumDataset) -> None:
     seen = trace(scene, data.subset([0]))
-    blank = BistaticField.fit(scene, data.subset([0]), transport=seen, iterations=0)
-    view = blank.view(seen.sights[0], np.arange(0, SHAPE[0] * SHAPE[1], 7))
-    layout = fitting.Layout(2, len(blank.terms.lobes), indirect=True, gain=True)
+    measured = SpectrumPixels(BeamOperator(SHAPE, SIGMA), np.arange(0, SHAPE[0] * SHAPE[1], 7))
+    lobes = Terms().lobes
+    response = respond(seen.views[0], measured, lobes, data.floor)
+    layout = Layout(2, len(lobes), indirect=True, gain=True)
     rng = np.random.default_rng(0)
     p = layout.unpack(rng.normal(-1.0, 0.2, layout.size))
-    power, slopes, index = fitting.jacobian(view, p, layout)
+    power, slopes, index = jacobian(response, p, layout)
     dense = np.zeros((len(power), layout.size))
-    np.add.at(dense.T, index, slopes.T)
-    assert np.allclose(power, fitting.predict(view, p), rtol=1e-4)
+    dense[:, index] = slopes.T
+    assert np.allclose(power, predict(response, p), rtol=1e-4)
     for k in range(layout.size):
         step = np.zeros(layout.size)
         step[k] = 0.02
-        up, down = (fitting.predict(view, layout.unpack(layout.pack(p) + s * step)) for s in (1, -1))
+        up, down = (predict(response, layout.unpack(layout.pack(p) + s * step)) for s in (1, -1))
         numeric = (up - down) / 0.04
         scale = np.abs(numeric).max() + 1e-3 * power.max()
         # The permittivity's table is linear between its nodes, which a difference may straddle.
@@ -151,22 +154,9 @@ def test_jacobian_against_differences(scene: RadioScene, data: SpectrumDataset) 
         assert np.abs(dense[:, k] - numeric).max() < allowed * scale, k
     planted = dense[:, 0] * 1.2
     up, down = (
-        fitting.predict(view, layout.unpack(layout.pack(p) + s * np.eye(layout.size)[0] * 0.02))
-        for s in (1, -1)
+        predict(response, layout.unpack(layout.pack(p) + s * np.eye(layout.size)[0] * 0.02)) for s in (1, -1)
     )
     assert np.abs(planted - (up - down) / 0.04).max() > 0.1 * np.abs(dense[:, 0]).max()
-
-
-def test_gauss_newton_ends_no_higher_than_adam(scene: RadioScene, data: SpectrumDataset) -> None:
-    seen = trace(scene, data.subset(np.arange(3)))
-    blank = BistaticField.fit(scene, data.subset(np.arange(3)), transport=seen, iterations=0)
-    target = to_db(data.path_gain, data.floor) - 10 * np.log10(data.floor)
-    views = [blank.view(s, np.arange(0, target[0].size, 2), target[r]) for r, s in enumerate(seen.sights)]
-    start = fitting.Parameters.prior(2, len(blank.terms.lobes))
-    newton = fitting.fit_groups(views, start, np.ones(2))
-    adam = fitting.fit_groups_adam(views, start, np.ones(2), steps=150)
-    assert newton.losses[-1] < adam.losses[-1] * 1.05
-    assert newton.losses[-1] < 0.2 * adam.losses[0]
 
 
 def test_an_uncalibrated_gain_is_found(scene: RadioScene, data: SpectrumDataset) -> None:
@@ -306,40 +296,12 @@ def test_bad_options_are_refused(scene: RadioScene, data: SpectrumDataset) -> No
 
 def test_a_tracer_on_true_materials_matches_the_exact_engine(scene: RadioScene) -> None:
     surface = Surface.of(scene)
-    tracer = BounceTracer(surface, SHAPE, lobes=(0, 4))
-    met = tracer.meet(RECEIVERS[0])
-    lit = tracer.light(met, TX)
+    grid = RayGrid(surface, SHAPE, 3)
+    hits = grid.hit(RECEIVERS[0])
     weight = np.array([[0.0, 0.25], [0.64, 0.0]])
-    power = tracer.scatter(met, lit, weight, np.log([2.0, 5.0]), WAVELENGTH)
+    power = scatter(surface, hits.face, grid.light(hits, TX), (0, 4), weight, np.log([2.0, 5.0]), WAVELENGTH)
     engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
     assert power.sum() == pytest.approx(engine.diffuse(RECEIVERS[0]).power.sum(), rel=0.02)
-
-
-@pytest.mark.skipif(not o3d.installed(), reason="Open3D is not installed: there is one way to search")
-@pytest.mark.parametrize("count", [1, 3])
-def test_rays_by_embree_and_inside_kernels_see_the_same(
-    scene: RadioScene, count: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    surface = Surface.of(scene)
-    found = []
-    for installed in (True, False):
-        monkeypatch.setattr(o3d, "installed", lambda installed=installed: installed)
-        tracer = BounceTracer(surface, SHAPE)
-        met = tracer.meet(RECEIVERS[:count])
-        found.append(
-            (met, tracer.light(met, TX), tracer.light(met, surface.images(TX)[0][0], real=TX, patch=0))
-        )
-    (ours, lit, mirrored), (other, lit_2, mirrored_2) = found
-    assert (ours.face.numpy() >= 0).all() and len(ours.face) == count * SHAPE[0] * SHAPE[1] * 9
-    same = ours.face.numpy() == other.face.numpy()
-    assert same.mean() > 0.999  # on an edge either face may be named
-    np.testing.assert_allclose(ours.range_m.numpy()[same], other.range_m.numpy()[same], rtol=1e-6)
-    for a, b in ((lit, lit_2), (mirrored, mirrored_2)):
-        a, b = a.strength.numpy(), b.strength.numpy()
-        assert 0.02 < (a > 0).mean() < 0.98
-        assert ((a > 0) == (b > 0))[same].mean() > 0.998  # the border of a shadow
-        both = same & (a > 0) & (b > 0)
-        np.testing.assert_allclose(a[both], b[both], rtol=1e-5)
 
 
 def test_the_beam_operator_is_the_beam_of_every_pixel() -> None:
@@ -384,21 +346,23 @@ def test_a_fit_goes_on_after_steps_that_were_cut_short() -> None:
     from dataclasses import replace
 
     lit, hopeless = 20, 4000
-    none = np.zeros((lit + hopeless, 0), np.float32)
-    basis = np.zeros((lit + hopeless, 1, 1, 3), np.float32)
-    true = fitting.Parameters.prior(1, 1)
-    basis[:lit, 0, 0] = 200.0 * fresnel_curves().at(fresnel_curves().coordinates, true.log_excess)[0][0]
-    view = fitting.View(
-        groups=np.array([0]), basis=basis, seen=np.zeros(0, int), dark=none, gain=np.zeros(0),
-        path_group=np.zeros((0, 3), int), cosine=np.zeros((0, 3)), turn=np.zeros((0, 3)), beam=none.T,
-        extra=np.zeros(lit + hopeless, np.float32), again_group=np.zeros(0, int), again=none,
-        target_db=np.full(lit + hopeless, 40.0),
+    count = lit + hopeless
+    none = np.zeros((0, count), np.float32)
+    bounce = np.zeros((1, 1, 3, count), np.float32)
+    true = Parameters.prior(1, 1)
+    component = fresnel_curves().at(fresnel_curves().coordinates, true.log_excess)[0][0]
+    bounce[0, 0, :, :lit] = 200.0 * component[:, None]
+    index, angle = np.zeros((0, 3), int), np.zeros((0, 3))
+    response = Response(
+        group=np.array([0]), bounce=bounce, seen=np.zeros(0, int), indirect=none, sender=np.zeros(0, int), sent=none,
+        path_group=index, cosine=angle, turn=angle, path_power=np.zeros(0), path=none, offset=np.zeros(count),
     )  # fmt: skip
-    target = fitting.NEPER * np.log1p(fitting.predict(view, true)[0])
-    view.target_db[:lit] = target
+    target = np.full(count, 40.0)
+    target[:lit] = fitting.NEPER * np.log1p(predict(response, true)[0])
+    reading = fitting.Reading(response, target)
     start = replace(true, log_weight=true.log_weight - 9.0)
     loose = fitting.Deviations(weight=1e3, excess=1e-3, mirror=1e3, energy=1e6)
-    found = fitting.fit_groups([view], start, np.ones(1), deviations=loose)
-    now = fitting.NEPER * np.log1p(fitting.predict(view, found.parameters)[:lit])
+    found = fitting.fit_groups([reading], start, np.ones(1), fitting.GroupFit(deviations=loose))
+    now = reading.error_db(found.parameters)[:lit]
     assert found.steps > 5
-    assert np.abs(now - target).max() < 0.1
+    assert np.abs(now).max() < 0.1

@@ -1,4 +1,4 @@
-"""What differs within a material group: planted gains come back, few spectra move elements, many texels."""
+"""What differs within a material group: planted gains come back, few spectra move elements, many cells."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,18 +8,24 @@ import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra
 from scipy import sparse
 
+from warprrf.rf.fields import files
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import NEPER
-from warprrf.rf.fields.bistatic.residuals import Shares, fit_residual, gather_shares
-from warprrf.rf.fields.bistatic.surface import ELEMENT_M, TEXELS, Surface
+from warprrf.rf.fields.bistatic.links import LinkTracer
+from warprrf.rf.fields.bistatic.residuals import ResidualFit, Shares, fit_residual, gather_shares
+from warprrf.rf.fields.bistatic.surface import CELLS, ELEMENT_M, Surface
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.maps.tracing import LinkTracer
+from warprrf.rf.maps.links import LinkOptions
+from warprrf.rf.spectra.beam import BeamOperator
 
 F = 300e9
 SHAPE = (24, 48)
 TX = np.array([0.8, 0.9, 2.2])
 RECEIVERS = np.array([[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9]])
+
+
+BEAM = BeamOperator(SHAPE, np.radians(5.0))
 
 
 @pytest.fixture(scope="module")
@@ -47,47 +53,46 @@ def shares_of(field: BistaticField, planted: np.ndarray) -> list[Shares]:
     """What the receivers would see of ``field`` with the gains ``planted``, written out term by term."""
     surface, pixels, found = field.surface, SHAPE[0] * SHAPE[1], []
     for receiver in RECEIVERS:
-        sight = field.see(receiver)
+        view = field.view(receiver)
         bare = replace(field, residual=np.zeros_like(field.residual))
-        parts = bare.compose(sight)
-        pixel = np.arange(len(parts.rays)) // field.tracer.sub_pixels**2
-        single = gather_shares(pixel, sight.met.face.numpy(), parts.rays / field.floor, pixels, surface)
-        further = sum(
-            gather_shares(pixel, face, power / field.floor, pixels, surface)
-            for pixel, face, power in field.sent_on(sight)
-        )
-        image = replace(field, residual=planted).compose(sight).image / field.floor
-        specular = np.tensordot(parts.specular, sight.beams, axes=1).ravel() / field.floor
+        powers = bare.render(view).powers
+        per_pixel = len(powers.single) // pixels
+        pixel, face = np.arange(len(powers.single)) // per_pixel, view.hits.face.numpy()
+        single = gather_shares(pixel, face, powers.single / field.floor, pixels, surface)
+        sent = powers.further.sent
+        further = gather_shares(sent.ray // per_pixel, sent.face, sent.power / field.floor, pixels, surface)
+        image = replace(field, residual=planted).render(view).image / field.floor
+        specular = np.tensordot(powers.mirror, view.beams, axes=1).ravel() / field.floor
         found.append(Shares(single, further, specular, NEPER * np.log1p(image.ravel())))
     return found
 
 
-def test_texels_are_pieces_of_elements(field: BistaticField) -> None:
+def test_cells_are_pieces_of_elements(field: BistaticField) -> None:
     s = field.surface
-    assert s.texels > 3 * len(s.element_area)
-    assert np.array_equal(s.texel_element[s.texel], s.element)
+    assert s.cells > 3 * len(s.element_area)
+    assert np.array_equal(s.cell_element[s.cell], s.element)
     centre = s.mesh.triangles.mean(axis=1)
-    for k in range(0, s.texels, 7):
-        assert np.ptp(centre[s.texel == k], axis=0).max() <= ELEMENT_M / TEXELS
+    for k in range(0, s.cells, 7):
+        assert np.ptp(centre[s.cell == k], axis=0).max() <= ELEMENT_M / CELLS
 
 
 def test_planted_gains_come_back(field: BistaticField) -> None:
     """Noiseless spectra: the image is met to 0.1 dB and the gains of what is seen well to a fraction of a dB."""
     rng = np.random.default_rng(3)
-    smooth = rng.normal(0.0, 0.3, (2, len(field.surface.element_area)))[:, field.surface.texel_element]
+    smooth = rng.normal(0.0, 0.3, (2, len(field.surface.element_area)))[:, field.surface.cell_element]
     shares = shares_of(field, smooth)
-    found = fit_residual(shares, field.beam, field.surface, noise_db=0.1)
-    assert found.shape == (2, field.surface.texels)
+    found = fit_residual(shares, BEAM, field.surface, ResidualFit(noise_db=0.1))
+    assert found.shape == (2, field.surface.cells)
     known, gaps = replace(field, residual=found), []
     for receiver, share in zip(RECEIVERS, shares, strict=True):
-        image = known.compose(known.see(receiver)).image.ravel() / field.floor
+        image = known.render(known.view(receiver)).image.ravel() / field.floor
         gaps.append(NEPER * np.log1p(image) - share.target_db)
     assert np.sqrt(np.mean(np.square(gaps))) < 0.1
     power = sum(np.asarray(s.single.sum(axis=0)).ravel() for s in shares)
-    element = field.surface.texel_element
+    element = field.surface.cell_element
     bright = power > np.quantile(power, 0.5)
     assert np.corrcoef(found[0][bright], smooth[0][bright])[0, 1] > 0.9
-    # alike elements need no texels of their own
+    # alike elements need no cells of their own
     within = found[0] - (np.bincount(element, found[0]) / np.bincount(element))[element]
     assert within.std() < 0.5 * smooth[0].std()
 
@@ -95,35 +100,35 @@ def test_planted_gains_come_back(field: BistaticField) -> None:
 def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
     """Spectra that the field explains already, and surfaces that no spectrum shows, have gains of 1."""
     shares = shares_of(field, np.zeros_like(field.residual))
-    assert np.abs(fit_residual(shares, field.beam, field.surface)).max() < 1e-4
+    assert np.abs(fit_residual(shares, BEAM, field.surface)).max() < 1e-4
     surface = field.surface
     shown = np.isin(
-        np.arange(surface.texels), np.unique(surface.texel_element, return_index=True)[1], invert=True
+        np.arange(surface.cells), np.unique(surface.cell_element, return_index=True)[1], invert=True
     )
     shown &= (
-        surface.element_centre[surface.texel_element][:, 2] < 2.9
-    )  # no ceiling, and else all texels but one
+        surface.element_centre[surface.cell_element][:, 2] < 2.9
+    )  # no ceiling, and else all cells but one
     hide = sparse.diags_array(shown.astype(np.float32))
     doubled = [
         replace(s, single=s.single @ hide, further=s.further @ hide)
         for s in shares_of(field, np.full_like(field.residual, np.log(2.0)))
     ]
-    found = fit_residual(doubled, field.beam, surface)
-    dark = np.bincount(surface.texel_element, shown)[surface.texel_element] == 0
+    found = fit_residual(doubled, BEAM, surface)
+    dark = np.bincount(surface.cell_element, shown)[surface.cell_element] == 0
     assert dark.any() and np.array_equal(found[:, dark], np.zeros((2, dark.sum())))
-    # a texel that nobody saw, of an element that somebody did, has the element's
+    # a cell that nobody saw, of an element that somebody did, has the element's
     assert (found[0][~shown & ~dark] > 0).mean() > 0.8
 
 
 def test_gains_multiply_their_own_light_alone(field: BistaticField) -> None:
-    sight = field.see(RECEIVERS[0])
-    bare = field.compose(sight)
-    ones, twos = np.zeros(field.surface.texels), np.full(field.surface.texels, np.log(2.0))
-    single = replace(field, residual=np.stack([twos, ones])).compose(sight)
-    np.testing.assert_allclose(single.rays, 2.0 * bare.rays, rtol=1e-12)
+    view = field.view(RECEIVERS[0])
+    bare = field.render(view)
+    ones, twos = np.zeros(field.surface.cells), np.full(field.surface.cells, np.log(2.0))
+    single = replace(field, residual=np.stack([twos, ones])).render(view)
+    np.testing.assert_allclose(single.powers.single, 2.0 * bare.powers.single, rtol=1e-12)
     np.testing.assert_array_equal(single.further, bare.further)
-    further = replace(field, residual=np.stack([ones, twos])).compose(sight)
-    np.testing.assert_array_equal(further.rays, bare.rays)
+    further = replace(field, residual=np.stack([ones, twos])).render(view)
+    np.testing.assert_array_equal(further.powers.single, bare.powers.single)
     np.testing.assert_allclose(further.further, 2.0 * bare.further, rtol=1e-12)
     assert bare.further.sum() > 0
 
@@ -134,9 +139,10 @@ def test_another_transmitters_light_falls_elsewhere(field: BistaticField) -> Non
     there = TX + [1.0, 0.5, -0.3]
     rng = np.random.default_rng(5)
     own = replace(field, residual=rng.normal(size=field.residual.shape))
-    sight = own.see(RECEIVERS[0], there)
-    np.testing.assert_array_equal(own.compose(sight).further, field.compose(sight).further)
-    assert not np.allclose(own.compose(sight).rays, field.compose(sight).rays, atol=0.0)
+    view = own.view(RECEIVERS[0], there)
+    ours, bare = own.render(view), field.render(view)
+    np.testing.assert_array_equal(ours.further, bare.further)
+    assert not np.allclose(ours.powers.single, bare.powers.single, atol=0.0)
     moved = replace(own, residual=own.residual * [[1.0], [0.0]])
     np.testing.assert_array_equal(
         own.spectrum(RECEIVERS[0], there).path_gain, moved.spectrum(RECEIVERS[0], there).path_gain
@@ -148,7 +154,9 @@ def test_links_have_the_same_gains(field: BistaticField) -> None:
     rng = np.random.default_rng(6)
 
     def totals(asked: BistaticField) -> tuple[np.ndarray, np.ndarray]:
-        links = LinkTracer(asked, TX, asked.beam_sigma_rad, SHAPE)(RECEIVERS)
+        transport = asked.transport()
+        sent, options = asked.sent_radiance(transport), LinkOptions(asked.beam_sigma_rad, SHAPE)
+        links = LinkTracer(transport, asked.materials, sent, options, SHAPE)(RECEIVERS)
         return links.total_path_gain, np.array([asked.spectrum(r).path_gain.sum() for r in RECEIVERS])
 
     bare = totals(field)
@@ -162,22 +170,24 @@ def test_the_file_keeps_them_and_refuses_others(field: BistaticField, tmp_path: 
     textured.save(tmp_path / "field.safetensors")
     back = RadioField.load(tmp_path / "field.safetensors")
     np.testing.assert_array_equal(back.residual, textured.residual)
-    np.testing.assert_array_equal(back.surface.texel_element, textured.surface.texel_element)
+    np.testing.assert_array_equal(back.surface.cell_element, textured.surface.cell_element)
     np.testing.assert_array_equal(
         back.spectrum(RECEIVERS[1]).path_gain, textured.spectrum(RECEIVERS[1]).path_gain
     )
-    wrong = replace(textured, residual=np.zeros(len(field.surface.element_area)))
-    wrong.save(tmp_path / "wrong.safetensors")
-    with pytest.raises(ValueError, match="residual does not fit its surface"):
+    tensors, header = files.read(tmp_path / "field.safetensors")
+    files.write(tmp_path / "wrong.safetensors", tensors | {"residual": textured.residual[:, :-1]}, header)
+    with pytest.raises(ValueError, match="wrong.safetensors: corrupt bistatic field: residual: got shape"):
         RadioField.load(tmp_path / "wrong.safetensors")
+    with pytest.raises(ValueError, match="residual: got shape"):
+        replace(textured, residual=np.zeros(len(field.surface.element_area)))
 
 
-def test_a_surface_of_faces_larger_than_texels(field: BistaticField) -> None:
-    """Each of them is a texel of its own; nothing is lost."""
+def test_a_surface_of_faces_larger_than_cells(field: BistaticField) -> None:
+    """Each of them is a cell of its own; nothing is lost."""
     vertices, faces = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
     surface = Surface.of(RadioScene(*_plain(vertices, faces), [SlabMaterial("walls")]))
-    assert np.array_equal(surface.texel_element[surface.texel], surface.element)
-    assert np.bincount(surface.texel, minlength=surface.texels).min() >= 1
+    assert np.array_equal(surface.cell_element[surface.cell], surface.element)
+    assert np.bincount(surface.cell, minlength=surface.cells).min() >= 1
 
 
 def _plain(vertices: np.ndarray, faces: np.ndarray):

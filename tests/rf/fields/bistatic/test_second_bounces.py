@@ -9,13 +9,23 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Layout, Parameters, View, fit_groups, jacobian, predict
+from warprrf.rf.fields.bistatic.fit import Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import regroup
+from warprrf.rf.fields.bistatic.materials import Layout, Parameters
 from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.fields.bistatic.response import (
+    Response,
+    SpectrumPixels,
+    jacobian,
+    predict,
+    respond,
+    with_further_bounces,
+)
 from warprrf.rf.fields.bistatic.specular import specular_paths
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.fields.bistatic.transport import Transport
 from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
@@ -97,13 +107,13 @@ def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
             parameters=Parameters(
                 weight, np.array([np.log(4.0), np.log(199.0)]), np.array([nothing, 0.0]), np.full(2, -np.inf)
             ),
-            material=np.arange(2), residual=np.zeros((2, surface.texels)),
+            material=np.arange(2), residual=np.zeros((2, surface.cells)),
         )  # fmt: skip
 
     lit = field(both, transmitter, mirror_scatter=True)
     dark = field(both, transmitter)
-    seen = lit.see(receiver)
-    extra = lit.compose(seen).image - dark.compose(seen).image
+    seen = lit.view(receiver)
+    extra = lit.render(seen).image - dark.render(seen).image
     wanted = field(alone, image).spectrum(receiver).path_gain
     # The mirror keeps what its Fresnel curve says, which hardly depends on the angle up to 60 degrees.
     reflected = fresnel_curves().value(np.full(2, np.log(199.0)), np.array([0.5, 1.0]))[0]
@@ -112,7 +122,7 @@ def test_light_that_a_mirror_throws_on_a_floor_comes_from_the_image() -> None:
     assert 0.97 * reflected.min() < np.median(ratio) < 1.03 * reflected.max()
     assert 0.9 * reflected.min() < ratio.min() and ratio.max() < 1.1 * reflected.max()
     assert 0.97 * reflected.min() < extra.sum() / wanted.sum() < 1.03 * reflected.max()
-    assert lit.further(seen).sum() == pytest.approx(extra.sum(), rel=1e-6)
+    assert lit.render(seen).further.sum() == pytest.approx(extra.sum(), rel=1e-6)
 
 
 @pytest.mark.usefixtures("device")
@@ -121,13 +131,18 @@ def test_what_groups_send_on_adds_up(scene: RadioScene) -> None:
     ds = spectra(scene, RECEIVERS[:1])
     terms = Terms(mirror_scatter=True, diffuse_order=3)
     field = BistaticField.prior(surface, ds, terms=terms)
-    sight = field.see(RECEIVERS[0])
-    pixels = np.arange(SHAPE[0] * SHAPE[1])
-    groups, images, shown = field.further_by_group(sight, pixels)
-    assert len(groups) == images.shape[1]
-    assert not shown.any()
-    whole = field.beam(field.further(sight)).ravel()
-    assert np.allclose(images.sum(axis=1), whole, rtol=1e-4, atol=1e-7 * whole.max())
+    view, beam = field.view(RECEIVERS[0]), BeamOperator(SHAPE, np.radians(5.0))
+    measured = SpectrumPixels(beam, np.arange(SHAPE[0] * SHAPE[1]))
+    bare, sent = respond(view, measured, terms.lobes, ds.floor), field.sent_radiance(view.transport)
+    follows, held = (
+        with_further_bounces(bare, view, measured, field.materials, sent, ds.floor, follow=follow)
+        for follow in (True, False)
+    )
+    whole = beam(field.render(view).further).ravel() / ds.floor
+    assert not follows.offset.any()
+    share = field.parameters.scattered_share[follows.sender]
+    assert np.allclose(share @ follows.sent, whole, rtol=1e-4, atol=1e-7 * whole.max())
+    assert np.allclose(held.offset, whole, rtol=1e-4, atol=1e-7 * whole.max())
 
 
 MATERIALS = [
@@ -155,65 +170,66 @@ def spectra(scene: RadioScene, receivers: np.ndarray) -> SpectrumDataset:
 
 
 @pytest.fixture(scope="module")
-def views(scene: RadioScene) -> list[View]:
+def readings(scene: RadioScene) -> list[Reading]:
     ds = spectra(scene, RECEIVERS)
-    seen = trace(scene, ds)
-    blank = BistaticField.prior(seen.surface, ds)
     target = to_db(ds.path_gain, ds.floor) - 10 * np.log10(ds.floor)
-    pixels = np.arange(SHAPE[0] * SHAPE[1])
-    return [blank.view(s, pixels, t) for s, t in zip(seen.sights, target, strict=True)]
+    measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)), np.arange(SHAPE[0] * SHAPE[1]))
+    return [
+        Reading(respond(view, measured, Terms().lobes, ds.floor), t.ravel())
+        for view, t in zip(trace(scene, ds).views, target, strict=True)
+    ]
 
 
-def test_spectra_join_groups_of_one_material_and_no_others(views: list[View], scene: RadioScene) -> None:
+def test_spectra_join_groups_of_one_material_and_no_others(
+    readings: list[Reading], scene: RadioScene
+) -> None:
     area = np.bincount(scene.face_material, scene.mesh.areas)
-    separate = fit_groups(views, Parameters.prior(3, 5), area)
+    separate = fit_groups(readings, Parameters.prior(3, 5), area)
     alike = np.zeros((3, 4))  # all look the same
-    material, parameters = regroup(views, separate.parameters, np.arange(3), alike, area)
+    material, parameters = regroup(readings, separate.parameters, np.arange(3), alike, area)
     assert material[1] == material[2] != material[0]
     assert len(parameters.log_excess) == 2
     # and a group that was put with the wrong material goes over
     mixed = np.array([0, 1, 0])
-    again = fit_groups([v.tied(mixed) for v in views], parameters, np.bincount(mixed, area))
-    moved, _ = regroup(views, again.parameters, mixed, alike, area)
+    again = fit_groups([r.tied(mixed) for r in readings], parameters, np.bincount(mixed, area))
+    moved, _ = regroup(readings, again.parameters, mixed, alike, area)
     assert moved[2] == moved[1] != moved[0]
 
 
-def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(views: list[View], scene: RadioScene) -> None:
-    dark = [replace(v, target_db=np.zeros_like(v.target_db), basis=0 * v.basis) for v in views]
+def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(
+    readings: list[Reading], scene: RadioScene
+) -> None:
+    dark = [
+        Reading(replace(r.response, bounce=0 * r.response.bounce), np.zeros_like(r.target_db))
+        for r in readings
+    ]
     area = np.bincount(scene.face_material, scene.mesh.areas)
     look = np.array([[0.0, 0, 0, 0], [0.1, 0, 0, 0], [9.0, 0, 0, 0]])
     material, _ = regroup(dark, Parameters.prior(3, 5), np.arange(3), look, area)
     assert material[0] == material[1]  # nothing speaks against it
 
 
-def test_tied_views_predict_the_same(views: list[View]) -> None:
+def test_tied_responses_predict_the_same(readings: list[Reading]) -> None:
     rng = np.random.default_rng(0)
     owner = np.array([0, 1, 1])
     p = Parameters(
         rng.normal(-2, 0.5, (2, 5)), rng.normal(1, 0.3, 2), rng.normal(-1, 0.3, 2), rng.normal(-3, 0.2, 2)
     )
-    for view in views:
-        view = with_light(view, rng)
-        assert np.allclose(predict(view, p.take(owner)), predict(view.tied(owner), p), rtol=1e-5)
+    for reading in readings:
+        response = with_light(reading.response, rng)
+        assert np.allclose(predict(response, p.take(owner)), predict(response.tied(owner), p), rtol=1e-5)
 
 
-def with_light(view: View, rng: np.random.Generator) -> View:
-    light = rng.uniform(0, 5, (len(view.target_db), 2)).astype(np.float32)
-    return replace(view, again_group=np.array([0, 2]), again=light)
+def with_light(response: Response, rng: np.random.Generator) -> Response:
+    light = rng.uniform(0, 5, (2, len(response.offset))).astype(np.float32)
+    return replace(response, sender=np.array([0, 2]), sent=light)
 
 
-def test_derivatives_follow_light_that_is_sent_on(views: list[View]) -> None:
+def test_derivatives_follow_light_that_is_sent_on(readings: list[Reading]) -> None:
     rng = np.random.default_rng(1)
-    view = with_light(views[0], rng)
+    response = with_light(readings[0].response, rng)
     # beams of single paths would drown the rest in single precision
-    view = replace(
-        view,
-        gain=view.gain[:0],
-        beam=view.beam[:0],
-        path_group=view.path_group[:0],
-        cosine=view.cosine[:0],
-        turn=view.turn[:0],
-    )
+    response = response.limited(Terms(line_of_sight=False, mirror_order=0))
     layout = Layout(3, 5, indirect=True, gain=True)
     p = Parameters(
         rng.normal(-1.5, 0.3, (3, 5)),
@@ -223,14 +239,16 @@ def test_derivatives_follow_light_that_is_sent_on(views: list[View]) -> None:
         0.2,
     )
     x = layout.pack(p)
-    power, table, index = jacobian(view, layout.unpack(x), layout)
-    assert np.allclose(power, predict(view, layout.unpack(x)), rtol=1e-5)
+    power, table, index = jacobian(response, layout.unpack(x), layout)
+    assert np.allclose(power, predict(response, layout.unpack(x)), rtol=1e-5)
     dense = np.zeros((len(power), layout.size))
-    np.add.at(dense.T, index, table.T)
+    dense[:, index] = table.T
     for k in range(layout.size):
         step = np.zeros(layout.size)
         step[k] = 1e-3
-        slope = (predict(view, layout.unpack(x + step)) - predict(view, layout.unpack(x - step))) / 2e-3
+        slope = (
+            predict(response, layout.unpack(x + step)) - predict(response, layout.unpack(x - step))
+        ) / 2e-3
         # single precision, and curves that are linear piece by piece
         gap = np.abs(dense[:, k] - slope)
         assert np.quantile(gap, 0.99) <= 0.02 * np.abs(slope).max() + 3e-5 * power.max()
@@ -254,16 +272,15 @@ def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
     import trimesh
 
     from warprrf.geometry.mesh import Mesh
-    from warprrf.rf.fields.bistatic.bounces import BounceTracer
-    from warprrf.rf.fields.bistatic.second_bounce import SeenSurface
-    from warprrf.rf.fields.bistatic.surface import Surface
 
-    box = trimesh.creation.box((6.0, 4.0, 3.0))
+    box, shape = trimesh.creation.box((6.0, 4.0, 3.0)), (12, 24)
     surface = Surface.of(Mesh(box.vertices, box.faces[:, ::-1]))
-    tracer = BounceTracer(surface, (12, 24))
-    seen = SeenSurface.of(tracer, tracer.meet(np.array([0.5, -0.3, 0.2])))
-    assert seen.solid_angle.sum() == pytest.approx(4.0 * np.pi, rel=1e-6)
-    radiance, wavelength = 0.7, 1e-3
-    power = seen.power(np.full(len(seen.face), radiance), wavelength)
-    assert power.sum() == pytest.approx((wavelength / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6)
-    assert np.array_equal(np.unique(seen.pixel), np.arange(12 * 24))
+    radiance = 0.7
+    for sub_pixels in (1, 3):
+        transport = Transport.of(surface, np.array([1.0, 0.5, 0.0]), F, shape, sub_pixels)
+        view = transport.view(np.array([0.5, -0.3, 0.2]), Terms(mirror_order=0))
+        ray, _, unit = view.seen()
+        assert radiance * unit.sum() == pytest.approx(
+            (WAVELENGTH / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6
+        )
+        assert np.array_equal(np.unique(ray // sub_pixels**2), np.arange(12 * 24))

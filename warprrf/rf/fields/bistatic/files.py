@@ -4,42 +4,41 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields import files as field_files
-from warprrf.rf.fields.bistatic.fit import Parameters
+from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 
-if TYPE_CHECKING:
-    from warprrf.rf.fields.bistatic.field import BistaticField
-
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
-_SURFACE = (
-    "normal", "patch", "plane_normal", "plane_offset", "group", "material", "look", "patch_group", "element",
-    "texel", "texel_element", "element_centre", "element_area", "element_group",
-)  # fmt: skip
+_SURFACE = {
+    name: name
+    for name in ("normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element",
+                 "element_centre", "element_area", "element_group")
+} | {"colour": "look", "cell": "texel", "cell_element": "texel_element"}  # fmt: skip
+"""Arrays of a surface, and what files call them."""
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")
 
 
-def write(field: BistaticField, path: str | os.PathLike[str]) -> None:
-    """Write everything that makes ``field`` to one safetensors file, in one go."""
-    s, p = field.surface, field.parameters
-    tensors = {f"surface/{name}": np.asarray(getattr(s, name)) for name in _SURFACE}
+def write(parts: dict[str, Any], path: str | os.PathLike[str]) -> None:
+    """Write all ``parts`` of a field, by the names of its attributes, to one safetensors file, in one go."""
+    s, p = parts["surface"], parts["parameters"]
+    tensors = {f"surface/{filed}": np.asarray(getattr(s, name)) for name, filed in _SURFACE.items()}
     tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
     tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
-    tensors |= {"residual": field.residual, "material": field.material, "transmitter": field.transmitter}
-    if field.errors is not None:
-        tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(field.errors).items()}
-    header = {name: getattr(field, name) for name in _PLAIN}
-    header |= {"model": "bistatic", "terms": asdict(field.terms), "report": field.report}
+    tensors |= {name: parts[name] for name in ("residual", "material", "transmitter")}
+    if parts["errors"] is not None:
+        tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(parts["errors"]).items()}
+    header = {name: parts[name] for name in _PLAIN}
+    header |= {"model": "bistatic", "terms": asdict(parts["terms"]), "report": parts["report"]}
     header |= {"log_gain": p.log_gain, "group_names": s.group_names, "skin_m": s.skin_m}
-    header |= {} if field.air is None else field.air.attributes
+    header |= {} if parts["air"] is None else parts["air"].attributes
     field_files.write(path, tensors, header)
 
 
@@ -52,15 +51,13 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
             group_names=tuple(header["group_names"]),
             skin_m=float(header["skin_m"]),
-            **{name: tensors[f"surface/{name}"] for name in _SURFACE},
+            **{name: tensors[f"surface/{filed}"] for name, filed in _SURFACE.items()},
         )
         parameters = Parameters(
             **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS}, log_gain=header["log_gain"]
         )
-        if len(surface.patch) != len(surface.mesh.faces) or len(parameters.log_excess) != surface.groups:
-            raise ValueError("its parameters do not fit its surface")
-        if tensors["residual"].shape != (2, surface.texels):
-            raise ValueError("its residual does not fit its surface")
+        if len(surface.patch) != len(surface.mesh.faces):
+            raise ValueError("its surface does not fit its mesh")
         errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
         plain = {name: header[name] for name in _PLAIN}
         return {

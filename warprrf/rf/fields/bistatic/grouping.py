@@ -9,53 +9,57 @@ better goes over. Fewer parameters, and purer materials, are learned better from
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from warprrf.rf.em.half_spaces import fresnel_curves
-from warprrf.rf.fields.bistatic.fit import (
-    NEPER,
-    Parameters,
-    View,
-    huber,
-    predict,
-    scattered_share,
-    specular_power,
-)
+from warprrf.rf.fields.bistatic.fit import NEPER, GroupFit, Reading, huber
+from warprrf.rf.fields.bistatic.materials import Parameters, mirror_power
+from warprrf.rf.fields.bistatic.response import Response, predict
 
-LOOK_COST = 3.0  # what one unit of difference in look, squared, counts as in the objective
-MOST_LOOK = 9.0
-JOIN = 30.0  # rise of the objective that a material of its own must be worth
-MOVE = -4.0  # fall of the objective that a group must bring to go over
+
+@dataclass(frozen=True)
+class Regrouping:
+    """What it takes to be of one material, in units of the fit's objective.
+
+    Attributes:
+        colour_cost: of one unit of difference in colour, squared.
+        most_colour: largest squared difference that counts: colours that differ more tell no more.
+        join: rise that a material of its own must be worth.
+        move: fall that a group must bring to go over.
+    """
+
+    colour_cost: float = 3.0
+    most_colour: float = 9.0
+    join: float = 30.0
+    move: float = 4.0
 
 
 def regroup(
-    views: Sequence[View],
+    readings: Sequence[Reading],
     p: Parameters,
     material: np.ndarray,
-    look: np.ndarray,
+    colour: np.ndarray,
     area: np.ndarray,
-    *,
-    noise_db: float = 3.0,
+    options: Regrouping | None = None,
 ) -> tuple[np.ndarray, Parameters]:
     """Materials of the groups anew, shape ``(G,)``, numbered without gaps, and the parameters of those left.
 
     Args:
-        views: of the training receivers, by groups.
+        readings: of the training receivers, by groups.
         p: parameters of the materials.
         material: of each group now.
-        look: of each group, shape ``(G, 4)``; see :class:`warprrf.rf.fields.bistatic.surface.Surface`.
+        colour: of each group, shape ``(G, 4)``; see :class:`warprrf.rf.fields.bistatic.surface.Surface`.
         area: of each group [m^2].
-        noise_db: as in :func:`warprrf.rf.fields.bistatic.fit.fit_groups`.
+        options: what it takes.
     """
-    material = material.copy()
-    count = len(p.log_excess)
-    typical = _mean_look(look, material, area, count)
+    o, count = options or Regrouping(), len(p.log_excess)
+    typical = _mean_colour(colour, material, area, count)
 
     # whole materials first, small ones before large ones
-    cost = _costs([v.tied(material) for v in views], p, np.arange(count), noise_db) + _look_cost(
-        typical, typical
-    )
+    cost = _costs([r.tied(material) for r in readings], p, np.arange(count))
+    cost += _colour_cost(typical, typical, o)
     np.fill_diagonal(cost, np.inf)
     size = np.bincount(material, area, minlength=count)
     target = np.arange(count)
@@ -64,74 +68,75 @@ def regroup(
         if touched[m]:
             continue
         k = int(np.where(target == np.arange(count), cost[m], np.inf).argmin())
-        if cost[m, k] < JOIN:
+        if cost[m, k] < o.join:
             target[m] = k
             touched[k] = True  # what takes others in stays itself this time
     material = target[material]
 
     # then single groups
-    typical = _mean_look(look, material, area, count)
+    typical = _mean_colour(colour, material, area, count)
     alive = np.unique(material)
-    cost = _costs(views, p, material, noise_db) + _look_cost(look, typical)
+    cost = _costs(readings, p, material) + _colour_cost(colour, typical, o)
     rows = np.arange(len(material))
     change = cost - cost[rows, material][:, None]
     change[:, np.setdiff1d(np.arange(count), alive)] = np.inf
     best = change.argmin(axis=1)
-    moves = change[rows, best] < MOVE
+    moves = change[rows, best] < -o.move
     material = np.where(moves, best, material)
     left, material = np.unique(material, return_inverse=True)
     return material.reshape(-1), p.take(left)
 
 
-def _mean_look(look: np.ndarray, material: np.ndarray, area: np.ndarray, count: int) -> np.ndarray:
+def _mean_colour(colour: np.ndarray, material: np.ndarray, area: np.ndarray, count: int) -> np.ndarray:
+    """Mean colour of each material, shape ``(count, 4)``."""
     size = np.maximum(np.bincount(material, area, minlength=count), 1e-12)
-    return np.stack(
-        [np.bincount(material, area * look[:, k], minlength=count) / size for k in range(look.shape[1])],
-        axis=1,
-    )
+    sums = [np.bincount(material, area * channel, minlength=count) for channel in colour.T]
+    return np.stack(sums, axis=1) / size[:, None]
 
 
-def _look_cost(look: np.ndarray, typical: np.ndarray) -> np.ndarray:
-    gap = ((look[:, None] - typical[None]) ** 2).sum(axis=2)
-    return LOOK_COST * np.minimum(np.nan_to_num(gap, nan=MOST_LOOK), MOST_LOOK)
+def _colour_cost(colour: np.ndarray, typical: np.ndarray, o: Regrouping) -> np.ndarray:
+    gap = ((colour[:, None] - typical[None]) ** 2).sum(axis=2)
+    return o.colour_cost * np.minimum(np.nan_to_num(gap, nan=o.most_colour), o.most_colour)
 
 
-def _costs(views: Sequence[View], p: Parameters, owner: np.ndarray, noise_db: float) -> np.ndarray:
-    """Rise of the objective if one unit (a view's group) alone became each material, ``(units, materials)``.
+def _costs(readings: Sequence[Reading], p: Parameters, owner: np.ndarray) -> np.ndarray:
+    """Rise of the objective if one unit (a reading's group) alone became each material, ``(units, materials)``.
 
     ``owner`` is the material of each unit now.
     """
-    curves = fresnel_curves()
+    curves, fit = fresnel_curves(), GroupFit()
     count = len(p.log_excess)
     alpha = curves.at(curves.coordinates, p.log_excess)[0]
     mix = (p.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
-    share = scattered_share(p).astype(np.float32)
+    share = p.scattered_share.astype(np.float32)
     out = np.zeros((len(owner), count))
-    for view in views:
-        power = predict(view.tied(owner), p)
-        loss = huber(NEPER * np.log1p(power) - view.target_db)[0].sum()
-        met = view.path_group >= 0
-        now = np.where(met, owner[np.where(met, view.path_group, 0)], -1)
-        strength = specular_power(view.gain, now, view.cosine, view.turn, p)[0]
-        units = np.unique(np.concatenate([view.groups, view.again_group, view.path_group[met]]))
-        for unit in units:
-            change = np.zeros((len(power), count), np.float32)
-            a = np.searchsorted(view.groups, unit)
-            if a < len(view.groups) and view.groups[a] == unit:
-                own = view.basis[:, a].reshape(len(power), -1)
-                change += own @ (mix - mix[owner[unit]]).T
-            c = np.searchsorted(view.again_group, unit)
-            if c < len(view.again_group) and view.again_group[c] == unit:
-                change += view.again[:, c, None] * (share - share[owner[unit]])
-            paths = np.flatnonzero((view.path_group == unit).any(axis=1))
-            if len(paths):
-                trial = np.repeat(now[paths][None], count, axis=0)
-                own = np.broadcast_to(view.path_group[paths] == unit, trial.shape)
-                trial = np.where(own, np.arange(count)[:, None, None], trial).reshape(-1, trial.shape[2])
-                gain = np.tile(view.gain[paths], count)
-                cosine, turn = (np.tile(a[paths], (count, 1)) for a in (view.cosine, view.turn))
-                new = specular_power(gain, trial, cosine, turn, p)[0].reshape(count, -1)
-                change += ((new - strength[paths]).astype(np.float32) @ view.beam[paths]).T
-            trial_db = NEPER * np.log1p(np.maximum(power[:, None] + np.exp(p.log_gain) * change, 0.0))
-            out[unit] += (huber(trial_db - view.target_db[:, None])[0].sum(axis=0) - loss) / noise_db**2
+    for reading in readings:
+        r, target = reading.response, reading.target_db
+        power = predict(r.tied(owner), p)
+        loss = huber(NEPER * np.log1p(power) - target, fit.huber_db)[0].sum()
+        met = r.path_group >= 0
+        now = np.where(met, owner[np.where(met, r.path_group, 0)], -1)
+        for unit in np.unique(np.concatenate([r.group, r.sender, r.path_group[met]])):
+            change = _mirror_change(r, now, unit, p)
+            for a in np.flatnonzero(r.group == unit):
+                change += (mix - mix[owner[unit]]) @ r.bounce[a].reshape(-1, len(power))
+            for c in np.flatnonzero(r.sender == unit):
+                change += (share - share[owner[unit]])[:, None] * r.sent[c]
+            trial_db = NEPER * np.log1p(np.maximum(power + p.gain * change, 0.0))
+            rise = huber(trial_db - target, fit.huber_db)[0].sum(axis=1) - loss
+            out[unit] += rise / fit.noise_db**2
     return out
+
+
+def _mirror_change(r: Response, now: np.ndarray, unit: int, p: Parameters) -> np.ndarray:
+    """Change of readings, shape ``(materials, N)``, by paths that meet ``unit`` if it became each material; ``now`` are
+    the materials that the paths meet."""
+    count, paths = len(p.log_excess), np.flatnonzero((r.path_group == unit).any(axis=1))
+    if len(paths) == 0:
+        return np.zeros((count, len(r.offset)), np.float32)
+    own = np.broadcast_to(r.path_group[paths] == unit, (count, len(paths), now.shape[1]))
+    trial = np.where(own, np.arange(count)[:, None, None], now[paths]).reshape(-1, now.shape[1])
+    cosine, turn = (np.tile(a[paths], (count, 1)) for a in (r.cosine, r.turn))
+    new = mirror_power(np.tile(r.path_power[paths], count), trial, cosine, turn, p)[0].reshape(count, -1)
+    old = mirror_power(r.path_power[paths], now[paths], r.cosine[paths], r.turn[paths], p)[0]
+    return np.asarray((new - old).astype(np.float32) @ r.path[paths])

@@ -13,49 +13,41 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warprrf.rf.em.half_spaces import fresnel_curves
-from warprrf.rf.fields.bistatic.bounces import NEAREST_M, BounceTracer, Lit, Met
-from warprrf.rf.fields.bistatic.fit import Parameters
+from warprrf.rf.fields.bistatic.materials import Parameters, mirror_share
 from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.fields.bistatic.rays import NEAREST_M, Hits, Illumination, RayGrid
 from warprrf.rf.fields.bistatic.specular import unobstructed
 
 
 @dataclass(frozen=True)
-class MirrorSight:
-    """What receivers see of mirrored light, one row for each pair of a ray and an image that lights it.
+class MirrorLit:
+    """Light that mirrors throw on what rays hit, one row for each pair of a ray and an image that lights its hit.
 
     Attributes:
-        pixel: pixel of the ray, shape ``(L,)``; those of the second receiver count on from the first's.
+        ray: of the view's grid, shape ``(L,)``.
         patch: the mirror, shape ``(L,)``.
         cosine: of incidence on the mirror, shape ``(L,)``.
-        face: what the ray meets, on the device.
-        lit: how the image lights that.
+        face: what the ray hits, on the device.
+        light: how the image illuminates that.
     """
 
-    pixel: np.ndarray
+    ray: np.ndarray
     patch: np.ndarray
     cosine: np.ndarray
     face: wp.array
-    lit: Lit
-
-
-def reflected_share(tracer: BounceTracer, p: Parameters, patch: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Share of power that mirrors ``patch`` reflect at ``cosine`` of incidence, shape ``(L,)``."""
-    group = tracer.surface.patch_group[patch]
-    return np.exp(p.log_mirror[group]) * fresnel_curves().value(p.log_excess[group], cosine)[0]
+    light: Illumination
 
 
 class MirrorLight:
     """What one transmitter sends to a surface by way of one mirror; geometry is traced once.
 
     Args:
-        tracer: rays of the field on its surface.
+        grid: casts the rays.
         transmitter: position (3,) [m].
     """
 
-    def __init__(self, tracer: BounceTracer, transmitter: np.ndarray) -> None:
-        self.tracer, self.surface = tracer, tracer.surface
-        s = self.surface
+    def __init__(self, grid: RayGrid, transmitter: np.ndarray) -> None:
+        self.surface = s = grid.surface
         self.tree = MirrorTree(s, transmitter, 1)
         if not self.tree.levels:
             self._first, self._chains = np.zeros(len(s.mesh.faces) + 1, int), np.zeros(0, int)
@@ -64,14 +56,14 @@ class MirrorLight:
         flat = s.mesh.face_normals
         normal = np.where(((s.normal * flat).sum(axis=1) < 0)[:, None], -s.normal, s.normal)
         centre = s.mesh.triangles.mean(axis=1)
-        face, chain, point = self.tree.candidates(centre, 1, device=tracer.device)
+        face, chain, point = self.tree.candidates(centre, 1, device=grid.device)
         level = self.tree.levels[0]
         # light must come from in front of the face, and not from the patch that it belongs to
         facing = ((point[:, 0] - centre[face]) * normal[face]).sum(axis=1) > 0
         facing &= s.patch[face] != level.patch[chain, 0]
         face, chain, point = face[facing], chain[facing], point[facing]
         free = unobstructed(
-            s, self.tree, centre[face], chain, point, tracer.device, s.skin_m * normal[face]
+            s, self.tree, centre[face], chain, point, grid.device, s.skin_m * normal[face]
         )  # fmt: skip
         face, chain = face[free], chain[free]
         way = level.image[chain] - centre[face]
@@ -82,7 +74,7 @@ class MirrorLight:
         self._cosine = np.abs((toward * s.plane_normal[patch]).sum(axis=1))
         cos_in = np.maximum((toward * normal[face]).sum(axis=1), 0.0)
         share = s.mesh.areas[face] / s.element_area[s.element[face]]
-        self._irradiance = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * tracer.through_air(length)
+        self._irradiance = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
         order = np.lexsort((chain, face))
         self._chains = chain[order]
         self._first = np.searchsorted(face[order], np.arange(len(s.mesh.faces) + 1))
@@ -92,18 +84,12 @@ class MirrorLight:
         elements = len(self.surface.element_area)
         if len(self._face) == 0:
             return np.zeros(elements)
-        share = reflected_share(self.tracer, p, self._patch, self._cosine)
+        share = mirror_share(p, self.surface.patch_group[self._patch], self._cosine)
         return np.bincount(self.surface.element[self._face], share * self._irradiance, minlength=elements)
 
-    def sight(self, receivers: np.ndarray, met: Met, tracer: BounceTracer | None = None) -> MirrorSight:
-        """What rays from ``receivers``, (3,) or (O, 3), see of mirrored light.
-
-        Args:
-            receivers: where they start.
-            met: what they met.
-            tracer: whose rays they are, if another's of the same surface.
-        """
-        s, tracer = self.surface, tracer or self.tracer
+    def view(self, tracer: RayGrid, receivers: np.ndarray, met: Hits) -> MirrorLit:
+        """Mirrored light that the rays of ``tracer`` from ``receivers``, (3,) or (O, 3), see where they ``met`` faces."""
+        s = self.surface
         # About two rays of a pixel look for mirrored light; the stride takes all of their places in turn.
         every = tracer.sub_pixels**2 // 2 + 1
         grid = len(tracer.directions)
@@ -120,7 +106,7 @@ class MirrorLight:
         points = start + met.range_m.numpy()[rays, None] * direction
         if len(row) == 0:
             none = np.zeros(0, int)
-            return self._pack(none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
+            return _packed(tracer, none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
         level, chain = self.tree.levels[0], self._chains[pair]
         normal = s.normal[face]
         turned = (s.mesh.face_normals[face] * direction).sum(axis=1) > 0
@@ -137,9 +123,10 @@ class MirrorLight:
         low = np.maximum(cos_s - tracer.half_width, 0.01 * tracer.half_width)
         strength = every * tracer.solid_angle[own[row[k]]] * cos_in[k]
         strength /= (4.0 * np.pi * np.maximum(length[k], NEAREST_M)) ** 2
-        strength *= tracer.through_air(length[k] + met.range_m.numpy()[rays[row[k]]])
-        return self._pack(
-            rays[row[k]] // tracer.sub_pixels**2,
+        strength *= tracer.transmittance(length[k] + met.range_m.numpy()[rays[row[k]]])
+        return _packed(
+            tracer,
+            rays[row[k]],
             patch[k],
             np.abs((toward[k] * s.plane_normal[patch[k]]).sum(axis=1)),
             face[row[k]],
@@ -149,18 +136,16 @@ class MirrorLight:
             np.log(high / low) / (high - low),
         )
 
-    def _pack(
-        self, pixel: np.ndarray, patch: np.ndarray, cosine: np.ndarray, face: np.ndarray, *lit: np.ndarray
-    ) -> MirrorSight:
-        where = self.tracer.device
-        return MirrorSight(
-            pixel, patch, cosine, wp.array(face, dtype=wp.int32, device=where),
-            Lit(*(wp.array(value, dtype=wp.float32, device=where) for value in lit)),
-        )  # fmt: skip
 
-    def power(self, sight: MirrorSight, p: Parameters, wavelength_m: float) -> np.ndarray:
-        """Path gain of each row of ``sight``, shape ``(L,)``, before the beam."""
-        if len(sight.pixel) == 0:
-            return np.zeros(0)
-        power = self.tracer.scatter_faces(sight.face, sight.lit, p.weight, p.log_excess, wavelength_m)
-        return power * reflected_share(self.tracer, p, sight.patch, sight.cosine)
+def _packed(
+    grid: RayGrid,
+    ray: np.ndarray,
+    patch: np.ndarray,
+    cosine: np.ndarray,
+    face: np.ndarray,
+    *light: np.ndarray,
+) -> MirrorLit:
+    return MirrorLit(
+        ray, patch, cosine, wp.array(face, dtype=wp.int32, device=grid.device),
+        Illumination(*(wp.array(value, dtype=wp.float32, device=grid.device) for value in light)),
+    )  # fmt: skip

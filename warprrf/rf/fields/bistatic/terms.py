@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from warprrf.rf.fields.bistatic.bounces import LOBES, SUB_PIXELS
+LOBES = (0, 2, 5, 12, 30)
+"""Exponents of the lobe mix; 0 is Lambertian."""
 
 
 @dataclass(frozen=True)
 class Terms:
-    """What a bistatic field models; see :meth:`BistaticField.fit`.
+    """What a bistatic field models; see :class:`warprrf.rf.fields.bistatic.training.FitOptions`.
 
     Attributes:
         line_of_sight, diffuse: whether there are such paths.
@@ -32,7 +33,7 @@ class Terms:
     diffuse_order: int = 1
     indirect: bool = False
     residual: bool = False
-    sub_pixels: int = SUB_PIXELS
+    sub_pixels: int = 3
 
     def __post_init__(self) -> None:
         whole = {"mirror_order": (0, 1, 2, 3), "diffuse_order": (1, 2, 3), "sub_pixels": range(1, 17)}
@@ -47,3 +48,8 @@ class Terms:
     def further(self) -> bool:
         """Whether elements send on what other surfaces scattered to them."""
         return self.diffuse and self.diffuse_order > 1
+
+    @property
+    def after_first_bounce(self) -> bool:
+        """Whether there is light that comes over more than one surface, or a mirror and a surface."""
+        return self.further or self.mirror_scatter or self.scatter_mirror

@@ -16,6 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warprrf.rf.fields.bistatic.fit import NEPER
+from warprrf.rf.fields.bistatic.materials import Layout, Materials
+from warprrf.rf.fields.bistatic.render import Rendered
+from warprrf.rf.fields.bistatic.response import SpectrumPixels, jacobian, respond
+from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.spectra.beam import BeamOperator
+
 STEEPNESS_DB = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 20.0)  # lower ends of the bins
 LEVEL_DB = (0.0, 0.02, 0.3, 3.0, 12.0, 30.0)
 ENOUGH = 60  # errors in a bin
@@ -51,14 +58,46 @@ class ErrorModel:
         Args:
             image_db: predicted image, dB above the floor, shape ``(H, W)``.
             receiver: position (3,) [m].
-            slopes: derivatives of the image to parameters ``index`` [dB], shape ``(H W, C)``.
+            slopes: derivatives of the image to parameters ``index`` [dB], shape ``(C, H W)``.
         """
         gap = float(np.linalg.norm(self.receivers - receiver, axis=1).min())
         rest = self.table[bins(image_db)] * np.exp(self.growth * (gap - self.middle_m))
         part = self.covariance[np.ix_(index, index)].astype(np.float32)
-        slopes = slopes.astype(np.float32)
-        laplace = np.maximum(((slopes @ part) * slopes).sum(axis=1), 0.0).reshape(image_db.shape)
+        laplace = np.maximum(((part @ slopes) * slopes).sum(axis=0), 0.0).reshape(image_db.shape)
         return np.sqrt(rest**2 + laplace)
+
+
+def predicted_std_db(
+    errors: ErrorModel,
+    view: ReceiverView,
+    rendered: Rendered,
+    materials: Materials,
+    material: np.ndarray,
+    beam: BeamOperator,
+    floor: float,
+) -> np.ndarray:
+    """Standard deviation of a spectrum's dB image per pixel, shape ``(H, W)``.
+
+    Args:
+        errors: what was learned.
+        view: what the receiver sees.
+        rendered: its spectrum.
+        materials: of the groups.
+        material: of each group, shape ``(G,)``; ``errors.covariance`` is of materials.
+        beam: of the receiver.
+        floor: N0.
+    """
+    terms = materials.terms
+    p = materials.parameters.take(np.unique(material, return_index=True)[1])
+    size = Layout(*p.log_weight.shape, indirect=terms.indirect, gain=False).size
+    gain = size < len(errors.covariance)
+    layout = Layout(*p.log_weight.shape, indirect=terms.indirect, gain=gain)
+    measured = SpectrumPixels(beam, np.arange(rendered.image.size))
+    response = respond(view, measured, terms.lobes, floor).tied(material)
+    slopes, index = jacobian(response, p, layout)[1:]
+    image = rendered.image / floor
+    slopes *= (NEPER / (1.0 + image.ravel())).astype(np.float32)
+    return errors.std_db(NEPER * np.log1p(image), view.receivers[0], slopes, index)
 
 
 def negative_log_likelihood(error_db: np.ndarray, std_db: np.ndarray | float, outlier_db: float) -> float:

@@ -42,8 +42,8 @@ from warprrf.rf.fields.harmonic.problem import Problem, harmonics
 from warprrf.rf.fields.harmonic.single_bounce import SingleBounce
 from warprrf.rf.fields.harmonic.targets import targets
 from warprrf.rf.fields.harmonic.transport import Transport, transport
-from warprrf.rf.fields.receivers import check_receiver
 from warprrf.rf.paths.trace import Paths
+from warprrf.rf.receivers import check_receiver
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
 from warprrf.steps import digest

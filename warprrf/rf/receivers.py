@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from warprrf.device import check_array
-
-if TYPE_CHECKING:
-    from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh import Mesh
 
 ON_A_WALL_M = 1e-4  # a receiver nearer to the mesh than this sits in the wall
 

@@ -1,0 +1,172 @@
+"""What a bistatic field knows of its surfaces: radio parameters of material groups, and gains of what differs in them.
+
+A group scatters with a mix of lobes, reflects as a mirror, and may have an indirect radiance. Scattering and mirrors
+share one Fresnel curve of one permittivity; their weights, S^2 and 1 - S^2, are free, so that an edge in the wrong place
+does not spoil both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.fields.bistatic.chains import chain_reflection
+from warprrf.rf.fields.bistatic.terms import Terms
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Radio parameters of the groups.
+
+    Attributes:
+        log_weight: ln of the lobe weights, shape ``(G, L)``; their sum is S^2.
+        log_excess: ln(epsilon_r - 1), shape ``(G,)``.
+        log_mirror: ln of the share of |Gamma|^2 that is reflected as by a mirror, shape ``(G,)``; 1 - S^2.
+        log_indirect: ln of the indirect radiance [1/m^2], shape ``(G,)``; -inf where there is none.
+        log_gain: ln of a gain common to all paths (an uncalibrated receiver).
+    """
+
+    log_weight: np.ndarray
+    log_excess: np.ndarray
+    log_mirror: np.ndarray
+    log_indirect: np.ndarray
+    log_gain: float = 0.0
+
+    @property
+    def weight(self) -> np.ndarray:
+        """Lobe weights ``(G, L)``."""
+        return np.exp(self.log_weight)
+
+    @property
+    def gain(self) -> float:
+        """The common gain."""
+        return float(np.exp(self.log_gain))
+
+    @property
+    def scattered_share(self) -> np.ndarray:
+        """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
+        return self.weight.sum(axis=1) * fresnel_curves().even(self.log_excess)[0]
+
+    def take(self, index: np.ndarray) -> Parameters:
+        """The rows ``index``: of materials to those of groups, say."""
+        return replace(
+            self, log_weight=self.log_weight[index], log_excess=self.log_excess[index],
+            log_mirror=self.log_mirror[index], log_indirect=self.log_indirect[index],
+        )  # fmt: skip
+
+    @classmethod
+    def prior(cls, groups: int, lobes: int) -> Parameters:
+        """What a surface is taken for before any measurement: half scattered, half mirrored, epsilon_r of 4."""
+        return cls(
+            np.full((groups, lobes), np.log(0.5 / lobes)), np.full(groups, np.log(3.0)), np.full(groups, np.log(0.5)),
+            np.full(groups, -np.inf),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Materials:
+    """What is modelled, and with which values: all that a spectrum depends on besides the geometry.
+
+    Attributes:
+        terms: kinds of paths.
+        parameters: of the groups.
+        residual: ln gain of each surface cell over its group, shape ``(2, X)``: for single bounces, and for light that
+            the cell sends on after others; see :mod:`warprrf.rf.fields.bistatic.residuals`.
+        transmitter: under which the gains of light sent on were learned [m], shape ``(3,)``. Light of another falls
+            elsewhere: of that nothing was learned, so its gains are 1.
+    """
+
+    terms: Terms
+    parameters: Parameters
+    residual: np.ndarray
+    transmitter: np.ndarray
+
+    def cell_gain(self, cell: np.ndarray) -> np.ndarray | float:
+        """Gain of cells (K,) for single bounces."""
+        return np.asarray(np.exp(self.residual[0]))[cell] if self.terms.residual else 1.0
+
+    def sent_gain(self, cell: np.ndarray, transmitter: np.ndarray) -> np.ndarray | float:
+        """Gain of cells (K,) for light of ``transmitter`` (3,) that they send on after others."""
+        if not self.terms.residual or not np.array_equal(transmitter, self.transmitter):
+            return 1.0
+        return np.asarray(np.exp(self.residual[1]))[cell]
+
+
+class Layout:
+    """Order of the free parameters in a vector: per group lobes, excess, mirror, indirect; then the common gain.
+
+    Attributes:
+        groups, lobes: how many.
+        indirect, gain: whether indirect radiance and the common gain are free.
+        stride: parameters of a group.
+        size: of the vector.
+    """
+
+    def __init__(self, groups: int, lobes: int, *, indirect: bool, gain: bool) -> None:
+        self.groups, self.lobes, self.indirect, self.gain = groups, lobes, indirect, gain
+        self.stride = lobes + 2 + int(indirect)
+        self.size = groups * self.stride + int(gain)
+
+    def weight(self, group: np.ndarray) -> np.ndarray:
+        """Places of the lobe weights of each of ``group`` (K,), shape ``(K, L)``."""
+        return self.stride * group[:, None] + np.arange(self.lobes)
+
+    def excess(self, group: np.ndarray) -> np.ndarray:
+        """Places of the permittivity of each of ``group``."""
+        return self.stride * group + self.lobes
+
+    def mirror(self, group: np.ndarray) -> np.ndarray:
+        """Places of the mirror share of each of ``group``."""
+        return self.stride * group + self.lobes + 1
+
+    def radiance(self, group: np.ndarray) -> np.ndarray:
+        """Places of the indirect radiance of each of ``group``."""
+        return self.stride * group + self.lobes + 2
+
+    def pack(self, p: Parameters) -> np.ndarray:
+        """Vector of ``p``."""
+        columns = [p.log_weight, p.log_excess[:, None], p.log_mirror[:, None]]
+        if self.indirect:
+            columns.append(p.log_indirect[:, None])
+        vector = np.concatenate(columns, axis=1).ravel()
+        return np.append(vector, p.log_gain) if self.gain else vector
+
+    def unpack(self, vector: np.ndarray) -> Parameters:
+        """Parameters of a vector."""
+        table = vector[: self.groups * self.stride].reshape(self.groups, self.stride)
+        n = self.lobes
+        return Parameters(
+            table[:, :n].copy(), table[:, n].copy(), table[:, n + 1].copy(),
+            table[:, n + 2].copy() if self.indirect else np.full(self.groups, -np.inf),
+            float(vector[-1]) if self.gain else 0.0,
+        )  # fmt: skip
+
+
+def mirror_share(p: Parameters, group: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Share of unpolarised power that mirrors of ``group`` (K,) reflect at ``cosine`` (K,) of incidence."""
+    return np.asarray(np.exp(p.log_mirror[group]) * fresnel_curves().value(p.log_excess[group], cosine)[0])
+
+
+def mirror_power(
+    power: np.ndarray, path_group: np.ndarray, cosine: np.ndarray, turn: np.ndarray, p: Parameters
+) -> tuple[np.ndarray, np.ndarray]:
+    """Power of line-of-sight and mirror paths, the common gain apart.
+
+    Args:
+        power: of each path without its reflections, shape ``(K,)``.
+        path_group: groups that it meets, -1 for none, shape ``(K, 3)``.
+        cosine: of incidence at each, shape ``(K, 3)``.
+        turn: angle of its plane of incidence to the one before [rad], shape ``(K, 3)``.
+        p: parameters of the groups.
+
+    Returns:
+        Power, shape ``(K,)``, and its logarithmic derivatives to ``log_excess`` of each group met, shape ``(K, 3)``,
+        0 for none; those to ``log_mirror`` are 1.
+    """
+    met = path_group >= 0
+    own = np.maximum(path_group, 0)
+    share, slope = chain_reflection(p.log_excess[own], cosine, turn, met)
+    strength = np.where(met, p.log_mirror[own], 0.0).sum(axis=1)
+    return np.asarray(power, float) * np.exp(strength) * share, slope

@@ -1,0 +1,198 @@
+"""From what a receiver sees and the materials to the powers of its paths, and from those to a spectrum.
+
+Pure functions: geometry (:class:`warprrf.rf.fields.bistatic.transport.ReceiverView`) and
+:class:`warprrf.rf.fields.bistatic.materials.Materials` in, powers out. Their derivatives to the parameters are in
+:mod:`warprrf.rf.fields.bistatic.response`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from warprrf.rf.fields.bistatic.elements import RAYS
+from warprrf.rf.fields.bistatic.materials import Materials, Parameters, mirror_power, mirror_share
+from warprrf.rf.fields.bistatic.scattering import scatter
+from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.spectra.beam import BeamOperator
+
+
+@dataclass(frozen=True)
+class SentOn:
+    """Light that surfaces got from others and send on to a receiver, one row for each ray that sees some.
+
+    Attributes:
+        ray: of the view's grid, shape ``(M,)``.
+        face: that sends it, shape ``(M,)``.
+        power: path gain, shape ``(M,)``.
+    """
+
+    ray: np.ndarray
+    face: np.ndarray
+    power: np.ndarray
+
+
+@dataclass(frozen=True)
+class Further:
+    """Path gain of everything after a first bounce, before any beam.
+
+    Attributes:
+        rays: how many the view has.
+        sent: light that surfaces send on.
+        shown: what mirrors show of the lit scene: rays and their path gain, shape ``(M,)`` each.
+    """
+
+    rays: int
+    sent: SentOn
+    shown: tuple[np.ndarray, np.ndarray]
+
+    def by_ray(self) -> np.ndarray:
+        """All of it by the ray that sees it, shape ``(R K,)``."""
+        found = np.bincount(self.sent.ray, self.sent.power, minlength=self.rays)
+        return np.asarray(found + np.bincount(*self.shown, minlength=self.rays))
+
+
+@dataclass(frozen=True)
+class PathPowers:
+    """Path gain of everything that receivers get, before any beam.
+
+    Attributes:
+        single: of each ray's single bounce, shape ``(R K,)``.
+        mirror: of each line-of-sight and mirror path, shape ``(L,)``.
+        further: of what comes after a first bounce.
+    """
+
+    single: np.ndarray
+    mirror: np.ndarray
+    further: Further
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A spectrum with what it is made of, path gain.
+
+    Attributes:
+        powers: of its paths.
+        further: of everything after a first bounce, per pixel before the beam, shape ``(H, W)``.
+        image: all, after the beam, shape ``(H, W)``.
+    """
+
+    powers: PathPowers
+    further: np.ndarray
+    image: np.ndarray
+
+
+def render(view: ReceiverView, materials: Materials, beam: BeamOperator, sent: np.ndarray | None) -> Rendered:
+    """The spectrum of one receiver.
+
+    Args:
+        view: what the receiver sees.
+        materials: of the surfaces.
+        beam: of the receiver.
+        sent: what elements send on under these materials; see :func:`sent_radiance`.
+    """
+    powers = path_powers(view, materials, sent)
+    shape = view.transport.grid.shape
+    further = powers.further.by_ray().reshape(*shape, -1).sum(axis=-1)
+    if view.beams is None:
+        raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
+    image = np.tensordot(powers.mirror.astype(np.float32), view.beams, axes=1).astype(np.float64)
+    image += beam(powers.single.reshape(*shape, -1).sum(axis=-1) + further)
+    return Rendered(powers, further, np.maximum(image, 0.0))
+
+
+def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> PathPowers:
+    """Path gain of everything that the receivers of ``view`` get, residual and common gain included; arguments as for
+    :func:`render`."""
+    t, terms, p = view.transport, materials.terms, materials.parameters
+    paths = view.paths
+    mirror = mirror_power(view.friis, view.path_groups, paths.cosine, paths.turn, p)[0] * p.gain
+    kept = (paths.order <= terms.mirror_order) & ((paths.order > 0) | terms.line_of_sight)
+    mirror = np.where(kept, mirror, 0.0)
+    single = np.zeros(len(view.hits.face))
+    if terms.diffuse:
+        face = view.hits.face
+        power = scatter(t.surface, face, view.light, terms.lobes, p.weight, p.log_excess, t.wavelength_m)
+        single = p.gain * power * materials.cell_gain(t.surface.cell[np.maximum(face.numpy(), 0)])
+    return PathPowers(single, mirror, further_bounces(view, materials, sent))
+
+
+def further_bounces(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> Further:
+    """What comes after a first bounce, residual and common gain included; arguments as for :func:`render`."""
+    t, gain = view.transport, materials.parameters.gain
+    on, (ray, shown) = sent_on(view, materials, sent), mirror_shown(view, materials, sent)
+    power = gain * on.power * materials.sent_gain(t.surface.cell[on.face], t.transmitter)
+    return Further(len(view.hits.face), replace(on, power=power), (ray, gain * shown))
+
+
+def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> SentOn:
+    """Light that surfaces send on, without residual and common gain."""
+    t, p = view.transport, materials.parameters
+    rows = [(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0))]
+    if sent is not None:
+        ray, face, unit = view.seen()
+        power = unit * sent[t.surface.element[face]]
+        lit = power > 0
+        rows.append((ray[lit], face[lit], power[lit]))
+    m = view.mirror_lit if materials.terms.diffuse and materials.terms.mirror_scatter else None
+    if m is not None and len(m.ray):
+        power = scatter(
+            t.surface, m.face, m.light, materials.terms.lobes, p.weight, p.log_excess, t.wavelength_m
+        )
+        rows.append(
+            (m.ray, m.face.numpy(), power * mirror_share(p, t.surface.patch_group[m.patch], m.cosine))
+        )
+    return SentOn(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+def mirror_shown(
+    view: ReceiverView, materials: Materials, sent: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rays, and path gain of what mirrors show there, without the common gain: first bounces, and the radiance that
+    elements send on."""
+    t, p, m = view.transport, materials.parameters, view.mirror_shown
+    wanted = materials.terms.diffuse and materials.terms.scatter_mirror
+    if not wanted or m is None or len(m.ray) == 0:
+        return np.zeros(0, int), np.zeros(0)
+    wavelength, face = t.wavelength_m, m.hits.face.numpy()
+    power = scatter(
+        t.surface, m.hits.face, m.light, materials.terms.lobes, p.weight, p.log_excess, wavelength
+    )
+    power = power.astype(float)
+    if sent is not None:
+        radiance = np.where(face >= 0, sent[t.surface.element[np.maximum(face, 0)]], 0.0)
+        air = t.grid.transmittance(np.where(face >= 0, m.hits.range_m.numpy(), 0.0))
+        power += (wavelength / (4.0 * np.pi)) ** 2 * m.hits.solid_angle.numpy() * radiance * air
+    return m.ray, mirror_share(p, m.group, m.cosine) * power * m.air
+
+
+def sent_radiance(transport: Transport, materials: Materials) -> np.ndarray | None:
+    """Radiance that elements send on besides first bounces [1/(m^2 sr)], shape ``(E,)``; None where there is none.
+
+    Radiance is in units in which the transmitter gives an irradiance of cos(theta_i) / d1^2 [1/m^2].
+    """
+    terms, p, surface = materials.terms, materials.parameters, transport.surface
+    if not (terms.further or terms.indirect):
+        return None
+    sent = np.zeros(len(surface.element_area))
+    if terms.further:
+        sent += _element_radiance(transport, p, materials)
+    if terms.indirect:
+        sent += np.exp(p.log_indirect)[surface.element_group]
+    return sent
+
+
+def _element_radiance(transport: Transport, p: Parameters, materials: Materials) -> np.ndarray:
+    """Radiance of light that elements got from other surfaces, one or two diffuse bounces before, shape ``(E,)``."""
+    terms, links, wavelength = materials.terms, transport.elements, transport.wavelength_m
+    power = scatter(
+        transport.surface, links.hits.face, links.light, terms.lobes, p.weight, p.log_excess, wavelength
+    )
+    # rays are drawn by the cosine: pi times the mean radiance that they see is the irradiance
+    got = np.pi * (power.reshape(-1, RAYS) * (4.0 * np.pi / wavelength) ** 2).mean(axis=1)
+    share = p.scattered_share[transport.surface.element_group] / np.pi
+    if terms.diffuse_order > 2:
+        before = got + transport.mirror_light.irradiance(p) if terms.mirror_scatter else got
+        got = got + np.pi * ((share * before)[links.element] * links.air).mean(axis=1)
+    return share * got
