@@ -271,9 +271,12 @@ def point_at_transmitter(ds: SpectrumDataset, device: Any = None) -> Callable[[A
     return predict
 
 
-def _torch_device(device: Any) -> str | None:
-    """The torch device beside a Warp device: networks go to the GPU that everything else is on."""
-    return None if device is None else str(device)
+def _training(task: Task, iterations: int) -> Any:
+    """How a network is trained: on the GPU that everything else is on."""
+    from benchmarks.baselines import Training
+
+    device = None if task.geometry.device is None else str(task.geometry.device)
+    return Training(iterations, task.seed, device, task.scratch / "checkpoint", task.progress)
 
 
 def _nerf2(task: Task) -> Fitted:
@@ -285,10 +288,8 @@ def _nerf2(task: Task) -> Fitted:
         far_m=diagonal, samples=task.effort.nerf2_samples, scale_m=0.5 * float((high - low).max())
     )
     model = NeRF2.fit(
-        task.train, options, iterations=task.effort.nerf2_iterations, rays=task.effort.nerf2_rays,
-        checkpoint=task.scratch / "checkpoint", seed=task.seed, device=_torch_device(task.geometry.device),
-        progress=task.progress,
-    )  # fmt: skip
+        task.train, options, _training(task, task.effort.nerf2_iterations), rays=task.effort.nerf2_rays
+    )
     return _network(model)
 
 
@@ -296,10 +297,8 @@ def _cgan(task: Task) -> Fitted:
     from benchmarks.baselines import CGAN
 
     model = CGAN.fit(
-        task.train, iterations=task.effort.cgan_iterations, batch=task.effort.cgan_batch,
-        checkpoint=task.scratch / "checkpoint", seed=task.seed, device=_torch_device(task.geometry.device),
-        progress=task.progress,
-    )  # fmt: skip
+        task.train, how=_training(task, task.effort.cgan_iterations), batch=task.effort.cgan_batch
+    )
     return _network(model)
 
 
@@ -331,7 +330,7 @@ def _misjudged(material: Material, sign: np.ndarray) -> Material:
 
 
 def _calibrated(task: Task) -> Fitted:
-    from benchmarks.baselines.sionna_calibration import calibrate_sionna
+    from benchmarks.baselines.sionna_calibration import Calibration, calibrate_sionna
     from warprrf.rf.interop.twin import write_twin
 
     seconds = task.budget_s or task.effort.calibration_s
@@ -339,10 +338,10 @@ def _calibrated(task: Task) -> Fitted:
     task.scratch.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=task.scratch) as folder:
         twin = write_twin(prior, Path(folder) / "twin")
+        how = Calibration(seconds, depth=task.depth, seed=task.seed)
         found = calibrate_sionna(
-            Scene.load(twin.xml), task.train, seconds=seconds, depth=task.depth, seed=task.seed,
-            device=task.geometry.device, progress=task.progress,
-        )  # fmt: skip
+            Scene.load(twin.xml), task.train, how, device=task.geometry.device, progress=task.progress
+        )
         fitted = _sionna(found.scene, task)
     return replace(
         fitted, transport_s=found.start_s, fit_s=found.seconds, losses=found.losses,

@@ -7,6 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from benchmarks.engine import torch_renderer
 from benchmarks.engine.blend import blend_figures
 from benchmarks.engine.peers import Scene, take_turns
 from benchmarks.engine.torch_renderer import render_with_torch
@@ -14,6 +15,13 @@ from warprrf.device import threads
 from warprrf.geometry.splats import torch_functions as interop
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.rasterizer import Blending
+
+
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch):
+    """The torch renderer works in several batches, as it does on large scenes."""
+    monkeypatch.setattr(torch_renderer, "CHUNK", 1 << 12)
+
 
 POSE = np.eye(4)
 POSE[:3, 3] = (0.1, -0.2, 0.3)
@@ -34,7 +42,7 @@ def tensors(seed, n=80, channels=5, dtype=torch.float64, spread=2.0):
 
 def both(values, cam, blending):
     ours = interop.rasterize(*values[:5], cam, values[5], blending=blending)
-    peer = render_with_torch(*values[:5], cam, values[5], blending=blending, chunk=1 << 12)
+    peer = render_with_torch(*values[:5], cam, values[5], blending=blending)
     return ours, (peer.features, peer.alpha, peer.depth)
 
 
@@ -82,7 +90,7 @@ def test_torch_gradcheck_passes_and_a_planted_wrong_adjoint_fails(monkeypatch):
         return interop.rasterize(*v[:5], cam, v[5], blending=smooth)
 
     assert torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-6, rtol=1e-6)
-    Function = interop._functions().rasterize
+    Function = interop._Rasterize
     right = Function.backward
 
     def wrong(ctx, *incoming):
