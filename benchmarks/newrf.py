@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.report import Report, cell, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress
-from warprrf.rf.interop.newrf import NewrfRays, load_newrf, match_rays
+from warprrf.rf.interop.newrf import NewrfRays, load_newrf
 from warprrf.rf.paths.mirror_paths import MirrorPaths
 from warprrf.rf.paths.reflections import fit_reflections
 from warprrf.rf.paths.trace import MirrorTracer
@@ -40,6 +40,114 @@ def snr_db(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Channel prediction SNR [dB] over all receivers, complex ``(R,)`` each; minus the NMSE in decibels."""
     error = float(np.sum(np.abs(prediction - truth) ** 2) / np.sum(np.abs(truth) ** 2))
     return -10.0 * float(np.log10(max(error, 1e-30)))
+
+
+MATCH_M = 1e-3
+"""Rays of one order are the same if last points and lengths together differ by less [m]."""
+
+
+@dataclass(frozen=True)
+class RayMatch:
+    """NeWRF's rays beside ours; arrays over their N rays, NaN where ours has none.
+
+    Attributes:
+        receiver: Index of the receiver, shape ``(N,)``.
+        order: Reflections: 0, 1 or 2, shape ``(N,)``.
+        found: Whether a ray of ours is the same, shape ``(N,)``, bool.
+        length_error_m: Absolute difference of unfolded lengths [m].
+        point_error_m: Distance between the last points [m].
+        phase_error_rad: Absolute difference of the gains' phases [rad].
+        gain_error: Relative difference of the complex gains, ``|ours - theirs| / |theirs|``.
+        extra_receiver: Receivers of the rays that only we have, shape ``(E,)``.
+        extra_order: Their orders, shape ``(E,)``.
+        extra_point: Their last points [m], shape ``(E, 3)``.
+        missing_point: Last points of the rays that only they have [m], shape ``(N - found, 3)``.
+    """
+
+    receiver: np.ndarray
+    order: np.ndarray
+    found: np.ndarray
+    length_error_m: np.ndarray
+    point_error_m: np.ndarray
+    phase_error_rad: np.ndarray
+    gain_error: np.ndarray
+    extra_receiver: np.ndarray
+    extra_order: np.ndarray
+    extra_point: np.ndarray
+    missing_point: np.ndarray
+
+    def summary(self) -> dict[str, dict[str, float | int | None]]:
+        """Figures per kind of ray ("line_of_sight", "once", "twice"): counts, share found, median and worst errors."""
+        rows: dict[str, dict[str, float | int | None]] = {}
+        for order, name in enumerate(("line_of_sight", "once", "twice")):
+            mine = self.order == order
+            if not mine.any():
+                continue
+            row: dict[str, float | int | None] = {
+                "rays": int(mine.sum()),
+                "found": int(self.found[mine].sum()),
+                "share": float(self.found[mine].mean()),
+                "only_ours": int((self.extra_order == order).sum()),
+            }
+            for error in ("length_error_m", "point_error_m", "phase_error_rad", "gain_error"):
+                values = getattr(self, error)[mine & self.found]
+                row[f"{error}_median"] = float(np.median(values)) if len(values) else None
+                row[f"{error}_worst"] = float(values.max()) if len(values) else None
+            rows[name] = row
+        return rows
+
+
+def match_rays(rays: NewrfRays, *, order: int = 1, device: Any = None) -> RayMatch:
+    """Trace the same room by our image method and pair the rays, one to one, by order, last point and length.
+
+    Args:
+        rays: What :func:`load_newrf` read.
+        order: Most reflections to compare: 0, 1 or 2 (theirs have no more).
+
+    Raises:
+        ValueError: on another order.
+    """
+    tracer = MirrorTracer(
+        rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=device
+    )
+    ours = tracer.find(rays.receivers, order)
+    our_gain = ours.gain(rays.wavelength_m)
+    their_order, their_length = rays.order, rays.length_m
+    receiver, column = np.nonzero((their_order >= 0) & (their_order <= order))
+    partner = np.full(len(receiver), -1)
+    taken = np.zeros(len(ours.receiver), dtype=bool)
+    bounces = ours.order
+    for k in range(len(rays.receivers)):
+        theirs, mine = np.flatnonzero(receiver == k), np.flatnonzero(ours.receiver == k)
+        c = column[theirs]
+        gap = np.linalg.norm(rays.last_point[k, c][:, None] - ours.last_point[mine][None], axis=2)
+        gap = gap + np.abs(their_length[k, c][:, None] - ours.length_m[mine][None])
+        gap[their_order[k, c][:, None] != bounces[mine][None]] = np.inf
+        while gap.size and gap.min() < MATCH_M:
+            i, j = np.unravel_index(gap.argmin(), gap.shape)
+            partner[theirs[i]] = mine[j]
+            taken[mine[j]] = True
+            gap[i], gap[:, j] = np.inf, np.inf
+    found = partner >= 0
+    gain, mirror = rays.gain[receiver, column], our_gain[partner]
+    last = rays.last_point[receiver, column]
+
+    def where_found(values: np.ndarray) -> np.ndarray:
+        return np.where(found, values, np.nan)
+
+    return RayMatch(
+        receiver=receiver,
+        order=their_order[receiver, column],
+        found=found,
+        length_error_m=where_found(np.abs(their_length[receiver, column] - ours.length_m[partner])),
+        point_error_m=where_found(np.linalg.norm(last - ours.last_point[partner], axis=1)),
+        phase_error_rad=where_found(np.abs(np.angle(gain / mirror))),
+        gain_error=where_found(np.abs(mirror - gain) / np.abs(gain)),
+        extra_receiver=ours.receiver[~taken],
+        extra_order=bounces[~taken],
+        extra_point=ours.last_point[~taken],
+        missing_point=last[~found],
+    )
 
 
 HELP = """\

@@ -16,7 +16,7 @@ from benchmarks.data import Geometry, Truth
 from benchmarks.report import Row
 from warprrf.device import Progress
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.uncertainty import negative_log_likelihood
+from warprrf.rf.fields.bistatic.uncertainty import OUTLIERS
 from warprrf.rf.spectra import metrics
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import pixel_directions, to_db
@@ -261,3 +261,10 @@ def _same_receivers(ds: SpectrumDataset, test: SpectrumDataset) -> SpectrumDatas
 
 def _in_range_of(ds: SpectrumDataset, other: SpectrumDataset) -> SpectrumDataset:
     return replace(ds, floor=other.floor, range_db=other.range_db)
+
+
+def negative_log_likelihood(error_db: np.ndarray, std_db: np.ndarray | float, outlier_db: float) -> float:
+    """Mean negative log likelihood of errors [dB] under standard deviations and a share ``OUTLIERS`` of outliers."""
+    near = np.log1p(-OUTLIERS) - 0.5 * (error_db / std_db) ** 2 - np.log(std_db)
+    far = np.log(OUTLIERS) - 0.5 * (error_db / outlier_db) ** 2 - np.log(outlier_db)
+    return float(0.5 * np.log(2.0 * np.pi) - np.logaddexp(near, far).mean())

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import LOBBY
+from radio_scenes import enclosed_volume, is_wound_alike
 
 from benchmarks.lobby.photos import HELD_OUT_EVERY, look, read_poses, shown, surface_samples
 from benchmarks.lobby.scene import ROOM, build, lobby
 from benchmarks.lobby.textures import STYLES, paint
-from warprrf.geometry.mesh_files import enclosed_volume, is_closed, read_mesh
+from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.rf.scene import Scene
 
@@ -26,7 +27,7 @@ def scene() -> Scene:
 def test_every_object_is_a_closed_solid_that_faces_outwards() -> None:
     for solid in lobby():
         mesh = read_mesh(LOBBY / "meshes" / f"{solid.name}.ply")
-        assert is_closed(mesh.vertices, mesh.faces), solid.name
+        assert is_wound_alike(mesh.vertices, mesh.faces), solid.name
         assert enclosed_volume(mesh.vertices, mesh.faces) > 0.01, solid.name
 
 

@@ -83,3 +83,16 @@ def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, 
         aod=np.stack([f.aod for f in found]), line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=sigma,
         engine="exact",
     )  # fmt: skip
+
+
+def enclosed_volume(vertices, faces):
+    """Signed volume [m^3]: positive where the faces of a closed surface point outwards."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
+
+
+def is_wound_alike(vertices, faces):
+    """Whether every edge, vertices at one place (to 1e-5 m) being one, has two faces that run it in opposite directions."""
+    index = np.unique(np.round(vertices, 5), axis=0, return_inverse=True)[1].reshape(-1)[faces]
+    edges = [(int(f[k]), int(f[k - 1])) for f in index for k in range(3)]
+    return len(set(edges)) == len(edges) and {(b, a) for a, b in edges} == set(edges)

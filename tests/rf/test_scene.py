@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import LOBBY
+from radio_scenes import enclosed_volume, is_wound_alike
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_files import enclosed_volume, is_closed, read_mesh, write_mesh
+from warprrf.geometry.mesh_files import read_mesh, write_mesh
 from warprrf.rf.em.materials import Material
 from warprrf.rf.scene import Scene
 
@@ -110,7 +111,7 @@ def test_meshes_survive_a_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.faces, faces)
     assert back.uv is not None
     np.testing.assert_allclose(back.uv, uv)
-    assert is_closed(back.vertices, back.faces)
-    assert not is_closed(back.vertices, back.faces[1:])
+    assert is_wound_alike(back.vertices, back.faces)
+    assert not is_wound_alike(back.vertices, back.faces[1:])
     assert enclosed_volume(back.vertices, back.faces) == pytest.approx(1.5 / 6)  # base times height over six
     assert enclosed_volume(back.vertices, back.faces[:, ::-1]) == pytest.approx(-1.5 / 6)

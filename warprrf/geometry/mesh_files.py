@@ -68,49 +68,21 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshFile:
     return MeshFile(vertices, faces, None if uv is None else np.asarray(uv, dtype=np.float64))
 
 
-def write_mesh(
-    path: str | os.PathLike[str], vertices: Any, faces: Any, *, uv: Any = None, colors: Any = None
-) -> None:
+def write_mesh(path: str | os.PathLike[str], vertices: Any, faces: Any, *, uv: Any = None) -> None:
     """Write a mesh (the suffix of ``path`` picks the format) to a temporary name, then move it into place.
 
     Args:
         vertices: positions [m], shape ``(V, 3)``.
         faces: vertex indices, shape ``(F, 3)``.
         uv: texture coordinates, shape ``(V, 2)``.
-        colors: vertex colours in [0, 1], shape ``(V, 3)``.
     """
     path = Path(path)
     trimesh = _trimesh()
     vertices = check_array("vertices", vertices, (None, 3))
     mesh = trimesh.Trimesh(vertices, check_array("faces", faces, (None, 3), dtype=np.int32), process=False)
-    if colors is not None:
-        rgb = check_array("colors", colors, (len(vertices), 3))
-        mesh.visual = trimesh.visual.ColorVisuals(
-            mesh, vertex_colors=np.round(255 * np.clip(rgb, 0, 1)).astype(np.uint8)
-        )
     if uv is not None:
         coordinates = check_array("uv", uv, (len(vertices), 2)).astype(np.float32)
         mesh.vertex_attributes["s"] = coordinates[:, 0]
         mesh.vertex_attributes["t"] = coordinates[:, 1]
     data = mesh.export(file_type=path.suffix.lstrip("."))
     write_atomically(path, lambda file: file.write_bytes(data.encode() if isinstance(data, str) else data))
-
-
-def merge_vertices(vertices: np.ndarray, faces: np.ndarray, digits: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices at one place (rounded to ``digits`` decimals) become one; returns vertices and faces."""
-    _, first, inverse = np.unique(np.round(vertices, digits), axis=0, return_index=True, return_inverse=True)
-    return vertices[first], np.asarray(inverse).reshape(-1)[faces].astype(np.int32)
-
-
-def enclosed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Signed volume [m^3]: positive where the faces of a closed surface point outwards."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
-
-
-def is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
-    """True if every edge is shared by exactly two triangles that run it in opposite directions."""
-    _, merged = merge_vertices(vertices, faces)
-    edges = np.concatenate([merged[:, [0, 1]], merged[:, [1, 2]], merged[:, [2, 0]]])
-    forward = {(int(a), int(b)) for a, b in edges}
-    return len(forward) == len(edges) and all((b, a) in forward for a, b in forward)

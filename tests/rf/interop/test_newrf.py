@@ -11,7 +11,7 @@ from radio_scenes import box_mesh, joined
 import warprrf as wr
 from benchmarks import newrf as bench
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.interop.newrf import load_newrf, match_rays, read_stl
+from warprrf.rf.interop.newrf import load_newrf, read_stl
 from warprrf.rf.paths.reflections import fit_reflections, mesh_parts
 from warprrf.rf.paths.trace import MirrorTracer
 
@@ -49,7 +49,7 @@ def rays(folder):
 
 
 def test_all_receivers_rays_once_reflected_and_in_sight_agree(rays):
-    match = match_rays(rays, order=1)
+    match = bench.match_rays(rays, order=1)
     for name in ("line_of_sight", "once"):
         row = match.summary()[name]
         assert row["share"] >= 0.99
@@ -67,7 +67,7 @@ def test_all_receivers_rays_once_reflected_and_in_sight_agree(rays):
 
 @pytest.mark.slow
 def test_twice_reflected_rays_agree(rays):
-    row = match_rays(rays, order=2).summary()["twice"]
+    row = bench.match_rays(rays, order=2).summary()["twice"]
     assert row["share"] >= 0.99 and row["only_ours"] <= 0.01 * row["rays"]
     assert row["length_error_m_worst"] < 1e-4 and row["phase_error_rad_worst"] < 0.02
 

@@ -1,4 +1,4 @@
-"""NeWRF's published conference room: MATLAB's rays to read, and our image method beside them, ray by ray.
+"""NeWRF's published conference room: the rays that MATLAB traced there, to read.
 
 NeWRF (Lu, Vattheuer, Mirzasoleiman, Abari, ICML 2024; github.com/LuHaofan/NeWRF, MIT licence) traces its rooms with
 MATLAB's image method: perfect reflectors without a sign change, up to two reflections, isotropic antennas. Here that
@@ -18,7 +18,6 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.paths.trace import MirrorTracer
 
 RAYS_FILE = "newrf_conference.npz"
 MESH_FILE = "conferenceroom.stl"
@@ -27,8 +26,6 @@ MESH_FILE = "conferenceroom.stl"
 # miss by millimetres and more, so anything between separates single from double reflections.
 _ONCE_M = 1e-5
 _AT_TRANSMITTER_M = 1e-6
-MATCH_M = 1e-3
-"""Rays of one order are the same if last points and lengths together differ by less [m]."""
 
 
 @dataclass(frozen=True)
@@ -185,112 +182,3 @@ def read_stl(path: str | os.PathLike[str]) -> Mesh:
     if not np.isfinite(floats[:, 1:]).all():
         raise ValueError(f"path: {file} holds vertices that are NaN or infinite")
     return Mesh(floats[:, 1:].reshape(-1, 3).astype(np.float64), np.arange(3 * count).reshape(-1, 3))
-
-
-@dataclass(frozen=True)
-class RayMatch:
-    """NeWRF's rays beside ours; arrays over their N rays, NaN where ours has none.
-
-    Attributes:
-        receiver: Index of the receiver, shape ``(N,)``.
-        order: Reflections: 0, 1 or 2, shape ``(N,)``.
-        found: Whether a ray of ours is the same, shape ``(N,)``, bool.
-        length_error_m: Absolute difference of unfolded lengths [m].
-        point_error_m: Distance between the last points [m].
-        phase_error_rad: Absolute difference of the gains' phases [rad].
-        gain_error: Relative difference of the complex gains, ``|ours - theirs| / |theirs|``.
-        extra_receiver: Receivers of the rays that only we have, shape ``(E,)``.
-        extra_order: Their orders, shape ``(E,)``.
-        extra_point: Their last points [m], shape ``(E, 3)``.
-        missing_point: Last points of the rays that only they have [m], shape ``(N - found, 3)``.
-    """
-
-    receiver: np.ndarray
-    order: np.ndarray
-    found: np.ndarray
-    length_error_m: np.ndarray
-    point_error_m: np.ndarray
-    phase_error_rad: np.ndarray
-    gain_error: np.ndarray
-    extra_receiver: np.ndarray
-    extra_order: np.ndarray
-    extra_point: np.ndarray
-    missing_point: np.ndarray
-
-    def summary(self) -> dict[str, dict[str, float | int | None]]:
-        """Figures per kind of ray ("line_of_sight", "once", "twice"): counts, share found, median and worst errors."""
-        rows: dict[str, dict[str, float | int | None]] = {}
-        for order, name in enumerate(("line_of_sight", "once", "twice")):
-            mine = self.order == order
-            if not mine.any():
-                continue
-            row: dict[str, float | int | None] = {
-                "rays": int(mine.sum()),
-                "found": int(self.found[mine].sum()),
-                "share": float(self.found[mine].mean()),
-                "only_ours": int((self.extra_order == order).sum()),
-            }
-            for error in ("length_error_m", "point_error_m", "phase_error_rad", "gain_error"):
-                values = getattr(self, error)[mine & self.found]
-                row[f"{error}_median"] = float(np.median(values)) if len(values) else None
-                row[f"{error}_worst"] = float(values.max()) if len(values) else None
-            rows[name] = row
-        return rows
-
-
-def match_rays(
-    rays: NewrfRays, *, order: int = 1, tolerance_m: float = MATCH_M, device: Any = None
-) -> RayMatch:
-    """Trace the same room by our image method and pair the rays, one to one, by order, last point and length.
-
-    Args:
-        rays: What :func:`load_newrf` read.
-        order: Most reflections to compare: 0, 1 or 2 (theirs have no more).
-        tolerance_m: Distance of last points plus difference of lengths below which rays are the same [m].
-
-    Raises:
-        ValueError: on another order or a tolerance that is not positive.
-    """
-    if not tolerance_m > 0:
-        raise ValueError(f"tolerance_m: got {tolerance_m!r}, expected a positive distance in metres")
-    tracer = MirrorTracer(
-        rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=device
-    )
-    ours = tracer.find(rays.receivers, order)
-    our_gain = ours.gain(rays.wavelength_m)
-    their_order, their_length = rays.order, rays.length_m
-    receiver, column = np.nonzero((their_order >= 0) & (their_order <= order))
-    partner = np.full(len(receiver), -1)
-    taken = np.zeros(len(ours.receiver), dtype=bool)
-    bounces = ours.order
-    for k in range(len(rays.receivers)):
-        theirs, mine = np.flatnonzero(receiver == k), np.flatnonzero(ours.receiver == k)
-        c = column[theirs]
-        gap = np.linalg.norm(rays.last_point[k, c][:, None] - ours.last_point[mine][None], axis=2)
-        gap = gap + np.abs(their_length[k, c][:, None] - ours.length_m[mine][None])
-        gap[their_order[k, c][:, None] != bounces[mine][None]] = np.inf
-        while gap.size and gap.min() < tolerance_m:
-            i, j = np.unravel_index(gap.argmin(), gap.shape)
-            partner[theirs[i]] = mine[j]
-            taken[mine[j]] = True
-            gap[i], gap[:, j] = np.inf, np.inf
-    found = partner >= 0
-    gain, mirror = rays.gain[receiver, column], our_gain[partner]
-    last = rays.last_point[receiver, column]
-
-    def where_found(values: np.ndarray) -> np.ndarray:
-        return np.where(found, values, np.nan)
-
-    return RayMatch(
-        receiver=receiver,
-        order=their_order[receiver, column],
-        found=found,
-        length_error_m=where_found(np.abs(their_length[receiver, column] - ours.length_m[partner])),
-        point_error_m=where_found(np.linalg.norm(last - ours.last_point[partner], axis=1)),
-        phase_error_rad=where_found(np.abs(np.angle(gain / mirror))),
-        gain_error=where_found(np.abs(mirror - gain) / np.abs(gain)),
-        extra_receiver=ours.receiver[~taken],
-        extra_order=bounces[~taken],
-        extra_point=ours.last_point[~taken],
-        missing_point=last[~found],
-    )

@@ -100,13 +100,6 @@ def predicted_std_db(
     return errors.std_db(NEPER * np.log1p(image), view.receivers[0], slopes, index)
 
 
-def negative_log_likelihood(error_db: np.ndarray, std_db: np.ndarray | float, outlier_db: float) -> float:
-    """Mean negative log likelihood of errors [dB] under standard deviations and a share ``OUTLIERS`` of outliers."""
-    near = np.log1p(-OUTLIERS) - 0.5 * (error_db / std_db) ** 2 - np.log(std_db)
-    far = np.log(OUTLIERS) - 0.5 * (error_db / outlier_db) ** 2 - np.log(outlier_db)
-    return float(0.5 * np.log(2.0 * np.pi) - np.logaddexp(near, far).mean())
-
-
 def steepness(image_db: np.ndarray) -> np.ndarray:
     """Largest difference within 3 x 3 pixels [dB], azimuth wrapped, shape ``(H, W)``."""
     padded = np.pad(np.pad(image_db, ((1, 1), (0, 0)), mode="edge"), ((0, 0), (1, 1)), mode="wrap")
