@@ -99,7 +99,7 @@ def run_map(
     steps = len(wanted) + len(samples) + 2
     started = time.perf_counter(), time.process_time()
     fitted.sent_radiance(fitted.transport())  # once for a transmitter, whatever the map
-    fitted.transport().mirror_tree(fitted.terms.mirror_order)
+    fitted.transport().images.candidates(fitted.transmitter[None] + 0.1, fitted.terms.mirror_order)
     prepared = _spent(started)
     maps: list[RadioMap] = []
     fitted.radio_map(height, 8.0 * cell)  # kernels are loaded
