@@ -77,7 +77,7 @@ test: lint docs
 	$(RUN) -m pytest $(ARGS)
 
 gpu: $(VENV)/.test
-	@$(RUN) -m benchmarks.gpu $(ARGS)
+	@$(RUN) -m benchmarks gpu $(ARGS)
 
 notebooks: $(VENV)/.test
 	$(RUN) tools/run_notebooks.py

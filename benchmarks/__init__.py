@@ -1,1 +1,1 @@
-"""Experiments and benchmarks: every table and figure of the README from one command each."""
+"""Experiments on warprrf: every table and figure from one command each, ``python -m benchmarks NAME``."""

@@ -3,11 +3,35 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
-from benchmarks.commands import add_benches
-from benchmarks.lobby.commands import add_data, add_lobby
+from benchmarks.runner import Benchmark, add_options, run_command
 from warprrf import cli
+
+NAMES = {
+    "lobby": ("benchmarks.lobby.pipeline", "the main job: photos -> geometry -> radio -> evaluation"),
+    "lobby-seeds": ("benchmarks.lobby.seeds", "the main job's figures over several seeds: mean and spread"),
+    "data": ("benchmarks.lobby.make_data", "regenerate data/lobby/ from nothing (hours; resumable)"),
+    "table1": ("benchmarks.evaluation.command", "every method of the paper's table, and more, side by side"),
+    "sparsity": ("benchmarks.evaluation.command", "PSNR and SSIM over the number of training receivers"),
+    "bistatic": (
+        "benchmarks.bistatic.table",
+        "the bistatic field beside other systems, and what its parts are worth",
+    ),
+    "beams": ("benchmarks.beams.run", "beams chosen from the field, beside pilots"),
+    "engine": ("benchmarks.engine.table", "the engine's speed against error"),
+    "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
+    "channel": ("benchmarks.channel", "channels: closed forms, Sionna RT, wide responses, the near field"),
+    "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
+    "relevance": ("benchmarks.relevance", "what each effect is worth, at two bands and roughnesses"),
+    "newrf": ("benchmarks.newrf", "rays and channels of NeWRF's conference room"),
+    "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
+}
+"""Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""
 
 EPILOG = """\
   python -m benchmarks lobby            photos -> geometry -> radio -> evaluation, into runs/lobby/
@@ -16,15 +40,38 @@ EPILOG = """\
 """
 
 
-def parser() -> argparse.ArgumentParser:
-    """Every benchmark as a command."""
-    return cli.make_parser(
-        "python -m benchmarks",
-        "Experiments: every table and figure from one command each.",
-        EPILOG,
-        (add_lobby, add_data, add_benches),
-    )
+def benchmark(name: str) -> Benchmark:
+    """The benchmark of that name; its module is imported now."""
+    found: Benchmark = importlib.import_module(NAMES[name][0]).BENCHMARKS[name]
+    return found
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one benchmark and return its exit status: 0 done, 2 bad input, 130 interrupted."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    asked = next((word for word in words if word in NAMES), None)
+    definitions = [partial(_define, name=name, whole=name == asked) for name in NAMES]
+    text = "Experiments: every table and figure from one command each."
+    return cli.run(cli.make_parser("python -m benchmarks", text, EPILOG, definitions), words)
+
+
+def _define(add: Callable[..., argparse.ArgumentParser], name: str, whole: bool) -> None:
+    """One command; its options are read from its module only where it is the one that was asked for."""
+    line = NAMES[name][1]
+    if not whole:
+        add(name, _nothing, line, "")
+        return
+    one = benchmark(name)
+    add_options(add(name, partial(_run, one), line, one.help), one)
+
+
+def _run(one: Benchmark, args: argparse.Namespace, bars: Any) -> None:
+    run_command(one, args, bars)
+
+
+def _nothing(args: argparse.Namespace, bars: Any) -> None:
+    """Stands for the commands that were not asked for."""
 
 
 if __name__ == "__main__":
-    sys.exit(cli.run(parser()))
+    sys.exit(main())

@@ -10,17 +10,16 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.machine import machine
-from benchmarks.stages import write_json
-from warprrf import device as _device
-from warprrf.device import Progress
-from warprrf.files import write_atomically, write_text
+from benchmarks.pictures import figure_of
+from benchmarks.report import Report, table
+from benchmarks.runner import Benchmark, Job, option
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.arrays import PlanarArray, plane_wave_error
 from warprrf.rf.channel.band_plan import thz_channel
@@ -33,7 +32,6 @@ from warprrf.rf.paths.trace import MirrorTracer, trace_paths
 from warprrf.rf.scene import Scene
 
 FREQUENCY_HZ = 300e9
-SCENE = "data/lobby/scene.xml"
 TRANSMITTER = (13.6, 11.2, 2.5)
 SAME_M = 5e-3  # paths of the two tracers are one if lengths and unit directions differ by less, summed
 SHORT_LEG_M = 0.2
@@ -45,51 +43,56 @@ ENTRIES = 400
 """Entries of the large response that are summed densely to check it: half at random, half among the largest."""
 
 
-def run_channel(
-    out: str | os.PathLike[str] = "runs/channel",
-    *,
-    scene: str | os.PathLike[str] = SCENE,
-    receivers: int = 30,
-    large: bool = True,
-    sionna: bool = True,
-    seed: int = 0,
-    device: Any = None,
-    progress: Progress | None = None,
-) -> dict[str, Any]:
-    """Measure all rows; writes ``channel.json``, ``channel.md`` and, with matplotlib, ``plane_wave.png`` to ``out``.
+HELP = """\
+Closed forms at 300 GHz and 100 m, line of sight and mirrors of the lobby beside Sionna RT's, the frequency response
+over 69.12 GHz beside Sionna's own, and what the plane wave costs a large array near by.
 
-    Args:
-        scene: Scene XML of the comparison with Sionna RT, materials beside it.
-        receivers: Receivers of that comparison.
-        large: Whether to measure 1e5 paths between 1024 and 16 elements at 2048 frequencies (about 1.5 GB).
-        sionna: Whether to compare with Sionna RT, which must then be installed.
-        seed: Of receivers and paths.
+examples:
+  python -m benchmarks channel
+  python -m benchmarks channel --no-large --no-sionna        a first look, in seconds
+"""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the channels.
+
+    Attributes:
+        scene: scene XML of the comparison with Sionna RT, materials beside it.
+        large: whether to measure 1e5 paths between 1024 and 16 elements at 2048 frequencies (about 1.5 GB).
+        sionna: whether to compare with Sionna RT, which must then be installed.
+        receivers: of that comparison.
+    """
+
+    scene: str = option("data/lobby/scene.xml", "scene compared with Sionna RT (XML)")
+    large: bool = option(True, "1e5 paths between 1024 and 16 elements (1.5 GB)")
+    sionna: bool = option(True, "the comparison with Sionna RT")
+    receivers: int = option(30, "receivers of that comparison")
+
+
+def run(options: Options, job: Job) -> Report:
+    """Measure all rows.
 
     Raises:
         ImportError: if Sionna RT is asked for and missing.
     """
-    folder = Path(out)
-    stages: list[tuple[str, Callable[[], Any]]] = [
-        ("closed_forms", lambda: closed_forms(seed)),
+    steps: list[tuple[str, Callable[[], Any]]] = [
+        ("closed_forms", lambda: closed_forms(job.seed)),
         ("plane_wave", plane_wave_table),
     ]
-    if sionna:
-        stages.append(("lobby", lambda: against_sionna(scene, receivers, seed, device)))
-        stages.append(("small", lambda: small_response(scene)))
-    if large:
-        stages.append(("large", lambda: [large_response(s, seed) for s in (False, True)]))
-    report: dict[str, Any] = {"machine": machine(device), "seed": seed}
-    for k, (name, measure) in enumerate(stages):
-        if progress is not None:
-            progress("channel", k, len(stages))
-        report[name] = measure()
-    if progress is not None:
-        progress("channel", len(stages), len(stages))
-    write_json(folder / "channel.json", report)
-    text = table(report)
-    write_text(folder / "channel.md", text)
-    _plot(report["plane_wave"], folder / "plane_wave.png")
-    return report
+    if options.sionna:
+        scene = options.scene
+        steps.append(("lobby", lambda: against_sionna(scene, options.receivers, job.seed, job.device)))
+        steps.append(("small", lambda: small_response(scene)))
+    if options.large:
+        steps.append(("large", lambda: [large_response(s, job.seed) for s in (False, True)]))
+    figures: dict[str, Any] = {"machine": machine(job.device), "seed": job.seed}
+    for k, (name, measure) in enumerate(steps):
+        job.progress("channel", k, len(steps))
+        figures[name] = measure()
+    job.progress("channel", len(steps), len(steps))
+    caption = "What a beam steered by a plane wave loses near by."
+    return Report("channel", figures, text(figures), {"plane_wave.png": (_picture, caption)}, dpi=120)
 
 
 def closed_forms(seed: int = 0, trials: int = 50) -> dict[str, dict[str, float]]:
@@ -160,7 +163,7 @@ def against_sionna(
     room = Scene.load(scene)
     points = _places(room, receivers, seed)
     carrier = thz_channel(69).center_hz
-    solved, sionna_s = _solve(room, points, carrier, ("VH", 1, 1), ("VH", 1, 1), depth=2, samples=200_000)
+    solved, sionna_s = _solve(room, points, carrier, _Ask())
     theirs = Paths.from_sionna(solved, frequency_hz=carrier, drop_repeated=True)
     start = time.perf_counter()
     tracer = MirrorTracer(room, transmitter=TRANSMITTER, frequency_hz=carrier, device=device)
@@ -223,9 +226,9 @@ def small_response(scene: str | os.PathLike[str], repeats: int = 5) -> dict[str,
     channel = thz_channel(69)
     carrier, f = channel.center_hz, channel.frequencies_hz(256)
     point = _places(room, 1, 0)
-    options: dict[str, Any] = {"depth": 2, "samples": 20_000, "diffuse": True, "most": 1000}
-    solved, _ = _solve(room, point, carrier, ("V", 2, 2), ("V", 8, 8), **options)
-    plain, _ = _solve(room, point, carrier, ("VH", 1, 1), ("VH", 1, 1), **options)
+    plain_ask = _Ask(samples=20_000, diffuse=True, most=1000)
+    solved, _ = _solve(room, point, carrier, replace(plain_ask, tx=("V", 2, 2), rx=("V", 8, 8)))
+    plain, _ = _solve(room, point, carrier, plain_ask)
     paths = Paths.from_sionna(plain, frequency_hz=carrier)[0]
     tx, rx = PlanarArray(2, 2, polarisation="V"), PlanarArray(8, 8, polarisation="V")
     baseband = (f - carrier).astype(np.float32)
@@ -306,66 +309,54 @@ def plane_wave_table() -> list[dict[str, float]]:
     return rows
 
 
-def table(report: dict[str, Any]) -> str:
-    """The report as Markdown."""
-    lines = ["| measured | value | asked |", "|---|---|---|"]
-
-    def row(what: str, value: str, asked: str = "") -> None:
-        lines.append(f"| {what} | {value} | {asked} |")
-
+def text(figures: dict[str, Any]) -> str:
+    """The figures as Markdown."""
     titles = {
         "friis": "Friis",
         "two_ray": "two rays over a slab, V and H",
         "images": "four images in a corner",
     }
-    for name, e in report["closed_forms"].items():
-        row(
+    rows = [
+        (
             f"{titles[name]}, 100 m, {e['trials']} trials",
             f"gain {e['gain']:.1e}, phase {e['phase_rad']:.1e} rad",
-            "gain 1e-6, phase 1e-3 rad",
         )
-    if "lobby" in report:
-        e = report["lobby"]
-        row(
-            f"lobby beside Sionna RT: {e['paths']} paths, {e['receivers']} receivers",
+        for name, e in figures["closed_forms"].items()
+    ]
+    if "lobby" in figures:
+        e = figures["lobby"]
+        found = (
             f"gain {e['gain_db']:.3f} dB ({e['gain_db_all']:.3f} dB with the {e['short_legs']} paths that have a leg "
             f"shorter than {SHORT_LEG_M:g} m), tau {e['tau_s']:.1e} s, angles {e['arrival_rad']:.1e} and "
             f"{e['departure_rad']:.1e} rad, coefficients {100 * e['jones']:.2f} %; Sionna only {e['sionna_only']}, "
-            f"ours only {e['ours_only']}",
-            "gain 0.05 dB, tau 1e-12 s, angles 1e-4 rad",
+            f"ours only {e['ours_only']}"
         )
-    if "small" in report:
-        e = report["small"]
-        row(
-            f"cfr, {e['paths']} paths, 64 x 4 elements, 256 frequencies",
-            f"{1e3 * e['grid_seconds']:.1f} ms, error {e['grid_error']:.1e}; Sionna "
-            f"{1e3 * e['sionna_seconds']:.0f} ms, error {e['sionna_error']:.1e}: {e['times_faster']:.0f} times faster",
-            "5 times faster, error 1e-5",
+        rows.append((f"lobby beside Sionna RT: {e['paths']} paths, {e['receivers']} receivers", found))
+    if "small" in figures:
+        e = figures["small"]
+        grid = (
+            f"{1e3 * e['grid_seconds']:.1f} ms, error {e['grid_error']:.1e}; Sionna {1e3 * e['sionna_seconds']:.0f} ms, "
+            f"error {e['sionna_error']:.1e}: {e['times_faster']:.0f} times faster"
         )
-        row(
-            "the same, dense sum in float64",
-            f"{1e3 * e['dense_seconds']:.1f} ms, error {e['dense_error']:.1e}",
-        )
-        row("the same with beam squint", f"{1e3 * e['squint_seconds']:.1f} ms")
-    for e in report.get("large", []):
-        row(
-            "cfr, 1e5 paths, 1024 x 16 elements, 2048 frequencies" + (", beam squint" if e["squint"] else ""),
+        dense = f"{1e3 * e['dense_seconds']:.1f} ms, error {e['dense_error']:.1e}"
+        rows.append((f"cfr, {e['paths']} paths, 64 x 4 elements, 256 frequencies", grid))
+        rows.append(("the same, dense sum in float64", dense))
+        rows.append(("the same with beam squint", f"{1e3 * e['squint_seconds']:.1f} ms"))
+    for e in figures.get("large", []):
+        squint = ", beam squint" if e["squint"] else ""
+        found = (
             f"{e['seconds']:.1f} s ({e['cpu_seconds']:.1f} s of processor time), error {e['error_of_largest']:.1e} of "
-            f"the largest entry, {e['error_in_largest_entries']:.1e} in the largest entries",
-            "" if e["squint"] else "60 s, error 1e-3 in the largest entries",
+            f"the largest entry, {e['error_in_largest_entries']:.1e} in the largest entries"
         )
-    lines += [
-        "",
-        "Loss of a beam steered by a plane wave [dB], 300 GHz, elements half a wavelength apart:",
-        "",
-    ]
-    lines.append("| elements | " + " | ".join(f"{d:g} m" for d in DISTANCES_M) + " | 2 D^2 / lambda |")
-    lines.append("|---|" + "---|" * (len(DISTANCES_M) + 1))
+        rows.append((f"cfr, 1e5 paths, 1024 x 16 elements, 2048 frequencies{squint}", found))
+    losses = []
     for side in SIDES:
-        found = [e for e in report["plane_wave"] if e["elements"] == side**2]
-        losses = " | ".join(f"{e['beam_loss_db']:.2g}" for e in found)
-        lines.append(f"| {side**2} | {losses} | {found[0]['fraunhofer_m']:.2g} m |")
-    return "\n".join(lines) + "\n"
+        own = [e for e in figures["plane_wave"] if e["elements"] == side**2]
+        cells = [f"{e['beam_loss_db']:.2g}" for e in own]
+        losses.append([str(side**2), *cells, f"{own[0]['fraunhofer_m']:.2g} m"])
+    head = ["elements", *(f"{d:g} m" for d in DISTANCES_M), "2 D^2 / lambda"]
+    about = "Loss of a beam steered by a plane wave [dB], 300 GHz, elements half a wavelength apart:"
+    return "\n\n".join([table(("measured", "value"), rows), about, table(head, losses)])
 
 
 # ------------------------------------------------------------------------------------------------------- pieces
@@ -382,22 +373,22 @@ def _places(room: Scene, count: int, seed: int) -> np.ndarray:
     return found[:count]
 
 
-def _solve(
-    room: Scene,
-    points: np.ndarray,
-    carrier: float,
-    tx: tuple[str, int, int],
-    rx: tuple[str, int, int],
-    *,
-    depth: int,
-    samples: int,
-    diffuse: bool = False,
-    most: int = 1_000_000,
-) -> tuple[Any, float]:
-    """Sionna RT's paths from :data:`TRANSMITTER` to ``points``, and the seconds of its solver."""
+@dataclass(frozen=True)
+class _Ask:
+    """What Sionna's solver is asked for: polarisation, rows and columns of both arrays, and its own settings."""
+
+    tx: tuple[str, int, int] = ("VH", 1, 1)
+    rx: tuple[str, int, int] = ("VH", 1, 1)
+    samples: int = 200_000
+    diffuse: bool = False
+    most: int = 1_000_000
+
+
+def _solve(room: Scene, points: np.ndarray, carrier: float, ask: _Ask) -> tuple[Any, float]:
+    """Sionna RT's paths of order 2 from :data:`TRANSMITTER` to ``points``, and the seconds of its solver."""
     loaded = load_sionna_scene(room, frequency_hz=carrier)
     rt = sionna_rt()
-    for name, (polarisation, rows, cols) in (("tx_array", tx), ("rx_array", rx)):
+    for name, (polarisation, rows, cols) in (("tx_array", ask.tx), ("rx_array", ask.rx)):
         array = rt.PlanarArray(num_rows=rows, num_cols=cols, pattern="iso", polarization=polarisation)
         setattr(loaded, name, array)
     loaded.add(rt.Transmitter("tx", position=list(TRANSMITTER)))
@@ -406,8 +397,8 @@ def _solve(
     solver = rt.PathSolver(deterministic=True)
     start = time.perf_counter()
     solved = solver(
-        loaded, max_depth=depth, samples_per_src=samples, max_num_paths_per_src=most, synthetic_array=True,
-        los=True, specular_reflection=True, diffuse_reflection=diffuse, refraction=False, seed=1,
+        loaded, max_depth=2, samples_per_src=ask.samples, max_num_paths_per_src=ask.most, synthetic_array=True,
+        los=True, specular_reflection=True, diffuse_reflection=ask.diffuse, refraction=False, seed=1,
     )  # fmt: skip
     np.asarray(solved.tau.numpy())
     return solved, time.perf_counter() - start
@@ -451,15 +442,10 @@ def _scattered(count: int, carrier: float, seed: int) -> Paths:
     )
 
 
-def _plot(rows: list[dict[str, float]], path: Path) -> None:
-    """Beam loss over distance, a line for each size of array; nothing without matplotlib."""
-    try:
-        figure_module = _device.require("matplotlib.figure", extra="plots")
-    except ImportError:
-        return
+def _picture() -> Any:
+    """Beam loss over distance, a line for each size of array."""
     wavelength = SPEED_OF_LIGHT / FREQUENCY_HZ
-    figure = figure_module.Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.add_subplot()
+    figure, (axes,) = figure_of(1, (6.4, 4.0))
     distances = np.geomspace(0.3, 30.0, 60)
     for side in SIDES[1:]:
         array = PlanarArray(side, side)
@@ -471,4 +457,7 @@ def _plot(rows: list[dict[str, float]], path: Path) -> None:
     axes.grid(True, which="major", alpha=0.4)
     axes.legend(title="elements")
     axes.set_title("Beam steered by a plane wave at 300 GHz, half-wavelength spacing", fontsize=10)
-    write_atomically(path, lambda name: figure.savefig(name, dpi=120))
+    return figure
+
+
+BENCHMARKS = {"channel": Benchmark("channel", Options, run, HELP)}

@@ -1,9 +1,5 @@
 """What a GPU does: its tests, and the times of everything that is launched there, within ten minutes.
 
-``python -m benchmarks.gpu`` runs each part in a process of its own, so that a part that fails or hangs costs no other,
-and writes ``benchmarks/results/gpu-NAME.json``. Without a CUDA device it runs all parts on the CPU in tiny sizes, which
-goes through the same code, says so and writes nothing.
-
 gsplat (Ye et al., "gsplat: An open-source library for Gaussian splatting", JMLR 26, 2025; version 1.5's
 ``rasterization``) takes turns with ours if it and a torch with CUDA are installed. It blends ellipses of a projection
 made affine, so its image is another one.
@@ -11,7 +7,6 @@ made affine, so its image is another one.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import re
@@ -32,6 +27,7 @@ from benchmarks.engine.rays import bumpy_sphere
 from benchmarks.engine.scenes import gaussians, panorama, photo, room
 from benchmarks.lobby.spectra import TRANSMITTER
 from benchmarks.machine import machine
+from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import resolve
 from warprrf.files import write_json
 from warprrf.geometry.mesh import Mesh
@@ -206,45 +202,53 @@ PARTS: dict[str, Callable[[Sizes, wp.Device], dict[str, Any]]] = {
 }
 
 
-def run(
-    out: str | Path = "benchmarks/results", *, dry: bool = False, parts: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Every part, or those named, one process each; a part that fails is told under ``failed``.
+@dataclass(frozen=True)
+class Options:
+    """What of it to measure."""
 
-    Args:
-        out: folder of the result file; a dry run writes none.
-        dry: tiny sizes on the CPU.
-        parts: of :data:`PARTS`, and ``"tests"``.
+    dry: bool = option(False, "tiny sizes on the CPU, although there is a GPU")
+    parts: tuple[str, ...] = option(("tests", *PARTS), "what to run", choices=("tests", *PARTS))
+
+
+def run(options: Options, job: Job) -> None:
+    """Every part, one process each; a part that fails is told under ``failed`` and costs no other.
 
     Raises:
-        ValueError: for an unknown part.
+        ValueError: if a part failed.
     """
-    names = list(parts) or ["tests", *PARTS]
-    for name in names:
-        if name not in ("tests", *PARTS):
-            raise ValueError(f"parts: got {name!r}, expected some of tests, {', '.join(PARTS)}")
-    sizes = DRY if dry else Sizes()
-    device = resolve("cpu" if dry else "cuda:0")
-    name = re.sub(r"\W+", "-", device.name.lower()).strip("-")
-    path = Path(out) / f"gpu-{name}.json"
+    dry = options.dry or not wp.is_cuda_available()
+    device = resolve("cpu" if dry else job.device or "cuda:0")
+    path = job.out / f"gpu-{re.sub(r'[^a-z0-9]+', '-', device.name.lower()).strip('-')}.json"
     result: dict[str, Any] = {
-        "machine": machine(device), "sizes": asdict(sizes), "asked": ASKED, "seconds": {}, "failed": {},
+        "machine": machine(device), "sizes": asdict(DRY if dry else Sizes()), "asked": ASKED, "seconds": {}, "failed": {},
     }  # fmt: skip
-    for name in names:
+    for name in options.parts:
         print(f"{name} ...", flush=True)
         started = time.monotonic()
-        found, error = _tests(dry) if name == "tests" else _apart(name, dry)
+        found, error = _tests(dry) if name == "tests" else _apart(name, str(device), dry)
         result["seconds"][name] = time.monotonic() - started
+        result[name] = found
         if error:
             result["failed"][name] = error
-            print(error, file=sys.stderr)
-        result[name] = found
-        print(json.dumps({k: v for k, v in found.items() if k != "kernels_ms"}, indent=2), flush=True)
+        print(
+            error or json.dumps({k: v for k, v in found.items() if k != "kernels_ms"}, indent=2), flush=True
+        )
         if not dry:
             write_json(path, result)  # after each part: what was measured is not lost
-    if not dry:
-        print(f"written: {path}")
-    return result
+    why = "asked for a dry run" if options.dry else "no CUDA device here"
+    print(
+        f"No GPU was measured: {why}. Every part ran on the CPU in tiny sizes; nothing written."
+        if dry
+        else path
+    )
+    if result["failed"]:
+        raise ValueError(f"failed: {', '.join(result['failed'])}")
+
+
+def run_part(name: str, device: str, dry: bool, file: str) -> None:
+    """Measure one part of :data:`PARTS` and write it to ``file``."""
+    with wp.ScopedDevice(device):
+        write_json(Path(file), PARTS[name](DRY if dry else Sizes(), resolve(device)))
 
 
 def _tests(dry: bool) -> tuple[dict[str, Any], str]:
@@ -264,19 +268,12 @@ def _tests(dry: bool) -> tuple[dict[str, Any], str]:
     return {"summary": line.strip("= ")}, error
 
 
-def _apart(name: str, dry: bool) -> tuple[dict[str, Any], str]:
+def _apart(name: str, device: str, dry: bool) -> tuple[dict[str, Any], str]:
+    """A part in a process of its own: what it found, and its error."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "part.json"
-        words = [
-            sys.executable,
-            "-m",
-            "benchmarks.gpu",
-            "--part",
-            name,
-            str(file),
-            *(["--dry"] if dry else []),
-        ]
-        _, error = _process(words)
+        code = f"from benchmarks.gpu import run_part; run_part({name!r}, {device!r}, {dry}, {str(file)!r})"
+        _, error = _process([sys.executable, "-c", code])
         return (json.loads(file.read_text()) if file.exists() else {}), error
 
 
@@ -352,30 +349,15 @@ def _activities(work: Callable[[], Any]) -> dict[str, float]:
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Measure; 0 if every part worked."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--out", default="benchmarks/results", help="folder of the result file")
-    parser.add_argument("--dry", action="store_true", help="tiny sizes on the CPU, although there is a GPU")
-    parser.add_argument("--parts", nargs="*", default=(), help=f"tests, {', '.join(PARTS)}; default: all")
-    parser.add_argument("--part", nargs=2, help=argparse.SUPPRESS, metavar=("NAME", "FILE"))
-    args = parser.parse_args(argv)
-    dry = args.dry or not wp.is_cuda_available()
-    if args.part:
-        name, file = args.part
-        device = "cpu" if dry else "cuda:0"
-        with wp.ScopedDevice(device):
-            write_json(Path(file), PARTS[name](DRY if dry else Sizes(), resolve(device)))
-        return 0
-    result = run(args.out, dry=dry, parts=args.parts)
-    if dry:
-        print(
-            "No GPU was measured: "
-            + ("asked for --dry" if args.dry else "no CUDA device here")
-            + ". Every part ran on the CPU in tiny sizes; nothing written."
-        )
-    return 1 if result["failed"] else 0
+HELP = """\
+Runs the tests of kernels and laws on CUDA, then measures, each in a process of its own: forward and backward of a
+million Gaussians beside gsplat (if it is installed), blending weights, a spectrum, a fit of RF-3DGS+ to 700 receivers,
+a bistatic field's fit and spectrum, and mesh rays. Writes benchmarks/results/gpu-NAME.json, in less than ten minutes.
+Without a CUDA device it runs all parts on the CPU in tiny sizes, says so, and writes nothing.
 
+examples:
+  python -m benchmarks gpu
+  python -m benchmarks gpu --parts blending mesh_rays
+"""
 
-if __name__ == "__main__":
-    sys.exit(main())
+BENCHMARKS = {"gpu": Benchmark("gpu", Options, run, HELP, "benchmarks/results")}

@@ -1,46 +1,91 @@
-"""What several benches compare, fitted in one way: fields on the reconstruction, lookups, and what needs no data.
+"""The methods that the benchmarks compare, each behind one function: fields on the reconstruction, lookups, networks, a
+ray tracer, and what needs no data.
 
-What receivers see of the geometry is computed once and shared by the methods that need it (:class:`Geometry`); its time
-is counted to every one of them.
+A method takes a :class:`Task` - training set, what may be known of the room, a time or a number of iterations - and
+returns a :class:`Fitted`: what it predicts, what it cost, how large it is. The blending weights of receivers are
+computed once and shared by the methods that need them (:class:`~benchmarks.data.Geometry`); their time is counted to
+every one of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import warprrf as wr
-from benchmarks import setting
-from benchmarks.setting import Geometry
-from benchmarks.stages import fingerprint
+from benchmarks.data import VERSIONS, Geometry
+from benchmarks.report import Row
 from warprrf.device import Progress
-from warprrf.marks import code_mark
+from warprrf.files import write_atomically
+from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.training import TrainingViews
-from warprrf.rf.fields.bistatic.transport import ReceiverView
-from warprrf.rf.fields.harmonic.field import HarmonicField
-from warprrf.rf.spectra import lookups
+from warprrf.rf.scene import Scene
+from warprrf.rf.spectra import lookups, metrics
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, spread
 
-METRICS_CODE = ("warprrf.rf.spectra.metrics", "warprrf.rf.spectra.dataset")
-LOOKUPS_CODE = ("warprrf.rf.spectra.lookups", *METRICS_CODE)
-HARMONIC_CODE = ("warprrf.rf.fields.harmonic", "warprrf.geometry.geometry_files", *METRICS_CODE)
-BISTATIC_CODE = ("warprrf.rf.fields.bistatic", "warprrf.geometry.geometry_files", *METRICS_CODE)
-"""Modules that the figures of a method depend on, for :func:`warprrf.marks.code_mark`."""
+PERMITTIVITY_OFF, ROUGHNESS_OFF = 1.2, 1.5
+"""Factors by which assumed materials are wrong, up or down: what a table for another sample of the material gives."""
+GAINS = ("exp", "linear")  # domains of a harmonic field's gain, which the paper leaves open
 
 
-def method_mark(modules: Sequence[str], *files: str) -> str:
-    """Fingerprint of the code of a method's figures: ``modules``, and of the benches what is shared and ``files``.
+@dataclass(frozen=True)
+class Effort:
+    """How long methods may work that go on as long as they are let.
 
-    What the benches import belongs to other methods too: their files count alone.
+    Attributes:
+        harmonic_iterations: steps of RF-3DGS+ and RF-3DGS; None: their own.
+        nerf2_iterations, nerf2_rays, nerf2_samples: steps of NeRF2, rays a step, samples a ray.
+        cgan_iterations, cgan_batch: steps of the GAN, spectra a step.
+        calibration_s: seconds of Sionna's calibration where there is no bistatic run to take them from.
+        sionna_samples: rays of Sionna's predictions.
     """
-    return fingerprint([code_mark(*modules), *(Path(file) for file in (__file__, setting.__file__, *files))])
+
+    harmonic_iterations: int | None = None
+    nerf2_iterations: int = 30_000
+    nerf2_rays: int = 8192
+    nerf2_samples: int = 64
+    cgan_iterations: int = 30_000
+    cgan_batch: int = 8
+    calibration_s: float = 60.0
+    sionna_samples: int = 1_000_000
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a method is given.
+
+    Attributes:
+        train: training set; empty for methods that see no spectrum.
+        test: receivers that will be asked for; their spectra are not looked at.
+        geometry: what is known of the room.
+        scratch: folder for a half-done training.
+        progress: told of ``"transport"``, ``"fit"`` and ``"evaluate"``.
+        slot: where the geometry keeps what the test receivers see.
+        variant: which of the method's variants.
+        seed: of every random choice.
+        effort: how long.
+        depth: most bounces of Sionna's paths: those that the truth has.
+        budget_s: seconds that the bistatic field took on the same spectra; None if it was not run.
+    """
+
+    train: SpectrumDataset
+    test: SpectrumDataset
+    geometry: Geometry
+    scratch: Path
+    progress: Progress
+    slot: str = "test"
+    variant: str = ""
+    seed: int = 0
+    effort: Effort = Effort()
+    depth: int = 1
+    budget_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -68,20 +113,59 @@ class Fitted:
     details: dict[str, Any] | None = None
 
 
+@dataclass(frozen=True)
+class Method:
+    """A method.
+
+    Attributes:
+        fit: learns from a task.
+        code: which of :data:`~benchmarks.data.VERSIONS` its figures depend on, with that of the metrics.
+        variants: of which the better one counts.
+        network: whether it is a network, trained on fewer sets in a small evaluation.
+        untaught: whether it sees no spectrum: one run for all numbers of training receivers.
+        random: whether it differs by seed though it sees no spectrum.
+        note: how it is to be read.
+    """
+
+    fit: Callable[[Task], Fitted]
+    code: str
+    variants: tuple[str, ...] = ("",)
+    network: bool = False
+    untaught: bool = False
+    random: bool = False
+    note: str = ""
+
+    @property
+    def version(self) -> int:
+        """Grows when the method or the metrics compute something else."""
+        return 1000 * VERSIONS["metrics"] + VERSIONS[self.code]
+
+
+def score(method: str, task: Task, keep: Path | None = None) -> tuple[Fitted, Row]:
+    """Fit a method and ask it for every test receiver.
+
+    Returns:
+        What was fitted, and a row: ``transport_s``, ``fit_s`` and the figures of :func:`warprrf.evaluate`.
+
+    Args:
+        keep: file to leave the fitted field in, if it is one.
+    """
+    fitted = METHODS[method].fit(task)
+    if keep is not None and fitted.field is not None:
+        write_atomically(keep, fitted.field.save)
+    row: Row = {"transport_s": fitted.transport_s, "fit_s": fitted.fit_s}
+    row |= metrics.evaluate(task.test, fitted.predict, progress=task.progress)
+    row["seconds_per_spectrum"] += fitted.before_s
+    return fitted, row
+
+
 def fit_bistatic(
-    geometry: Geometry,
-    train: SpectrumDataset,
-    *,
-    quick: bool = False,
-    progress: Progress | None = None,
-    **options: Any,
+    geometry: Geometry, train: SpectrumDataset, *, progress: Progress | None = None, **options: Any
 ) -> Fitted:
-    """The bistatic field on the reconstruction; a quick one traces its own, fewer rays."""
-    rays = None if quick else geometry.rays(train, progress=progress)
+    """The bistatic field on the reconstruction; ``options`` are those of :meth:`wr.RadioField.fit`."""
     found = wr.RadioField.fit(
-        geometry.reconstruction, train, transport=rays, quick=quick, device=geometry.device, progress=progress,
-        **options,
-    )  # fmt: skip
+        geometry.reconstruction, train, model="bistatic", device=geometry.device, progress=progress, **options
+    )
     spent = found.report
     return Fitted(
         found.spectrum, transport_s=spent["transport_time_s"], fit_s=spent["fit_time_s"], field=found
@@ -106,12 +190,12 @@ def fit_harmonic(
     Args:
         test: receivers that will be asked for.
         slot: where the geometry keeps their weights.
-        options: of :meth:`HarmonicField.fit`.
+        options: of :meth:`wr.RadioField.fit`.
     """
     weights, seconds = geometry.weights(train, progress=progress)
-    learned = HarmonicField.fit(
-        geometry.reconstruction, train, model, transport=weights, device=geometry.device, progress=progress,
-        **options,
+    learned: Any = wr.RadioField.fit(
+        geometry.reconstruction, train, model=model, transport=weights, device=geometry.device,
+        progress=progress, **options,
     )  # fmt: skip
     losses = learned.report["losses"]["gain"]
     timed = {
@@ -137,17 +221,33 @@ def fit_lookup(name: str, variant: str, train: SpectrumDataset) -> Fitted:
     )
 
 
-def untaught(name: str, geometry: Geometry, test: SpectrumDataset) -> Fitted:
-    """``"zero"``: our model on the reconstruction before any spectrum; ``"transmitter"``: its direction alone.
+def _bistatic(quick: bool = False) -> Callable[[Task], Fitted]:
+    return lambda task: fit_bistatic(task.geometry, task.train, quick=quick, progress=task.progress)
 
-    Of ``test`` only transmitter, carrier, grid, beam, floor and range are looked at.
-    """
-    if name == "zero":
-        prior = BistaticField.prior(geometry.reconstruction, test, device=geometry.device)
-        return Fitted(prior.spectrum, field=prior)
-    if name != "transmitter":
-        raise ValueError(f'name: got {name!r}, expected "zero" or "transmitter"')
-    return Fitted(point_at_transmitter(test, geometry.device), size_bytes=24)
+
+def _harmonic(model: str, **options: Any) -> Callable[[Task], Fitted]:
+    def fit(task: Task) -> Fitted:
+        given: dict[str, Any] = {"gain": task.variant, "seed": task.seed, **options}
+        if task.effort.harmonic_iterations is not None:
+            given["iterations"] = task.effort.harmonic_iterations
+        return fit_harmonic(
+            task.geometry, task.train, task.test, model, slot=task.slot, progress=task.progress, **given
+        )
+
+    return fit
+
+
+def _lookup(name: str) -> Callable[[Task], Fitted]:
+    return lambda task: fit_lookup(name, task.variant, task.train)
+
+
+def _zero(task: Task) -> Fitted:
+    prior = BistaticField.prior(task.geometry.reconstruction, task.test, device=task.geometry.device)
+    return Fitted(prior.spectrum, field=prior)
+
+
+def _transmitter(task: Task) -> Fitted:
+    return Fitted(point_at_transmitter(task.test, task.geometry.device), size_bytes=24)
 
 
 def point_at_transmitter(ds: SpectrumDataset, device: Any = None) -> Callable[[Any], Spectrum]:
@@ -171,7 +271,155 @@ def point_at_transmitter(ds: SpectrumDataset, device: Any = None) -> Callable[[A
     return predict
 
 
-def view_of(rays: TrainingViews) -> Callable[[Any], ReceiverView]:
-    """What was traced for a receiver, by its position."""
-    known = {v.receivers[0].tobytes(): v for v in rays.views}
-    return lambda receiver: known[np.asarray(receiver, np.float64).tobytes()]
+def _training(task: Task, iterations: int) -> Any:
+    """How a network is trained: on the GPU that everything else is on."""
+    from benchmarks.baselines import Training
+
+    device = None if task.geometry.device is None else str(task.geometry.device)
+    return Training(iterations, task.seed, device, task.scratch / "checkpoint", task.progress)
+
+
+def _nerf2(task: Task) -> Fitted:
+    from benchmarks.baselines import NeRF2, NeRF2Options
+
+    low, high = task.geometry.reconstruction.mesh.bounds  # how far the room reaches, and nothing else of it
+    diagonal = float(np.linalg.norm(high - low))
+    options = NeRF2Options(
+        far_m=diagonal, samples=task.effort.nerf2_samples, scale_m=0.5 * float((high - low).max())
+    )
+    model = NeRF2.fit(
+        task.train, options, _training(task, task.effort.nerf2_iterations), rays=task.effort.nerf2_rays
+    )
+    return _network(model)
+
+
+def _cgan(task: Task) -> Fitted:
+    from benchmarks.baselines import CGAN
+
+    model = CGAN.fit(
+        task.train, how=_training(task, task.effort.cgan_iterations), batch=task.effort.cgan_batch
+    )
+    return _network(model)
+
+
+def _network(model: Any) -> Fitted:
+    return Fitted(
+        model.spectrum,
+        fit_s=model.report["fit_time_s"],
+        size_bytes=model.model_bytes,
+        losses=model.report["losses"],
+    )
+
+
+def _assumed(task: Task) -> Fitted:
+    scene = task.geometry.scene
+    rng = np.random.default_rng([task.seed, 2])
+    wrong = [_misjudged(material, rng.choice((-1.0, 1.0), 2)) for material in scene.materials]
+    return _sionna(scene.with_materials(wrong), task)
+
+
+def _misjudged(material: Material, sign: np.ndarray) -> Material:
+    """A material as one would assume it: permittivity and roughness off by the stated factors, up or down."""
+    factor, rough = PERMITTIVITY_OFF ** sign[0], ROUGHNESS_OFF ** sign[1]
+    bands = tuple(
+        replace(b, a=b.a * factor) if b.a > PERMITTIVITY_OFF else b  # a metal's is 1, and stays
+        for b in material.bands
+    )
+    share = None if material.scattering is None else float(np.clip(material.scattering * rough, 0.0, 1.0))
+    return replace(material, bands=bands, roughness_m=float(material.roughness_m * rough), scattering=share)
+
+
+def _calibrated(task: Task) -> Fitted:
+    from benchmarks.baselines.sionna_calibration import Calibration, calibrate_sionna
+    from warprrf.rf.interop.twin import write_twin
+
+    seconds = task.budget_s or task.effort.calibration_s
+    prior = BistaticField.prior(task.geometry.reconstruction, task.train, device=task.geometry.device)
+    task.scratch.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=task.scratch) as folder:
+        twin = write_twin(prior, Path(folder) / "twin")
+        how = Calibration(seconds, depth=task.depth, seed=task.seed)
+        found = calibrate_sionna(
+            Scene.load(twin.xml), task.train, how, device=task.geometry.device, progress=task.progress
+        )
+        fitted = _sionna(found.scene, task)
+    return replace(
+        fitted, transport_s=found.start_s, fit_s=found.seconds, losses=found.losses,
+        details={"budget_s": seconds, "steps": len(found.losses)},
+    )  # fmt: skip
+
+
+def _sionna(scene: Scene, task: Task) -> Fitted:
+    """Sionna RT's PathSolver on ``scene``, which it has read when this returns."""
+    from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
+
+    test = task.test
+    engine = SionnaEngine(
+        scene, transmitter=test.transmitter, frequency_hz=test.frequency_hz, shape=test.shape,
+        beam_sigma_rad=test.beam_sigma_rad, device=task.geometry.device,
+        sampling=Sampling(depth=task.depth, samples=task.effort.sionna_samples, seed=task.seed + 1),
+    )  # fmt: skip
+
+    def predict(receiver: Any) -> Spectrum:
+        found = engine.receive(receiver)
+        return Spectrum(
+            path_gain=found.path_gain.astype(np.float32), delay_s=found.delay_s, aod=found.aod,
+            floor=test.floor, range_db=test.range_db,
+        )  # fmt: skip
+
+    mesh = scene.mesh
+    size = 4 * (mesh.vertices.size + mesh.faces.size) + 24 * len(scene.materials)
+    return Fitted(predict, size_bytes=size, details={"depth": task.depth})
+
+
+_MISJUDGED = f"permittivity off by a factor {PERMITTIVITY_OFF}, roughness by {ROUGHNESS_OFF}, up or down"
+
+METHODS: dict[str, Method] = {
+    "bistatic": Method(_bistatic(), "bistatic"),
+    "bistatic-quick": Method(
+        _bistatic(quick=True),
+        "bistatic",
+        note="no term is tried: single bounces and even light, one ray a pixel",
+    ),
+    "rf3dgs+": Method(_harmonic("rf3dgs+"), "harmonic", GAINS, note="opacity frozen"),
+    "rf3dgs+los": Method(
+        _harmonic("rf3dgs+", line_of_sight="explicit"), "harmonic", GAINS, note="line of sight apart"
+    ),
+    "rf3dgs": Method(
+        _harmonic("rf3dgs"), "harmonic", GAINS, note="opacity frozen, delay and AoD channels trained"
+    ),
+    "rf3dgs+alpha": Method(
+        _harmonic("rf3dgs+", train_opacity=True), "harmonic", ("exp",), note="opacity trained with the gain"
+    ),
+    "rf3dgs-alpha": Method(
+        _harmonic("rf3dgs", train_opacity=True),
+        "harmonic",
+        ("exp",),
+        note="opacity trained with the gain, as published; delay and AoD channels trained",
+    ),
+    "nerf2": Method(_nerf2, "networks", network=True, note="ours, after the published code; no geometry"),
+    "cgan": Method(_cgan, "networks", network=True, note="ours: none is public; no geometry"),
+    "sionna-calibrated": Method(
+        _calibrated,
+        "sionna",
+        note="Sionna RT's gradients on our reconstructed mesh, as many seconds as bistatic took",
+    ),
+    "nearest": Method(_lookup("nearest"), "lookups"),
+    "idw": Method(_lookup("idw"), "lookups", ("db", "linear")),
+    "constant": Method(_lookup("constant"), "lookups"),
+    "mean": Method(_lookup("mean"), "lookups"),
+    "sionna": Method(
+        _assumed,
+        "sionna",
+        untaught=True,
+        random=True,
+        note=f"Sionna RT on the true mesh, {_MISJUDGED}",
+    ),
+    "transmitter": Method(_transmitter, "metrics", untaught=True),
+    "zero": Method(_zero, "bistatic", untaught=True, note="our mesh, every surface taken for the prior"),
+}
+"""Every method by its name."""
+OURS = ("bistatic", "bistatic-quick")
+"""Our own model."""
+AFTER = {"sionna-calibrated": "bistatic"}
+"""Methods that are given the seconds of another one's run, and so come after it."""

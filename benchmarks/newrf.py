@@ -9,29 +9,19 @@ included; ours has the room's mesh.
 
 from __future__ import annotations
 
-import os
 import time
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from benchmarks.stages import write_json
+from benchmarks.report import Report, cell, table
+from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress
-from warprrf.files import write_text
 from warprrf.rf.interop.newrf import NewrfRays, load_newrf, match_rays
 from warprrf.rf.paths.mirror_paths import MirrorPaths
 from warprrf.rf.paths.reflections import fit_reflections
 from warprrf.rf.paths.trace import MirrorTracer
-
-COUNTS = (10, 50, 200, 346)
-"""Training receivers; 346 is NeWRF's own 80 %."""
-
-DATA = "../shared/external/newrf"
-
-ASKED = {"share": 0.99, "length_error_m": 1e-4, "phase_error_rad": 0.02}
-"""What line-of-sight and single-reflection rays must reach: share found, and worst errors."""
 
 PUBLISHED = {
     "method": "NeWRF (published)",
@@ -52,63 +42,61 @@ def snr_db(prediction: np.ndarray, truth: np.ndarray) -> float:
     return -10.0 * float(np.log10(max(error, 1e-30)))
 
 
-def run(
-    out: str | os.PathLike[str] = "runs/newrf",
-    data: str | os.PathLike[str] = DATA,
-    *,
-    counts: tuple[int, ...] = COUNTS,
-    device: Any = None,
-    progress: Progress | None = None,
-) -> dict[str, Any]:
-    """Compare rays, fit and predict, write ``newrf.json`` and ``newrf.md`` into ``out``; returns the report.
+HELP = """\
+Rays of the image method beside NeWRF's, and channels predicted at held-out receivers from reflection coefficients that
+are fitted to few of them. Needs NeWRF's files: see :func:`warprrf.load_newrf`.
 
-    Args:
-        out: Folder of the results.
-        data: Folder that :func:`load_newrf` reads.
-        counts: Training receivers.
+examples:
+  python -m benchmarks newrf --data external/newrf
+"""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the comparison with NeWRF.
+
+    Attributes:
+        data: folder that :func:`warprrf.load_newrf` reads.
+        counts: training receivers; 346 is NeWRF's own 80 %.
+    """
+
+    data: str = option("external/newrf", "folder of NeWRF's files")
+    counts: tuple[int, ...] = option((10, 50, 200, 346), "training receivers")
+
+
+def run(options: Options, job: Job) -> Report:
+    """Compare rays, fit and predict.
 
     Raises:
-        FileNotFoundError, ValueError: as :func:`load_newrf` does.
+        FileNotFoundError, ValueError: as :func:`warprrf.load_newrf` does.
     """
-    rays = load_newrf(data)
-    tick = progress or (lambda stage, done, total: None)
-    tick("rays", 0, 2)
+    rays = load_newrf(options.data)
+    job.progress("rays", 0, 2)
     start = time.perf_counter()
-    match = match_rays(rays, order=2, device=device)
+    match = match_rays(rays, order=2, device=job.device)
     matching_s = time.perf_counter() - start
-    tick("rays", 1, 2)
+    job.progress("rays", 1, 2)
     tracer = MirrorTracer(
-        rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=device
+        rays.mesh, transmitter=rays.transmitter, frequency_hz=rays.frequency_hz, device=job.device
     )
     start = time.perf_counter()
     chains = tracer.find(rays.receivers, 2)
     trace_s = time.perf_counter() - start
-    tick("rays", 2, 2)
-    summary = match.summary()
+    job.progress("rays", 2, 2)
     other = np.concatenate([match.extra_receiver, match.receiver[~match.found]])
-    report = {
+    figures = {
         "source": "NeWRF conference room (github.com/LuHaofan/NeWRF, MIT), MATLAB image method, up to 2 reflections",
         "receivers": len(rays.receivers),
         "frequency_hz": rays.frequency_hz,
-        "rays": summary,
-        "asked": ASKED,
-        "passed": all(
-            summary[name]["share"] >= ASKED["share"]  # type: ignore[operator]
-            and summary[name]["length_error_m_worst"] <= ASKED["length_error_m"]  # type: ignore[operator]
-            and summary[name]["phase_error_rad_worst"] <= ASKED["phase_error_rad"]  # type: ignore[operator]
-            for name in ("line_of_sight", "once")
-        ),
+        "rays": match.summary(),
         "matching_seconds": matching_s,
         "trace_seconds": trace_s,
         "held_out": len(rays.split()[1]),
         "held_out_same_rays": int((~np.isin(rays.split()[1], other)).sum()),
         "receivers_with_other_rays": np.unique(other),
-        "prediction": _predictions(rays, chains, counts, other, tick),
+        "prediction": _predictions(rays, chains, options.counts, other, job.progress),
     }
-    folder = Path(out)
-    write_json(folder / "newrf.json", report)
-    write_text(folder / "newrf.md", summary_text(report) + "\n")
-    return report
+    return Report("newrf", figures, text(figures))
 
 
 def _predictions(
@@ -177,41 +165,39 @@ def _of(chains: MirrorPaths, chosen: np.ndarray, count: int) -> MirrorPaths:
     return replace(kept, receiver=number[kept.receiver])
 
 
-def summary_text(report: dict[str, Any]) -> str:
-    """The report as Markdown tables."""
-    lines = [
-        f"{report['source']}; {report['receivers']} receivers, {report['frequency_hz'] / 1e9:g} GHz.",
-        "",
-        "| rays | theirs | found | share | only ours | length error, median / worst [m] | phase, worst [rad] | "
-        "relative gain, worst |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, row in report["rays"].items():
-        lines.append(
-            f"| {name.replace('_', ' ')} | {row['rays']} | {row['found']} | {100 * row['share']:.2f} % | "
-            f"{row['only_ours']} | {row['length_error_m_median']:.1e} / {row['length_error_m_worst']:.1e} | "
-            f"{row['phase_error_rad_worst']:.1e} | {row['gain_error_worst']:.1e} |"
-        )
-    asked = report["asked"]
-    lines += [
-        "",
-        f"Asked of line of sight and single reflections: {100 * asked['share']:g} % found, length within "
-        f"{asked['length_error_m']:g} m, phase within {asked['phase_error_rad']:g} rad: "
-        f"{'met' if report['passed'] else 'NOT met'}. Tracing takes {report['trace_seconds']:.1f} s for all.",
-        "",
-        f"Held out: {report['held_out']} receivers, of which {report['held_out_same_rays']} have the same rays in both "
-        "tracers; `same rays` is the SNR over those alone.",
-        "",
-        "| method | given | training receivers | SNR [dB] | same rays [dB] | median of receivers [dB] | fit [s] |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for row in report["prediction"]:
-        cells = [
-            "-" if row.get(key) is None else f"{row[key]:{form}}"
-            for key, form in (("snr_same_rays_db", ".1f"), ("snr_median_db", ".1f"), ("solve_seconds", ".2f"))
+def text(figures: dict[str, Any]) -> str:
+    """The figures as Markdown."""
+    rays = [
+        [
+            name.replace("_", " "), str(row["rays"]), str(row["found"]), f"{100 * row['share']:.2f} %",
+            str(row["only_ours"]), f"{row['length_error_m_median']:.1e} / {row['length_error_m_worst']:.1e}",
+            f"{row['phase_error_rad_worst']:.1e}", f"{row['gain_error_worst']:.1e}",
         ]
-        lines.append(
-            f"| {row['method']} | {row['given']} | {row['n_train']} | {row['snr_db']:.1f} | "
-            f"{' | '.join(cells)} |"
-        )
-    return "\n".join([*lines, "", f"NeWRF's figure: {PUBLISHED['source']}"])
+        for name, row in figures["rays"].items()
+    ]  # fmt: skip
+    head = (
+        "rays", "theirs", "found", "share", "only ours", "length error, median / worst [m]", "phase, worst [rad]",
+        "relative gain, worst",
+    )  # fmt: skip
+    channels = [
+        [row["method"], row["given"], str(row["n_train"]), f"{row['snr_db']:.1f}", cell(row.get("snr_same_rays_db"), "{:.1f}"),
+         cell(row.get("snr_median_db"), "{:.1f}"), cell(row.get("solve_seconds"))]
+        for row in figures["prediction"]
+    ]  # fmt: skip
+    columns = (
+        "method", "given", "training receivers", "SNR [dB]", "same rays [dB]", "median of receivers [dB]", "fit [s]",
+    )  # fmt: skip
+    return "\n\n".join(
+        [
+            f"{figures['source']}; {figures['receivers']} receivers, {figures['frequency_hz'] / 1e9:g} GHz.",
+            table(head, rays),
+            f"Tracing takes {figures['trace_seconds']:.1f} s for all.",
+            f"Held out: {figures['held_out']} receivers, of which {figures['held_out_same_rays']} have the same rays in "
+            "both tracers; `same rays` is the SNR over those alone.",
+            table(columns, channels),
+            f"NeWRF's figure: {PUBLISHED['source']}",
+        ]
+    )
+
+
+BENCHMARKS = {"newrf": Benchmark("newrf", Options, run, HELP)}

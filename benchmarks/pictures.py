@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from warprrf.device import require
-from warprrf.files import write_atomically, write_text
 
 METHODS = {
     "bistatic": ("bistatic (ours)", "#b3123c"),
@@ -35,22 +32,14 @@ METHODS = {
 
 
 def figure_of(
-    count: int, size: tuple[float, float], widths: Sequence[float] | None = None
+    count: int, size: tuple[float, float], widths: Sequence[float] | None = None, sharey: bool = False
 ) -> tuple[Any, Any]:
     """A figure with ``count`` panels side by side, and its axes; ``size`` in inches, relative ``widths``."""
     figure = require("matplotlib.figure", extra="plots").Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(1, count, squeeze=False, gridspec_kw={"width_ratios": widths} if widths else None)
+    axes = figure.subplots(
+        1, count, squeeze=False, sharey=sharey, gridspec_kw={"width_ratios": widths} if widths else None
+    )
     return figure, axes[0]
-
-
-def write_page(path: Path, text: str, pictures: Mapping[str, tuple[Any, str]], *, dpi: int = 100) -> Path:
-    """Write Markdown ``text`` to ``path``, pictures below it: file name to figure and caption; returns ``path``."""
-    parts = [text]
-    for name, (figure, caption) in pictures.items():
-        write_atomically(path.parent / name, partial(figure.savefig, dpi=dpi))
-        parts.append(f"![{caption}]({name})\n\n{caption}")
-    write_text(path, "\n\n".join(parts) + "\n")
-    return path
 
 
 def spectrum_rows(

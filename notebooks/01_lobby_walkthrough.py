@@ -33,6 +33,7 @@
 # from the receiver to where the path last met something.
 
 # %%
+import json
 import time
 from pathlib import Path
 
@@ -42,7 +43,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 from PIL import Image
 
 import warprrf as wr
-from benchmarks.lobby import pipeline, report
+from warprrf.geometry.photos.config import ReconstructionConfig
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 WORK = DATA.parent.parent / "runs" / "notebook"
@@ -62,7 +63,16 @@ clock = time.perf_counter()
 # nothing to hold on to; signs, carpets and furniture do.
 
 # %%
-photos, held_out, surveyed = pipeline.photos(DATA, pipeline.REDUCED)
+# Part of the photos: those of the north-eastern part of the room, where the transmitter hangs.
+CHOSEN = [
+    *range(16, 30), *range(48, 62), 69, 70, 72, 75, 78, 79, 82, 83, 84, 86, 89, 92, 93, 94, 96, 97, 99, 100, 105, 108,
+    110, 113, 114, 117, 119,
+]  # fmt: skip
+roles = json.loads((DATA / "photos.json").read_text())
+names = [roles["photos"][index] for index in CHOSEN]
+photos = [DATA / "photos" / name for name in names]
+held_out = [name for name in roles["held_out"] if name in names]
+surveyed = {n: p for n, p in json.loads((DATA / "surveyed.json").read_text()).items() if n in names}
 print(
     f"{len(photos)} photos, {len(held_out)} of them held out for scoring, {len(surveyed)} with surveyed positions"
 )
@@ -88,9 +98,7 @@ from warprrf.geometry.photos.sfm import structure_from_motion
 from warprrf.geometry.photos.sparse import align_to_known
 
 start = time.perf_counter()
-sparse = structure_from_motion(
-    photos, workspace=WORK / "workspace", max_features=pipeline.REDUCED.features, seed=0
-)
+sparse = structure_from_motion(photos, workspace=WORK / "workspace", max_features=1200, seed=0)
 print(
     f"{len(sparse.cameras)} of {len(photos)} photos posed, {len(sparse.points)} points, "
     f"{time.perf_counter() - start:.0f} s"
@@ -115,8 +123,9 @@ plt.show()
 
 # %%
 metric = align_to_known(sparse, surveyed)
-true_cameras = pipeline.truth_scores.true_cameras(DATA / "poses_true.json")
-error = np.array([np.linalg.norm(c.position - true_cameras[n].position) for n, c in metric.cameras.items()])
+poses = json.loads((DATA / "poses_true.json").read_text())["views"]
+true_places = {n: np.linalg.inv(view["world_to_camera"])[:3, 3] for n, view in poses.items()}
+error = np.array([np.linalg.norm(c.position - true_places[n]) for n, c in metric.cameras.items()])
 print(
     f"rms at the surveyed positions {100 * metric.scale_rms_m:.2f} cm, at all cameras {100 * np.sqrt(np.mean(error**2)):.2f} cm"
 )
@@ -153,8 +162,10 @@ rec = wr.reconstruct(
     photos,
     workspace=WORK / "workspace",
     known_positions=surveyed,
+    held_out=held_out,
+    config=ReconstructionConfig(max_features=1200, gaussians=8000),
+    iterations=100,
     seed=0,
-    **pipeline.options(pipeline.REDUCED, held_out),
 )
 print(
     f"{len(rec.gaussians)} Gaussians, {len(rec.mesh.faces)} triangles, {len(rec.patches)} planar patches, "
@@ -185,8 +196,16 @@ plt.show()
 scene = wr.Scene.load(DATA / "scene.xml")
 figure, ax = plt.subplots(figsize=(9, 6.5))
 for mesh, colour, label in ((scene.mesh, "#bbbbbb", "true"), (rec.mesh, "#0b6e99", "reconstructed")):
-    lines = report.section(mesh.vertices, mesh.faces, 1.2)
-    ax.plot(*lines.transpose(2, 1, 0), color=colour, linewidth=3 if label == "true" else 1)
+    # An edge of the section runs between the two points where a triangle's sides cross the plane.
+    corners = mesh.vertices[mesh.faces]
+    following = np.roll(corners, -1, axis=1)
+    up = corners[..., 2] - 1.2
+    down = following[..., 2] - 1.2
+    crossed = up * down < 0
+    met = crossed.sum(axis=1) == 2
+    share = (up / np.where(crossed, up - down, 1))[..., None]
+    ends = (corners + share * (following - corners))[met][crossed[met]].reshape(-1, 2, 3)
+    ax.plot(*ends.transpose(2, 1, 0)[:2], color=colour, linewidth=3 if label == "true" else 1)
     ax.plot([], color=colour, label=label)
 ax.set_aspect("equal"), ax.legend(), ax.set_xlabel("x [m]"), ax.set_ylabel("y [m]")
 plt.show()
@@ -199,7 +218,7 @@ plt.show()
 # weak. Who sees the transmitter is therefore the first question, and a ray query on the mesh answers it.
 
 # %%
-dataset = wr.SpectrumDataset.load(DATA / pipeline.TRUTHS["exact"])
+dataset = wr.SpectrumDataset.load(DATA / "spectra.nc")
 x, y = np.meshgrid(np.arange(0.25, 15, 0.25), np.arange(0.25, 12, 0.25))
 heads = np.stack([x, y, np.full_like(x, 1.5)], axis=-1).reshape(-1, 3)
 seen = rec.mesh.visible(np.broadcast_to(dataset.transmitter, heads.shape).copy(), heads).reshape(x.shape)
@@ -221,7 +240,9 @@ plt.show()
 # data set.
 
 # %%
-train, test = pipeline.receivers(dataset, pipeline.REDUCED)
+near = (dataset.receivers[:, :2] > (8.0, 3.0)).all(axis=1)  # the part of the room that these photos show
+train, test = dataset.subset(near).split(16)
+test = test.subset(range(16))
 print(
     f"{dataset.frequency_hz / 1e9:g} GHz, {len(train.receivers)} receivers to learn from, {len(test.receivers)} held out"
 )
@@ -252,7 +273,7 @@ plt.show()
 
 # %%
 start = time.perf_counter()
-harmonic = wr.RadioField.fit(rec, train, model="rf3dgs+", iterations=pipeline.REDUCED.steps, seed=0)
+harmonic = wr.RadioField.fit(rec, train, model="rf3dgs+", iterations=60, seed=0)
 print(f"RF-3DGS+: {time.perf_counter() - start:.1f} s for {len(train.receivers)} receivers")
 start = time.perf_counter()
 field = wr.RadioField.fit(rec, train, model="bistatic", seed=0)
@@ -283,12 +304,16 @@ for index in (open_view, blocked):
         "bistatic": field.spectrum(receiver).path_gain_db,
         "RF-3DGS+": harmonic.spectrum(receiver).path_gain_db,
     }
-    figure = report.spectrum_rows(truth.path_gain_db, guesses, low, high)
-    display(figure)  # noqa: F821
+    figure, axes = plt.subplots(1, 3, figsize=(16, 3.2), sharey=True)
+    for ax, (name, image) in zip(axes, {"truth": truth.path_gain_db, **guesses}.items(), strict=True):
+        ax.imshow(image, vmin=low, vmax=high, extent=(-180, 180, 180, 0), aspect="auto")
+        ax.set_title(name), ax.set_xlabel("azimuth [degrees]")
+    axes[0].set_ylabel("zenith [degrees]")
+    plt.show()
 
 # %%
 methods = {"bistatic": field.spectrum, "rf3dgs+": harmonic.spectrum} | {
-    name: build(train) for name, build in pipeline.LOOKUPS.items()
+    name: getattr(wr.lookups, name)(train) for name in ("nearest", "idw", "constant", "mean")
 }
 print(f"{'method':<10}{'PSNR dB':>9}{'direction deg':>15}{'within 3 deg':>14}{'beam loss dB':>14}")
 for name, predict in methods.items():

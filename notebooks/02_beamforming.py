@@ -31,6 +31,7 @@
 
 # %%
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -38,7 +39,6 @@ import numpy as np
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 import warprrf as wr
-from benchmarks.beams.links import Links, ends, gains
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 RECEIVERS = 24
@@ -116,10 +116,22 @@ plt.show()
 # %%
 blocked = int(np.flatnonzero(~test.line_of_sight)[0])
 receiver = test.receivers[blocked]
-between = {e.name: e for e in ends(dataset, (4, 8, 16, 32), (8, 8))}
-rx = between["rx 256"]
+# All arrays are upright and face each other across the room: a beam's index means the same direction everywhere.
+level = (dataset.transmitter - dataset.receivers.mean(axis=0)) * [1, 1, 0]
+
+
+def book(side, toward):
+    """Codebook of a square array, oversampled twice; one beam for a single element."""
+    array = wr.PlanarArray(side, side, orientation=wr.orientation_towards(toward))
+    return wr.dft_codebook(array, 2 if side > 1 else 1)
+
+
+arrays = {f"rx {n * n}": (book(1, -level), book(n, level)) for n in (4, 8, 16, 32)}
+arrays |= {f"tx {n * n}": (book(n, -level), book(1, level)) for n in (4, 8, 16, 32)}
+arrays["tx 64, rx 64"] = book(8, -level), book(8, level)
+rx_book = arrays["rx 256"][1]
 paths = field.paths(receiver)
-choice = wr.select_beams(paths, rx_array=rx.rx_book, count=3)
+choice = wr.select_beams(paths, rx_array=rx_book, count=3)
 print(
     f"blocked receiver: {len(paths.gain)} paths; best beams {choice.rx} with {10 * np.log10(choice.gain).round(1)} dB"
 )
@@ -132,7 +144,7 @@ zenith, turn = np.meshgrid(
     (np.arange(60) + 0.5) * np.pi / 60, -np.pi + (np.arange(120) + 0.5) * np.pi / 60, indexing="ij"
 )
 sphere = np.stack([np.sin(zenith) * np.cos(turn), np.sin(zenith) * np.sin(turn), np.cos(zenith)], axis=-1)
-one = wr.Codebook(rx.rx, (rx.rx_book.beam(choice.rx[0])[None],))
+one = wr.Codebook(rx_book.array, (rx_book.beam(choice.rx[0])[None],))
 shown = 10 * np.log10(np.abs(one.amplitude(sphere.reshape(-1, 3))[0]) ** 2 + 1e-3).reshape(60, 120)
 image = axes[2].imshow(shown, extent=(-180, 180, 180, 0), aspect="auto", vmin=0, vmax=24)
 figure.colorbar(image, ax=axes[2], label="gain [dB]")
@@ -143,16 +155,59 @@ plt.show()
 # <a id="truth"></a>
 # ## 4. The true channel
 #
-# What is the choice worth? The true channel is made from the true scene: line of sight and mirrors with every element
-# at its own distance, and every ray of scattering with its own delay and a random phase, over a band of 2.16 GHz. There
-# exhaustive search tries all 1024 beams and keeps the one that received most.
+# What is the choice worth? The true channel is made from what the data set holds of this receiver: line of sight and
+# mirrors of the true scene by the image method with every element at its own distance, and in every other pixel above
+# the floor one wave with that pixel's power, delay and angle of departure and a random phase, over a band of 2.16 GHz.
+# There exhaustive search tries all 1024 beams and keeps the one that received most.
 
 # %%
-links = Links(scene, test)
-h = links.link(blocked).channels([rx])[0]
-worth = gains(rx, h)[:, :, 0]
+FREQUENCIES = dataset.frequency_hz + ((np.arange(8) + 0.5) / 8 - 0.5) * 2.16e9
+
+
+def true_paths(index):
+    """Specular paths of a test receiver, and its scattering as waves with random phases."""
+    point, spectrum = test.receivers[index], test[index]
+    specular = wr.trace_paths(
+        scene, transmitter=test.transmitter, receivers=point, frequency_hz=test.frequency_hz, mirror_order=1
+    )
+    rows, columns = spectrum.shape
+    theta, phi = np.meshgrid(
+        (np.arange(rows) + 0.5) * np.pi / rows,
+        -np.pi + (np.arange(columns) + 0.5) * 2 * np.pi / columns,
+        indexing="ij",
+    )
+    arrival = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
+    away = (arrival @ specular.arrival.T).max(axis=-1, initial=-1) < np.cos(5 * test.beam_sigma_rad)
+    lit = away & (spectrum.path_gain > test.floor) & np.isfinite(spectrum.delay_s)
+    power, tau = spectrum.path_gain[lit], spectrum.delay_s[lit]
+    turns = np.exp(2j * np.pi * np.random.default_rng(index).random(lit.sum()))
+    scattered = replace(
+        specular, gain=np.sqrt(power) * turns, tau=tau, theta_r=theta[lit], phi_r=phi[lit],
+        theta_t=spectrum.aod[lit][:, 0], phi_t=spectrum.aod[lit][:, 1],
+        vertices=np.full((lit.sum(), *specular.vertices.shape[1:]), np.nan),
+        kind=np.full(lit.sum(), "diffuse"), valid=np.ones(lit.sum(), bool), jones=None,
+    )  # fmt: skip
+    return specular, scattered
+
+
+def gains(index, tx, rx):
+    """|w_r^T H w_t|^2 of every pair of beams at every frequency, shape (F, Br, Bt)."""
+    known, waves = true_cache.setdefault(index, true_paths(index)), []
+    for found, wave in zip(known, ("spherical", "plane"), strict=True):
+        waves.append(
+            found.cfr(
+                FREQUENCIES, tx_array=tx.array, rx_array=rx.array, wave=wave, squint=False, diffuse="given"
+            )
+        )
+    h = np.moveaxis(sum(waves), -1, 0)
+    received = rx.received(np.swapaxes(h, 1, 2))
+    return np.abs(tx.received(np.swapaxes(received, 1, 2))) ** 2
+
+
+true_cache = {}
+worth = gains(blocked, *arrays["rx 256"])[:, :, 0]
 mean = 10 * np.log10(worth.mean(axis=0))
-expected = 10 * np.log10(wr.beam_gains(paths, rx_array=rx.rx_book)[:, 0])
+expected = 10 * np.log10(wr.beam_gains(paths, rx_array=rx_book)[:, 0])
 print(
     f"exhaustive search {mean.max():.1f} dB, our beam {mean[choice.rx[0]]:.1f} dB, the median beam {np.median(mean):.1f} dB"
 )
@@ -191,18 +246,17 @@ def straight(point):
     )
 
 
-links_of = [links.link(k) for k in chosen]
 asked = {
     "our field": [field.paths(test.receivers[k]) for k in chosen],
     "at the transmitter": [straight(test.receivers[k]) for k in chosen],
 }
 results = {}
-for name, e in between.items():
-    for k, link in enumerate(links_of):
-        worth = gains(e, link.channels([e])[0])
+for name, (tx, rx) in arrays.items():
+    for k, index in enumerate(chosen):
+        worth = gains(index, tx, rx)
         results.setdefault((name, "exhaustive"), []).append(worth.mean(axis=0).max())
         for method, found in asked.items():
-            pick = wr.select_beams(found[k], e.tx_book, e.rx_book)
+            pick = wr.select_beams(found[k], tx, rx)
             results.setdefault((name, method), []).append(worth[:, pick.rx[0], pick.tx[0]].mean())
 results = {key: np.array(value) for key, value in results.items()}
 
@@ -244,18 +298,19 @@ plt.show()
 # `select_beams_multiuser` lets users choose in turn until nobody's change raises the predicted sum of rates.
 
 # %%
-from warprrf.rf.channel.beams import signal_over_interference
-
-e = between["tx 256"]
+tx, rx = arrays["tx 256"]
 sums = {"each for itself": [], "minding the others": []}
 for first in range(0, RECEIVERS - 3, 4):
     group = range(first, first + 4)
     seen = [asked["our field"][k] for k in group]
-    true = [gains(e, links_of[k].channels([e])[0]).mean(axis=0) for k in group]
-    alone = [wr.select_beams(p, e.tx_book) for p in seen]
-    together = wr.select_beams_multiuser(seen, e.tx_book, noise=1 / ratio)
-    for how, tx in (("each for itself", [c.tx[0] for c in alone]), ("minding the others", together.tx)):
-        sinr = signal_over_interference(true, tx, np.zeros(4, int), 1 / ratio)
+    true = [gains(chosen[k], tx, rx).mean(axis=0)[0] for k in group]
+    alone = [wr.select_beams(p, tx) for p in seen]
+    together = wr.select_beams_multiuser(seen, tx, noise=1 / ratio)
+    for how, beams in (("each for itself", [c.tx[0] for c in alone]), ("minding the others", together.tx)):
+        heard = np.array([gain[beams] for gain in true])  # of each user in each one's beam
+        wanted = np.diag(heard)
+        # the transmitter's power is shared by its four beams
+        sinr = wanted / (heard.sum(axis=1) - wanted + 4 / ratio)
         sums[how].append(np.log2(1 + sinr).sum())
 for how, values in sums.items():
     print(f"{how:<20}{np.mean(values):6.2f} bit/s/Hz over four users, on the true channel")

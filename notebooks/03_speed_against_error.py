@@ -18,7 +18,7 @@
 # enough for a minute; `python -m benchmarks engine` and `python -m benchmarks map` do the same on sizes worth quoting.
 #
 # 1. [The rasteriser](#raster): cutoff, weights kept per pixel, resolution
-# 2. [Rays per pixel](#rays) of the deterministic engine
+# 2. [Rays per pixel](#rays) of a field
 # 3. [The grid of a spectrum](#grid)
 # 4. [How many bounces](#bounces): mirrors and diffuse bounces
 # 5. [Rays per cell](#map) of a radio map
@@ -38,10 +38,6 @@ import numpy as np
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 import warprrf as wr
-from benchmarks.engine import knobs
-from warprrf.rf.exact import ExactEngine
-from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.terms import Terms
 
 DATA = next(p / "data/lobby" for p in [Path.cwd(), *Path.cwd().parents] if (p / "data/lobby").is_dir())
 set_matplotlib_formats("png")
@@ -86,14 +82,60 @@ def curve(ax, rows, error, label, colour="#0b6e99"):
 # image at the nearest pixel, so it is a property of the picture, not of the method.
 
 # %%
-room = knobs.Scene(3_000, (30, 60), seed=0)
-cutoff = knobs.cutoff_rows(room, "alpha_min", (1e-2, 1 / 255, 1e-3, 1e-4, 1e-5), repeats=3)
-kept = knobs.top_k_rows(room, (1, 2, 4, 8, 16, 32), repeats=2)
-grid = knobs.resolution_rows(room, ((15, 30), (30, 60), (60, 120)), repeats=2)
-for row in cutoff:
-    row["value"] = f"{row['value']:.0e}"
-for row in grid:
-    row["value"] = "{} x {}".format(*row["value"])
+rng = np.random.default_rng(0)
+size = np.array([18.0, 12.0, 4.0])  # a room [m], covered by flat Gaussians
+wall = rng.integers(0, 6, 3_000)
+means = rng.uniform(0, 1, (3_000, 3)) * size
+means[np.arange(3_000), wall % 3] = (wall < 3) * size[wall % 3]
+scales = rng.uniform(0.2, 0.6, (3_000, 3))
+scales[np.arange(3_000), wall % 3] = 0.02
+room = wr.Gaussians(
+    means, np.tile([1.0, 0, 0, 0], (3_000, 1)), scales, rng.uniform(0.3, 0.95, 3_000), np.zeros((3_000, 1, 3))
+)
+gains = 10 ** ((-35 + 15 * np.sin(1.3 * means[:, 0]) * np.cos(1.7 * means[:, 1])) / 10)
+RADIO = wr.Blending(alpha_min=1e-4, alpha_max=1 - 1e-6, transmittance_min=1e-7)
+
+
+def panorama(shape):
+    return wr.Camera.spherical(shape[1], shape[0], position=(7.0, 5.0, 1.5))
+
+
+def image(alpha_min=1e-4, shape=(30, 60)):
+    blending = replace(RADIO, alpha_min=alpha_min)
+    return wr.render(room, panorama(shape), features=gains[:, None], blending=blending).features[..., 0]
+
+
+def error_db(found, truth):
+    floor = truth.max() * 1e-6
+    return np.sqrt(np.mean((10 * np.log10((found + floor) / (truth + floor))) ** 2))
+
+
+def rows_of(values, make, truth, shown=str):
+    rows = []
+    for value in values:
+        seconds, found = seconds_of(lambda value=value: make(value))
+        rows.append({"value": shown(value), "seconds": seconds, "error_rms_db": error_db(found, truth)})
+    return rows
+
+
+def of_strongest(k):
+    """The image of the strongest `k` Gaussians of each pixel."""
+    found = wr.blend_weights(room, panorama((30, 60)), top_k=k, blending=RADIO)
+    return (found.weight * np.where(found.index >= 0, gains[found.index], 0)).sum(axis=-1)
+
+
+fine = image(shape=(120, 240))
+
+
+def nearest_pixel(shape):
+    """A coarse image read at the pixels of a fine one."""
+    found = image(shape=shape)
+    return found[np.ix_(np.arange(120) * shape[0] // 120, np.arange(240) * shape[1] // 240)]
+
+
+cutoff = rows_of((1e-2, 1 / 255, 1e-3, 1e-4, 1e-5), image, image(1e-8), "{:.0e}".format)
+kept = rows_of((1, 2, 4, 8, 16, 32), of_strongest, of_strongest(256))
+grid = rows_of(((15, 30), (30, 60), (60, 120)), nearest_pixel, fine, lambda s: "{} x {}".format(*s))
 figure, axes = plt.subplots(1, 3, figsize=(14, 3.6))
 for ax, rows, title in zip(axes, (cutoff, kept, grid), ("alpha_min", "top K", "grid"), strict=True):
     curve(ax, rows, "error_rms_db", title)
@@ -105,60 +147,45 @@ plt.show()
 # <a id="rays"></a>
 # ## 2. Rays per pixel
 #
-# The deterministic engine (`engine="exact"`) evaluates diffuse scattering along a lattice of rays in every pixel. More
-# rays make edges and shadows sharper; nothing else changes. The error below is that of the total diffuse power against
-# 256 rays a pixel, rms over four places in the lobby. Since rays lie in a lattice and not at random, the error falls
-# faster than one over the square root of their number.
+# A bistatic field evaluates scattering along a lattice of rays in every pixel. More rays make edges and shadows
+# sharper; nothing else changes. The error below is that of the dB image of a whole query (60 x 120 pixels, rays traced
+# from nothing, beam and delays included) against 64 rays a pixel. Since rays lie in a lattice and not at random, it
+# falls faster than one over the square root of their number.
 #
-# A bistatic field knows its materials and its mesh less well than that, so fewer rays do: on the right the dB image of
-# a whole query (60 x 120 pixels, rays traced from nothing, beam and delays included) against 64 rays a pixel. A fit
-# takes 9 (`sub_pixels=3`); `RadioField.fit(..., quick=True)` takes one, and tries no terms.
+# A field knows its materials and its mesh less well than that, so few rays do: a fit takes 9, `sub_pixels=3`, and
+# `RadioField.fit(..., quick=True)`, as here, takes one, and tries no terms.
 
 # %%
 scene = wr.Scene.load(DATA / "scene.xml")
 dataset = wr.SpectrumDataset.load(DATA / "spectra.nc")
 seen, blocked = (dataset.receivers[dataset.line_of_sight == flag] for flag in (True, False))
 places = np.concatenate([seen[:2], blocked[:2]])
-asked = {"transmitter": dataset.transmitter, "frequency_hz": dataset.frequency_hz}
+start = time.perf_counter()
+field = wr.RadioField.fit(scene, dataset.split(10)[0], quick=True)
+print(f"fitted to ten spectra in {time.perf_counter() - start:.1f} s: {field.terms}")
 
 
-def diffuse_totals(sub_pixels, shape=(30, 60)):
-    """Time for one place, and the total diffuse power at all of them."""
-    engine = ExactEngine(scene, **asked, shape=shape, sub_pixels=sub_pixels)
-    seconds, totals = seconds_of(lambda: [engine.diffuse(p).power.sum() for p in places])
-    return seconds / len(places), np.array(totals)
+def with_terms(**changed):
+    """The same field with other terms."""
+    return replace(field, terms=replace(field.terms, **changed))
 
 
-truth = diffuse_totals(16)[1]
-rays = []
-for n in (1, 2, 4, 8):
-    seconds, totals = diffuse_totals(n)
-    rays.append(
-        {"value": n * n, "seconds": seconds, "error": np.sqrt(np.mean((10 * np.log10(totals / truth)) ** 2))}
-    )
-    print(f"{n * n:3d} rays a pixel: {1e3 * seconds:6.1f} ms a place, {rays[-1]['error']:.4f} dB")
+def images(sub_pixels):
+    """Time of a query, and the dB images at all places."""
+    finer = with_terms(sub_pixels=sub_pixels)
+    seconds, found = seconds_of(lambda: [finer.spectrum(p).path_gain_db for p in places])
+    return seconds / len(places), np.array(found)
 
 
-def field_images(sub_pixels):
-    """Time of a query of the bistatic field, and the dB images at all places."""
-    asked_of = BistaticField.prior(scene, dataset, terms=Terms(sub_pixels=sub_pixels))
-    seconds, images = seconds_of(lambda: [asked_of.spectrum(p).path_gain_db for p in places])
-    return seconds / len(places), np.array(images)
-
-
-truth_db = field_images(8)[1]
+truth_db = images(8)[1]
 queries = []
 for n in (1, 2, 3, 4, 6):
-    seconds, images = field_images(n)
-    queries.append({"value": n * n, "seconds": seconds, "error": np.sqrt(np.mean((images - truth_db) ** 2))})
-    print(
-        f"{n * n:3d} rays a pixel of the field: {1e3 * seconds:6.1f} ms a query, {queries[-1]['error']:.3f} dB"
-    )
-figure, axes = plt.subplots(1, 2, figsize=(11, 3.4))
-curve(axes[0], rays, "error", "rays per pixel")
-curve(axes[1], queries, "error", "rays per pixel", "#b3123c")
-axes[0].set_title("engine"), axes[1].set_title("bistatic field")
-axes[0].set_ylabel("error of diffuse power [dB]"), axes[1].set_ylabel("rms error of the dB image [dB]")
+    seconds, found = images(n)
+    queries.append({"value": n * n, "seconds": seconds, "error": np.sqrt(np.mean((found - truth_db) ** 2))})
+    print(f"{n * n:3d} rays a pixel: {1e3 * seconds:6.1f} ms a query, {queries[-1]['error']:.3f} dB")
+figure, ax = plt.subplots(figsize=(6, 3.4))
+curve(ax, queries, "error", "rays per pixel", "#b3123c")
+ax.set_ylabel("rms error of the dB image [dB]")
 plt.show()
 
 # %% [markdown]
@@ -171,14 +198,12 @@ plt.show()
 # times the pixels.
 
 # %%
-field = BistaticField.prior(scene, dataset, terms=Terms(mirror_order=2))
 near = seen[:5]
 toward = dataset.transmitter - near
 toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
 rows = []
 for shape in ((15, 30), (30, 60), (60, 120)):
     coarse = replace(field, shape=shape)
-    coarse.spectrum(seen[0])  # set-up, made once for a grid
     seconds, spectra = seconds_of(lambda coarse=coarse: [coarse.spectrum(p) for p in near], repeats=1)
     angle = []
     for spectrum, direction in zip(spectra, toward, strict=True):
@@ -207,23 +232,26 @@ for row in rows:
 #
 # With line of sight, everything else is a small correction. Behind a corner it is all there is. Each row adds an effect
 # to the field before; what it changes is the total path gain, at places that see the transmitter and at places that do
-# not. (Materials here are guesses, not fitted ones, so this is about what effects are worth, not about the truth.
+# not. (Materials are those of a quick fit without these effects, so this is about what effects are worth, not the truth.
 # `warprrf.relevance` asks the same question of a scene and answers with the smallest model within a tolerance.)
 
 # %%
+alone = {"mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False}
 steps = {
-    "line of sight": Terms(mirror_order=0, diffuse=False),
-    "+ one mirror": Terms(mirror_order=1, diffuse=False),
-    "+ two mirrors": Terms(mirror_order=2, diffuse=False),
-    "+ three mirrors": Terms(mirror_order=3, diffuse=False),
-    "+ scattering": Terms(mirror_order=3),
-    "+ mirrors light surfaces": Terms(mirror_order=3, mirror_scatter=True),
-    "+ second diffuse bounce": Terms(mirror_order=3, mirror_scatter=True, diffuse_order=2),
-}
+    "line of sight": {**alone, "mirror_order": 0, "diffuse": False},
+    "+ one mirror": {**alone, "mirror_order": 1, "diffuse": False},
+    "+ two mirrors": {**alone, "mirror_order": 2, "diffuse": False},
+    "+ three mirrors": {**alone, "mirror_order": 3, "diffuse": False},
+    "+ scattering": {**alone, "mirror_order": 3, "diffuse": True},
+    "+ mirrors light surfaces": {**alone, "mirror_order": 3, "diffuse": True, "mirror_scatter": True},
+    "+ second diffuse bounce": {
+        **alone, "mirror_order": 3, "diffuse": True, "mirror_scatter": True, "diffuse_order": 2,
+    },
+}  # fmt: skip
 groups = {"seen": seen[:6], "blocked": blocked[:6]}
 gains, times = [], []
 for terms in steps.values():
-    model = replace(field, terms=terms)
+    model = with_terms(**terms)
     model.links(places[:1])  # what belongs to the transmitter is traced once
     totals = {}
     start = time.perf_counter()
@@ -252,7 +280,7 @@ plt.show()
 # error is that against the finest grid, over the cells without line of sight, where it matters.
 
 # %%
-model = replace(field, terms=Terms(mirror_order=2, mirror_scatter=True, diffuse_order=2))
+model = with_terms(mirror_order=2, mirror_scatter=True, diffuse_order=2)
 shapes = ((5, 10), (10, 20), (20, 40), (40, 80))
 model.radio_map(1.5, 3.0)
 maps, rows = [], []

@@ -1,6 +1,6 @@
 # == verbs ==
 # photos to cameras, Gaussians, a mesh and its planar pieces
-from warprrf.geometry.photos.pipeline import reconstruct as reconstruct
+from warprrf.geometry.pipeline import reconstruct as reconstruct
 
 # a picture of Gaussians from a camera
 from warprrf.geometry.splats.render import render as render

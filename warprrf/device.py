@@ -12,9 +12,9 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
-from threading import RLock, local
+from threading import RLock
 from types import ModuleType
 from typing import Any
 
@@ -109,26 +109,19 @@ def launch(
         elif threads() > 1:
             count = min(PIECES_PER_THREAD * threads(), max(1, dim // grain))
         bounds = [dim * k // count for k in range(count + 1)]
-    recording: Recording | None = getattr(_recorder, "active", None)
     arguments = [bounds[0], *inputs]
     with building:
         kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
-    if recording is not None:
-        recording.kept.append(inputs)
-    if len(bounds) == 2 and (recording is None or device.is_cuda):
+    if len(bounds) == 2:
         wp.launch(kernel, dim=size, inputs=arguments, device=device, record_tape=False, **extra)
         return
     # Arguments are packed once; a piece differs in its offset and length.
     whole = wp.launch(
         kernel, dim=size, inputs=arguments, device=device, record_tape=False, record_cmd=True, **extra
     )
-    pieces_of_whole = _cut(whole, bounds)
-    if recording is None:
-        _issue(pieces_of_whole)
-    else:
-        recording.again.append(partial(_issue, pieces_of_whole))
+    _issue(_cut(whole, bounds))
 
 
 def _cut(whole: wp.Launch, bounds: Sequence[int]) -> list[wp.Launch]:
@@ -156,51 +149,6 @@ def _issue(parts: Sequence[wp.Launch]) -> None:
     work()
     for other in others:
         other.result()
-
-
-class Recording:
-    """What ``work`` launches by :func:`launch`, to be issued again on whatever its arrays hold by then.
-
-    A launch packs its arguments, 15 to 50 us of Python; one that was recorded takes a few. On a CUDA device the
-    launches are captured as a graph, on a CPU kept packed and cut. ``work`` is run once, and once more to record it:
-    it may launch kernels on ``device`` only, with the same arrays each time, and not look at what they hold.
-
-    Args:
-        work: makes the launches.
-        device: where.
-
-    Raises:
-        RuntimeError: if another recording is being made in this thread.
-    """
-
-    def __init__(self, work: Callable[[], None], device: Any = None) -> None:
-        if getattr(_recorder, "active", None) is not None:
-            raise RuntimeError("work: a recording was begun while another is being made, expected launches")
-        self.again: list[Callable[[], None]] = []
-        self.kept: list[Sequence[Any]] = []  # arrays that are only pointers to a packed launch
-        on = resolve(device)
-        work()
-        _recorder.active = self
-        try:
-            if on.is_cuda:
-                with wp.ScopedCapture(on, force_module_load=False) as capture:  # loaded by the run before
-                    work()
-                self._graph = capture.graph
-            else:
-                work()
-                self._graph = None
-        finally:
-            _recorder.active = None
-
-    def run(self) -> None:
-        """Issue all launches again."""
-        if self._graph is not None:
-            wp.capture_launch(self._graph)
-        for issue in self.again:
-            issue()
-
-
-_recorder = local()
 
 
 def require(module: str, extra: str) -> ModuleType:

@@ -206,6 +206,15 @@ class Steps:
         write_atomically(path, lambda file: np.savez(file, key=np.array(key), **made))  # type: ignore[arg-type]
         return made
 
+    @property
+    def names(self) -> list[str]:
+        """Steps that this job has run or found finished, in order."""
+        return list(self._records)
+
+    def figures(self, name: str) -> dict[str, Any]:
+        """Figures of step ``name``, which this job has run."""
+        return dict(self._record(name)["figures"])
+
     def key(self, name: str) -> str:
         """Key of step ``name``, which this job has run: an input for the steps that read what it left."""
         return str(self._record(name)["key"])

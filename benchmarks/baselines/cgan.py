@@ -9,7 +9,6 @@ Predictions are drawn at noise zero, the most likely one, and so are repeatable.
 from __future__ import annotations
 
 import math
-import os
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,13 +18,14 @@ import numpy as np
 from benchmarks.baselines.images import SpectrumImages
 from benchmarks.baselines.training import (
     ImageModel,
+    Learner,
+    Training,
     draws,
     seeded,
     torch_device,
     torch_module,
     whole_number,
 )
-from warprrf.device import Progress
 
 if TYPE_CHECKING:
     from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -82,25 +82,17 @@ class CGAN(ImageModel):
         cls,
         data: SpectrumDataset | SpectrumImages,
         options: CGANOptions | None = None,
+        how: Training | None = None,
         *,
-        iterations: int = 30_000,
         batch: int = 8,
-        checkpoint: str | os.PathLike[str] | None = None,
-        seed: int = 0,
-        device: Any = None,
-        progress: Progress | None = None,
     ) -> CGAN:
         """Train on spectra.
 
         Args:
             data: training set: spectra, or pictures of other origin.
             options: of the networks; by default around the training receivers.
-            iterations: steps of both networks.
+            how: of the training; by default 30 000 iterations.
             batch: spectra per step.
-            checkpoint: file to save progress to and go on from; removed when training is done.
-            seed: of weights, batches and noise.
-            device: "cpu" or "cuda:0"; CUDA where there is a GPU by default.
-            progress: called with the stage ``"fit"``.
 
         Raises:
             ImportError: without torch.
@@ -108,12 +100,12 @@ class CGAN(ImageModel):
         """
         torch = torch_module()
         known = SpectrumImages.of(data)
-        iterations, batch = whole_number("iterations", iterations), whole_number("batch", batch)
+        how, batch = how or Training(), whole_number("batch", batch)
         chosen = options or CGANOptions.around(known.receivers)
-        where = torch_device(device)
+        seed, where = int(how.seed), torch_device(how.device)
         start = time.perf_counter()
-        generator = cls._build(chosen, known.shape, int(seed)).to(where)
-        with seeded(int(seed) + 1):
+        generator = cls._build(chosen, known.shape, seed).to(where)
+        with seeded(seed + 1):
             critic = _discriminator(torch, chosen).to(where)
         adams = {
             name: torch.optim.Adam(net.parameters(), lr=ADAM_RATE, betas=ADAM_DECAYS)
@@ -142,10 +134,9 @@ class CGAN(ImageModel):
             adams["generator"].step()
             return float(distance.detach())
 
-        return cls._trained(
-            known, chosen, {"generator": generator, "critic": critic}, adams, step, start=start, iterations=iterations,
-            seed=seed, about={"batch": batch, "loss": "L1 of the generator"}, checkpoint=checkpoint, progress=progress,
-        )  # fmt: skip
+        learner = Learner({"generator": generator, "critic": critic}, adams, step)
+        about = {"batch": batch, "loss": "L1 of the generator"}
+        return cls._trained(known, chosen, learner, how, start, about)
 
     def image(self, rx: Any, transmitter: Any = None) -> np.ndarray:
         """The picture at ``rx`` (3,) [m], shape ``(H, W)`` float32 in [0, 1]; it holds for the training transmitter."""

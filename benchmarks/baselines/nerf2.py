@@ -14,7 +14,6 @@ Published schedule: 30 000 iterations of 8192 rays with 64 samples each, Adam of
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -24,13 +23,14 @@ import numpy as np
 from benchmarks.baselines.images import SpectrumImages
 from benchmarks.baselines.training import (
     ImageModel,
+    Learner,
+    Training,
     draws,
     seeded,
     torch_device,
     torch_module,
     whole_number,
 )
-from warprrf.device import Progress
 
 if TYPE_CHECKING:
     from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -87,25 +87,17 @@ class NeRF2(ImageModel):
         cls,
         data: SpectrumDataset | SpectrumImages,
         options: NeRF2Options,
+        how: Training | None = None,
         *,
-        iterations: int = 30_000,
         rays: int = 8192,
-        checkpoint: str | os.PathLike[str] | None = None,
-        seed: int = 0,
-        device: Any = None,
-        progress: Progress | None = None,
     ) -> NeRF2:
         """Train on spectra.
 
         Args:
             data: training set: spectra, or pictures of other origin.
             options: network and rays.
-            iterations: steps.
+            how: of the training; by default 30 000 iterations.
             rays: per step, drawn evenly from all pixels of all spectra.
-            checkpoint: file to save progress to and go on from; removed when training is done.
-            seed: of the weights and of the draws.
-            device: "cpu" or "cuda:0"; CUDA where there is a GPU by default.
-            progress: called with the stage ``"fit"``.
 
         Raises:
             ImportError: without torch.
@@ -113,10 +105,10 @@ class NeRF2(ImageModel):
         """
         torch = torch_module()
         known = SpectrumImages.of(data)
-        iterations, rays = whole_number("iterations", iterations), whole_number("rays", rays)
-        where = torch_device(device)
+        how, rays = how or Training(), whole_number("rays", rays)
+        seed, where = int(how.seed), torch_device(how.device)
         start = time.perf_counter()
-        network = cls._build(options, known.shape, int(seed)).to(where)
+        network = cls._build(options, known.shape, seed).to(where)
         optimiser = torch.optim.Adam(network.parameters(), lr=ADAM_RATE, weight_decay=ADAM_DECAY)
 
         def upload(values: np.ndarray) -> Any:
@@ -128,7 +120,7 @@ class NeRF2(ImageModel):
         def step(i: int) -> float:
             chosen = torch.from_numpy(draws(seed, i).integers(len(target), size=rays)).to(where)
             view, pixel = chosen // len(toward), chosen % len(toward)
-            cosine = 0.5 * (1.0 + np.cos(np.pi * i / iterations))
+            cosine = 0.5 * (1.0 + np.cos(np.pi * i / how.iterations))
             for group in optimiser.param_groups:
                 group["lr"] = FINAL_RATE + (ADAM_RATE - FINAL_RATE) * cosine
             shown = render(network, options, origin[view], toward[pixel], source[view])
@@ -138,10 +130,8 @@ class NeRF2(ImageModel):
             optimiser.step()
             return float(loss.detach())
 
-        return cls._trained(
-            known, options, {"network": network}, {"adam": optimiser}, step, start=start, iterations=iterations,
-            seed=seed, about={"rays": rays}, checkpoint=checkpoint, progress=progress,
-        )  # fmt: skip
+        learner = Learner({"network": network}, {"adam": optimiser}, step)
+        return cls._trained(known, options, learner, how, start, {"rays": rays})
 
     def image(self, rx: Any, transmitter: Any = None) -> np.ndarray:
         """The picture at ``rx`` (3,) [m], shape ``(H, W)`` float32, not below zero.

@@ -50,16 +50,38 @@ class SionnaCalibration:
     start_s: float
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """How a scene is calibrated.
+
+    Attributes:
+        seconds: how long; at least one step is done. Start and compilation are not counted.
+        depth: most bounces on a path.
+        samples: rays a step.
+        rate: Adam's learning rate.
+        most_steps: stop after so many steps.
+        seed: of the receivers' order and the rays.
+    """
+
+    seconds: float
+    depth: int = 1
+    samples: int = SAMPLES
+    rate: float = RATE
+    most_steps: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.seconds) and self.seconds > 0):
+            raise ValueError(f"seconds: got {self.seconds!r}, expected a positive time")
+        if self.most_steps is not None and self.most_steps < 1:
+            raise ValueError(f"most_steps: got {self.most_steps!r}, expected at least 1, or None")
+
+
 def calibrate_sionna(
     scene: Scene,
     train: SpectrumDataset,
+    how: Calibration,
     *,
-    seconds: float,
-    depth: int = 1,
-    samples: int = SAMPLES,
-    rate: float = RATE,
-    most_steps: int | None = None,
-    seed: int = 0,
     device: Any = None,
     progress: Progress | None = None,
 ) -> SionnaCalibration:
@@ -68,28 +90,18 @@ def calibrate_sionna(
     Args:
         scene: scene of an XML file, such as the twin of a field before any measurement.
         train: spectra to fit.
-        seconds: how long; at least one step is done. Start and compilation are not counted.
-        depth: most bounces on a path.
-        samples: rays a step.
-        rate: Adam's learning rate.
-        most_steps: stop after so many steps.
-        seed: of the receivers' order and the rays.
         device: where beams are spread.
         progress: called with the stage ``"fit"``, in tenths of seconds.
 
     Raises:
         ImportError: without Sionna RT.
-        ValueError: for a scene without an XML file, or a time that is not positive.
+        ValueError: for a scene without an XML file.
     """
-    if not (np.isfinite(seconds) and seconds > 0):
-        raise ValueError(f"seconds: got {seconds!r}, expected a positive time")
-    if most_steps is not None and most_steps < 1:
-        raise ValueError(f"most_steps: got {most_steps!r}, expected at least 1, or None")
     begun = time.perf_counter()
     engine = _GradientEngine(
         scene, transmitter=train.transmitter, frequency_hz=train.frequency_hz, shape=train.shape,
         beam_sigma_rad=train.beam_sigma_rad,
-        sampling=Sampling(depth=depth, samples=samples, seed=seed), device=device,
+        sampling=Sampling(depth=how.depth, samples=how.samples, seed=how.seed), device=device,
     )  # fmt: skip
     beam = BeamOperator(train.shape, train.beam_sigma_rad, device=device)
     first = _unbound(scene.materials, float(train.frequency_hz))
@@ -99,7 +111,7 @@ def calibrate_sionna(
 
     def gradient(step: int) -> tuple[float, np.ndarray]:
         epoch, place = divmod(step, len(train))
-        receiver = int(np.random.default_rng([seed, epoch]).permutation(len(train))[place])
+        receiver = int(np.random.default_rng([how.seed, epoch]).permutation(len(train))[place])
         target = to_db(train.path_gain[receiver], floor)
 
         def adjoint(pixels: np.ndarray) -> tuple[float, np.ndarray]:
@@ -108,7 +120,7 @@ def calibrate_sionna(
             slope = np.sign(miss) * _NEPER_DB / power / miss.size
             return float(np.abs(miss).mean()), beam.adjoint(slope)
 
-        return engine.gradient(train.receivers[receiver], values, adjoint, seed + step)
+        return engine.gradient(train.receivers[receiver], values, adjoint, how.seed + step)
 
     gradient(0)  # compiles
     start_s, started = time.perf_counter() - begun, time.perf_counter()
@@ -120,12 +132,12 @@ def calibrate_sionna(
         square = ADAM_DECAYS[1] * square + (1 - ADAM_DECAYS[1]) * slope**2
         count = len(losses)
         unbiased = [m / (1 - decay**count) for m, decay in zip((mean, square), ADAM_DECAYS, strict=True)]
-        values = values - rate * unbiased[0] / (np.sqrt(unbiased[1]) + ADAM_EPSILON)
+        values = values - how.rate * unbiased[0] / (np.sqrt(unbiased[1]) + ADAM_EPSILON)
         values = np.clip(values, first - FARTHEST, first + FARTHEST)
         spent = time.perf_counter() - started
         if progress is not None:
-            progress("fit", int(10 * min(spent, seconds)), max(1, int(10 * seconds)))
-        if spent >= seconds or count == most_steps:
+            progress("fit", int(10 * min(spent, how.seconds)), max(1, int(10 * how.seconds)))
+        if spent >= how.seconds or count == how.most_steps:
             break
     calibrated = scene.with_materials(_bound(scene.materials, values, float(train.frequency_hz)))
     return SionnaCalibration(calibrated, losses, time.perf_counter() - started, start_s)

@@ -22,6 +22,7 @@ from benchmarks.baselines.images import SpectrumImages, path_gain_of
 from warprrf.device import Progress, check_array, require
 from warprrf.rf.fields import files as field_files
 from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.steps import digest
 
 FORMAT = "warprrf baseline 1"
 CHECKPOINT_FORMAT = "warprrf baseline checkpoint 1"
@@ -72,31 +73,49 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
     return int(value)
 
 
-def train(
-    networks: dict[str, Any],
-    optimisers: dict[str, Any],
-    step: Callable[[int], float],
-    *,
-    iterations: int,
-    identity: str,
-    checkpoint: str | os.PathLike[str] | None = None,
-    progress: Progress | None = None,
-) -> list[float]:
-    """Run ``step`` for each iteration, from where ``checkpoint`` stands, and return the loss of each.
+@dataclass(frozen=True)
+class Training:
+    """How a network is trained.
 
-    Args:
-        networks, optimisers: torch modules and Adam optimisers by name: all that changes.
-        step: does iteration ``i`` and returns its loss.
-        iterations: how many.
-        identity: fingerprint of everything that the result depends on.
+    Attributes:
+        iterations: steps.
+        seed: of weights and of every step's random choices.
+        device: "cpu" or "cuda:0"; CUDA where there is a GPU by default.
         checkpoint: file to save progress to every 20 s and go on from; removed when training is done.
         progress: called with the stage ``"fit"``.
+    """
+
+    iterations: int = 30_000
+    seed: int = 0
+    device: Any = None
+    checkpoint: str | os.PathLike[str] | None = None
+    progress: Progress | None = None
+
+    def __post_init__(self) -> None:
+        whole_number("iterations", self.iterations)
+
+
+@dataclass(frozen=True)
+class Learner:
+    """What is trained: torch modules and Adam optimisers by name, which is all that changes, and the function that does
+    iteration ``i`` and returns its loss."""
+
+    networks: dict[str, Any]
+    optimisers: dict[str, Any]
+    step: Callable[[int], float]
+
+
+def train(learner: Learner, how: Training, identity: str) -> list[float]:
+    """Do every step, from where the checkpoint stands, and return the loss of each.
+
+    Args:
+        identity: digest of everything that the result depends on.
 
     Raises:
         ValueError: for a checkpoint of another training.
         RuntimeError: if the loss stops being a number.
     """
-    path = None if checkpoint is None else Path(checkpoint)
+    path = None if how.checkpoint is None else Path(how.checkpoint)
     losses: list[float] = []
     if path is not None and path.exists():
         tensors, header = field_files.read(path, CHECKPOINT_FORMAT)
@@ -104,21 +123,21 @@ def train(
             raise ValueError(
                 f"checkpoint: {path} belongs to a training with other data or options; delete it or name another file"
             )
-        _restore(networks, optimisers, tensors)
+        _restore(learner.networks, learner.optimisers, tensors)
         losses = list(header["losses"])
     saved = time.monotonic()
-    for i in range(len(losses), iterations):
-        losses.append(step(i))
+    for i in range(len(losses), how.iterations):
+        losses.append(learner.step(i))
         if not np.isfinite(losses[-1]):
             raise RuntimeError(
                 f"loss: got {losses[-1]} at step {i}; lower the learning rate or check the spectra"
             )
-        if progress is not None:
-            progress("fit", i + 1, iterations)
+        if how.progress is not None:
+            how.progress("fit", i + 1, how.iterations)
         if path is not None and time.monotonic() - saved > CHECKPOINT_S:
             field_files.write(
                 path,
-                _state(networks, optimisers),
+                _state(learner.networks, learner.optimisers),
                 {"identity": identity, "losses": losses},
                 CHECKPOINT_FORMAT,
             )
@@ -276,44 +295,30 @@ class ImageModel(ABC):
         cls,
         known: SpectrumImages,
         options: Any,
-        networks: dict[str, Any],
-        optimisers: dict[str, Any],
-        step: Callable[[int], float],
-        *,
-        start: float,
-        iterations: int,
-        seed: int,
+        learner: Learner,
+        how: Training,
+        started: float,
         about: dict[str, Any],
-        checkpoint: str | os.PathLike[str] | None,
-        progress: Progress | None,
     ) -> Self:
-        """The model whose network is the first of ``networks``, trained by :func:`train`.
+        """The model whose network is the first of ``learner``'s, trained by :func:`train`.
 
-        ``start`` is when the fit began, by ``time.perf_counter``; ``about`` is what the result depends on besides, and
+        ``started`` is when the fit began, by ``time.perf_counter``; ``about`` is what the result depends on besides, and
         part of the report.
         """
-        losses = train(
-            networks,
-            optimisers,
-            step,
-            iterations=iterations,
-            identity=field_files.fingerprint(cls.__name__, options, iterations, *about.values(), seed, known),
-            checkpoint=checkpoint,
-            progress=progress,
-        )
+        losses = train(learner, how, digest(cls.__name__, options, how.iterations, how.seed, about, known))
         return cls(
             options=options,
-            network=next(iter(networks.values())).eval(),
+            network=next(iter(learner.networks.values())).eval(),
             directions=known.directions,
             transmitter=known.transmitters[0],
             floor=known.floor,
             range_db=known.range_db,
             report={
                 "receivers": len(known),
-                "fit_time_s": time.perf_counter() - start,
+                "fit_time_s": time.perf_counter() - started,
                 "losses": losses,
-                "seed": int(seed),
-                "iterations": iterations,
+                "seed": int(how.seed),
+                "iterations": how.iterations,
                 **about,
             },
         )

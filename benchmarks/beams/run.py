@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,26 +12,23 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import warprrf as wr
+from benchmarks.beams import report
 from benchmarks.beams.links import BANDWIDTH_HZ, Ends, Links, ends, gains
-from benchmarks.beams.report import write
 from benchmarks.beams.search import hierarchical
 from benchmarks.beams.users import several_users
-from benchmarks.bistatic.methods import source_of
+from benchmarks.data import TRUTHS, DataOptions, Geometry, Truth, checked, files
 from benchmarks.machine import machine
-from benchmarks.setting import DATA, TRUTHS, Geometry, Truth, files, scene_of
-from benchmarks.stages import StagedRun, write_json
+from benchmarks.methods import METHODS
+from benchmarks.report import Report, Row
+from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress
 from warprrf.files import write_atomically
-from warprrf.marks import code_mark
 from warprrf.rf.channel.beams import select_beams
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.steps import Attempt, Steps
 
-SIDES = (4, 8, 16, 32, 64)
-"""Elements along a side of the swept array."""
-BOTH = (8, 8)
-"""Elements along a side of transmitter and receiver where beams are chosen at both ends."""
 TX_POWER_DBM = 20.0
 NOISE_FIGURE_DB = 10.0
 NOISE_DBM = -173.98 + 10.0 * np.log10(BANDWIDTH_HZ) + NOISE_FIGURE_DB  # k T at 290 K
@@ -38,119 +36,146 @@ FRAME_PILOTS = 2000
 """Pilots that fill the time for which a beam holds: 10 us each (a sector sweep frame of IEEE 802.11ad takes 15) in 20
 ms, in which a user walking at 1 m/s moves 2 cm."""
 PILOT_SYMBOLS = 10e-6 * BANDWIDTH_HZ  # correlated over
-MODELS = {"bistatic": "bistatic", "rf3dgs+": "rf3dgs+"}
+MODELS = ("bistatic", "rf3dgs+")
 MULTI_USER_SIDE = 16
 WITHIN_DB = 1.0
+VERSION = 1  # counted up by hand when something else is computed here
 
 Predict = Callable[[np.ndarray], Paths]
 
+HELP = """\
+Fits the bistatic field and RF-3DGS+, picks each test receiver's beam without pilots, and compares received SNR and
+spectral efficiency on the true channel with exhaustive and hierarchical search, the nearest training receiver's beam,
+pointing at the transmitter, zero spectra and random beams. Fitted fields are kept: a killed run continues.
 
-def run_beams(
-    out: str | os.PathLike[str] = "runs/beams",
-    *,
-    data: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] = DATA,
-    geometry: str | os.PathLike[str] = "runs/lobby/reconstruction",
-    scene: str | os.PathLike[str] | None = None,
-    counts: Sequence[int] = (5, 10, 50),
-    truths: Sequence[str] = TRUTHS,
-    sides: Sequence[int] = SIDES,
-    both: tuple[int, int] = BOTH,
-    every: int = 1,
-    seed: int = 0,
-    fresh: bool = False,
-    device: Any = None,
-    progress: Progress | None = None,
-) -> dict[str, Any]:
+examples:
+  python -m benchmarks beams
+  python -m benchmarks beams --truths exact --counts 10 --every 4 --sides 4 16 --out runs/quick     a first look
+  python -m benchmarks beams --data spectra_full.nc spectra_sionna_full.nc --geometry room
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(DataOptions):
+    """Options of the beams.
+
+    Attributes:
+        counts: numbers of training receivers.
+        truths: ``"exact"``, ``"sionna"`` or both.
+        every: each how-manieth test receiver counts.
+        sides: elements along a side of the swept array, powers of two.
+        both: elements along a side of transmitter and receiver where beams are chosen at both ends, powers of two.
+    """
+
+    counts: tuple[int, ...] = option((5, 10, 50), "training receivers")
+    truths: tuple[str, ...] = option(TRUTHS, "exact, sionna or both")
+    every: int = option(1, "each K-th test receiver")
+    sides: tuple[int, ...] = option((4, 8, 16, 32, 64), "elements a side of the swept array")
+    both: tuple[int, int] = (8, 8)
+
+    def __post_init__(self) -> None:
+        for name in ("sides", "both"):
+            given = getattr(self, name)
+            if any(n < 2 or n & (n - 1) for n in given):
+                raise ValueError(f"{name}: got {tuple(given)}, expected powers of two, at least 2")
+        checked("every", self.every, 1)
+
+
+def run(options: Options, job: Job) -> Report:
     """Fit the fields, pick beams by every method, and judge them; a killed run continues.
 
-    Writes ``beams.json``, ``beams.md``, with matplotlib the pictures ``beams_*.png``, and the fitted fields to ``out``.
-
-    Args:
-        data: Folder of spectra and scene, or NetCDF files, one a truth.
-        geometry: A reconstruction's folder.
-        scene: True scene (XML); by default the one beside the data.
-        counts: Numbers of training receivers.
-        truths: "exact", "sionna" or both.
-        sides: Elements along a side of the swept array, powers of two.
-        both: Elements along a side of transmitter and receiver for beams at both ends, powers of two.
-        every: Each how-manieth test receiver counts.
-        seed: Of phases, noise, random beams and groups of users.
-        fresh: Start over instead of continuing.
-
     Raises:
-        ValueError: naming the argument.
+        ValueError: on missing or broken data, or another run at work in ``job.out``.
         FileNotFoundError: for a missing file.
     """
-    for name, given in (("sides", sides), ("both", both)):
-        if any(n < 2 or n & (n - 1) for n in given):
-            raise ValueError(f"{name}: got {tuple(given)}, expected powers of two, at least 2")
-    if every < 1:
-        raise ValueError(f"every: got {every}, expected at least 1")
-    place = Geometry(Path(geometry), Path(scene) if scene is not None else scene_of(data), device)
-    report: dict[str, Any] = {"machine": machine(device), "seed": seed, "every": every}
-    report |= {
+    place = options.place(job.device)
+    figures: dict[str, Any] = {
+        "machine": machine(job.device),
+        "seed": job.seed,
+        "every": options.every,
         "tx_power_dbm": TX_POWER_DBM,
         "noise_dbm": NOISE_DBM,
         "frame_pilots": FRAME_PILOTS,
+        "bandwidth_hz": BANDWIDTH_HZ,
         "truths": {},
     }
-    report["bandwidth_hz"] = BANDWIDTH_HZ
-    with StagedRun(out, fresh=fresh, progress=progress) as run:
-        for file in files(data, truths):
-            truth = Truth.load(file, tuple(counts), every)
-            fields = {}
-            for model in MODELS:
-                for count in truth.counts:
-                    fields[model, count] = _fit(run, truth, place, model, count)
-            code = code_mark("warprrf.rf", "warprrf.kernels", "warprrf.geometry", "benchmarks.beams")
-            settings = [truth.mark, place.mark, place.scene_mark, list(truth.counts), list(sides), list(both)]
+    with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
+        for file in files(options.data, options.truths):
+            truth = Truth.load(file, options.counts, options.every)
+            fields = {
+                (model, count): _fit(steps, truth, place, model, count)
+                for model in MODELS
+                for count in truth.counts
+            }
+            keys = [steps.key(f"fit {truth.name} {model} {count}") for model, count in fields]
+            inputs = [
+                keys,
+                place.scene_key,
+                truth.counts,
+                options.sides,
+                options.both,
+                options.every,
+                job.seed,
+            ]
             # A receiver's matrices are small: on busy cores threads of BLAS wait for each other most of the time.
             with threadpool_limits(1, user_api="blas"):
-                report["truths"][truth.name] = run.stage(
+                figures["truths"][truth.name] = steps.run(
                     f"beams {truth.name}",
-                    lambda done, truth=truth, fields=fields: judge(  # type: ignore[misc]
-                        truth, place, fields, tuple(sides), both, seed, done
-                    ),
-                    inputs=[*settings, every, seed, code],
+                    partial(judge, truth, place, fields, options, job.seed),
+                    version=VERSION,
+                    inputs=inputs,
                 )
-            place.forget()
-    write_json(Path(out) / "beams.json", report)
-    write(out)
-    return report
+    figures["within"] = {truth: _within(found["links"]) for truth, found in figures["truths"].items()}
+    return Report("beams", figures, report.text(figures), report.pictures(figures), dpi=110)
 
 
-def _fit(run: StagedRun, truth: Truth, place: Geometry, model: str, count: int) -> Path:
+def _within(rows: list[Row]) -> dict[str, float | None]:
+    """The least shares within 1 dB of exhaustive search of our field from ten spectra, over all arrays."""
+    own = [r for r in rows if (r["method"], r["n_train"]) == ("bistatic", 10)]
+    found: dict[str, float | None] = {}
+    for name, key in (("all", "within"), ("blocked", "within_blocked")):
+        shares = [r[key] for r in own if r[key] is not None]
+        found[name] = min(shares) if shares else None
+    return found
+
+
+def _fit(steps: Steps, truth: Truth, place: Geometry, model: str, count: int) -> Path:
     """The file of a fitted field."""
     name = f"field_{truth.name}_{model.replace('+', '_plus')}_{count}.safetensors"
 
-    def work(progress: Progress) -> dict[str, Any]:
+    def make(attempt: Attempt) -> Row:
         field = wr.RadioField.fit(
-            place.reconstruction, truth.train(count), model=model, device=place.device, progress=progress
+            place.reconstruction,
+            truth.train(count),
+            model=model,
+            device=place.device,
+            progress=attempt.progress,
         )
-        write_atomically(run.folder / name, field.save)
+        write_atomically(steps.folder / name, field.save)
         return {"fit_s": field.report["fit_time_s"]}
 
-    run.stage(
+    inputs = [truth.key, place.key, count]
+    steps.run(
         f"fit {truth.name} {model} {count}",
-        work,
-        inputs=[truth.mark, place.mark, count, source_of(model)],
-        outputs=[name],
+        make,
+        version=METHODS[model].version,
+        inputs=inputs,
+        outputs=(name,),
     )
-    return run.folder / name
+    return steps.folder / name
 
 
 def judge(
     truth: Truth,
     place: Geometry,
     fields: dict[tuple[str, int], Path],
-    sides: tuple[int, ...],
-    both: tuple[int, int],
+    options: Options,
     seed: int,
-    progress: Progress,
-) -> dict[str, Any]:
+    attempt: Attempt,
+) -> Row:
     """All rows of one truth: ``links`` (beams of one user) and ``users`` (several served at once)."""
-    test = truth.test
-    between = ends(truth.data, sides, both)
+    test, progress = truth.test, attempt.progress
+    between = ends(truth.data, options.sides, options.both)
     predictors: dict[tuple[str, int | None], Predict] = {
         (model, count): wr.RadioField.load(file, device=place.device).paths
         for (model, count), file in fields.items()
@@ -199,11 +224,14 @@ def judge(
                 )
                 rows.setdefault((e.name, *key), []).append(outcome)
         progress("links", i + 1, len(test))
-    report = {"links": _summaries(between, rows, np.array(blocked), ratio), "blocked": int(np.sum(blocked))}
-    report |= {"receivers": len(test)}
+    found_rows: Row = {
+        "links": _summaries(between, rows, np.array(blocked), ratio),
+        "blocked": int(np.sum(blocked)),
+    }
+    found_rows |= {"receivers": len(test)}
     if group_ends is not None:
-        report["users"] = several_users(group_ends, shared, shared_worth, guesses, 1.0 / ratio, seed)
-    return report
+        found_rows["users"] = several_users(group_ends, shared, shared_worth, guesses, 1.0 / ratio, seed)
+    return found_rows
 
 
 class Outcome(NamedTuple):
@@ -306,3 +334,6 @@ def _over(columns: dict[str, np.ndarray]) -> dict[str, float | None]:
         "efficiency": float(columns["efficiency"].mean()),
         "efficiency_without_pilots": float(columns["efficiency_without_pilots"].mean()),
     }
+
+
+BENCHMARKS = {"beams": Benchmark("beams", Options, run, HELP)}

@@ -1,35 +1,26 @@
-"""What the table of methods does not say: which term is worth what, how sure the field is, how fast it learns, delays.
+"""What the table of methods does not say: which term is worth what, how sure the field is, delays, another transmitter.
 
 Each function makes one row from a fitted field or from a fit of its own, and returns plain figures.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
-from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 
-from benchmarks.bistatic.adam import fit_groups_adam
-from benchmarks.bistatic.methods import view_of
-from benchmarks.setting import Geometry, Truth
+import warprrf as wr
+from benchmarks.data import Geometry, Truth
+from benchmarks.report import Row
 from warprrf.device import Progress
-from warprrf.rf.fields.bistatic import fit as group_fit
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Parameters
-from warprrf.rf.fields.bistatic.response import SpectrumPixels, respond
-from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.fields.bistatic.training import Selection
 from warprrf.rf.fields.bistatic.uncertainty import negative_log_likelihood
-from warprrf.rf.paths.trace import MirrorTracer
-from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra import metrics
-from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import pixel_directions, to_db
+from warprrf.steps import Attempt
 
 ABLATION: dict[str, dict[str, Any]] = {
     "no line of sight": {"line_of_sight": False},
@@ -48,7 +39,6 @@ ABLATION: dict[str, dict[str, Any]] = {
 """Options of the fit that leave a part of the model out. The last one fits on the true scene instead."""
 TRUE_MESH = "true mesh, its materials as groups"
 
-ADAM_STEPS = 300
 LEVELS = (*np.round(np.arange(0.05, 1.0, 0.05), 2).tolist(), 0.99)
 """Shares of pixels at which the reliability curve is read."""
 MATCH_DEG = 3.0  # a path of ours within this angle of a true one is that path
@@ -57,27 +47,22 @@ NEAR_A_PATH_SIGMA = (
 )
 
 
-def ablation(
-    options: dict[str, Any], true: bool, truth: Truth, count: int, geometry: Geometry, progress: Progress
-) -> dict[str, Any]:
-    """Figures of a bistatic field fitted with ``options`` on ``count`` receivers, on the true mesh if ``true``.
-
-    Receivers are asked with cached rays, so ``seconds_per_spectrum`` is without them.
-    """
-    train = truth.train(count)
-    rays = geometry.rays(train, true=true, progress=progress)
-    place = geometry.scene if true else geometry.reconstruction
-    field = BistaticField.fit(
-        place, train, transport=rays, device=geometry.device, progress=progress, **options
+def ablation(name: str, truth: Truth, count: int, geometry: Geometry, progress: Progress) -> Row:
+    """Figures of a bistatic field fitted with the options of :data:`ABLATION` on ``count`` receivers."""
+    place = geometry.scene if name == TRUE_MESH else geometry.reconstruction
+    field: Any = wr.RadioField.fit(
+        place,
+        truth.train(count),
+        model="bistatic",
+        device=geometry.device,
+        progress=progress,
+        **ABLATION[name],
     )
-    view = view_of(geometry.rays(truth.test, slot="test", true=true, progress=progress))
-    found = metrics.evaluate(
-        truth.test, lambda rx: field.spectrum(rx, view=view(rx)), progress=progress
-    )  # fmt: skip
+    found = metrics.evaluate(truth.test, field.spectrum, progress=progress)
     return {"fit_s": field.report["fit_time_s"], "choices": field.report["choices"], **found}
 
 
-def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[str, Any]:
+def calibration(field: BistaticField, truth: Truth, progress: Progress) -> Row:
     """How often the truth lies as near to the prediction as its standard deviation says, over the test pixels.
 
     Returns ``within_1_sigma`` and ``within_2_sigma`` (also ``..._blocked``, and ``..._lit`` of pixels whose truth or
@@ -101,7 +86,7 @@ def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[
     lit = np.stack(levels) > test.floor
     rms = float(np.sqrt(np.mean(e**2)))
     normal, outlier = NormalDist(), float(np.asarray(field.errors.outlier_db).item())
-    row: dict[str, Any] = {
+    row: Row = {
         "sigma_median_db": float(np.median(s)),
         "rms_error_db": rms,
         "nll": negative_log_likelihood(e, s, outlier),
@@ -122,58 +107,7 @@ def calibration(field: BistaticField, truth: Truth, progress: Progress) -> dict[
     return row
 
 
-def optimisers(truth: Truth, count: int, geometry: Geometry, seed: int, progress: Progress) -> dict[str, Any]:
-    """Gauss-Newton and Adam on the same cached views of ``count`` receivers, single bounces, all materials free.
-
-    Returns for each ``seconds``, ``steps``, the final ``objective`` per pixel [dB^2] and the curves ``at_s`` and
-    ``losses``; ``adam_reaches_s``, when Adam is first within 1 % of what Gauss-Newton ends at (None: never).
-    """
-    train = truth.train(count)
-    rays = geometry.rays(train, progress=progress)
-    beam, lobes = BeamOperator(train.shape, train.beam_sigma_rad, device=geometry.device), Terms().lobes
-    rng = np.random.default_rng(seed)
-    pixels = train.shape[0] * train.shape[1]
-    target = to_db(train.path_gain, train.floor) - 10.0 * np.log10(train.floor)
-    most, readings = min(pixels, max(200, Selection().readings // count)), []
-    for r, view in enumerate(rays.views):
-        chosen = np.sort(rng.choice(pixels, most, replace=False))
-        response = respond(view, SpectrumPixels(beam, chosen), lobes, train.floor)
-        readings.append(group_fit.Reading(response, target[r].ravel()[chosen]).tied(rays.surface.material))
-        progress("views", r + 1, len(rays.views))
-    surface = rays.surface
-    area = np.bincount(surface.material[surface.group], surface.mesh.areas)
-    prior = Parameters.prior(len(area), len(lobes))
-    group_fit.objective(readings, prior, 3.0)  # tables are made on first use, which is no fit's time
-    times: list[float] = []
-    began = time.perf_counter()
-    newton = group_fit.fit_groups(
-        readings, prior, area, progress=lambda *_: times.append(time.perf_counter() - began)
-    )
-    newton_s = time.perf_counter() - began
-    progress("optimisers", 1, 2)
-    began = time.perf_counter()
-    adam = fit_groups_adam(readings, prior, area, steps=ADAM_STEPS)
-    adam_s = time.perf_counter() - began
-    progress("optimisers", 2, 2)
-    losses = [adam.losses[0], *newton.losses]  # both start from the same parameters
-    at = [0.0, *times[: len(newton.losses)]]
-    adam_at = np.arange(len(adam.losses)) * adam_s / len(adam.losses)
-    near = np.flatnonzero(np.array(adam.losses) <= 1.01 * losses[-1])
-    return {
-        "gauss_newton": {
-            "seconds": newton_s, "steps": newton.steps, "objective": losses[-1], "at_s": at, "losses": losses,
-        },
-        "adam": {
-            "seconds": adam_s, "steps": adam.steps, "objective": adam.losses[-1], "at_s": adam_at,
-            "losses": adam.losses,
-        },
-        "adam_reaches_s": float(adam_at[near[0]]) if len(near) else None,
-        "parameters": newton.layout.size,
-        "pixels": sum(len(r.target_db) for r in readings),
-    }  # fmt: skip
-
-
-def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Progress) -> dict[str, Any]:
+def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Progress) -> Row:
     """Delay errors [ns] of line of sight and mirror paths, and of the pixels that hold scattering.
 
     True specular paths are those of the image method on the true scene, one reflection at most (the exact engine's;
@@ -184,8 +118,8 @@ def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Pro
     ``median_by_power_ns``, a missing delay counted as infinite.
     """
     test = truth.test
-    tracer = MirrorTracer(
-        geometry.scene, transmitter=test.transmitter, frequency_hz=test.frequency_hz, device=geometry.device
+    traced = wr.trace_paths(
+        geometry.scene, transmitter=test.transmitter, receivers=test.receivers, frequency_hz=test.frequency_hz
     )
     directions = pixel_directions(test.shape)
     names = {"los": "line_of_sight", "mirror": "mirror"}
@@ -194,7 +128,7 @@ def delays(field: BistaticField, truth: Truth, geometry: Geometry, progress: Pro
     scattered: list[np.ndarray] = []
     weights: list[np.ndarray] = []
     for i, receiver in enumerate(test.receivers):
-        true, ours = tracer.trace(receiver, 1), field.paths(receiver)
+        true, ours = traced[i], field.paths(receiver)
         for kind in names:
             mine = np.flatnonzero(ours.kind == kind)
             for k in np.flatnonzero((true.kind == kind) & (true.power > test.floor)):
@@ -235,9 +169,7 @@ def _quantiles(errors_ns: np.ndarray) -> dict[str, float | None]:
     return {"median_ns": float(median), "p90_ns": float(p90)}
 
 
-def repeat(
-    truth: Truth, count: int, geometry: Geometry, workspace: Path, progress: Progress
-) -> dict[str, Any]:
+def repeat(truth: Truth, count: int, geometry: Geometry, attempt: Attempt) -> Row:
     """How well a sampled truth predicts itself: another seed of the same engine, on ``count`` test receivers.
 
     No prediction can be expected to score better than this on the data set.
@@ -245,7 +177,7 @@ def repeat(
     chosen = np.unique(np.linspace(0, len(truth.test) - 1, min(count, len(truth.test))).round().astype(int))
     test = truth.test.subset(chosen)
     settings = {name: int(test.attributes[name]) for name in ("depth", "samples") if name in test.attributes}
-    again = simulate(
+    again = wr.simulate(
         geometry.scene,
         transmitter=test.transmitter,
         receivers=test.receivers,
@@ -256,8 +188,8 @@ def repeat(
         refraction=bool(test.attributes.get("refraction", 0)),
         seed=test.seed + 1,
         floor=test.floor,
-        workspace=workspace,
-        progress=progress,
+        workspace=attempt.folder,
+        progress=attempt.progress,
         device=geometry.device,
         **settings,  # type: ignore[arg-type]
     )
@@ -266,12 +198,10 @@ def repeat(
     return {**found, "seconds_per_spectrum": None, "seeds": [test.seed, test.seed + 1], **settings}
 
 
-def second_spectra(
-    truth: Truth, transmitter: Any, geometry: Geometry, workspace: Path, progress: Progress
-) -> SpectrumDataset:
+def second_spectra(truth: Truth, transmitter: Any, geometry: Geometry, attempt: Attempt) -> SpectrumDataset:
     """Spectra of all test receivers under another transmitter, by the exact engine."""
     test = truth.data.split(truth.few)[1]
-    return simulate(
+    return wr.simulate(
         geometry.scene,
         transmitter=transmitter,
         receivers=test.receivers,
@@ -279,15 +209,15 @@ def second_spectra(
         shape=test.shape,
         beam_sigma_rad=test.beam_sigma_rad,
         roles=["test"] * len(test),
-        workspace=workspace,
-        progress=progress,
+        workspace=attempt.folder,
+        progress=attempt.progress,
         device=geometry.device,
     )
 
 
 def second_transmitter(
     field: Any, ds: SpectrumDataset, truth: Truth, geometry: Geometry, progress: Progress
-) -> dict[str, Any]:
+) -> Row:
     """A field asked for a transmitter that it was not fitted for.
 
     Returns figures by the range of ``ds`` itself, and under ``first_range`` by floor and range of the data set that it

@@ -1,39 +1,22 @@
-"""The evaluation as Markdown, what was asked beside what was measured, and its pictures.
-
-Drawn from ``bistatic.json`` and the shown spectra alone, so it can be drawn again without computing anything.
-"""
+"""The bistatic field's evaluation as Markdown and pictures."""
 
 from __future__ import annotations
 
-import json
-import os
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.bistatic.plots import (
-    ASKED_WITHIN,
-    TRUTH_NAMES,
-    WHOLE,
-    Row,
-    ablation_bars,
-    optimiser_curves,
-    psnr_curves,
-    reliability,
-)
-from benchmarks.markdown import cell, table
-from benchmarks.pictures import METHODS, spectrum_rows, write_page
+from benchmarks.pictures import METHODS, figure_of, spectrum_rows
+from benchmarks.report import Row, cell, columns_table, table
 from warprrf.rf.fields.bistatic.uncertainty import OUTLIERS
 
-ASKED_MARGIN_DB: dict[str, dict[str, dict[int, float]]] = {
-    "exact": {"rf3dgs+": {10: 9.0, 50: 8.0, 400: 6.0}, "rf3dgs+los": {10: 7.0, 50: 6.0, 400: 5.0}},
-    "sionna": {"rf3dgs+": {10: 6.0, 50: 4.0, 400: 3.0}, "rf3dgs+los": {}},
-}
-"""By truth, baseline and training receivers: PSNR of the bistatic field over it, at least."""
-ASKED_PSNR_DB = {("sionna", 50): 28.0}
-ASKED_FIT_S = {50: 15.0}
-
+ASKED_WITHIN = {1: (0.60, 0.76), 2: (0.90, 0.98)}
+"""Share of pixels within so many standard deviations, drawn beside what was found."""
+TRUTH_NAMES = {"exact": "exact", "sionna": "Sionna RT"}
+WHOLE = "everything"  # the ablation's row that leaves nothing out
 VARIANT_NAMES = {"exp": "gain exp", "linear": "gain linear"}
 AVERAGE_NAMES = {"db": "in dB", "linear": "in linear power"}
 
@@ -55,141 +38,27 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 )
 
 
-def write(folder: str | os.PathLike[str]) -> Path:
-    """Write ``bistatic.md`` and the pictures from ``bistatic.json`` in ``folder``; returns the Markdown's path.
-
-    Raises:
-        ValueError: if there is no ``bistatic.json``.
-        ImportError: if matplotlib is missing.
-    """
-    folder = Path(folder)
-    if not (folder / "bistatic.json").is_file():
-        raise ValueError(
-            f"folder: {folder / 'bistatic.json'} is missing, expected the folder of a finished evaluation"
-        )
-    found = json.loads((folder / "bistatic.json").read_text())
-    pictures: dict[str, Any] = {
-        "psnr.png": psnr_curves(found["rows"]),
-        "ablation.png": ablation_bars(found["ablation"]),
-    }
-    if any(row.get("shares") for row in found["calibration"]):
-        pictures["reliability.png"] = reliability(found["calibration"])
-    pictures["optimisers.png"] = optimiser_curves(found["optimisers"])
-    captions = {
-        "psnr.png": "PSNR on the test receivers against the number of training receivers.",
-        "ablation.png": "PSNR with parts of the model left out.",
-        "reliability.png": "Share of test pixels within the stated interval, against the share that was stated.",
-        "optimisers.png": "Objective over time of Gauss-Newton and Adam on the same cached views.",
-    }
-    for shown in found["shown"]:
-        with np.load(folder / shown["file"], allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        low, high = (float(v) for v in arrays["range_db"])
-        for index, blocked in enumerate(shown["blocked"]):
-            state = "blocked" if blocked else "line of sight"
-            name = f"spectra-{shown['truth']}-{state.replace(' ', '_')}.png"
-            predictions = {
-                _name({"method": m, "variant": v}): arrays[m][index] for m, v in shown["methods"].items()
-            }
-            pictures[name] = spectrum_rows(arrays["truth"][index], predictions, low, high)
-            at = ", ".join(f"{x:.2f}" for x in shown["receivers"][index])
-            captions[name] = (
-                f"Receiver at ({at}) m, {state}: {TRUTH_NAMES[shown['truth']]} truth, predictions from "
-                f"{shown['n_train']} spectra, and their differences from the truth."
-            )
-    shown = {name: (figure, captions[name]) for name, figure in pictures.items()}
-    return write_page(folder / "bistatic.md", summary_text(found), shown)
-
-
 # ----------------------------------------------------------------------------------------------------- tables
 
 
-def summary_text(found: dict[str, Any]) -> str:
+def text(found: dict[str, Any]) -> str:
     """All tables as Markdown."""
-    parts = [
-        _about(found),
-        "### Asked and measured",
-        table(("figure", "asked", "measured", ""), asked(found)),
-    ]
+    parts = [_about(found)]
     for truth in found["data"]:
-        rows = [row for row in found["rows"] if row["truth"] == truth]
-        parts += [f"### Methods, truth: {TRUTH_NAMES[truth]}", _method_table(rows)]
-    parts += ["### Margins of the bistatic field", _margin_table(found["rows"])]
+        rows = [{**row, "name": _name(row)} for row in found["rows"] if row["truth"] == truth]
+        columns = (("n_train", "receivers", "{}"), ("name", "method", "{}"), *COLUMNS)
+        parts += [f"### Methods, truth: {TRUTH_NAMES[truth]}", columns_table(columns, rows)]
     if found["repeat"]:
-        parts += ["### The truth against itself", _repeat_text(found["repeat"])]
+        rows = [{**row, "name": TRUTH_NAMES[row["truth"]]} for row in found["repeat"]]
+        about = "Two solves with different seeds: no prediction can be expected to score better."
+        columns = (("name", "truth", "{}"), ("receivers", "receivers", "{}"), *COLUMNS)
+        parts += ["### The truth against itself", about, columns_table(columns, rows)]
     if found["second"]:
         parts += ["### A transmitter never seen in training", _second_table(found["second"])]
     parts += ["### What each part is worth", _ablation_table(found["ablation"])]
     parts += ["### Stated uncertainty", _calibration_table(found["calibration"])]
-    parts += ["### Gauss-Newton and Adam", _optimiser_table(found["optimisers"])]
     parts += ["### Delays", _delay_table(found["delays"])]
     return "\n\n".join(parts)
-
-
-def asked(found: dict[str, Any]) -> list[list[str]]:
-    """Rows of figure, asked, measured, verdict; what this run did not measure is left out."""
-    lines: list[list[str]] = []
-
-    def add(name: str, wanted: str, value: str, met: bool) -> None:
-        lines.append([name, wanted, value, "met" if met else "NOT met"])
-
-    for row in margins(found["rows"]):
-        for base in ("rf3dgs+", "rf3dgs+los"):
-            least = row[base]["asked_db"]
-            if least is not None:
-                margin = row[base]["margin_db"]
-                add(
-                    f"PSNR over {METHODS[base][0]}, {_case(row)}",
-                    f"at least {least:+g} dB",
-                    f"{margin:+.2f} dB",
-                    margin >= least,
-                )
-    for row in found["rows"]:
-        least = ASKED_PSNR_DB.get((row["truth"], row["n_train"]))
-        if least is not None and row["method"] == "bistatic":
-            value = row["psnr_db"]
-            add(f"PSNR, {_case(row)}", f"at least {least:g} dB", f"{value:.2f} dB", value >= least)
-    for row in found["rows"]:
-        most = ASKED_FIT_S.get(row["n_train"])
-        if most is not None and row["method"] == "bistatic":
-            value = row["fit_s"]
-            add(
-                f"fit with transport cached, {_case(row)}",
-                f"at most {most:g} s",
-                f"{value:.1f} s",
-                value <= most,
-            )
-    for row in found["calibration"]:
-        for k, (low, high) in ASKED_WITHIN.items():
-            share = row.get(f"within_{k}_sigma")
-            if share is not None:
-                add(
-                    f"pixels within {k} sigma, {_case(row)}",
-                    f"{low:.0%} to {high:.0%}",
-                    f"{share:.1%}",
-                    low <= share <= high,
-                )
-    return lines
-
-
-def margins(rows: list[Row]) -> list[Row]:
-    """PSNR of the bistatic field less that of each baseline, a row a truth and number of training receivers."""
-    known = {(row["truth"], row["n_train"], row["method"]): row for row in rows}
-    lines = []
-    for (truth, count, method), ours in known.items():
-        if method != "bistatic":
-            continue
-        line: Row = {"truth": truth, "n_train": count, "psnr_db": ours["psnr_db"]}
-        for base in ("rf3dgs+", "rf3dgs+los"):
-            other = known[truth, count, base]
-            line[base] = {
-                "psnr_db": other["psnr_db"],
-                "variant": other["variant"],
-                "margin_db": ours["psnr_db"] - other["psnr_db"],
-                "asked_db": ASKED_MARGIN_DB[truth][base].get(count),
-            }
-        lines.append(line)
-    return lines
 
 
 def _about(found: dict[str, Any]) -> str:
@@ -211,137 +80,61 @@ def _about(found: dict[str, Any]) -> str:
     return " ".join(parts)
 
 
-def _method_table(rows: list[Row]) -> str:
-    lines = []
-    for row in rows:
-        cells = [cell(row.get(key), form) for key, _, form in COLUMNS]
-        lines.append([str(row["n_train"]), _name(row), *cells])
-    return table(("receivers", "method", *(name for _, name, _ in COLUMNS)), lines)
-
-
-def _margin_table(rows: list[Row]) -> str:
-    lines = []
-    for row in margins(rows):
-        cells = []
-        for base in ("rf3dgs+", "rf3dgs+los"):
-            r = row[base]
-            wanted = "-" if r["asked_db"] is None else f"{r['asked_db']:+g}"
-            cells += [f"{r['psnr_db']:.2f} ({VARIANT_NAMES[r['variant']]})", f"{r['margin_db']:+.2f}", wanted]
-        lines.append([TRUTH_NAMES[row["truth"]], str(row["n_train"]), f"{row['psnr_db']:.2f}", *cells])
-    bases = [METHODS[base][0] for base in ("rf3dgs+", "rf3dgs+los")]
-    head = [h for base in bases for h in (f"{base} [dB]", "margin [dB]", "asked")]
-    return table(("truth", "receivers", "bistatic [dB]", *head), lines)
-
-
-def _repeat_text(rows: list[Row]) -> str:
-    lines = []
-    for row in rows:
-        lines.append(
-            [
-                TRUTH_NAMES[row["truth"]],
-                str(row["receivers"]),
-                " and ".join(map(str, row["seeds"])),
-                *(cell(row.get(key), form) for key, _, form in COLUMNS[:11]),
-            ]
-        )
-    head = ("truth", "receivers", "seeds", *(name for _, name, _ in COLUMNS[:11]))
-    return "Two solves with different seeds: no prediction can be expected to score better.\n\n" + table(
-        head, lines
-    )
-
-
 def _second_table(rows: list[Row]) -> str:
     at = ", ".join(f"{x:g}" for x in rows[0]["transmitter"])
-    text = (
+    about = (
         f"Transmitter at ({at}) m, exact engine, fields fitted to {rows[0]['n_train']} spectra of the first one, which "
         "`seen` scores. `first range`: by floor and range of the first data set, as `seen` is."
     )
-    lines = [
-        [
-            _name(row),
-            f"{row['seen']['psnr_db']:.2f}",
-            f"{row['psnr_db']:.2f}",
-            f"{row['first_range']['psnr_db']:.2f}",
-            *(cell(row.get(key), form) for key, _, form in COLUMNS[1:11]),
-        ]
+    shown = [
+        {**row, "name": _name(row), "seen": row["seen"]["psnr_db"], "first": row["first_range"]["psnr_db"]}
         for row in rows
     ]
     head = (
-        "method",
-        "PSNR seen [dB]",
-        "PSNR [dB]",
-        "PSNR, first range [dB]",
-        *(n for _, n, _ in COLUMNS[1:11]),
+        ("name", "method", "{}"),
+        ("seen", "PSNR seen [dB]", "{:.2f}"),
+        ("first", "PSNR, first range [dB]", "{:.2f}"),
     )
-    return f"{text}\n\n{table(head, lines)}"
+    return f"{about}\n\n{columns_table((*head, *COLUMNS), shown)}"
 
 
 def _ablation_table(rows: list[Row]) -> str:
-    chosen = [c for c in COLUMNS if c[0] not in ("transport_s", "seconds_per_spectrum", "fit_s")]
     whole = {row["truth"]: row["psnr_db"] for row in rows if row["model"] == WHOLE}
-    lines = []
-    for row in rows:
-        lines.append(
-            [
-                f"{TRUTH_NAMES[row['truth']]}, {row['n_train']}",
-                "the whole model" if row["model"] == WHOLE else row["model"],
-                f"{row['psnr_db'] - whole[row['truth']]:+.2f}",
-                *(cell(row.get(key), form) for key, _, form in chosen),
-            ]
-        )
-    return table(("truth, receivers", "model", "change [dB]", *(name for _, name, _ in chosen)), lines)
+    shown = [
+        {
+            **row,
+            "at": f"{TRUTH_NAMES[row['truth']]}, {row['n_train']}",
+            "change": row["psnr_db"] - whole[row["truth"]],
+        }
+        for row in rows
+    ]
+    head = (
+        ("at", "truth, receivers", "{}"),
+        ("model", "model", "{}"),
+        ("change", "change [dB]", "{:+.2f}"),
+    )
+    timed = ("transport_s", "seconds_per_spectrum", "fit_s")
+    return columns_table((*head, *(c for c in COLUMNS if c[0] not in timed)), shown)
 
 
 def _calibration_table(rows: list[Row]) -> str:
-    lines = []
-    for row in rows:
-        lines.append(
-            [
-                TRUTH_NAMES[row["truth"]],
-                str(row["n_train"]),
-                *(
-                    cell(row.get(f"within_{k}_sigma{b}"), "{:.1%}")
-                    for k in (1, 2)
-                    for b in ("", "_lit", "_blocked")
-                ),
-                cell(row.get("nll"), "{:.3f}"),
-                cell(row.get("nll_constant"), "{:.3f}"),
-                cell(row.get("nll_gaussian"), "{:.2f}")
-                + " / "
-                + cell(row.get("nll_gaussian_constant"), "{:.2f}"),
-                cell(row.get("sigma_median_db"), "{:.2f}"),
-                cell(row.get("rms_error_db"), "{:.2f}"),
-            ]
-        )
-    wanted = "; ".join(f"{low:.0%} to {high:.0%} within {k} sigma" for k, (low, high) in ASKED_WITHIN.items())
-    head = (
-        "truth", "receivers", "within 1 sigma", "lit", "blocked", "within 2 sigma", "lit", "blocked",
-        "negative log likelihood", "of the best constant sigma", "both as Gaussians", "median sigma [dB]",
-        "rms error [dB]",
-    )  # fmt: skip
-    text = (
-        f"Asked: {wanted}. `lit`: pixels whose truth or prediction is above the floor. Negative log likelihood of a "
-        f"pixel [nat], a share of {OUTLIERS:g} of the pixels taken to be outliers."
-    )
-    return f"{text}\n\n{table(head, lines)}"
-
-
-def _optimiser_table(found: Row) -> str:
-    reaches = found["adam_reaches_s"]
-    text = (
-        f"{TRUTH_NAMES[found['truth']]}, {found['n_train']} receivers: {found['pixels']} pixels, {found['parameters']} "
-        "parameters, the same cached views, start and objective. Adam "
-        + (
-            "never comes within 1 % of Gauss-Newton's objective."
-            if reaches is None
-            else f"comes within 1 % of Gauss-Newton's objective after {reaches:.1f} s."
-        )
-    )
-    lines = [
-        [name, str(r["steps"]), f"{r['seconds']:.2f}", f"{r['objective']:.4f}"]
-        for name, r in (("Gauss-Newton", found["gauss_newton"]), ("Adam", found["adam"]))
+    shares = [
+        (f"within_{k}_sigma{part}", name, "{:.1%}")
+        for k in (1, 2)
+        for part, name in (("", f"within {k} sigma"), ("_lit", "lit"), ("_blocked", "blocked"))
     ]
-    return f"{text}\n\n{table(('optimiser', 'steps', 'time [s]', 'objective a pixel [dB^2]'), lines)}"
+    columns = (
+        ("name", "truth", "{}"), ("n_train", "receivers", "{}"), *shares, ("nll", "negative log likelihood", "{:.3f}"),
+        ("nll_constant", "of the best constant sigma", "{:.3f}"), ("nll_gaussian", "as a Gaussian", "{:.2f}"),
+        ("nll_gaussian_constant", "constant, as a Gaussian", "{:.2f}"), ("sigma_median_db", "median sigma [dB]", "{:.2f}"),
+        ("rms_error_db", "rms error [dB]", "{:.2f}"),
+    )  # fmt: skip
+    about = (
+        "`lit`: pixels whose truth or prediction is above the floor. Negative log likelihood of a pixel [nat], a share "
+        f"of {OUTLIERS:g} of the pixels taken to be outliers."
+    )
+    shown = [{**row, "name": TRUTH_NAMES[row["truth"]]} for row in rows]
+    return f"{about}\n\n{columns_table(columns, shown)}"
 
 
 def _delay_table(rows: list[Row]) -> str:
@@ -378,3 +171,130 @@ def _name(row: Row) -> str:
     variant = row.get("variant") or ""
     said = AVERAGE_NAMES if row["method"] == "idw" else VARIANT_NAMES
     return f"{name} ({said[variant]})" if variant else name
+
+
+# --------------------------------------------------------------------------------------------------- pictures
+
+
+def pictures(found: dict[str, Any], folder: Path) -> dict[str, tuple[Callable[[], Any], str]]:
+    """What is drawn, by file name; the shown spectra are read from ``folder``."""
+    drawn: dict[str, tuple[Callable[[], Any], str]] = {
+        "psnr.png": (
+            partial(psnr_curves, found["rows"]),
+            "PSNR on the test receivers against the number of training receivers.",
+        ),
+        "ablation.png": (partial(ablation_bars, found["ablation"]), "PSNR with parts of the model left out."),
+    }
+    if any(row.get("shares") for row in found["calibration"]):
+        caption = "Share of test pixels within the stated interval, against the share that was stated."
+        drawn["reliability.png"] = partial(reliability, found["calibration"]), caption
+    for shown in found["shown"]:
+        with np.load(folder / shown["file"], allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        low, high = (float(v) for v in arrays["range_db"])
+        for index, blocked in enumerate(shown["blocked"]):
+            state = "blocked" if blocked else "line of sight"
+            predictions = {
+                _name({"method": m, "variant": v}): arrays[m][index] for m, v in shown["methods"].items()
+            }
+            at = ", ".join(f"{x:.2f}" for x in shown["receivers"][index])
+            caption = (
+                f"Receiver at ({at}) m, {state}: {TRUTH_NAMES[shown['truth']]} truth, predictions from "
+                f"{shown['n_train']} spectra, and their differences from the truth."
+            )
+            picture = partial(spectrum_rows, arrays["truth"][index], predictions, low, high)
+            drawn[f"spectra-{shown['truth']}-{state.replace(' ', '_')}.png"] = picture, caption
+    return drawn
+
+
+def psnr_curves(rows: list[Row]) -> Any:
+    """PSNR against training receivers, a panel a truth, a curve a method; what sees no spectrum is a level."""
+    truths = list(dict.fromkeys(row["truth"] for row in rows))
+    figure, axes = figure_of(len(truths), size=(7.0 * len(truths), 5.2))
+    for ax, truth in zip(axes, truths, strict=True):
+        for method, (name, colour) in METHODS.items():
+            own = sorted(
+                (r["n_train"], r["psnr_db"]) for r in rows if (r["truth"], r["method"]) == (truth, method)
+            )
+            if not own:
+                continue
+            if own[0][0] == 0:
+                ax.axhline(own[0][1], color=colour, linestyle="--", linewidth=1.4, label=name)
+            else:
+                ax.plot(*zip(*own, strict=True), color=colour, marker="o", markersize=5, label=name)
+        counts = sorted({r["n_train"] for r in rows if r["truth"] == truth and r["n_train"]})
+        ax.set_xscale("log")
+        ax.set_xticks(counts, [str(n) for n in counts])
+        ax.minorticks_off()
+        if len(counts) == 1:
+            ax.set_xlim(0.7 * counts[0], 1.4 * counts[0])
+        ax.set_title(f"truth: {TRUTH_NAMES[truth]}")
+        ax.set_xlabel("training receivers")
+        ax.set_ylabel("PSNR [dB]")
+        ax.grid(alpha=0.3)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    return figure
+
+
+def ablation_bars(rows: list[Row]) -> Any:
+    """PSNR of the model with parts left out, a panel a truth."""
+    truths = list(dict.fromkeys(row["truth"] for row in rows))
+    names = list(dict.fromkeys(row["model"] for row in rows))
+    others = {
+        "zero spectra": "zero",
+        "RF-3DGS+ with line of sight": "rf3dgs+los",
+    }  # last, in their own colours
+    order = [WHOLE, *(n for n in names if n != WHOLE and n not in others), *others]
+    figure, axes = figure_of(len(truths), size=(7.0 * len(truths), 0.42 * len(order) + 1.2))
+    for ax, truth in zip(axes, truths, strict=True):
+        own = {row["model"]: row for row in rows if row["truth"] == truth}
+        shown = [name for name in order if name in own]
+        values = [own[name]["psnr_db"] for name in shown]
+        colours = [METHODS[others.get(name, "bistatic")][1] for name in shown]
+        bars = ax.barh(
+            ["the whole model" if name == WHOLE else name for name in shown], values, color=colours
+        )
+        bars[0].set_edgecolor("black")
+        ax.bar_label(bars, [f"{v:.1f}" for v in values], padding=4, fontsize=9)
+        ax.axvline(values[0], color="black", linewidth=0.8, linestyle=":", zorder=0)
+        ax.invert_yaxis()
+        ax.set_xlim(0, 1.12 * max(values))
+        ax.set_title(
+            f"truth: {TRUTH_NAMES[truth]}, {own[shown[0]]['n_train']} training receivers", fontsize=10
+        )
+        ax.set_xlabel("PSNR [dB]")
+    return figure
+
+
+def reliability(rows: list[Row]) -> Any:
+    """Share of pixels inside the stated interval against the stated share, with what is asked at 1 and 2 sigma."""
+    truths = [
+        t
+        for t in dict.fromkeys(r["truth"] for r in rows)
+        if any(r["truth"] == t and r.get("shares") for r in rows)
+    ]
+    figure, axes = figure_of(len(truths), size=(5.2 * len(truths), 5.0))
+    for ax, truth in zip(axes, truths, strict=True):
+        ax.plot([0, 1], [0, 1], color="#888888", linewidth=1.0, label="as stated")
+        own = [row for row in rows if row["truth"] == truth and row.get("shares")]
+        shades = np.linspace(0.45, 1.0, len(own))
+        for row, shade in zip(own, shades, strict=True):
+            ax.plot(
+                row["levels"], row["shares"], color=METHODS["bistatic"][1], alpha=float(shade), marker=".",
+                label=f"{row['n_train']} training receivers",
+            )  # fmt: skip
+        for stated, (low, high) in zip((0.6827, 0.9545), ASKED_WITHIN.values(), strict=True):
+            ax.plot(
+                [stated, stated], [low, high], color="#0b6e99", linewidth=5, alpha=0.45, solid_capstyle="butt"
+            )
+        ax.plot([], [], color="#0b6e99", linewidth=5, alpha=0.45, label="asked within 1 and 2 sigma")
+        ax.set_xlim(0, 1)
+        ax.set_ylim(0, 1)
+        ax.set_aspect("equal")
+        ax.grid(alpha=0.3)
+        ax.set_title(f"truth: {TRUTH_NAMES[truth]}")
+        ax.set_xlabel("stated share of pixels")
+        ax.set_ylabel("share found")
+        ax.legend(fontsize=9, loc="upper left")
+    return figure

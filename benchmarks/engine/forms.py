@@ -1,4 +1,4 @@
-"""Ways to evaluate a Gaussian's exact response on a ray, and the exponential in it: time and error in float32.
+"""Ways to evaluate a Gaussian's exact response on a ray: time and error in float32.
 
 All response forms are exact in exact arithmetic; they differ in what cancels. ``M = diag(1/s) R^T``, ``m`` the mean
 from the ray origin, ``g = M d``, ``o = -M m``, response ``G = exp(-q/2)``:
@@ -15,33 +15,20 @@ so that times tell the forms apart, not how the rasteriser runs them.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from benchmarks.engine.form_kernels import (
-    COEFFICIENTS,
-    GRAM,
-    OFFSET_FIRST,
-    QUADRATIC,
-    STRIP,
-    TEXTBOOK,
-    TURNED,
-    double_precision,
-    exponential_kernel,
-    form_kernel,
-    library,
-    limit,
-    taylor3,
-    taylor6,
-)
+from benchmarks.engine.scenes import best_seconds
+from benchmarks.report import Row
 from warprrf.device import launch, resolve
 from warprrf.geometry.splats.gaussians import rotations_of
 
+TEXTBOOK, OFFSET_FIRST, GRAM, TURNED, QUADRATIC = range(5)
+COEFFICIENTS = 24  # room for a Gaussian's coefficients in any form
 FORMS = {
     "textbook": TEXTBOOK,
     "offset first": OFFSET_FIRST,
@@ -58,9 +45,71 @@ REGIMES = {
 RAYS = 32  # to each Gaussian, aimed at points drawn from it
 
 
+@wp.func
+def squared_distance(form: int, c: wp.array(dtype=wp.float32, ndim=2), i: int, d: wp.vec3):
+    """q of Gaussian ``i`` in direction ``d``; ``c`` holds what :func:`_coefficients` puts there."""
+    if form == wp.static(TEXTBOOK) or form == wp.static(OFFSET_FIRST):
+        g = wp.vec3(
+            c[i, 0] * d[0] + c[i, 1] * d[1] + c[i, 2] * d[2],
+            c[i, 3] * d[0] + c[i, 4] * d[1] + c[i, 5] * d[2],
+            c[i, 6] * d[0] + c[i, 7] * d[1] + c[i, 8] * d[2],
+        )
+        if form == wp.static(TEXTBOOK):
+            o = wp.vec3(c[i, 9], c[i, 10], c[i, 11])
+            along = wp.dot(o, g)
+            return c[i, 12] - along * along / wp.dot(g, g)
+        m = wp.vec3(c[i, 9], c[i, 10], c[i, 11])
+        p = wp.dot(m, d) * d - m
+        h = wp.vec3(
+            c[i, 0] * p[0] + c[i, 1] * p[1] + c[i, 2] * p[2],
+            c[i, 3] * p[0] + c[i, 4] * p[1] + c[i, 5] * p[2],
+            c[i, 6] * p[0] + c[i, 7] * p[1] + c[i, 8] * p[2],
+        )
+        x = wp.cross(g, h)
+        return wp.dot(x, x) / wp.dot(g, g)
+    if form == wp.static(QUADRATIC):
+        xx = d[0] * d[0]
+        yy = d[1] * d[1]
+        zz = d[2] * d[2]
+        xy = d[0] * d[1]
+        xz = d[0] * d[2]
+        yz = d[1] * d[2]
+        top = c[i, 0] * xx + c[i, 1] * yy + c[i, 2] * zz + c[i, 3] * xy + c[i, 4] * xz + c[i, 5] * yz
+        return top / (
+            c[i, 6] * xx + c[i, 7] * yy + c[i, 8] * zz + c[i, 9] * xy + c[i, 10] * xz + c[i, 11] * yz
+        )
+    u1 = c[i, 0] * d[0] + c[i, 1] * d[1] + c[i, 2] * d[2]
+    u2 = c[i, 3] * d[0] + c[i, 4] * d[1] + c[i, 5] * d[2]
+    w = c[i, 6] * d[0] + c[i, 7] * d[1] + c[i, 8] * d[2]
+    n = c[i, 9] * u1 * u1 + c[i, 10] * u2 * u2
+    if form == wp.static(GRAM):
+        n = n + c[i, 17] * u1 * u2
+    gg = w * (c[i, 11] * w + 2.0 * (c[i, 12] * u1 + c[i, 13] * u2))
+    gg = gg + u1 * (c[i, 14] * u1 + 2.0 * c[i, 15] * u2) + c[i, 16] * u2 * u2
+    return n / gg
+
+
+@cache
+def form_kernel(form: int) -> Any:
+    """Kernel of one form; the compiler drops the others."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def respond(
+        offset: int,
+        coefficients: wp.array(dtype=wp.float32, ndim=2),
+        directions: wp.array(dtype=wp.vec3, ndim=2),
+        q: wp.array(dtype=wp.float32, ndim=2),
+    ):
+        i = offset + wp.tid()
+        for k in range(directions.shape[1]):
+            q[i, k] = squared_distance(wp.static(form), coefficients, i, directions[i, k])
+
+    return respond
+
+
 def response_forms(
     *, gaussians: int = 20_000, repeats: int = 5, seed: int = 0, device: Any = "cpu"
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Error of the response against float64, and time, of every form in every regime.
 
     Returns:
@@ -77,7 +126,8 @@ def response_forms(
         for name, form in FORMS.items():
             table = wp.array(_coefficients(form, whiten, mean), dtype=wp.float32, device=on)
             results[name] = wp.zeros(toward.shape[:2], dtype=wp.float32, device=on)
-            runners[name] = _runner(form_kernel(form), gaussians, [table, directions, results[name]], on)
+            inputs = [table, directions, results[name]]
+            runners[name] = partial(launch, form_kernel(form), gaussians, inputs, on)
         seconds = best_seconds(runners, repeats)
         for name, q in results.items():
             found = q.numpy().astype(np.float64)
@@ -93,70 +143,6 @@ def response_forms(
                 }
             )
     return rows
-
-
-EXPONENTIALS: dict[str, Any] = {
-    "library, float32": library,
-    "Taylor 6, 4 squarings": taylor6,
-    "Taylor 3, 6 squarings": taylor3,
-    "(1 - h/256)^256": limit,
-    "library, float64": double_precision,
-}
-RASTERISER = "Taylor 6, 4 squarings"
-"""What the rasteriser computes in float32."""
-
-
-def exponential_forms(
-    *, values: int = 200_000, repeats: int = 5, seed: int = 0, device: Any = "cpu"
-) -> list[dict[str, Any]]:
-    """Error of exp(-h), h from 0 to 14, and time in strips of 16, of every form.
-
-    14 is where opacity one falls to alpha 1e-6.
-
-    Returns:
-        One row a form: ``form, error_max`` (absolute), ``relative_max``, ``ns_per_value``.
-    """
-    on, rounds = resolve(device), 8
-    strips = max(values // STRIP, 1)
-    h = np.random.default_rng(seed).uniform(0, 14.0, (strips, STRIP)).astype(np.float32)
-    exact = np.exp(-h.astype(np.float64))
-    given, runners, results = wp.array(h, dtype=wp.float32, device=on), {}, {}
-    for name, function in EXPONENTIALS.items():
-        kernel, out = exponential_kernel(function), wp.zeros(h.shape, dtype=wp.float32, device=on)
-        launch(kernel, strips, [1, given, out], device=on)
-        results[name] = out.numpy().astype(np.float64)
-        runners[name] = _runner(kernel, strips, [rounds, given, out], on)
-    seconds = best_seconds(runners, repeats)
-    return [
-        {
-            "form": name,
-            "error_max": float(np.abs(found - exact).max()),
-            "relative_max": float(np.abs(found / exact - 1).max()),
-            "ns_per_value": 1e9 * seconds[name] / (rounds * h.size),
-        }
-        for name, found in results.items()
-    ]
-
-
-def best_seconds(runners: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Shortest run of each [s], run in turn after one that doesn't count."""
-    best = dict.fromkeys(runners, np.inf)
-    for turn in range(repeats + 1):
-        for name, run in runners.items():
-            start = time.perf_counter()
-            run()
-            if turn:
-                best[name] = min(best[name], time.perf_counter() - start)
-    return best
-
-
-def _runner(kernel: Any, count: int, inputs: list[Any], device: Any) -> Callable[[], None]:
-    def run() -> None:
-        launch(kernel, count, inputs, device=device)
-        if device.is_cuda:
-            wp.synchronize_device(device)
-
-    return run
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.engine import opensplat
 from benchmarks.engine.scenes import photo, room
 from benchmarks.engine.torch_renderer import render_with_torch
 from warprrf.device import Progress, require
@@ -76,15 +75,6 @@ class Measured:
         }
 
 
-def renderers(folder: str | os.PathLike[str] | None = None) -> dict[str, Callable[..., Any]]:
-    """Ours and its peers by name; OpenSplat's if the ``folder`` of a checkout is given, which is compiled here."""
-    found: dict[str, Callable[..., Any]] = {"ours": _ours, "torch": _torch}
-    if folder is not None:
-        opensplat.build(os.fspath(folder))
-        found["opensplat"] = partial(_opensplat, os.fspath(folder))
-    return found
-
-
 def _ours(scene: Scene, parameters: list[torch.Tensor]) -> Callable[[], torch.Tensor]:
     # Torch checks the tensors and takes the loss here; its threads would spin beside ours.
     require("torch", "baselines").set_num_threads(1)
@@ -99,8 +89,8 @@ def _torch(scene: Scene, parameters: list[torch.Tensor]) -> Callable[[], torch.T
     return lambda: render_with_torch(means, quaternions, scales, opacities, colors, cam).features
 
 
-def _opensplat(folder: str, scene: Scene, parameters: list[torch.Tensor]) -> Callable[[], torch.Tensor]:
-    return opensplat.renderer(folder, photo(scene.width, scene.height), parameters)
+RENDERERS: dict[str, Callable[..., Any]] = {"ours": _ours, "torch": _torch}
+"""Ours and its peer by name: function of the scene and its tensors that returns the function to time."""
 
 
 def take_turns(
@@ -114,8 +104,8 @@ def take_turns(
     """Time forward and backward of each renderer on ``threads`` threads, ``turns`` times in turn.
 
     Args:
-        makers: name -> function of the scene and its tensors that returns the function to time, as of
-            :func:`renderers`.
+        makers: name -> function of the scene and its tensors that returns the function to time, as
+            :data:`RENDERERS`.
 
     Raises:
         RuntimeError: if a process ends before it is done.

@@ -1,86 +1,64 @@
-"""Mesh rays per second: Warp's hierarchy, Embree's, and what ``Mesh`` chooses, against Embree called bare.
+"""Mesh rays per second: Warp's hierarchy and what ``Mesh`` chooses, against Embree called bare.
 
 Two yardsticks, both Embree through Open3D on the same threads: ``embree bare`` gets rays that are already packed in
 float32 and returns float32 distances; ``embree from arrays`` starts, as :meth:`Mesh.cast` does, from float64 origins
-and directions of any length, and so packs and normalises them in NumPy first. ``Mesh.cast`` returns float64 distances
-besides. ``Mesh.visible`` is compared with Embree's search for any hit, which judges the ends of a segment in float32.
-All of one row are run in turn in one process, in another order each time, and the best of the repeats counts: by the
-clock, and by processor time, which other work on the machine disturbs less.
+and directions of any length, packs them in NumPy, and takes the distances in float64 from the faces' planes. Sight is
+compared with Embree's search for any hit. All of one row are run in turn in one process, and the best of the repeats
+counts, by processor time on a CPU, which other work on the machine disturbs less.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
-from warprrf.device import Progress, resolve, threads
+from benchmarks.report import Row
+from warprrf.device import Progress, require, resolve, threads
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.o3d import installed
-from warprrf.geometry.rays import EmbreeScene
-from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.spectrum import pixel_directions
+
+KINDS = ("panorama", "incoherent", "sight")
 
 
-def run_rays(
-    *,
-    scene: str | Path = "data/lobby/scene.xml",
-    triangles: int = 200_000,
-    rays: int = 1_000_000,
-    repeats: int = 5,
-    seed: int = 0,
-    device: Any = "cpu",
+def ray_rows(
+    meshes: dict[str, Mesh], *, rays: int = 1_000_000, repeats: int = 5, seed: int = 0, device: Any = "cpu",
     progress: Progress | None = None,
-) -> list[dict[str, Any]]:
-    """Rays per second on the scene's mesh and on a bumpy sphere of about ``triangles`` faces.
-
-    Args:
-        scene: Scene file of the first mesh.
-        triangles: Faces of the second.
-        rays: Rays a launch, at least 1.
-        repeats: Times that each is run after a first that doesn't count, at least 1.
-        seed: Of the incoherent rays.
-        device: Where Warp and ``Mesh.cast`` run; without a GPU's own yardstick, ratios are to Embree on the CPU.
-        progress: Called with ("rays", rows done, rows).
+) -> list[Row]:  # fmt: skip
+    """Rays per second on each mesh.
 
     Returns:
         One row a mesh and kind of rays (``panorama``: one origin, neighbours in order; ``incoherent``: origins and
-        directions at random; ``sight, free`` and ``sight, blocked``: segments between points in the bounds, for
-        ``Mesh.visible``): ``mesh, faces, kind, rays, threads``, and for each runner ``rays_per_s``,
-        ``rays_per_cpu_s`` and, over both yardsticks, ``over_bare`` and ``over_arrays`` (by processor time on a CPU,
-        else by the clock); ``t_difference_m``, the largest between Warp and Embree, and ``other_faces``, the share of
-        rays for which they name different faces. Without Open3D the Embree entries are absent.
+        directions at random; ``sight``: segments between points in the bounds, for ``Mesh.visible``):
+        ``mesh, faces, kind, rays, threads, device``, and for each runner ``rays_per_s`` and, over both yardsticks,
+        ``over_bare`` and ``over_arrays``; ``t_difference_m``, the largest between Warp and the second yardstick.
 
     Raises:
         ValueError: if ``rays`` or ``repeats`` is below 1.
+        ImportError: without Open3D.
     """
     for name, value in (("rays", rays), ("repeats", repeats)):
         if value < 1:
             raise ValueError(f"{name}: got {value}, expected at least 1")
-    on = resolve(device)
-    meshes = {"scene": Scene.load(scene).mesh, "bumpy sphere": bumpy_sphere(triangles)}
-    rng, rows = np.random.default_rng(seed), []
+    on, rng = resolve(device), np.random.default_rng(seed)
+    rows = []
     for name, mesh in meshes.items():
-        figures: dict[str, Any]
-        for kind in ("panorama", "incoherent"):
+        for kind in KINDS:
             origins, directions = _rays(mesh, kind, rays, rng)
-            figures, agreement = _measure(mesh, origins, directions, repeats, on)
-            about = {"mesh": name, "faces": len(mesh.faces), "kind": kind, "rays": len(directions)}
-            rows.append({**about, "threads": threads(), "device": str(on), **figures, **agreement})
+            runners = _runners(mesh, kind == "sight", origins, directions, on)
+            warp, other = runners["warp"](), runners["embree from arrays"]()
+            known = np.isfinite(warp) & np.isfinite(other)
+            row = {
+                "mesh": name, "faces": len(mesh.faces), "kind": kind, "rays": len(directions), "threads": threads(),
+                "device": str(on), "other_hits": float((np.isfinite(warp) != np.isfinite(other)).mean()),
+                "t_difference_m": float(np.abs(warp[known] - other[known]).max(initial=0.0)),
+            }  # fmt: skip
+            rows.append({**row, **_speeds(runners, len(directions), repeats, on.is_cpu)})
             if progress is not None:
-                progress("rays", len(rows), 4 * len(meshes))
-        a, b = rng.uniform(mesh.bounds[0], mesh.bounds[1], (2, rays, 3))
-        free = mesh.visible(a, b, device=on)
-        for kind, chosen in (("sight, free", free), ("sight, blocked", ~free)):
-            if chosen.any():
-                pick = np.resize(np.flatnonzero(chosen), rays)
-                figures, agreement = _measure_sight(mesh, a[pick], b[pick], repeats, on)
-                about = {"mesh": name, "faces": len(mesh.faces), "kind": kind, "rays": rays}
-                rows.append({**about, "threads": threads(), "device": str(on), **figures, **agreement})
-            if progress is not None:
-                progress("rays", len(rows), 4 * len(meshes))
+                progress("rays", len(rows), len(KINDS) * len(meshes))
     return rows
 
 
@@ -92,118 +70,97 @@ def bumpy_sphere(triangles: int) -> Mesh:
     """
     if triangles < 100:
         raise ValueError(f"triangles: got {triangles}, expected at least 100")
-    rings = int(np.sqrt(triangles)) // 2
-    around = 2 * rings
-    zenith, azimuth = np.meshgrid(
-        np.arange(1, rings) * np.pi / rings, np.arange(around) * 2 * np.pi / around, indexing="ij"
-    )
-    radius = 5.0 + 0.5 * np.sin(7 * zenith) * np.cos(9 * azimuth)
-    grid = radius[..., None] * np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1
-    )
-    vertices = np.concatenate([grid.reshape(-1, 3), [[0, 0, 5.0], [0, 0, -5.0]]])
-    index = np.arange((rings - 1) * around).reshape(rings - 1, around)
-    after = np.roll(index, -1, axis=1)
-    poles = np.full(around, len(vertices) - 2)
-    parts = [
-        (poles, index[0], after[0]),
-        (poles + 1, after[-1], index[-1]),
-        (index[:-1], index[1:], after[1:]),
-        (index[:-1], after[1:], after[:-1]),
-    ]
-    return Mesh(vertices, np.concatenate([np.stack(p, axis=-1).reshape(-1, 3) for p in parts]))
+    k = np.arange(triangles // 2)
+    z, azimuth = 1.0 - (2.0 * k + 1.0) / len(k), k * np.pi * (3.0 - np.sqrt(5.0))  # Fibonacci's lattice
+    ring = np.sqrt(1.0 - z**2)
+    unit = np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
+    faces = ConvexHull(unit).simplices
+    a, b, c = unit[faces].transpose(1, 0, 2)
+    inward = (np.cross(b - a, c - a) * a).sum(axis=1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    radius = 5.0 + 0.5 * np.sin(7 * np.arccos(z)) * np.cos(9 * azimuth)
+    return Mesh(radius[:, None] * unit, faces)
 
 
 def _rays(mesh: Mesh, kind: str, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions; of segments, starts and what leads to their ends."""
     if kind == "panorama":
         height = max(1, int(np.sqrt(count / 2)))
-        theta = (np.arange(height) + 0.5) * np.pi / height
-        phi = -np.pi + (np.arange(2 * height) + 0.5) * np.pi / height
-        th, ph = np.meshgrid(theta, phi, indexing="ij")
-        toward = np.stack([np.sin(th) * np.cos(ph), np.sin(th) * np.sin(ph), np.cos(th)], axis=-1)
-        return mesh.center[None] + [[0.1, 0.2, 0.3]], toward.reshape(-1, 3)
-    return mesh.center + rng.uniform(-1.0, 1.0, (count, 3)), rng.standard_normal((count, 3))
+        toward = pixel_directions((height, 2 * height)).reshape(-1, 3)
+        return np.broadcast_to(mesh.center + [0.1, 0.2, 0.3], toward.shape).copy(), toward
+    if kind == "incoherent":
+        return mesh.center + rng.uniform(-1.0, 1.0, (count, 3)), rng.standard_normal((count, 3))
+    a, b = rng.uniform(mesh.bounds[0], mesh.bounds[1], (2, count, 3))
+    return a, b - a
 
 
-def _measure(
-    mesh: Mesh, origins: np.ndarray, directions: np.ndarray, repeats: int, device: Any
-) -> tuple[dict[str, Any], dict[str, float]]:
-    runners: dict[str, Callable[[], Any]] = {
-        "warp": lambda: mesh.cast(origins, directions, device=device, backend="warp"),
-        "chosen": lambda: mesh.cast(origins, directions, device=device),
+def _runners(
+    mesh: Mesh, sight: bool, origins: np.ndarray, directions: np.ndarray, device: Any
+) -> dict[str, Callable[[], np.ndarray]]:
+    """Distances of rays [m], or 0 where a segment is blocked and inf where not, by name of who finds them."""
+    o3d = require("open3d", extra="photos")
+    scene = o3d.t.geometry.RaycastingScene()
+    vertices = (mesh.vertices - mesh.center).astype(np.float32)
+    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
+    ends = origins + directions
+    corner, normal = mesh.triangles[:, 0], mesh.face_normals
+
+    def pack(toward: np.ndarray) -> Any:
+        return o3d.core.Tensor(np.concatenate([origins - mesh.center, toward], axis=1).astype(np.float32))
+
+    def unit() -> np.ndarray:
+        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+    def occluded(packed: Any) -> np.ndarray:
+        return np.where(scene.test_occlusions(packed, 0.0, 1.0).numpy(), 0.0, np.inf)
+
+    def from_arrays() -> np.ndarray:
+        if sight:
+            return occluded(pack(directions))
+        toward = unit()
+        found = scene.cast_rays(pack(toward))["primitive_ids"].numpy()
+        met = found != o3d.t.geometry.RaycastingScene.INVALID_ID
+        face = found[met]
+        t = np.full(len(toward), np.inf)
+        across = ((corner[face] - origins[met]) * normal[face]).sum(axis=1)
+        t[met] = across / (toward[met] * normal[face]).sum(axis=1)
+        return t
+
+    def ours(backend: str) -> Callable[[], np.ndarray]:
+        if sight:
+            return lambda: np.where(mesh.visible(origins, ends, device=device, backend=backend), np.inf, 0.0)
+        return lambda: mesh.cast(origins, directions, device=device, backend=backend).t
+
+    ready = pack(directions if sight else unit())
+    bare = (lambda: occluded(ready)) if sight else (lambda: scene.cast_rays(ready)["t_hit"].numpy())
+    return {
+        "warp": ours("warp"),
+        "chosen": ours("auto"),
+        "embree bare": bare,
+        "embree from arrays": from_arrays,
     }
-    agreement = {}
-    if installed():
-        scene = EmbreeScene(mesh.vertices - mesh.center, mesh.faces, np.arange(len(mesh.faces)))
-        packed = _pack(mesh, origins, directions)
-        runners["embree bare"] = lambda: scene.cast(packed)
-        runners["embree from arrays"] = lambda: scene.cast(_pack(mesh, origins, directions))
-        runners["embree"] = lambda: mesh.cast(origins, directions, device="cpu", backend="embree")
-        ours, other = runners["warp"](), runners["embree"]()
-        both = ours.valid & other.valid
-        agreement = {
-            "t_difference_m": float(np.abs(ours.t[both] - other.t[both]).max(initial=0.0)),
-            "other_faces": float((ours.face != other.face).mean()),
-        }
-    return _figures(runners, len(directions), repeats, device), agreement
 
 
-def _measure_sight(
-    mesh: Mesh, a: np.ndarray, b: np.ndarray, repeats: int, device: Any
-) -> tuple[dict[str, Any], dict[str, float]]:
-    runners: dict[str, Callable[[], Any]] = {
-        "warp": lambda: mesh.visible(a, b, device=device, backend="warp"),
-        "chosen": lambda: mesh.visible(a, b, device=device),
-    }
-    agreement = {}
-    if installed():
-        scene = EmbreeScene(mesh.vertices - mesh.center, mesh.faces, np.arange(len(mesh.faces)))
-        packed = np.column_stack([a - mesh.center, b - a]).astype(np.float32)
-        runners["embree bare"] = lambda: scene.blocked(packed)
-        runners["embree from arrays"] = lambda: scene.blocked(
-            np.column_stack([a - mesh.center, b - a]).astype(np.float32)
-        )
-        runners["embree"] = lambda: mesh.visible(a, b, device="cpu", backend="embree")
-        agreement = {"other_sight": float((runners["warp"]() != runners["embree"]()).mean())}
-    return _figures(runners, len(a), repeats, device), agreement
-
-
-def _figures(runners: dict[str, Callable[[], Any]], rays: int, repeats: int, device: Any) -> dict[str, Any]:
-    """Rays per second of each runner and its speed over the yardsticks."""
-    clock, processor = _best_times(runners, repeats)
-    figures: dict[str, Any] = {}
-    yard = processor if device.is_cpu else clock
-    for name in runners:
-        figures[name] = {"rays_per_s": rays / clock[name], "rays_per_cpu_s": rays / processor[name]}
-        if "embree bare" in runners:
-            figures[name]["over_bare"] = yard["embree bare"] / yard[name]
-            figures[name]["over_arrays"] = yard["embree from arrays"] / yard[name]
-    return figures
-
-
-def _pack(mesh: Mesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Rays for Embree by NumPy, as its Python users write it."""
-    packed = np.empty((len(directions), 6), dtype=np.float32)
-    packed[:, :3] = origins - mesh.center
-    packed[:, 3:] = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return packed
-
-
-def _best_times(
-    runners: dict[str, Callable[[], Any]], repeats: int
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Shortest run of each [s], by the clock and in processor time, run in turn after one that doesn't count.
-
-    Each turn has an order of its own: what a runner leaves of the heap, the next one pays for in page faults.
-    """
-    clock, processor = dict.fromkeys(runners, np.inf), dict.fromkeys(runners, np.inf)
+def _speeds(
+    runners: dict[str, Callable[[], np.ndarray]], rays: int, repeats: int, by_processor: bool
+) -> dict[str, dict[str, float]]:
+    """Rays per second of each runner and its speed over the yardsticks; the best of runs in turn after one that doesn't
+    count, each turn in an order of its own: what a runner leaves of the heap, the next one pays for in page faults."""
+    clock, yard = dict.fromkeys(runners, np.inf), dict.fromkeys(runners, np.inf)
     rng = np.random.default_rng(0)
     for turn in range(repeats + 1):
         for name in rng.permutation(list(runners)).tolist():
-            run = runners[name]
             began, used = time.perf_counter(), time.process_time()
-            run()
+            runners[name]()
             if turn:
-                clock[name] = min(clock[name], time.perf_counter() - began)
-                processor[name] = min(processor[name], time.process_time() - used)
-    return clock, processor
+                spent = time.perf_counter() - began
+                clock[name] = min(clock[name], spent)
+                yard[name] = min(yard[name], time.process_time() - used if by_processor else spent)
+    return {
+        name: {
+            "rays_per_s": rays / clock[name],
+            "over_bare": yard["embree bare"] / yard[name],
+            "over_arrays": yard["embree from arrays"] / yard[name],
+        }
+        for name in runners
+    }

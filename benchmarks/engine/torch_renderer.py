@@ -59,7 +59,6 @@ def render_with_torch(
     background: torch.Tensor | None = None,
     *,
     blending: Blending | None = None,
-    chunk: int = CHUNK,
 ) -> TorchImage:
     """Blend Gaussians front to back along every pixel's ray; differentiable in every tensor.
 
@@ -67,7 +66,6 @@ def render_with_torch(
         means, quaternions, scales, opacities, features: shapes ``(N, 3)``, ``(N, 4)`` wxyz of any length, ``(N, 3)``
             [m], ``(N,)``, ``(N, C)``, one floating type; it is the precision of the image.
         background: shape ``(C,)``; default: zero.
-        chunk: pairs of pixel and Gaussian processed at once.
     """
     import torch
 
@@ -98,7 +96,7 @@ def render_with_torch(
     lengths = starts[1:] - starts[:-1]
     order = torch.argsort(lengths, stable=True)
     pieces, counts, tested = [], [], 0
-    for tiles in _batches(lengths[order].tolist(), chunk):
+    for tiles in _batches(lengths[order].tolist()):
         batch = order[tiles]
         longest = int(lengths[batch[-1]])
         slot = torch.arange(longest, device=device)
@@ -292,11 +290,11 @@ def _tile_lists(span: torch.Tensor, distance: torch.Tensor, cam: Camera) -> tupl
     return order[position], starts
 
 
-def _batches(lengths: list[int], chunk: int) -> list[slice]:
-    """Runs of tiles (by growing length) whose padded lists hold about ``chunk`` pairs."""
+def _batches(lengths: list[int]) -> list[slice]:
+    """Runs of tiles (by growing length) whose padded lists hold about :data:`CHUNK` pairs."""
     batches, first = [], 0
     for k in range(1, len(lengths) + 1):
-        if k == len(lengths) or (k + 1 - first) * max(lengths[k], 1) * TILE * TILE > chunk:
+        if k == len(lengths) or (k + 1 - first) * max(lengths[k], 1) * TILE * TILE > CHUNK:
             batches.append(slice(first, k))
             first = k
     return batches

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.evaluation.methods import OURS
 from benchmarks.evaluation.protocol import TRUTHS
-from benchmarks.evaluation.runs import SPREAD, Row
+from benchmarks.evaluation.runs import SPREAD
+from benchmarks.methods import OURS
+from benchmarks.report import Row
 
 PAIRS = {"rf3dgs+": "rf3dgs", "rf3dgs+alpha": "rf3dgs-alpha"}
 """What the paper's finding compares: with lengths, and without."""

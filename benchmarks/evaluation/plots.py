@@ -9,12 +9,11 @@ import numpy as np
 
 from benchmarks.evaluation.protocol import TRUTHS
 from benchmarks.pictures import METHODS, figure_of
+from benchmarks.report import Row
 from warprrf.device import require
 
 BANDED = ("bistatic", "rf3dgs+", "rf3dgs")
 """Methods whose smallest and largest values are drawn as bands; more would hide each other."""
-
-Row = dict[str, Any]
 
 
 def sparsity_curves(rows: Sequence[Row]) -> Any:

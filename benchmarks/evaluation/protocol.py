@@ -9,14 +9,13 @@ receivers there are left out and test receivers elsewhere are not asked.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.evaluation.methods import METHODS, UNTAUGHT, Effort
-from benchmarks.setting import Truth
+from benchmarks.data import Truth
+from benchmarks.methods import METHODS, Effort
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
 TRUTHS = {"exact": "exact", "sionna": "Sionna RT", "paper-law": "paper's law"}
@@ -24,7 +23,7 @@ TRUTHS = {"exact": "exact", "sionna": "Sionna RT", "paper-law": "paper's law"}
 SPLITS = ("random", "region")
 HELD_OUT = 0.25  # of the receivers' extent along the longer side
 
-TABLE_METHODS = tuple(METHODS)
+TABLE_METHODS = tuple(m for m in METHODS if m != "rf3dgs+los")
 CURVE_METHODS = ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "idw", "constant")
 OPACITY_METHODS = ("rf3dgs+alpha", "rf3dgs-alpha")
 LAW_METHODS = ("rf3dgs+", "rf3dgs")
@@ -157,11 +156,11 @@ def plan(
             counts = [n for n in wanted if n in held[truth, split]]
             for seed in scale.seeds:
                 for count in counts:
-                    for method in (m for m in own if m not in UNTAUGHT):
+                    for method in (m for m in own if not METHODS[m].untaught):
                         if not _wanted(method, truth, split, count, scale):
                             continue
                         runs += [Run(truth, split, count, seed, method, v) for v in METHODS[method].variants]
-            for method in (m for m in own if m in UNTAUGHT):
+            for method in (m for m in own if METHODS[m].untaught):
                 seeds = scale.seeds if METHODS[method].random else scale.seeds[:1]
                 runs += [Run(truth, split, 0, seed, method) for seed in seeds]
     return runs
@@ -197,7 +196,7 @@ def split_data(data: SpectrumDataset, split: str) -> SpectrumDataset:
     return data.subset(np.where(data.role == "test", inside, ~inside))
 
 
-def truth_of(name: str, mark: str, data: SpectrumDataset, split: str, every: int) -> Truth:
+def truth_of(name: str, key: str, data: SpectrumDataset, split: str, every: int) -> Truth:
     """A truth with the receivers of a split.
 
     Raises:
@@ -210,7 +209,7 @@ def truth_of(name: str, mark: str, data: SpectrumDataset, split: str, every: int
             f"data: the {split} split of {name} leaves {held} training and {len(part) - held} test receivers, expected "
             "some of both"
         )
-    return Truth(name, mark, part, tuple(range(1, held + 1)), (), every if split == "random" else 1)
+    return Truth(name, key, part, tuple(range(1, held + 1)), (), every if split == "random" else 1)
 
 
 def shown_receivers(test: SpectrumDataset) -> np.ndarray:
@@ -230,9 +229,9 @@ class Setting:
 
     Attributes:
         files: file of each truth.
-        marks: fingerprint of each truth's file.
+        keys: digest of each truth's file.
         geometry: folder of the reconstruction.
-        geometry_mark: its fingerprint.
+        geometry_key: digest of the reconstruction and the true scene.
         scene: true scene (XML).
         scratch: folder for half-done trainings and twins; workers on other machines need to see it for resuming only.
         every: each how-manieth test receiver of the random split counts.
@@ -241,9 +240,9 @@ class Setting:
     """
 
     files: tuple[tuple[str, str], ...]
-    marks: tuple[tuple[str, str], ...]
+    keys: tuple[tuple[str, str], ...]
     geometry: str
-    geometry_mark: str
+    geometry_key: str
     scene: str
     scratch: str
     every: int
@@ -254,11 +253,6 @@ class Setting:
         """The file of a truth."""
         return Path(dict(self.files)[truth])
 
-    def mark(self, truth: str) -> str:
-        """The fingerprint of a truth's file."""
-        return dict(self.marks)[truth]
-
-
-def changed(scale: Scale, **options: Any) -> Scale:
-    """``scale`` with the options that are not None."""
-    return replace(scale, **{name: value for name, value in options.items() if value is not None})
+    def key(self, truth: str) -> str:
+        """The digest of a truth's file."""
+        return dict(self.keys)[truth]

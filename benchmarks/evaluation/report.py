@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.evaluation.comparison import AHEAD
-from benchmarks.evaluation.methods import METHODS as KNOWN
 from benchmarks.evaluation.plots import law_bars, sparsity_curves, spectra_grid, speed_against_error
-from benchmarks.evaluation.protocol import TRUTHS, Run, Scale
-from benchmarks.evaluation.runs import Row, Store
-from benchmarks.markdown import cell, table
-from benchmarks.pictures import METHODS, write_page
-from warprrf.files import write_text
+from benchmarks.evaluation.protocol import TRUTHS, Run
+from benchmarks.evaluation.runs import pictures_of
+from benchmarks.methods import METHODS as KNOWN
+from benchmarks.pictures import METHODS
+from benchmarks.report import Row, cell, table
 
 PUBLISHED: tuple[Row, ...] = tuple(
     {
@@ -305,43 +305,39 @@ def _ahead_text(ahead: Sequence[Row]) -> str:
     return "\n\n".join([text, table(head, lines), verdict])
 
 
-# --------------------------------------------------------------------------------------------------------- files
+# ------------------------------------------------------------------------------------------------------ pictures
 
 
-def write(
-    kind: str, folder: Path, found: dict[str, Any], store: Store, runs: Sequence[Run], scale: Scale
-) -> Path:
-    """Write ``<kind>.md``, ``<kind>.csv`` and pictures into ``folder``; returns the Markdown's path."""
-    rows = found["rows"]
-    pictures: dict[str, tuple[Any, str]] = {}
-    random = [row for row in rows if row["split"] == "random"]
+def pictures(
+    kind: str, figures: dict[str, Any], folder: Path, runs: Mapping[str, Run]
+) -> dict[str, tuple[Callable[[], Any], str]]:
+    """What is drawn, by file name; the spectra of ``runs`` (by key) are read from ``folder``."""
+    found: dict[str, tuple[Callable[[], Any], str]] = {}
+    random = [row for row in figures["rows"] if row["split"] == "random"]
     if kind == "sparsity":
-        pictures["sparsity.png"] = (
-            sparsity_curves(random),
+        found["sparsity.png"] = (
+            partial(sparsity_curves, random),
             "PSNR and SSIM against the number of training receivers: mean, and bands from least to most over the test "
             "receivers.",
         )
     else:
         for truth in dict.fromkeys(row["truth"] for row in random if row["truth"] != "paper-law"):
             own = [row for row in random if row["truth"] == truth]
-            pictures[f"speed-{truth}.png"] = (
-                speed_against_error(own),
+            found[f"speed-{truth}.png"] = (
+                partial(speed_against_error, own),
                 "Error against the time of a spectrum and against training time; diamonds see no spectrum.",
             )
-            drawn = _grid(own, {run.key: run for run in runs}, store, scale)
+            drawn = _grid(own, runs, folder)
             if drawn is not None:
-                pictures[f"spectra-{truth}.png"] = drawn
-    if len(found["finding"]):
-        lines = [line for line in found["finding"] if line["split"] == "random" and not line["opacity"]]
-        pictures[f"{kind}-law.png"] = (
-            law_bars(lines),
-            "RF-3DGS+ less RF-3DGS, by the law that the truth's scattering obeys.",
-        )
-    write_text(folder / f"{kind}.csv", csv_text(rows))
-    return write_page(folder / f"{kind}.md", markdown(kind, found), pictures, dpi=110)
+                found[f"spectra-{truth}.png"] = drawn
+    if figures["finding"]:
+        lines = [line for line in figures["finding"] if line["split"] == "random" and not line["opacity"]]
+        text = "RF-3DGS+ less RF-3DGS, by the law that the truth's scattering obeys."
+        found[f"{kind}-law.png"] = partial(law_bars, lines), text
+    return found
 
 
-def _grid(rows: Sequence[Row], runs: dict[str, Run], store: Store, scale: Scale) -> tuple[Any, str] | None:
+def _grid(rows: Sequence[Row], runs: Mapping[str, Run], folder: Path) -> tuple[Callable[[], Any], str] | None:
     """Spectra of the shown receivers by every method, at a number of training receivers that all have."""
     counts = sorted({row["count"] for row in rows if row["count"]})
     most = max(counts, key=lambda n: (sum(row["count"] == n for row in rows), -n), default=None)
@@ -349,16 +345,14 @@ def _grid(rows: Sequence[Row], runs: dict[str, Run], store: Store, scale: Scale)
         return None
     own = [row for row in rows if row["count"] in (0, most)]
     own.sort(key=lambda row: list(KNOWN).index(row["method"]))
-    predictions, truth_db, limits = [], None, None
+    predictions = []
     for row in own:
-        with np.load(store.pictures(runs[row["keys"][0]]), allow_pickle=False) as stored:
+        with np.load(folder / pictures_of(runs[row["keys"][0]]), allow_pickle=False) as stored:
             predictions.append((METHODS[row["method"]][0], stored["prediction_db"]))
             truth_db, limits = stored["truth_db"], stored["range_db"]
-    if truth_db is None:
-        return None
     titles = ["line of sight", "blocked"][: len(truth_db)]
     text = (
         f"Spectra of the receivers of median path gain with and without line of sight: truth, and predictions from "
         f"{most} spectra."
     )
-    return spectra_grid(truth_db, predictions, titles, limits), text
+    return partial(spectra_grid, truth_db, predictions, titles, limits), text

@@ -1,17 +1,17 @@
-"""Runs carried out one by one, here or on the workers of a dask cluster; each finished one is kept in its own files.
+"""Runs carried out one by one, here or on the workers of a dask cluster; each finished one is a step that is kept.
 
 A worker takes a run and the setting, which is plain values and paths: on several machines they must see the same files.
-It returns figures and pictures, and the process that started the sweep writes them, under a temporary name that is then
-replaced. A worker that dies has written nothing: its run goes to another one. A sweep that is killed loses the runs at
-work; trainings of networks go on from their checkpoint.
+It returns figures and pictures, and the process that started the sweep keeps them. A worker that dies has written
+nothing: its run goes to another one. A sweep that is killed loses the runs at work; trainings of networks go on from
+their checkpoint.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import resource
+import shutil
 import sys
 import tempfile
 import time
@@ -24,23 +24,22 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from benchmarks.evaluation.methods import AFTER, METHODS, UNTAUGHT, Task, code_of
+from benchmarks.data import Geometry, Truth
 from benchmarks.evaluation.protocol import Run, Setting, shown_receivers, truth_of
 from benchmarks.machine import processor_name
-from benchmarks.methods import Fitted
-from benchmarks.setting import Geometry, Truth
-from benchmarks.stages import fingerprint, plain, write_json
+from benchmarks.methods import AFTER, METHODS, Fitted, Task, score
+from benchmarks.report import Row
 from warprrf.device import Progress, require, resolve, threads
 from warprrf.files import write_arrays
-from warprrf.rf.spectra import metrics
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
+from warprrf.steps import Attempt, Steps
 
 SPREAD = ("psnr_db", "ssim", "rmse_db", "beam_gain_loss_db")
 """Figures of which the smallest and the largest over the test receivers are kept."""
 
-Row = dict[str, Any]
-Execute = Callable[[Run, Setting, "float | None"], "tuple[Row, dict[str, np.ndarray]]"]
+Result = tuple[Row, dict[str, np.ndarray]]
+Execute = Callable[..., Result]
 
 
 class Lab:
@@ -55,7 +54,7 @@ class Lab:
         """The data set of a truth, with the receivers of a split."""
         if name not in self._data:
             self._data[name] = SpectrumDataset.load(self.setting.file(name))
-        return truth_of(name, self.setting.mark(name), self._data[name], split, self.setting.every)
+        return truth_of(name, self.setting.key(name), self._data[name], split, self.setting.every)
 
 
 @lru_cache(maxsize=1)
@@ -65,7 +64,7 @@ def _lab(setting: Setting) -> Lab:
 
 def execute(
     run: Run, setting: Setting, budget_s: float | None = None, progress: Progress | None = None
-) -> tuple[Row, dict[str, np.ndarray]]:
+) -> Result:
     """Carry out ``run``: its figures, and the dB images of the shown receivers.
 
     Args:
@@ -74,36 +73,32 @@ def execute(
         budget_s: seconds that the run may take, where another one sets them; see :data:`AFTER`.
         progress: called with ``"transport"``, ``"fit"`` and ``"evaluate"``.
     """
-    tick = progress or (lambda stage, done, total: None)
     lab, method = _lab(setting), METHODS[run.method]
     truth = lab.truth(run.truth, run.split)
     test = truth.test
-    lab.geometry.forget(keep=method.traces)
-    train = truth.data.subset([]) if run.method in UNTAUGHT else truth.train(run.count, run.seed)
+    scratch = Path(setting.scratch) / run.key
+    scratch.mkdir(parents=True, exist_ok=True)
     task = Task(
-        train=train,
+        train=truth.data.subset([]) if method.untaught else truth.train(run.count, run.seed),
         test=test,
-        slot=f"{run.truth}-{run.split}",
         geometry=lab.geometry,
+        scratch=scratch,
+        progress=progress or (lambda stage, done, total: None),
+        slot=f"{run.truth}-{run.split}",
         variant=run.variant,
         seed=run.seed,
         effort=setting.effort,
         depth=int(truth.data.attributes.get("depth", 1)),
         budget_s=budget_s,
-        checkpoint=Path(setting.scratch) / f"{run.key}.safetensors",
-        progress=tick,
     )
     with peak_memory(setting.device) as peak:
-        fitted = method.fit(task)
-        found = metrics.evaluate(test, fitted.predict, progress=tick)
-    found["seconds_per_spectrum"] += fitted.before_s
+        fitted, found = score(run.method, task)
     shown = shown_receivers(test)
     images = [to_db(fitted.predict(test.receivers[i]).path_gain, test.floor) for i in shown]
+    shutil.rmtree(scratch)
     row: Row = {
         **vars(run),
         "key": run.key,
-        "transport_s": fitted.transport_s,
-        "fit_s": fitted.fit_s,
         **found,
         **_extremes(found["per_receiver"]),
         **peak,
@@ -161,9 +156,9 @@ def peak_memory(device: Any = None) -> Iterator[Row]:
     mark be reset it is that of the process's life.
     """
     found: Row = {}
-    marked = Path("/proc/self/clear_refs")
+    reset_mark = Path("/proc/self/clear_refs")
     try:
-        marked.write_text("5")  # resets VmHWM, man 5 proc
+        reset_mark.write_text("5")  # resets VmHWM, man 5 proc
     except OSError:
         found["peak_memory_of_life"] = True
     where = resolve(device)
@@ -189,111 +184,99 @@ def _high_water_mark() -> int:
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-class Store:
-    """Finished runs: ``runs/<key>.json`` with the figures, ``runs/<key>.npz`` with the pictures."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder / "runs"
-
-    def load(self, run: Run, mark: str) -> Row | None:
-        """The figures of ``run`` if it was finished with the same inputs, else None."""
-        file = self.folder / f"{run.key}.json"
-        if not file.is_file() or not self.pictures(run).is_file():
-            return None
-        try:
-            row: Row = json.loads(file.read_text())
-        except ValueError as error:
-            raise ValueError(
-                f"{file}: not readable ({error}); remove it or start over with --fresh"
-            ) from error
-        return row if row.get("mark") == mark else None
-
-    def save(self, run: Run, mark: str, row: Row, arrays: dict[str, np.ndarray]) -> Row:
-        """Keep a finished run; the figures last, so that they never stand without their pictures."""
-        write_arrays(self.pictures(run), arrays)
-        kept: Row = {**plain(row), "mark": mark}
-        write_json(self.folder / f"{run.key}.json", kept)
-        return kept
-
-    def pictures(self, run: Run) -> Path:
-        """The file of a run's pictures."""
-        return self.folder / f"{run.key}.npz"
+def pictures_of(run: Run) -> str:
+    """The file of a run's pictures, beside the steps."""
+    return f"runs/{run.key}.npz"
 
 
-def mark_of(run: Run, setting: Setting) -> str:
-    """Fingerprint of what a run's figures depend on."""
-    return fingerprint(
-        [run.key, setting.mark(run.truth), setting.geometry_mark, setting.every if run.split == "random" else 1,
-         _effort(run, setting), code_of(run.method)]
-    )  # fmt: skip
+def _inputs(run: Run, setting: Setting) -> list[Any]:
+    """What a run's figures depend on, besides its method's version."""
+    return [
+        setting.key(run.truth),
+        setting.geometry_key,
+        setting.every if run.split == "random" else 1,
+        _effort(run, setting),
+    ]
 
 
 def _effort(run: Run, setting: Setting) -> dict[str, Any]:
     """The part of the effort that a method feels."""
     heads: dict[str, tuple[str, ...]] = {
-        **dict.fromkeys(("rf3dgs+", "rf3dgs", "rf3dgs+alpha", "rf3dgs-alpha"), ("harmonic",)),
         "nerf2": ("nerf2",),
         "cgan": ("cgan",),
         "sionna": ("sionna",),
         "sionna-calibrated": ("calibration", "sionna"),
     }
-    return {k: v for k, v in vars(setting.effort).items() if k.startswith(heads.get(run.method, ("none",)))}
+    felt = heads.get(run.method, ("harmonic",) if METHODS[run.method].code == "harmonic" else ("none",))
+    return {k: v for k, v in vars(setting.effort).items() if k.startswith(felt)}
 
 
 def sweep(
     runs: Iterable[Run],
     setting: Setting,
-    store: Store,
+    steps: Steps,
     *,
     scheduler: str | None = None,
     workers: int = 1,
     progress: Progress | None = None,
     work: Execute = execute,
 ) -> dict[Run, Row]:
-    """Carry out the runs that are not in ``store`` and return the figures of all.
+    """Carry out the runs that ``steps`` does not hold and return the figures of all.
 
     Args:
         runs: what to do; see :func:`benchmarks.evaluation.protocol.plan`.
         setting: where everything lies.
-        store: where finished runs are kept.
+        steps: where finished runs are kept, pictures in ``runs/``.
         scheduler: address of a running dask scheduler, such as ``"tcp://lab:8786"``.
         workers: processes of a local cluster otherwise; 0 works in this process, without dask.
-        progress: called with ``"runs"``, and in this process with the steps of each.
+        progress: called with ``"runs"``.
         work: what carries out one run; :func:`execute` but for tests.
 
     Raises:
         ImportError: without dask.distributed, where it is needed.
-        ValueError: for a negative number of workers.
         RuntimeError: naming the run that failed; those that were finished are kept.
     """
-    if isinstance(workers, bool) or not isinstance(workers, int | np.integer) or workers < 0:
-        raise ValueError(f"workers: got {workers!r}, expected a whole number of at least 0")
     everything = list(dict.fromkeys(runs))
-    marks = {run: mark_of(run, setting) for run in everything}
-    found = {run: row for run in everything if (row := store.load(run, marks[run])) is not None}
+    tell = progress or (lambda stage, done, total: None)
+    found: dict[Run, Row] = {}
+
+    def keep(run: Run, result: Callable[[Progress], Result]) -> None:
+        def make(attempt: Attempt) -> Row:
+            try:
+                row, arrays = result(attempt.progress)
+            except Exception as error:
+                raise RuntimeError(f"{run.key}: {type(error).__name__}: {error}") from error
+            write_arrays(steps.folder / pictures_of(run), arrays)
+            return row
+
+        found[run] = steps.run(run.key, make, **_known(run, setting))
+        tell("runs", len(found), len(everything))
+
+    for run in everything:
+        kept = steps.kept(run.key, **_known(run, setting))
+        if kept is not None:
+            found[run] = kept
+    tell("runs", len(found), len(everything))
     pending = [run for run in everything if run not in found]
     # What takes another run's seconds comes after that run.
-    first = [run for run in pending if run.method not in AFTER]
-    rest = [run for run in pending if run.method in AFTER]
-
-    def keep(run: Run, result: tuple[Row, dict[str, np.ndarray]]) -> None:
-        found[run] = store.save(run, marks[run], *result)
-        if progress is not None:
-            progress("runs", len(found), len(everything))
-
-    if progress is not None:
-        progress("runs", len(found), len(everything))
-    if not pending:
-        return {run: found[run] for run in everything}
-    carry_out = partial(_here, progress) if workers == 0 and scheduler is None else None
-    with _cluster(scheduler, workers) if carry_out is None else _nothing() as client:
-        for part in (first, rest):
-            jobs = [(run, _budget(run, found)) for run in part]
-            if carry_out is not None:
-                carry_out(jobs, setting, work, keep)
-            else:
-                _there(client, jobs, setting, work, keep)
+    parts = [[r for r in pending if (r.method in AFTER) == late] for late in (False, True)]
+    if workers == 0 and scheduler is None:
+        for part in parts:
+            for run in part:
+                keep(run, partial(work, run, setting, _budget(run, found)))
+    elif pending:
+        with _cluster(scheduler, workers) as client:
+            for part in parts:
+                _there(client, [(run, _budget(run, found)) for run in part], setting, work, keep)
     return {run: found[run] for run in everything}
+
+
+def _known(run: Run, setting: Setting) -> dict[str, Any]:
+    return {
+        "version": METHODS[run.method].version,
+        "inputs": _inputs(run, setting),
+        "outputs": (pictures_of(run),),
+    }
 
 
 def _budget(run: Run, found: dict[Run, Row]) -> float | None:
@@ -302,28 +285,6 @@ def _budget(run: Run, found: dict[Run, Row]) -> float | None:
         return None
     other = found.get(Run(run.truth, run.split, run.count, run.seed, AFTER[run.method]))
     return None if other is None else float(other["transport_s"]) + float(other["fit_s"])
-
-
-def _here(
-    progress: Progress | None,
-    jobs: list[tuple[Run, float | None]],
-    setting: Setting,
-    work: Execute,
-    keep: Any,
-) -> None:
-    for run, budget in jobs:
-        tick = None
-        if progress is not None:
-
-            def tick(stage: str, done: int, total: int, run: Run = run) -> None:
-                progress(f"{run.key}: {stage}", done, total)
-
-        try:
-            options = {"progress": tick} if work is execute else {}
-            result = work(run, setting, budget, **options)
-        except Exception as error:
-            raise RuntimeError(f"{run.key}: {type(error).__name__}: {error}") from error
-        keep(run, result)
 
 
 def _there(
@@ -338,20 +299,10 @@ def _there(
         futures[client.submit(work, run, setting, budget, key=name, pure=False, priority=-place)] = run
     try:
         for future in distributed.as_completed(list(futures), loop=client.loop):
-            run = futures[future]
-            try:
-                result = future.result()
-            except Exception as error:
-                raise RuntimeError(f"{run.key}: {type(error).__name__}: {error}") from error
-            keep(run, result)
+            keep(futures[future], lambda progress, future=future: future.result())
             future.release()
     finally:
         client.cancel(list(futures))
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield None
 
 
 @contextmanager

@@ -2,49 +2,60 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from benchmarks.lobby import photos, scene, spectra
-from warprrf.device import Progress
+from benchmarks.runner import Benchmark, Job, option
 
 STEPS = ("scene", "photos", "spectra")
 
+HELP = """\
+Builds the scene (meshes, textures, materials), renders the photos with Mitsuba and simulates the spectra with both
+engines; needs the extras photos and sionna, and an LLVM of at least 17 for Dr.Jit. Finished photos and receivers are
+kept, so that a killed run continues.
 
-def run(
-    data: str | os.PathLike[str] = "data/lobby",
-    *,
-    steps: Sequence[str] | None = None,
-    full: bool = False,
-    progress: Progress | None = None,
-    device: Any = None,
-) -> None:
-    """Make what is missing of the named steps (default: all, in order).
+examples:
+  python -m benchmarks data
+  python -m benchmarks data --only spectra
+"""
 
-    Args:
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the data.
+
+    Attributes:
         data: folder to write.
-        steps: of ``"scene"``, ``"photos"``, ``"spectra"``.
+        only: steps to do, of ``"scene"``, ``"photos"``, ``"spectra"``.
         full: also all 800 receivers, beside the committed sample (``*_full.nc``).
-        progress: ``progress(stage, done, total)``.
-        device: Warp device of the exact engine.
+    """
+
+    data: str = option("data/lobby", "folder to write")
+    only: tuple[str, ...] = option(STEPS, "steps to do", choices=STEPS)
+    full: bool = option(False, "all 800 receivers too (spectra_full.nc and spectra_sionna_full.nc)")
+
+
+def run(options: Options, job: Job) -> None:
+    """Make what is missing of the named steps.
 
     Raises:
         ValueError: for an unknown step, or photos and spectra without a scene.
         ImportError: if the extra ``sionna`` is not installed.
     """
-    wanted = STEPS if steps is None else tuple(steps)
-    unknown = sorted(set(wanted) - set(STEPS))
+    unknown = sorted(set(options.only) - set(STEPS))
     if unknown:
-        raise ValueError(f"steps: got {', '.join(unknown)}, expected some of {', '.join(STEPS)}")
-    data = Path(data)
-    if "scene" in wanted:
-        scene.build(data, progress=progress)
+        raise ValueError(f"only: got {', '.join(unknown)}, expected some of {', '.join(STEPS)}")
+    data = Path(options.data)
+    if "scene" in options.only:
+        scene.build(data, progress=job.progress)
     if not (data / "scene.xml").is_file():
         raise ValueError(f"data: {data} holds no scene.xml; make the scene first (step scene)")
-    if "photos" in wanted:
-        photos.make_photos(data, progress=progress)
-    if "spectra" in wanted:
-        for whole in (False, True) if full else (False,):
-            spectra.make(data, full=whole, progress=progress, device=device)
+    if "photos" in options.only:
+        photos.make_photos(data, progress=job.progress)
+    if "spectra" in options.only:
+        for whole in (False, True) if options.full else (False,):
+            spectra.make(data, full=whole, progress=job.progress, device=job.device)
+
+
+BENCHMARKS = {"data": Benchmark("data", Options, run, HELP)}

@@ -25,6 +25,7 @@ VARIANT = "llvm_ad_rgb"
 SIONNA_VARIANT = (
     "llvm_ad_mono_polarized"  # Sionna RT registers its plugins with the variant it is imported in
 )
+JPEG_QUALITY = 90
 
 
 @contextmanager
@@ -165,8 +166,6 @@ def render_photos(
     spp: int = 4,
     seed: int = 0,
     max_depth: int = 4,
-    exposure: float = 1.5,
-    quality: int = 90,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Render a JPEG for each camera; a file that is there already is kept, so a killed run goes on where it stopped.
@@ -178,8 +177,6 @@ def render_photos(
         spp: paths a pixel; the surfaces' texture is sampled four times as often.
         seed: view k is sampled with ``seed + k``.
         max_depth: longest light path.
-        exposure: factor on the radiance before the tone curve.
-        quality: JPEG quality.
 
     Returns:
         the files, in the order of ``cameras``.
@@ -200,9 +197,9 @@ def render_photos(
         scene = mi.load_file(str(xml))
         for k, (path, camera) in enumerate(zip(paths, cameras.values(), strict=True)):
             if not path.is_file():
-                pixels = tone_map(_radiance(mi, scene, camera, spp, seed + k, max_depth), exposure)
+                pixels = tone_map(_radiance(mi, scene, camera, spp, seed + k, max_depth))
                 photo = images.fromarray(np.round(255 * pixels).astype(np.uint8))
-                save = partial(photo.save, format="JPEG", quality=quality, optimize=True)
+                save = partial(photo.save, format="JPEG", quality=JPEG_QUALITY, optimize=True)
                 write_atomically(path, save)
             if progress is not None:
                 progress("photos", k + 1, len(paths))

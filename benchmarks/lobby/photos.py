@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.lobby.mitsuba_photos import render_photos
-from benchmarks.stages import write_json
 from warprrf.device import Progress, require
+from warprrf.files import write_json
 from warprrf.geometry.splats.camera import Camera
 from warprrf.rf.scene import Scene
 

@@ -1,7 +1,7 @@
 """The lobby run as one HTML page: every figure beside what was asked of it, and the pictures that explain them.
 
 The page needs nothing but itself: pictures are embedded. It is drawn from what the run left in its folder
-(``report.json`` and ``pictures.npz``), so it can be drawn again without computing anything.
+(``report.json`` and ``pictures.npz``).
 """
 
 from __future__ import annotations
@@ -9,35 +9,27 @@ from __future__ import annotations
 import base64
 import html
 import io
-import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.pictures import METHODS, figure_of, spectrum_rows
+from benchmarks.report import columns_table
+from benchmarks.targets import TARGETS, compared
 from warprrf.device import require
-from warprrf.files import write_text
-from warprrf.geometry.floor_plan import section as section
 
-# Key of report.json, its name, unit, what is asked (None: measured only), and whether more is better.
-FIGURES: tuple[tuple[str, str, str, float | None, bool], ...] = (
-    ("photo_psnr_db", "held-out photo PSNR of stage 1", "dB", 25.0, True),
-    (
-        "photo_noise_psnr_db",
-        "PSNR between two render seeds of a view (the photos' own noise)",
-        "dB",
-        None,
-        True,
-    ),
-    ("camera_rms_m", "surveyed-scale camera positions, rms error", "m", 0.02, False),
-    ("mesh_distance_median_m", "mesh to true surface where a photo sees it, median", "m", 0.02, False),
-    ("mesh_distance_p90_m", "the same, 90th percentile", "m", 0.06, False),
-    ("mesh_normal_median_deg", "mesh normal error, median", "degrees", 4.0, False),
-    ("fit_time_s", "stage 2 fit of RF-3DGS+", "s", 60.0, False),
-    ("pipeline_time_s", "photos to evaluation, set-up apart", "s", 900.0, False),
+FIGURES: tuple[tuple[str, str, str], ...] = (
+    ("photo_psnr_db", "held-out photo PSNR of stage 1", "dB"),
+    ("photo_noise_psnr_db", "PSNR between two render seeds of a view (the photos' own noise)", "dB"),
+    ("camera_rms_m", "surveyed-scale camera positions, rms error", "m"),
+    ("mesh_distance_median_m", "mesh to true surface where a photo sees it, median", "m"),
+    ("mesh_distance_p90_m", "the same, 90th percentile", "m"),
+    ("mesh_normal_median_deg", "mesh normal error, median", "degrees"),
+    ("fit_time_s", "stage 2 fit of RF-3DGS+", "s"),
+    ("pipeline_time_s", "photos to evaluation, set-up apart", "s"),
 )
+"""Key of report.json, its name and its unit."""
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("psnr_db", "PSNR [dB]", "{:.2f}"),
@@ -64,30 +56,20 @@ th:first-child, td:first-child { text-align: left; } .met { color: #1b6e35; } .m
 """
 
 
-def write(folder: str | os.PathLike[str]) -> Path:
-    """Draw ``report.html`` from ``report.json`` and ``pictures.npz`` in ``folder``; returns its path.
+def draw(folder: Path, figures: dict[str, Any]) -> str:
+    """The page of a run, from its figures and from ``pictures.npz`` in ``folder``.
 
     Raises:
-        ValueError: if one of the two is missing.
         ImportError: if matplotlib is missing.
     """
-    folder = Path(folder)
-    for name in ("report.json", "pictures.npz"):
-        if not (folder / name).is_file():
-            raise ValueError(
-                f"folder: {folder / name} is missing, expected the folder of a finished lobby run"
-            )
-    figures = json.loads((folder / "report.json").read_text())
     with np.load(folder / "pictures.npz", allow_pickle=False) as stored:
         pictures = {name: stored[name] for name in stored.files}
-    page = _page(figures, pictures)
-    path = folder / "report.html"
-    write_text(path, page)
-    return path
+    return _page(figures, pictures)
 
 
 def _page(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> str:
     machine = figures["machine"]
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
     parts = [
         f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>warprrf: the lobby</title>"
         f"<meta name='viewport' content='width=device-width, initial-scale=1'><style>{STYLE}</style></head><body>",
@@ -97,11 +79,19 @@ def _page(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> str:
         _figure_table(figures),
         _figure(
             time_bars(figures["stages"]),
-            "Wall time per stage, attempts that were killed included.",
-            "time per stage",
+            "Wall time per step, attempts that were killed included.",
+            "time per step",
         ),
-        "<h2>Stage 1: geometry from the photos</h2>",
+        *_geometry_part(pictures),
+        *_radio_part(figures, pictures),
+        *_spectra_part(pictures),
+        f"<p class='note'>{html.escape(versions)}</p></body></html>",
     ]
+    return "\n".join(parts)
+
+
+def _geometry_part(pictures: dict[str, np.ndarray]) -> list[str]:
+    parts = ["<h2>Stage 1: geometry from the photos</h2>"]
     for index, name in enumerate(pictures["photo_names"]):
         score = float(pictures["photo_psnr_db"][index])
         parts.append(
@@ -113,61 +103,53 @@ def _page(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> str:
                 jpeg=True,
             )
         )
-    parts.append(
-        _figure(
-            mesh_error_map(pictures),
-            "Points on the reconstructed mesh, seen from above and from the south: distance to the true surface. "
-            "Right: the share of points within a distance, with the asked median and 90th percentile.",
-            "mesh error",
-        )
+    text = (
+        "Points on the reconstructed mesh, seen from above and from the south: distance to the true surface. "
+        "Right: the share of points within a distance, with the asked median and 90th percentile."
     )
-    parts += [
+    return [*parts, _figure(mesh_error_map(pictures), text, "mesh error")]
+
+
+def _radio_part(figures: dict[str, Any], pictures: dict[str, np.ndarray]) -> list[str]:
+    settings = _sionna(figures["data"]["sionna"]["settings"])
+    return [
         "<h2>Stage 2: the radio field on receivers that it never saw</h2>",
         _method_table("Truth: exact (deterministic single bounce)", figures["methods"]),
-    ]
-    if figures.get("methods_sionna"):
-        title = f"Truth: Sionna RT ({_sionna(figures['data']['sionna']['settings'])})"
-        parts.append(_method_table(title, figures["methods_sionna"]))
-    parts.append(
+        _method_table(f"Truth: Sionna RT ({settings})", figures["methods_sionna"]),
         "<p class='note'>Blocked: receivers without line of sight to the transmitter alone. Lookups know no geometry; "
-        "the constant and the mean image know no receiver.</p>"
-    )
-    parts.append(
+        "the constant and the mean image know no receiver.</p>",
         _figure(
             floor_plan(pictures),
             "Section through the room at 1.2 m. Test receivers are coloured by the "
             "PSNR of RF-3DGS+; squares are blocked.",
             "floor plan",
-        )
-    )
-    parts.append(
+        ),
         _figure(
             psnr_curves(figures["methods"]),
             "Left: PSNR of every test receiver, sorted, one curve a method. Right: against the distance to the "
             "nearest training receiver, for the bistatic field, RF-3DGS+ and the nearest-receiver lookup.",
             "PSNR per receiver",
-        )
-    )
+        ),
+    ]
+
+
+def _spectra_part(pictures: dict[str, np.ndarray]) -> list[str]:
     low, high = (float(v) for v in pictures["range_db"])
+    parts = []
     for index, blocked in enumerate(pictures["spectrum_blocked"]):
         position = ", ".join(f"{x:.2f}" for x in pictures["spectrum_receivers"][index])
-        state = "blocked" if blocked else "line of sight"
         predictions = {
-            name: pictures[f"spectrum_{key}"][index]
-            for key, (name, _) in METHODS.items()
-            if f"spectrum_{key}" in pictures and key in ("bistatic", "rf3dgs+", "nearest")
+            METHODS[key][0]: pictures[f"spectrum_{key}"][index] for key in ("bistatic", "rf3dgs+", "nearest")
         }
         parts.append(
             _figure(
                 spectrum_rows(pictures["spectrum_truth"][index], predictions, low, high),
-                f"Receiver at ({position}) m, {state}. First row: truth; below: prediction and its difference from "
-                "the truth.",
+                f"Receiver at ({position}) m, {'blocked' if blocked else 'line of sight'}. First row: truth; below: "
+                "prediction and its difference from the truth.",
                 f"spectra at {position}",
             )
         )
-    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-    parts.append(f"<p class='note'>{html.escape(versions)}</p></body></html>")
-    return "\n".join(parts)
+    return parts
 
 
 def _one_line(figures: dict[str, Any], machine: dict[str, Any]) -> str:
@@ -190,18 +172,22 @@ def _sionna(settings: dict[str, Any]) -> str:
 # ----------------------------------------------------------------------------------------------------- tables
 
 
+def method_table(methods: dict[str, dict[str, Any]]) -> str:
+    """The figures of several methods as Markdown."""
+    columns = [("name", "method", "{}"), *((key, name, form) for key, name, form in COLUMNS if form != "ms")]
+    return columns_table(columns, [{"name": METHODS[key][0], **row} for key, row in methods.items()])
+
+
 def _figure_table(figures: dict[str, Any]) -> str:
+    asked = {line[0]: line[1:] for line in compared("report", figures)}
+    by_key = {target.path: target.name for target in TARGETS["report"]}
     rows = []
-    for key, name, unit, asked, more in FIGURES:
+    for key, name, unit in FIGURES:
         value = figures.get(key)
         shown = "-" if value is None else f"{value:.4g} {unit}"
-        if asked is None:
-            rows.append(f"<tr><td>{name}</td><td>{shown}</td><td></td><td></td></tr>")
-            continue
-        met = value is not None and (value >= asked if more else value <= asked)
-        sign = "at least" if more else "at most"
-        verdict = "<td class='met'>met</td>" if met else "<td class='missed'>missed</td>"
-        rows.append(f"<tr><td>{name}</td><td>{shown}</td><td>{sign} {asked:g} {unit}</td>{verdict}</tr>")
+        bound, _, verdict = asked.get(by_key.get(key, ""), ("", "", ""))
+        mark = {"met": "met", "NOT met": "missed"}.get(verdict, "")
+        rows.append(f"<tr><td>{name}</td><td>{shown}</td><td>{bound}</td><td class='{mark}'>{mark}</td></tr>")
     head = "<tr><th>figure</th><th>measured</th><th>asked</th><th></th></tr>"
     return f"<div class='wide'><table>{head}{''.join(rows)}</table></div>"
 

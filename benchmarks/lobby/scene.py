@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -65,10 +65,9 @@ def _box(
     *,
     texel: float = 0.008,
     top: str | None = None,
-    emits: bool = False,
 ) -> Solid:
     profile = ((x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1]))
-    return Solid(name, material, style, "z", z[0], z[1], profile, texel, top, emits)
+    return Solid(name, material, style, "z", z[0], z[1], profile, texel, top)
 
 
 def _sofa(name: str, axis: str, low: float, high: float, back: float, front: float, base: float) -> Solid:
@@ -98,14 +97,10 @@ def lobby() -> list[Solid]:
     gallery = ((9.6, 2.6), (9.6, 3.55), (9.45, 3.55), (9.45, 2.35), (12.02, 2.35), (12.02, 2.6))
     return [
         _box("floor", "marble", "terrazzo", (-0.10, 15.10), (-0.10, 12.10), (-0.20, 0.0), texel=0.01),
-        _box(
-            "ceiling",
-            "ceiling_board",
-            "ceiling",
-            (-0.11, 15.11),
-            (-0.11, 12.11),
-            (4.0, 4.2),
-            texel=0.01,
+        replace(
+            _box(
+                "ceiling", "ceiling_board", "ceiling", (-0.11, 15.11), (-0.11, 12.11), (4.0, 4.2), texel=0.01
+            ),
             emits=True,
         ),
         _box("wall_south", "concrete", "concrete", (-0.12, 15.12), (-0.25, 0.0), (-0.12, 4.12), texel=0.01),

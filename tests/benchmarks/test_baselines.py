@@ -16,6 +16,7 @@ from benchmarks.baselines import (
     NeRF2,
     NeRF2Options,
     SpectrumImages,
+    Training,
     load_nerf2_spectra,
     training,
 )
@@ -62,9 +63,11 @@ def spectra(count: int = 12) -> SpectrumDataset:
 
 def fit(name: str, data: Any, **changed: Any) -> Any:
     options = {**FIT[name], "device": "cpu", **changed}
+    size = {k: options.pop(k) for k in ("rays", "batch") if k in options}
+    how = Training(**options)
     if name == "NeRF2":
-        return NeRF2.fit(data, SMALL, **options)
-    return CGAN.fit(data, CGANOptions.around(SpectrumImages.of(data).receivers, channels=8), **options)
+        return NeRF2.fit(data, SMALL, how, **size)
+    return CGAN.fit(data, CGANOptions.around(SpectrumImages.of(data).receivers, channels=8), how, **size)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +190,7 @@ def test_errors_name_the_argument(fitted: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="near_m, far_m"):
         NeRF2Options(far_m=0.0)
     with pytest.raises(ValueError, match="iterations: got 0"):
-        NeRF2.fit(train, SMALL, iterations=0)
+        NeRF2.fit(train, SMALL, Training(iterations=0))
     with pytest.raises(ValueError, match="channels: got 12"):
         CGANOptions.around(train.receivers, channels=12)
     with pytest.raises(ValueError, match="rx"):
@@ -195,7 +198,7 @@ def test_errors_name_the_argument(fitted: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="transmitter: got"):
         fitted["CGAN"].image([1.0, 1.0, 1.0], [0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="device"):
-        NeRF2.fit(train, SMALL, iterations=1, device="cpu0x")
+        NeRF2.fit(train, SMALL, Training(iterations=1, device="cpu0x"))
 
 
 # ------------------------------------------------------------------------------------------- NeRF2's own files

@@ -11,12 +11,13 @@ import pytest
 from places import ROOT
 
 import warprrf as wr
-from benchmarks.beams import report, run_beams
+from benchmarks.beams import report
 from benchmarks.beams.links import BANDWIDTH_HZ, FREQUENCIES, Ends, Link, Links, ends, gains
-from benchmarks.beams.run import _over, straight
+from benchmarks.beams.run import BENCHMARKS, Options, _over, straight
 from benchmarks.beams.search import hierarchical
 from benchmarks.beams.users import several_users
 from benchmarks.beams.users import table as users_table
+from benchmarks.runner import Job, execute
 
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 TRANSMITTER = np.array([13.6, 11.2, 2.5])
@@ -121,23 +122,22 @@ def test_figures_of_a_loss_are_those_of_their_definition() -> None:
     assert set(_over(dict.fromkeys(names, loss[:0])).values()) == {None}
 
 
-def test_bad_sizes_are_named(tmp_path: Path) -> None:
+def test_bad_sizes_are_named() -> None:
     with pytest.raises(ValueError, match=r"sides: got \(4, 6\)"):
-        run_beams(tmp_path, sides=(4, 6))
+        Options(sides=(4, 6))
     with pytest.raises(ValueError, match="every: got 0"):
-        run_beams(tmp_path, every=0)
-    with pytest.raises(ValueError, match=r"has no beams\.json"):
-        report.write(tmp_path)
+        Options(every=0)
 
 
 @pytest.mark.slow
 def test_whole_run_on_a_small_data_set(tmp_path: Path, scene: wr.Scene, spectra: wr.SpectrumDataset) -> None:
     spectra.save(tmp_path / "spectra.nc")
     wr.Reconstruction(gaussians=_dots(scene), mesh=scene.mesh).save(tmp_path / "room")
-    options = {"data": [tmp_path / "spectra.nc"], "geometry": tmp_path / "room", "scene": SCENE}
-    found = run_beams(
-        tmp_path / "out", **options, counts=(2,), truths=("exact",), sides=(4, 8), both=(2, 4), seed=1
-    )
+    options = Options(
+        data=(str(tmp_path / "spectra.nc"),), geometry=str(tmp_path / "room"), scene=str(SCENE), counts=(2,),
+        truths=("exact",), sides=(4, 8), both=(2, 4),
+    )  # fmt: skip
+    found = execute(BENCHMARKS["beams"], options, Job(tmp_path / "out", seed=1))
     rows = found["truths"]["exact"]["links"]
     assert {r["ends"] for r in rows} == {"rx 16", "rx 64", "tx 16", "tx 64", "tx 4, rx 16"}
     for row in rows:
@@ -192,6 +192,8 @@ def test_several_users_of_one_path_each_are_parted_by_whoever_knows_their_direct
     h = np.stack([channels[u][0, 0] for u in order])
     own = 1.0 / np.diag(np.linalg.inv(h @ h.conj().T)).real
     assert rate[4, "channel", "zf"] == pytest.approx(np.log2(1.0 + own / (4 * noise)).sum(), rel=1e-6)
-    text = "\n".join(users_table(rows, report.NAMES | {"channel": "true channel"}))
+    text = "\n".join(
+        users_table(rows, {m: name for m, (name, _) in report.METHODS.items()} | {"channel": "true channel"})
+    )
     assert "### 4 users at once, tx 64 elements" in text
     assert f"{rate[4, 'channel', 'zf']:.2f}" in text

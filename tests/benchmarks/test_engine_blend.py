@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
-from benchmarks.engine.blend import run_blend
+from benchmarks.engine import torch_renderer
+from benchmarks.engine.blend import blend_figures
 from benchmarks.engine.peers import Scene, take_turns
 from benchmarks.engine.torch_renderer import render_with_torch
 from warprrf.device import threads
 from warprrf.geometry.splats import torch_functions as interop
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.rasterizer import Blending
+
+
+@pytest.fixture(autouse=True)
+def small_batches(monkeypatch):
+    """The torch renderer works in several batches, as it does on large scenes."""
+    monkeypatch.setattr(torch_renderer, "CHUNK", 1 << 12)
+
 
 POSE = np.eye(4)
 POSE[:3, 3] = (0.1, -0.2, 0.3)
@@ -36,7 +42,7 @@ def tensors(seed, n=80, channels=5, dtype=torch.float64, spread=2.0):
 
 def both(values, cam, blending):
     ours = interop.rasterize(*values[:5], cam, values[5], blending=blending)
-    peer = render_with_torch(*values[:5], cam, values[5], blending=blending, chunk=1 << 12)
+    peer = render_with_torch(*values[:5], cam, values[5], blending=blending)
     return ours, (peer.features, peer.alpha, peer.depth)
 
 
@@ -179,21 +185,15 @@ def test_bad_tensors_are_named(place, value, name):
         interop.rasterize(*values[:5], CAMERAS["spherical"], values[5])
 
 
-def test_blend_benchmark_runs_small_and_its_two_images_are_one(tmp_path):
-    result = run_blend(tmp_path / "blend.json", n=300, width=40, height=30, repeats=1)
-    assert json.loads((tmp_path / "blend.json").read_text())["gaussians"] == 300
-    assert result["image_difference"]["quantile_99.9"] < result["asked"]["image_difference"]
+def test_blend_benchmark_runs_small_and_its_two_images_are_one():
+    result = blend_figures(300, 40, 30, repeats=1)
+    assert result["image_difference"]["quantile_99.9"] < 1e-4
     assert max(result["gradient_difference"].values()) < 1e-2
     assert result["passing_pairs"] > 1000
     assert [run["threads"] for run in result["runs"]] == sorted({1, threads()})
     for run in result["runs"]:
-        assert run["speedup"]["torch"] == pytest.approx(run["torch"]["seconds"] / run["ours"]["seconds"])
+        assert run["speedup"] == pytest.approx(run["torch"]["seconds"] / run["ours"]["seconds"])
         assert run["ours"]["seconds"] == run["ours"]["forward_s"] + run["ours"]["backward_s"] > 0
-    # Both renderers count the same pairs, but for those on a cutoff.
-    assert result["pairs"]["dense"]["passing_pairs"] == pytest.approx(result["passing_pairs"], rel=1e-3)
-    assert result["pairs"]["sparse"]["forward_ns"] > 0
-    assert result["spectrum"]["render_s"] > 0 and result["spectrum"]["gaussians"] == 1500
-    assert threads() == 1 or result["cores"]["identical"]
 
 
 def _failing(scene, parameters):
@@ -204,8 +204,3 @@ def test_a_renderer_that_fails_in_its_process_is_named(capfd):
     with pytest.raises(RuntimeError, match="^bad: its process ended"):
         take_turns({"bad": _failing}, Scene(10, 8, 8), threads=1, turns=1)
     assert "planted" in capfd.readouterr().err
-
-
-def test_a_folder_that_is_no_checkout_of_opensplat_is_named(tmp_path):
-    with pytest.raises(ValueError, match=r"^opensplat: .* lacks project_gaussians.cpp"):
-        run_blend(opensplat=tmp_path)

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
+from places import LOBBY
 
 pytest.importorskip("matplotlib")
+pytest.importorskip("open3d")
 
-from benchmarks import engine
-from benchmarks.engine import knobs, report, table
-from benchmarks.engine.forms import FORMS, RASTERISER, exponential_forms, response_forms
+from benchmarks.engine import knobs, table
+from benchmarks.engine.forms import FORMS, response_forms
+from benchmarks.runner import Job, execute
 from warprrf.geometry.splats.rasterizer import RADIO
 
-TINY = engine.Sizes(
+TINY = table.Sizes(
     gaussians=600,
     shape=(12, 24),
     counts=(300, 1000),
     shapes=((6, 12), (12, 24)),
-    receivers=(1, 2),
     top_k=(1, 4, 64),
     form_gaussians=100,
-    exponentials=1600,
     rays=500,
     triangles=200,
     blend=(50, 20, 16),
-    stored=(300, 1, 3),
     repeats=1,
 )
 
@@ -37,20 +37,11 @@ def scene():
 
 
 def test_smaller_cutoffs_and_longer_lists_err_less(scene):
-    errors = [
-        r["error_rms_db"] for r in knobs.cutoff_rows(scene, "alpha_min", (0.1, 1e-2, 1e-3, 1e-5), repeats=1)
-    ]
+    errors = [r["error_rms_db"] for r in knobs.cutoff_rows(scene, (0.1, 1e-2, 1e-3, 1e-5), repeats=1)]
     assert (np.diff(errors) < 0).all() and errors[0] > 1 and errors[-1] < 0.02
     rows = knobs.top_k_rows(scene, (1, 4, 16, 64), repeats=1)
     errors = [r["error_rms_db"] for r in rows]
     assert (np.diff(errors) <= 0).all() and errors[0] > 0.5 and errors[-1] < 1e-4
-    assert [r["pairs_per_pixel"] for r in rows][:2] == pytest.approx([1, 4], abs=0.1)
-
-
-def test_a_clamp_below_one_leaks_through_a_dark_screen():
-    hidden = knobs.Scene.screened(3000, (16, 32), device="cpu")
-    rows = knobs.cutoff_rows(hidden, "alpha_max", (0.9, 1 - 1e-6), repeats=1)
-    assert rows[0]["error_rms_db"] > 0.2 and rows[1]["error_rms_db"] < 0.1 * rows[0]["error_rms_db"]
 
 
 def test_float64_agrees_with_rays_traced_one_by_one(scene):
@@ -62,7 +53,7 @@ def test_float64_agrees_with_rays_traced_one_by_one(scene):
 def test_finer_grids_and_more_discs_err_less(scene):
     rows = knobs.resolution_rows(scene, ((8, 16), (16, 32), (32, 64)), repeats=1)
     assert (np.diff([r["error_rms_db"] for r in rows]) < 0).all()
-    few, many = (knobs.count_row(n, (24, 48), repeats=1, device="cpu") for n in (500, 10_000))
+    few, many = (knobs.growth_row(n, (24, 48), repeats=1, device="cpu") for n in (500, 10_000))
     assert many["error_rms_db"] < 0.5 * few["error_rms_db"]
     assert many["range_error_median_m"] < few["range_error_median_m"] < 1e-3
 
@@ -87,64 +78,51 @@ def test_forms_of_the_response_err_as_their_cancellation_says():
     assert rows[needle, "Gram"]["error_mean"] > 20 * rows[needle, "Gram, turned"]["error_mean"]
 
 
-def test_exponentials_err_as_stated():
-    rows = {r["form"]: r for r in exponential_forms(values=20_000, repeats=1)}
-    assert rows["library, float32"]["relative_max"] < 2e-7
-    assert rows[RASTERISER]["error_max"] < 1e-6
-    assert 1e-4 < rows["(1 - h/256)^256"]["error_max"] < 2e-3  # h^2 exp(-h) / 512 at h = 2
+def test_the_mesh_hit_is_exact_and_the_centre_errs_by_a_discs_size():
+    rows = knobs.point_rows(1500, 2, (16, 32), device="cpu")
+    error = {row["interaction_point"]: row["length_error_median_m"] for row in rows}
+    assert list(error) == ["centre", "peak", "expected", "mesh"]
+    assert error["mesh"] < 1e-9
+    assert error["peak"] < error["centre"]
+    spacing = np.sqrt(672.0 / 1500)  # m: 672 m^2 of surface
+    assert 0.01 * spacing < error["centre"] < spacing
+    assert all(row["milliseconds_per_receiver"] > 0 for row in rows)
 
 
 @pytest.mark.slow
 def test_a_run_writes_tables_and_pictures_and_is_not_measured_twice(tmp_path, monkeypatch):
-    found = engine.run_engine(tmp_path, sizes=TINY, device="cpu")
-    for name in ("engine.json", "engine.md", "knobs.png", "counts.png", "growth.png", "forms.png"):
+    run = partial(
+        execute, table.BENCHMARKS["engine"], table.Options(scene=str(LOBBY / "scene.xml"), sizes=TINY)
+    )
+    found = run(Job(tmp_path, device="cpu"))
+    for name in ("engine.json", "engine.md", "knobs.png", "growth.png"):
         assert (tmp_path / name).stat().st_size > 500
     text = (tmp_path / "engine.md").read_text()
-    for title in ("Alpha cutoff", "Top K", "Growth", "Interaction point", "Transport on disk", "knobs.png"):
+    for title in ("Alpha cutoff", "Top K", "Growth", "Interaction point", "Mesh rays", "knobs.png"):
         assert title in text
     assert json.loads((tmp_path / "engine.json").read_text()) == found
-    assert found["transport"]["fit_peak_gb"] > 0.05 and found["transport"]["receivers"] == 3
 
     def fail(*_, **__):
         raise AssertionError("measured again")
 
-    for name in ("run_rays", "run_transport", "response_forms", "exponential_forms"):
+    for name in ("ray_rows", "response_forms", "blend_figures"):
         monkeypatch.setattr(table, name, fail)
-    for name in ("cutoff_rows", "top_k_rows", "count_row", "point_rows"):
+    for name in ("cutoff_rows", "top_k_rows", "growth_row", "point_rows"):
         monkeypatch.setattr(knobs, name, fail)
-    again = engine.run_engine(tmp_path, sizes=TINY, device="cpu")
-    assert again["top_k"] == found["top_k"] and again["counts"] == found["counts"]
+    again = run(Job(tmp_path, device="cpu"))
+    assert again["top_k"] == found["top_k"] and again["growth"] == found["growth"]
 
 
-def test_the_cheapest_setting_within_the_tolerance_is_picked():
-    def row(value, rms, worst, seconds):
-        return {"value": value, "error_rms_db": rms, "error_worst_db": worst, "seconds": seconds}
+def test_the_coarsest_setting_within_the_tolerance_is_picked():
+    def row(value, rms, worst):
+        return {"value": value, "error_rms_db": rms, "error_worst_db": worst}
 
-    point = {
-        "length_error_median_m": 2e-4,
-        "milliseconds_per_receiver": 4.0,
-        "weights_milliseconds_per_receiver": 50.0,
+    figures = {
+        "alpha_min": [row(1e-2, 0.3, 5), row(1e-3, 0.04, 1.5), row(1e-4, 0.01, 0.3)],
+        "top_k": [row(8, 0.2, 3), row(16, 0.01, 3)],
+        "precision": [row("float32", 1e-5, 1e-4), row("float64", 0, 0)],
     }
-    centre = {**point, "length_error_median_m": 0.1, "milliseconds_per_receiver": 1.0}
-    found = {
-        "alpha_min": [row(1e-2, 0.3, 5, 1), row(1e-3, 0.04, 1.5, 2), row(1e-4, 0.01, 0.3, 1.9)],
-        "alpha_max": [row(0.99, 0.04, 3.0, 1), row(0.999, 0.01, 0.5, 1)],
-        "top_k": [row(8, 0.2, 3, 1), row(16, 0.01, 1, 2)],
-        "precision": [row("float32", 1e-5, 1e-4, 1), row("float64", 0, 0, 2)],
-        "points": [{"interaction_point": "centre", **centre}, {"interaction_point": "peak", **point}],
-        "responses": [
-            {"regime": "a", "form": "fast", "error_mean": 0.2, "ns_per_pair": 1},
-            {"regime": "a", "form": "good", "error_mean": 1e-5, "ns_per_pair": 2},
-        ],
-        "exponentials": [{"form": "slow", "error_max": 1e-8, "ns_per_value": 3}],
-    }
-    picked = {r["knob"]: r["value"] for r in report.choices(found)}
-    assert picked == {
-        "alpha_min": 1e-3, "alpha_max": 0.999, "top_k": 16, "precision": "float32", "points": "peak",
-        "responses": "good", "exponentials": "slow",
-    }  # fmt: skip
-    found["top_k"] = found["top_k"][:1]
-    assert {r["knob"]: r["value"] for r in report.choices(found)}["top_k"] is None
+    assert table.choices(figures) == {"alpha_min": 1e-3, "top_k": None, "precision": "float32"}
 
 
 def test_the_scene_s_reference_is_out_of_reach_of_the_cutoffs(scene):

@@ -21,24 +21,24 @@ import pytest
 from small_room import SHAPE, small_room
 
 import warprrf as wr
-from benchmarks import evaluation
-from benchmarks.evaluation import comparison, protocol, report, runs
-from benchmarks.evaluation.methods import METHODS, UNTAUGHT, Effort, code_of
+from benchmarks.evaluation import command, comparison, protocol, report, runs
 from benchmarks.evaluation.paper_law import law_reach, paper_law_spectra
 from benchmarks.evaluation.protocol import Run, Setting
-from benchmarks.evaluation.runs import Store, sweep
-from warprrf import cli, marks
+from benchmarks.evaluation.runs import pictures_of, sweep
+from benchmarks.methods import METHODS, Effort
+from benchmarks.runner import Job, execute
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.metrics import angle_deg
 from warprrf.rf.spectra.spectrum import pixel_directions
+from warprrf.steps import Steps
 
 EFFORT = Effort(
     harmonic_iterations=40, nerf2_iterations=3, nerf2_rays=16, nerf2_samples=4, cgan_iterations=2, cgan_batch=2,
     calibration_s=1.0, sionna_samples=20_000,
 )  # fmt: skip
 OPTIONS: dict[str, Any] = {
-    "counts": (4,), "splits": ("random",), "every": 1, "workers": 0, "device": "cpu", "effort": EFFORT,
+    "counts": (4,), "splits": ("random",), "every": 1, "workers": 0, "effort": EFFORT,
 }  # fmt: skip
 FILLED = (
     "psnr_db", "psnr_db_min", "psnr_db_max", "ssim", "rmse_db", "seconds_per_spectrum", "peak_memory_gib", "model_mib",
@@ -51,7 +51,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def whole(kind: str, out: Path, data: Path, **changed: Any) -> dict[str, Any]:
-    return evaluation.run(kind, out, data, geometry=data / "reconstruction", **{**OPTIONS, **changed})
+    options = {"data": (str(data),), "geometry": str(data / "reconstruction"), **OPTIONS, **changed}
+    return execute(command.BENCHMARKS[kind], command.Options(**options), Job(out, device="cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -64,11 +65,13 @@ def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 def test_every_method_has_a_row_that_is_filled(finished: tuple[Path, dict[str, Any]]) -> None:
     out, found = finished
     rows = {(row["truth"], row["method"]): row for row in found["rows"]}
-    expected = {("exact", m) for m in METHODS} | {("paper-law", m) for m in protocol.LAW_METHODS}
+    expected = {("exact", m) for m in protocol.TABLE_METHODS} | {
+        ("paper-law", m) for m in protocol.LAW_METHODS
+    }
     assert set(rows) == expected
     assert [(key, name) for key, row in rows.items() for name in FILLED if row.get(name) is None] == []
     for (_, method), row in rows.items():
-        assert row["count"] == (0 if method in UNTAUGHT else 4)
+        assert row["count"] == (0 if METHODS[method].untaught else 4)
         assert row["psnr_db_min"] <= row["psnr_db"] <= row["psnr_db_max"]
         assert row["receivers"] == 4
     assert json.loads((out / "table1.json").read_text()) == found
@@ -112,7 +115,7 @@ def test_tables_state_what_was_published_and_where_ours_stands(finished: tuple[P
 def test_what_others_are_given_is_what_ours_took(finished: tuple[Path, dict[str, Any]]) -> None:
     out, _ = finished
     ours, other = (
-        json.loads((out / f"runs/exact-random-4-s0-{m}.json").read_text())
+        json.loads((out / f".steps/exact-random-4-s0-{m}.json").read_text())["figures"]
         for m in ("bistatic", "sionna-calibrated")
     )
     assert other["details"]["budget_s"] == pytest.approx(ours["transport_s"] + ours["fit_s"])
@@ -127,8 +130,11 @@ def test_sparsity_shares_the_runs_and_draws_bands(
     shutil.copytree(finished[0], out)
     done = counted(monkeypatch)
     found = whole("sparsity", out, data, truths=("exact", "paper-law"), counts=(4, 7))
-    assert [run.count for run in done] == [7] * len(done)  # those of 4 are there
-    assert {run.method for run in done} == set(protocol.CURVE_METHODS)
+    assert all("-random-7-s0-" in key for key in done)  # those of 4 are there
+    methods = {
+        key.split("-s0-")[1].removesuffix("-exp").removesuffix("-linear").removesuffix("-db") for key in done
+    }
+    assert methods == set(protocol.CURVE_METHODS)
     text = (out / "sparsity.md").read_text()
     for name in ("sparsity.png", "sparsity-law.png"):
         assert (out / name).read_bytes()[:4] == b"\x89PNG" and f"({name})" in text
@@ -137,16 +143,16 @@ def test_sparsity_shares_the_runs_and_draws_bands(
     assert pairs == {(t, n) for t in ("exact", "paper-law") for n in (4, 7)}
 
 
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[Run]:
-    """Runs that are carried out."""
-    done: list[Run] = []
-    original = runs.Store.save
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Keys of the runs that are carried out."""
+    done: list[str] = []
+    original = runs.write_arrays
 
-    def noted(self: Store, run: Run, *rest: Any) -> Any:
-        done.append(run)
-        return original(self, run, *rest)
+    def noted(file: Path, *rest: Any) -> None:
+        done.append(file.stem)
+        original(file, *rest)
 
-    monkeypatch.setattr(runs.Store, "save", noted)
+    monkeypatch.setattr(runs, "write_arrays", noted)
     return done
 
 
@@ -159,35 +165,20 @@ def test_finished_runs_are_kept_and_changed_options_are_not_mistaken(
     few = {"methods": ("rf3dgs", "nearest"), "truths": ("exact",)}
     whole("table1", out, data, **few)
     assert done == []
-    (out / "runs/exact-random-4-s0-nearest.json").unlink()
+    (out / "runs/exact-random-4-s0-nearest.npz").unlink()
     whole("table1", out, data, **few)
-    assert [run.key for run in done] == ["exact-random-4-s0-nearest"]
+    assert done == ["exact-random-4-s0-nearest"]
     done.clear()
     whole("table1", out, data, **few, effort=replace(EFFORT, harmonic_iterations=41))
-    assert [run.method for run in done] == ["rf3dgs", "rf3dgs"]  # a lookup does not feel the effort
-    (out / "runs/exact-random-4-s0-nearest.json").write_text("{")
-    with pytest.raises(ValueError, match="not readable"):
-        whole("table1", out, data, **few)
+    # a lookup does not feel the effort
+    assert done == [f"exact-random-4-s0-rf3dgs-{gain}" for gain in ("exp", "linear")]
+    done.clear()
+    (out / ".steps/exact-random-4-s0-nearest.json").write_text("{")
+    whole("table1", out, data, **few, effort=replace(EFFORT, harmonic_iterations=41))
+    assert done == ["exact-random-4-s0-nearest"]  # a damaged record is none
 
 
 # --------------------------------------------------------------------------------------------------- the sets
-
-
-def test_a_method_is_marked_by_the_code_that_it_runs() -> None:
-    behind = {name: set(marks._sources(method.code)) for name, method in METHODS.items()}
-    own = {
-        "bistatic": "warprrf.rf.fields.bistatic.fit",
-        "rf3dgs+": "warprrf.rf.fields.harmonic.fitting",
-        "nerf2": "benchmarks.baselines.training",
-        "sionna": "warprrf.rf.paths.sionna",
-        "nearest": "warprrf.rf.spectra.lookups",
-    }
-    for name, module in own.items():
-        assert module in behind[name]
-        # A change in one method's code leaves the others' runs as they are.
-        assert not [other for other in own if other != name and module in behind[other]]
-    assert all("warprrf.rf.spectra.metrics" in modules for modules in behind.values())
-    assert len({code_of(name) for name in own}) == len(own)
 
 
 def test_plan_has_nested_counts_one_run_for_what_is_untaught_and_networks_where_asked() -> None:
@@ -335,8 +326,8 @@ def slow_job(
 
 def setting_of(data: Path) -> Setting:
     return Setting(
-        files=(("exact", str(data / "spectra.nc")),), marks=(("exact", "m"),), geometry=str(data / "reconstruction"),
-        geometry_mark="g", scene=str(data / "scene.xml"), scratch=str(data / "scratch"), every=1, effort=EFFORT,
+        files=(("exact", str(data / "spectra.nc")),), keys=(("exact", "m"),), geometry=str(data / "reconstruction"),
+        geometry_key="g", scene=str(data / "scene.xml"), scratch=str(data / "scratch"), every=1, effort=EFFORT,
         device="cpu",
     )  # fmt: skip
 
@@ -364,10 +355,11 @@ def test_a_killed_worker_loses_nothing(data: Path, tmp_path: Path) -> None:
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL"
     ) as cluster:
         killer.start()
-        rows = sweep(
-            planned, setting_of(data), Store(tmp_path), scheduler=cluster.scheduler_address,
-            work=partial(slow_job, str(started)),
-        )  # fmt: skip
+        with Steps(tmp_path) as steps:
+            rows = sweep(
+                planned, setting_of(data), steps, scheduler=cluster.scheduler_address,
+                work=partial(slow_job, str(started)),
+            )  # fmt: skip
     killer.join()
     assert killed
     assert [rows[run]["count"] for run in planned] == [1, 2, 3, 4]
@@ -376,7 +368,7 @@ def test_a_killed_worker_loses_nothing(data: Path, tmp_path: Path) -> None:
     assert len(starts) > len(planned)  # what the killed one was at was done again, by another process
     assert all(starts.count(stem) >= 2 for stem in again[:1])
     for run in planned:
-        with np.load(Store(tmp_path).pictures(run)) as stored:
+        with np.load(tmp_path / pictures_of(run)) as stored:
             assert stored["prediction_db"][0, 0, 0] == run.count
     assert not list(tmp_path.rglob("*.partial*"))
 
@@ -385,16 +377,17 @@ def test_a_killed_sweep_loses_the_run_it_was_at(data: Path, tmp_path: Path) -> N
     planned = [Run("exact", "random", n, 0, "nearest") for n in (1, 2, 3)]
     done: list[int] = []
 
-    def job(run: Run, setting: Setting, budget_s: float | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def job(run: Run, setting: Setting, *_: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         done.append(run.count)
         if len(done) == 2:
             raise KeyboardInterrupt
         return vars(run) | {}, {"prediction_db": np.zeros((1, 2, 2))}
 
     options = {"workers": 0, "work": job}
-    with pytest.raises(KeyboardInterrupt):
-        sweep(planned, setting_of(data), Store(tmp_path), **options)
-    rows = sweep(planned, setting_of(data), Store(tmp_path), **options)
+    with pytest.raises(KeyboardInterrupt), Steps(tmp_path) as steps:
+        sweep(planned, setting_of(data), steps, **options)
+    with Steps(tmp_path) as steps:
+        rows = sweep(planned, setting_of(data), steps, **options)
     assert done == [1, 2, 2, 3]
     assert [rows[run]["count"] for run in planned] == [1, 2, 3]
 
@@ -403,37 +396,15 @@ def test_a_run_that_fails_is_named(data: Path, tmp_path: Path) -> None:
     def job(*_: Any) -> Any:
         raise OSError("disk full")
 
-    with pytest.raises(RuntimeError, match="exact-random-1-s0-nearest: OSError: disk full"):
-        sweep(
-            [Run("exact", "random", 1, 0, "nearest")], setting_of(data), Store(tmp_path), workers=0, work=job
-        )
+    planned = [Run("exact", "random", 1, 0, "nearest")]
+    with (
+        Steps(tmp_path) as steps,
+        pytest.raises(RuntimeError, match="exact-random-1-s0-nearest: OSError: disk full"),
+    ):
+        sweep(planned, setting_of(data), steps, workers=0, work=job)
 
 
 # ------------------------------------------------------------------------------------------------- the command
-
-
-def test_command_line_hands_on_its_options(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    asked: list[Any] = []
-
-    def run(kind: str, out: str, **options: Any) -> Any:
-        asked.append((kind, out, options))
-        return {}
-
-    monkeypatch.setattr(evaluation, "run", run)
-    monkeypatch.setattr(evaluation, "markdown", lambda kind, found: "the tables")
-    assert cli.main(
-        ["bench", "sparsity", "--counts", "10", "50", "--scheduler", "tcp://lab:8786", "--data", "a.nc", "b.nc",
-         "--scale", "paper", "--quiet"]
-    ) == 0  # fmt: skip
-    kind, out, options = asked[0]
-    assert (kind, out) == ("sparsity", "runs/evaluation")
-    assert options["counts"] == [10, 50]
-    assert options["data"] == ["a.nc", "b.nc"]
-    assert (options["scheduler"], options["scale"], options["workers"]) == ("tcp://lab:8786", "paper", 1)
-    assert "methods" not in options
-    assert "the tables" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -445,13 +416,12 @@ def test_command_line_hands_on_its_options(
         ({"scale": "huge"}, "scale: got huge"),
         ({"truths": ("sionna", "fake")}, "truths: got fake"),
         ({"workers": -1, "methods": ("nearest",)}, "workers: got -1"),
-        ({"geometry": Path("nowhere")}, "geometry: there is no folder nowhere"),
+        ({"geometry": "nowhere"}, "geometry: there is no folder nowhere"),
     ],
 )
 def test_bad_options_are_named(data: Path, tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
-    options = {**OPTIONS, "geometry": data / "reconstruction", "truths": ("exact",), **wrong}
     with pytest.raises(ValueError, match=said):
-        evaluation.run("table1", tmp_path, data, **options)
+        whole("table1", tmp_path, data, **{"truths": ("exact",), **wrong})
 
 
 def test_shown_receivers_are_one_with_line_of_sight_and_one_without() -> None:

@@ -12,8 +12,10 @@ import pytest
 from places import LOBBY
 
 import warprrf as wr
-from benchmarks import stages
-from benchmarks.lobby import pipeline, report
+from benchmarks.lobby import pipeline, seeds
+from benchmarks.runner import Job, execute
+from warprrf.files import write_json
+from warprrf.geometry.floor_plan import section
 from warprrf.geometry.splats.discs import discs_on_mesh
 
 SIZES = pipeline.Sizes(steps=20, train=6, test=4)
@@ -58,9 +60,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
             images.fromarray(pixels).save(folder / sub / f"v{index}.jpg")
     views = {name.replace("png", "jpg"): view for name, view in views.items()}
     names = list(views)
-    stages.write_json(folder / "poses_true.json", {"width": 64, "height": 48, **lens, "views": views})
-    stages.write_json(folder / "photos.json", {"photos": names, "held_out": names[1:3]})
-    stages.write_json(folder / "surveyed.json", {name: [0.0, 0.0, 0.0] for name in names})
+    write_json(folder / "poses_true.json", {"width": 64, "height": 48, **lens, "views": views})
+    write_json(folder / "photos.json", {"photos": names, "held_out": names[1:3]})
+    write_json(folder / "surveyed.json", {name: [0.0, 0.0, 0.0] for name in names})
     places = rng.uniform([1.0, 1.0, 1.0], [14.0, 11.0, 2.0], (200, 3))
     places = places[scene.is_free(places, clearance_m=0.3)][:10]
     dataset = wr.simulate(
@@ -76,11 +78,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _true_geometry(
-    out: Path, data: Path, sizes: Any, seed: int, device: Any, progress: Any
-) -> dict[str, Any]:
-    mesh = wr.Scene.load(data / "scene.xml").mesh
-    cameras = pipeline.truth_scores.true_cameras(data / "poses_true.json")
+def _true_geometry(lobby: pipeline.Lobby, attempt: Any) -> dict[str, Any]:
+    out, mesh = lobby.job.out, lobby.place.scene.mesh
+    cameras = pipeline.truth_scores.true_cameras(lobby.data / "poses_true.json")
     reconstruction = wr.Reconstruction(discs_on_mesh(mesh), mesh, cameras)
     reconstruction.save(out / "reconstruction")
     reconstruction.gaussians.save_ply(out / "geometry.ply")
@@ -96,17 +96,22 @@ def _true_geometry(
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "_geometry", _true_geometry)
+    monkeypatch.setattr(pipeline.Lobby, "geometry", _true_geometry)
     monkeypatch.setattr(pipeline, "REDUCED", SIZES)
+
+
+def whole(out: Path, data: Path, **job: Any) -> dict[str, Any]:
+    options = pipeline.Options(data=str(data), reduced=True)
+    return execute(pipeline.BENCHMARKS["lobby"], options, Job(out, device="cpu", **job))
 
 
 @pytest.fixture(scope="module")
 def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("runs") / "whole"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "_geometry", _true_geometry)
+        patch.setattr(pipeline.Lobby, "geometry", _true_geometry)
         patch.setattr(pipeline, "REDUCED", SIZES)
-        return out, pipeline.run(out, data, reduced=True, device="cpu")
+        return out, whole(out, data)
 
 
 def test_report_holds_every_figure(finished: tuple[Path, dict[str, Any]]) -> None:
@@ -140,9 +145,9 @@ def test_second_run_computes_nothing(
     def refuse(*args: Any, **options: Any) -> None:
         raise AssertionError("computed again")
 
-    for name in ("_geometry", "_geometry_error", "_fit", "_evaluation", "_pictures"):
-        monkeypatch.setattr(pipeline, name, refuse)
-    assert pipeline.run(out, data, reduced=True, device="cpu")["methods"] == first["methods"]
+    for name in ("geometry", "geometry_error", "fit", "evaluation", "pictures"):
+        monkeypatch.setattr(pipeline.Lobby, name, refuse)
+    assert whole(out, data)["methods"] == first["methods"]
 
 
 def test_killed_run_ends_with_the_same_figures(
@@ -153,8 +158,8 @@ def test_killed_run_ends_with_the_same_figures(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        pipeline.run(tmp_path, data, reduced=True, device="cpu", progress=kill)
-    again = pipeline.run(tmp_path, data, reduced=True, device="cpu")
+        whole(tmp_path, data, progress=kill)
+    again = whole(tmp_path, data)
     assert again["stages"]["fit bistatic, exact"]["attempts"] == 2
     assert again["stages"]["geometry"]["attempts"] == 1
     for name, figures in finished[1]["methods"].items():
@@ -163,8 +168,8 @@ def test_killed_run_ends_with_the_same_figures(
 
 
 def test_missing_data_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"photos.*warprrf data"):
-        pipeline.run(tmp_path / "out", tmp_path)
+    with pytest.raises(ValueError, match=r"photos.*benchmarks data"):
+        whole(tmp_path / "out", tmp_path)
     assert not (tmp_path / "out").exists()
 
 
@@ -172,6 +177,42 @@ def test_section_of_a_box_is_its_outline() -> None:
     corners = np.array([[x, y, z] for x in (0.0, 4.0) for y in (0.0, 3.0) for z in (0.0, 2.0)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    lines = report.section(corners, faces, 1.2)
+    lines = section(corners, faces, 1.2)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * (4 + 3))
-    assert report.section(corners, faces, 2.5).shape == (0, 2, 2)
+    assert section(corners, faces, 2.5).shape == (0, 2, 2)
+
+
+def test_spread_over_seeds_is_that_of_the_reports() -> None:
+    def report(psnr: float, camera: float | None) -> dict[str, Any]:
+        methods = {"bistatic": {"psnr_db": psnr, "ssim": None}}
+        return {"camera_rms_m": camera, "methods": methods, "methods_sionna": methods}
+
+    rows = {
+        row["key"]: row for row in seeds.spread([report(30.0, 0.01), report(32.0, 0.01), report(34.0, 0.04)])
+    }
+    assert set(rows) == {"camera_rms_m", "methods.bistatic.psnr_db", "methods_sionna.bistatic.psnr_db"}
+    found = rows["methods.bistatic.psnr_db"]
+    assert (found["mean"], found["spread"], found["least"], found["most"]) == (32.0, 2.0, 30.0, 34.0)
+    assert rows["camera_rms_m"]["mean"] == pytest.approx(0.02)
+
+
+def test_seeds_have_runs_of_their_own_and_results_where_asked(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Path, int]] = []
+
+    def run(options: Any, job: Job) -> Any:
+        asked.append((job.out, job.seed))
+        return pipeline.Report(
+            "report", {"methods": {}, "methods_sionna": {}, "camera_rms_m": 0.01 * job.seed}, ""
+        )
+
+    monkeypatch.setattr(pipeline, "run", run)
+    results = tmp_path / "results" / "lobby_seeds.json"
+    options = seeds.Options(seeds=(1, 3), results=str(results))
+    execute(seeds.BENCHMARKS["lobby-seeds"], options, Job(tmp_path / "out"))
+    assert asked == [(tmp_path / "out/seed-1", 1), (tmp_path / "out/seed-3", 3)]
+    (row,) = json.loads(results.read_text())["rows"]
+    assert (row["key"], row["mean"], row["values"]) == ("camera_rms_m", 0.02, [0.01, 0.03])
+    with pytest.raises(ValueError, match="seeds: got"):
+        seeds.run(seeds.Options(seeds=(2,)), Job(tmp_path))

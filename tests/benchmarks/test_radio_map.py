@@ -3,12 +3,14 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from places import LOBBY
 
 from benchmarks import radio_map as bench
+from benchmarks.runner import Job
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.maps.radio_map import RadioMap
@@ -56,15 +58,14 @@ def test_both_maps_of_the_lobby_agree_where_the_transmitter_is_seen(tmp_path: Pa
     pytest.importorskip("sionna.rt")
     ds = SpectrumDataset.load(LOBBY / "spectra_sionna.nc")
     field = BistaticField.prior(Scene.load(LOBBY / "scene.xml"), ds, terms=Terms(mirror_order=1))
-    run = {
-        "field": field,
-        "scene": LOBBY / "scene.xml",
-        "cell": 1.5,
-        "shapes": ((5, 10), (10, 20)),
-        "samples": (1_000, 100_000),
-        "reference": 400_000,
-    }
-    report = bench.run_map(tmp_path, **run)
+    options = bench.Options(
+        scene=str(LOBBY / "scene.xml"), cell=1.5, shapes=((5, 10), (10, 20)), samples=(1_000, 100_000), reference=400_000
+    )  # fmt: skip
+
+    def run(field: BistaticField) -> dict[str, Any]:
+        return bench.run(options, Job(tmp_path), field).write(tmp_path)
+
+    report = run(field)
     # With line of sight the rest is worth a decibel, whatever the materials are taken for.
     assert report["ours"][1]["rms_seen_db"] < 1.5
     few, many = report["sionna"]
@@ -79,7 +80,7 @@ def test_both_maps_of_the_lobby_agree_where_the_transmitter_is_seen(tmp_path: Pa
         (200, 1, 1), (800, 1, 1), (200, 1, 4),
     ]  # fmt: skip
     longer = replace(field, terms=replace(field.terms, mirror_order=3))
-    again = bench.run_map(tmp_path, **run | {"field": longer})
+    again = run(longer)
     assert [(r["rays"], r["mirrors"], r["average"]) for r in again["ours"]] == [
         (200, 3, 1), (800, 3, 1), (200, 2, 1), (200, 2, 4),
     ]  # fmt: skip
@@ -91,6 +92,6 @@ def test_both_maps_of_the_lobby_agree_where_the_transmitter_is_seen(tmp_path: Pa
 
 def test_a_run_asks_for_a_bistatic_field_and_something_to_measure(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="shapes, samples: got"):
-        bench.run_map(tmp_path, shapes=())
+        bench.Options(shapes=())
     with pytest.raises(FileNotFoundError):
-        bench.run_map(tmp_path, field=tmp_path / "none.safetensors")
+        bench.run(bench.Options(field=str(tmp_path / "none.safetensors")), Job(tmp_path))

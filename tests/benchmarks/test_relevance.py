@@ -8,6 +8,7 @@ import pytest
 from places import ROOT
 
 from benchmarks import relevance as bench
+from benchmarks.runner import Job, execute
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
 
@@ -24,10 +25,11 @@ def test_receivers_that_judge_did_not_choose_and_half_are_blocked() -> None:
 
 @pytest.mark.slow
 def test_a_small_run_writes_table_picture_and_figures(tmp_path: Path) -> None:
-    report = bench.run(
-        tmp_path, ROOT / "data" / "lobby", carriers_hz=(300e9,), roughness={"smooth": 0.3}, tolerances_db=(1.0, 30.0),
+    options = bench.Options(
+        data=str(ROOT / "data" / "lobby"), carriers_hz=(300e9,), roughness=(("smooth", 0.3),), tolerances_db=(1.0, 30.0),
         choosers=2, judges=2, shape=(16, 32), fit=False,
     )  # fmt: skip
+    report = execute(bench.BENCHMARKS["relevance"], options, Job(tmp_path))
     tight, loose = report["cases"][0]["choices"]
     assert tight["own_image_db"] <= 1.0
     assert (

@@ -15,7 +15,14 @@ sys.path.insert(0, str(ROOT / "bench"))
 from small_room import small_room
 
 import warprrf as wr
-from benchmarks.baselines.sionna_calibration import _bound, _physical, _slopes, _unbound, calibrate_sionna
+from benchmarks.baselines.sionna_calibration import (
+    Calibration,
+    _bound,
+    _physical,
+    _slopes,
+    _unbound,
+    calibrate_sionna,
+)
 
 
 def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) -> None:
@@ -27,7 +34,7 @@ def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) ->
         [replace(m, scattering=0.5 * s) for m, s in zip(true.materials, truth, strict=True)]
     )
     found = calibrate_sionna(
-        wrong, train, seconds=60.0, most_steps=12, samples=20_000, rate=0.5, device="cpu"
+        wrong, train, Calibration(seconds=60.0, most_steps=12, samples=20_000, rate=0.5), device="cpu"
     )
     assert len(found.losses) == 12
     assert np.mean(found.losses[-4:]) < 0.7 * np.mean(found.losses[:4])
@@ -53,6 +60,6 @@ def test_unbound_values_go_there_and_back_and_slopes_are_theirs(tmp_path: Path) 
 
 def test_bad_times_are_named() -> None:
     with pytest.raises(ValueError, match="seconds: got 0"):
-        calibrate_sionna(None, None, seconds=0)  # type: ignore[arg-type]
+        Calibration(seconds=0)
     with pytest.raises(ValueError, match="most_steps: got 0"):
-        calibrate_sionna(None, None, seconds=1.0, most_steps=0)  # type: ignore[arg-type]
+        Calibration(seconds=1.0, most_steps=0)

@@ -3,7 +3,8 @@
 import numpy as np
 from twin_fields import BLOCKED, SEES, SHAPE, SIGMA, TX, F, known_field, room
 
-from benchmarks.twin import compare_twin
+from benchmarks.runner import Job
+from benchmarks.twin import Options, compare
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
@@ -17,7 +18,7 @@ def test_the_twin_of_a_known_room_scores_like_the_room(tmp_path):
         aod=np.stack([f.aod for f in found]), line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=SIGMA,
         engine="exact",
     )  # fmt: skip
-    figures = compare_twin(known_field(), test, tmp_path / "twin", engine="exact")
+    figures = compare(known_field(), test, None, Options(engine="exact"), Job(tmp_path / "twin"))
     assert "true_scene" not in figures
     assert figures["twin"]["psnr_db"] > 55
     assert figures["field"]["psnr_db"] > 35

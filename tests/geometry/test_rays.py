@@ -18,9 +18,14 @@ ROOM = (np.array([-7.0, -6.0, 0.0]), np.array([8.0, 6.0, 4.0]))
 no_embree = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="needs open3d")
 
 
-@pytest.fixture(params=["warp", pytest.param("embree", marks=no_embree)])
-def backend(request):
-    return request.param
+@pytest.fixture(
+    params=["warp", pytest.param("embree", marks=no_embree), pytest.param("cuda", marks=pytest.mark.cuda)]
+)
+def where(request):
+    """What searches, and where."""
+    if request.param == "cuda":
+        return {"backend": "warp", "device": "cuda:0"}
+    return {"backend": request.param, "device": "cpu"}
 
 
 def box(low, high):
@@ -71,7 +76,7 @@ def rotation(seed):
     return q * np.sign(np.diag(r))
 
 
-def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(backend):
+def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(where):
     mesh, rng = sphere(), np.random.default_rng(1)
     assert mesh.is_closed
     vertex = mesh.vertices[rng.integers(len(mesh.vertices), size=60_000)]
@@ -80,7 +85,7 @@ def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(backend):
     edge = share * face[:, 0] + (1 - share) * face[:, 1]
     target = np.concatenate([vertex, edge, 10.0 * directions(80_000)])
     origin = rng.uniform(-0.05, 0.05, (len(target), 3))
-    hit = mesh.cast(origin, target - origin, backend=backend, device="cpu")
+    hit = mesh.cast(origin, target - origin, **where)
     assert hit.valid.all()
     distance = np.linalg.norm(target - origin, axis=1)[:120_000]
     np.testing.assert_allclose(hit.t[:120_000], distance, atol=5e-5)
@@ -95,7 +100,7 @@ def test_only_the_recast_stops_rays_at_vertices(monkeypatch):
     assert not mesh.cast(origin, vertex - origin, backend="warp", device="cpu").valid.all()
 
 
-def test_a_miss_from_outside_stays_a_miss(backend, monkeypatch):
+def test_a_miss_from_outside_stays_a_miss(where, monkeypatch):
     mesh = sphere()
     calls = []
     nearest = raysearch.RaySearch.nearest
@@ -105,19 +110,19 @@ def test_a_miss_from_outside_stays_a_miss(backend, monkeypatch):
         lambda self, o, d, **k: calls.append(len(d)) or nearest(self, o, d, **k),
     )
     outward = directions(1000)
-    hit = mesh.cast(20.0 * outward, outward, backend=backend, device="cpu")
+    hit = mesh.cast(20.0 * outward, outward, **where)
     assert not hit.valid.any() and calls == [1000]
 
 
-def test_an_open_mesh_is_not_recast(backend):
+def test_an_open_mesh_is_not_recast(where):
     mesh = Mesh(sphere().vertices, sphere().faces[:-1])
     assert not mesh.is_closed
     hole = sphere().triangles[-1].mean(axis=0)
-    assert mesh.cast([0, 0, 0], hole, backend=backend, device="cpu").face[0] == -1
+    assert mesh.cast([0, 0, 0], hole, **where).face[0] == -1
 
 
 @pytest.mark.parametrize("height", [1e-3, 1e-5])
-def test_grazing_rays_meet_floor_or_wall_where_they_should(backend, height):
+def test_grazing_rays_meet_floor_or_wall_where_they_should(where, height):
     rng = np.random.default_rng(2)
     n = 20_000
     origin = np.column_stack([rng.uniform(-6, 7, n), rng.uniform(-5, 5, n), np.full(n, height)])
@@ -125,7 +130,7 @@ def test_grazing_rays_meet_floor_or_wall_where_they_should(backend, height):
     slope = height * 10.0 ** rng.uniform(-2, 2, n)
     d = np.column_stack([np.cos(azimuth), np.sin(azimuth), -slope])
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    hit = Mesh(*box(*ROOM)).cast(origin, d, backend=backend, device="cpu")
+    hit = Mesh(*box(*ROOM)).cast(origin, d, **where)
     t = box_exit(origin, d, *ROOM)
     # Float32 places the foot of the wall to 1e-6 m: there a ray may be given either face.
     foot = np.abs(origin[:, 2] + d[:, 2] * box_exit(origin, d * [1, 1, 0], *ROOM)) < 4e-6
@@ -134,7 +139,7 @@ def test_grazing_rays_meet_floor_or_wall_where_they_should(backend, height):
     assert hit.valid.all()
 
 
-def test_degenerate_and_duplicate_triangles_change_nothing(backend):
+def test_degenerate_and_duplicate_triangles_change_nothing(where):
     clean = sphere()
     rng = np.random.default_rng(3)
     some = rng.permutation(len(clean.faces))[:400]
@@ -149,14 +154,14 @@ def test_degenerate_and_duplicate_triangles_change_nothing(backend):
     needles = Mesh(vertices, np.concatenate([collinear, points, clean.faces[some], clean.faces]))
     assert dirty.is_closed
     aimed = np.concatenate([directions(100_000), clean.vertices, middle])
-    expected = clean.cast([0.01, 0.02, 0.03], aimed, backend=backend, device="cpu")
+    expected = clean.cast([0.01, 0.02, 0.03], aimed, **where)
     for mesh in (dirty, needles):
-        hit = mesh.cast([0.01, 0.02, 0.03], aimed, backend=backend, device="cpu")
+        hit = mesh.cast([0.01, 0.02, 0.03], aimed, **where)
         np.testing.assert_allclose(hit.t, expected.t, atol=2e-6)
         np.testing.assert_allclose(hit.t[:100_000], expected.t[:100_000], atol=1e-9)
 
 
-def test_a_receiver_on_a_surface_meets_the_next_surface(backend):
+def test_a_receiver_on_a_surface_meets_the_next_surface(where):
     turn, n = rotation(4), 30_000
     vertices, faces = box(*ROOM)
     room = Mesh(vertices @ turn.T + [3.0, -2.0, 1.0], faces)
@@ -170,27 +175,27 @@ def test_a_receiver_on_a_surface_meets_the_next_surface(backend):
     t = box_exit(
         p, d, *ROOM
     )  # -0 and tiny distances to the own wall cannot arise: the ray leads away from it
-    hit = room.cast(p @ turn.T + [3.0, -2.0, 1.0], d @ turn.T, backend=backend, device="cpu")
+    hit = room.cast(p @ turn.T + [3.0, -2.0, 1.0], d @ turn.T, **where)
     np.testing.assert_allclose(hit.t[steep], t[steep], rtol=1e-9)
 
 
-def test_a_surface_just_before_the_receiver_is_met(backend):
+def test_a_surface_just_before_the_receiver_is_met(where):
     rng = np.random.default_rng(7)
     gap = 10.0 ** rng.uniform(-9, -3, 5000)
     origin = np.column_stack([rng.uniform(-6, 7, 5000), rng.uniform(-5, 5, 5000), gap])
     down = directions(5000, seed=8)
     down[:, 2] = -np.abs(down[:, 2]) - 0.2
     unit = down / np.linalg.norm(down, axis=1, keepdims=True)
-    hit = Mesh(*box(*ROOM)).cast(origin, down, backend=backend, device="cpu")
+    hit = Mesh(*box(*ROOM)).cast(origin, down, **where)
     np.testing.assert_allclose(hit.t, -gap / unit[:, 2], rtol=1e-6)
 
 
-def test_a_kilometre_scene_far_from_the_origin_is_exact(backend):
+def test_a_kilometre_scene_far_from_the_origin_is_exact(where):
     low, high = np.array([431_000.0, 5_411_000.0, 200.0]), np.array([432_000.0, 5_412_000.0, 260.0])
     mesh = Mesh(*box(low, high))
     origin = np.random.default_rng(9).uniform(low + 1, high - 1, (50_000, 3))
     d = directions(50_000, seed=10)
-    hit = mesh.cast(origin, d, backend=backend, device="cpu")
+    hit = mesh.cast(origin, d, **where)
     t = box_exit(origin, d, low, high)
     exit_point = origin + t[:, None] * d
     gap = np.sort(np.minimum(exit_point - low, high - exit_point), axis=1)[:, 1]
@@ -200,12 +205,12 @@ def test_a_kilometre_scene_far_from_the_origin_is_exact(backend):
     np.testing.assert_allclose(hit.t, t, atol=2e-2)
 
 
-def test_a_kilometre_scene_sees_from_floor_to_wall(backend):
+def test_a_kilometre_scene_sees_from_floor_to_wall(where):
     mesh, rng = Mesh(*box([0, 0, 0], [1000.0, 1000, 30])), np.random.default_rng(11)
     floor = np.column_stack([rng.uniform(1, 999, (2000, 2)), np.zeros(2000)])
     wall = np.column_stack([np.full(2000, 1000.0), rng.uniform(1, 999, 2000), rng.uniform(1, 29, 2000)])
-    assert mesh.visible(floor, wall, backend=backend, device="cpu").all()
-    assert not mesh.visible(floor, wall + [0.01, 0, 0], backend=backend, device="cpu").any()
+    assert mesh.visible(floor, wall, **where).all()
+    assert not mesh.visible(floor, wall + [0.01, 0, 0], **where).any()
 
 
 @no_embree
@@ -267,13 +272,13 @@ def test_many_rays_meet_what_each_meets_alone(length):
 
 
 @pytest.mark.parametrize("ask", ["cast", "visible", "distance"])
-def test_a_fresh_mesh_answers_several_threads_as_one(ask, backend):
+def test_a_fresh_mesh_answers_several_threads_as_one(ask, where):
     d = directions(4_000, seed=17)
     sources = {"cast": (0.1 * d, d), "visible": (0.1 * d, 6.0 * d), "distance": (4.0 * d,)}
-    options = {} if ask == "distance" else {"backend": backend}
+    options = {"device": where["device"]} if ask == "distance" else where
 
     def answer(mesh):
-        found = getattr(mesh, ask)(*sources[ask], device="cpu", **options)
+        found = getattr(mesh, ask)(*sources[ask], **options)
         return found.t if ask == "cast" else found
 
     expected = answer(sphere())
@@ -290,16 +295,18 @@ def test_a_fresh_mesh_answers_several_threads_as_one(ask, backend):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_child_answers_as_its_parent(backend):
+def test_a_forked_child_answers_as_its_parent(where):
     """Neither the pool of threads that the parent has used nor its hierarchies hang in the child."""
+    if where["device"] != "cpu":
+        pytest.skip("CUDA cannot be used in a forked child")
     mesh, d = sphere(), directions(20_000, seed=18)
-    expected = mesh.cast([0.0, 0.0, 0.0], d, backend=backend, device="cpu").t
+    expected = mesh.cast([0.0, 0.0, 0.0], d, **where).t
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe()
 
     def answer():
-        used = mesh.cast([0.0, 0.0, 0.0], d, backend=backend, device="cpu").t
-        fresh = sphere().cast([0.0, 0.0, 0.0], d, backend=backend, device="cpu").t
+        used = mesh.cast([0.0, 0.0, 0.0], d, **where).t
+        fresh = sphere().cast([0.0, 0.0, 0.0], d, **where).t
         theirs.send((used, fresh))
 
     child = context.Process(target=answer, daemon=True)
@@ -331,22 +338,22 @@ def test_unknown_back_ends_are_refused():
         Mesh(*box(*ROOM)).cast([0, 0, 1], [0, 0, 1], backend="optix")
 
 
-def test_bad_rays_are_refused_by_both(backend):
+def test_bad_rays_are_refused_by_both(where):
     mesh = Mesh(*box(*ROOM))
     with pytest.raises(ValueError, match="directions.*zero"):
-        mesh.cast([0, 0, 1], [[1, 0, 0], [0, 0, 0]], backend=backend, device="cpu")
+        mesh.cast([0, 0, 1], [[1, 0, 0], [0, 0, 0]], **where)
     with pytest.raises(ValueError, match="directions.*NaN"):
-        mesh.cast([0, 0, 1], [[1, 0, 0], [0, np.inf, 0]], backend=backend, device="cpu")
+        mesh.cast([0, 0, 1], [[1, 0, 0], [0, np.inf, 0]], **where)
     with pytest.raises(ValueError, match="origins.*NaN"):
-        mesh.cast([[0, 0, 1], [0, 0, np.nan]], [1, 0, 0], backend=backend, device="cpu")
+        mesh.cast([[0, 0, 1], [0, 0, np.nan]], [1, 0, 0], **where)
     with pytest.raises(ValueError, match="b: got 30000 values that are NaN"):
-        mesh.visible([0, 0, 1], np.full((10_000, 3), np.nan), backend=backend, device="cpu")
-    assert mesh.cast(np.zeros((0, 3)), np.zeros((0, 3)), backend=backend, device="cpu").t.shape == (0,)
+        mesh.visible([0, 0, 1], np.full((10_000, 3), np.nan), **where)
+    assert mesh.cast(np.zeros((0, 3)), np.zeros((0, 3)), **where).t.shape == (0,)
 
 
-def test_points_and_normals_are_computed_when_asked_for(backend):
+def test_points_and_normals_are_computed_when_asked_for(where):
     origin, d = np.array([0.5, 0.25, 1.5]), 3.0 * directions(500)
-    hit = Mesh(*box(*ROOM)).cast(origin, d, backend=backend, device="cpu")
+    hit = Mesh(*box(*ROOM)).cast(origin, d, **where)
     assert not {"point", "normal"} & set(vars(hit))
     t = box_exit(origin, d / 3.0, *ROOM)
     unit = d / 3.0
@@ -356,15 +363,15 @@ def test_points_and_normals_are_computed_when_asked_for(backend):
     np.testing.assert_allclose(np.abs(hit.normal).max(axis=1), 1.0)
 
 
-def test_points_stand_whatever_is_cast_later(backend):
+def test_points_stand_whatever_is_cast_later(where):
     mesh, rng = Mesh(*box(*ROOM)), np.random.default_rng(20)
     origin, toward, hits = rng.uniform(0.5, 1.5, (6, 3_001, 3)), rng.standard_normal((6, 3_001, 3)), []
     for o, d in zip(origin, toward, strict=True):
         given = o.copy(), d.copy()
-        hits.append(mesh.cast(*given, backend=backend, device="cpu"))
+        hits.append(mesh.cast(*given, **where))
         for array in given:
             array[:] = np.nan
-        mesh.cast(d, o, backend=backend, device="cpu")
+        mesh.cast(d, o, **where)
     for o, d, hit in zip(origin, toward, hits, strict=True):
         unit = d / np.linalg.norm(d, axis=1, keepdims=True)
         np.testing.assert_allclose(
@@ -372,12 +379,12 @@ def test_points_stand_whatever_is_cast_later(backend):
         )
 
 
-def test_segments_too_long_for_float32_are_judged_and_those_too_long_for_float64_refused(backend):
+def test_segments_too_long_for_float32_are_judged_and_those_too_long_for_float64_refused(where):
     mesh, outward = sphere(), directions(35, seed=21)
     start = np.where(np.arange(35)[:, None] % 2, 1.0, 9.0) * outward
     start[::7] = 1e17 * outward[::7]
     for length in (1e16, 1e25, 1e60):
-        seen = mesh.visible(start, length * outward, backend=backend, device="cpu")
+        seen = mesh.visible(start, length * outward, **where)
         expected = np.arange(35) % 2 == 0
         expected[::7] = True
         np.testing.assert_array_equal(seen, expected)
@@ -385,7 +392,7 @@ def test_segments_too_long_for_float32_are_judged_and_those_too_long_for_float64
         end = 7.0 * outward
         end[place] *= 1e200
         with pytest.raises(ValueError, match="a, b: got numbers too large"):
-            mesh.visible(start, end, backend=backend, device="cpu")
+            mesh.visible(start, end, **where)
 
 
 @no_embree

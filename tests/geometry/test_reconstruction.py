@@ -10,13 +10,14 @@ from places import LOBBY
 from views import look
 
 import warprrf as wr
-from warprrf.geometry.photos import pipeline as from_photos
+from warprrf.geometry import geometry_files as files
+from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.photos import sparse
 from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
 from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
-from warprrf.geometry.photos.pipeline import reconstruct
 from warprrf.geometry.photos.planes import Plane, plane_axes
+from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.discs import discs_on_mesh
 
@@ -199,7 +200,7 @@ def test_a_killed_run_continues_to_the_same_result(whole):
 @pytest.mark.parametrize(
     "changed, again",
     [
-        ("start", {"planes", "refine", "depth", "surface"}),
+        ("initial", {"planes", "refine", "depth", "surface"}),
         ("refined", {"refine", "depth", "surface"}),
         ("surface", {"depth", "surface"}),
     ],
@@ -275,6 +276,12 @@ def test_damaged_files_are_refused_and_survive_a_failed_save(whole, tmp_path):
     assert path.read_bytes() == good and len(list(tmp_path.iterdir())) == 1
     path.write_bytes(good[: len(good) // 2])
     with pytest.raises(ValueError, match="damaged"):
+        Reconstruction.load(tmp_path)
+
+
+def test_a_file_of_an_older_format_says_what_to_do(tmp_path):
+    files.write(tmp_path / "reconstruction.safetensors", {"means": np.zeros((1, 3))}, {"format": 1})
+    with pytest.raises(ValueError, match="format 1, this version reads 2; make it again"):
         Reconstruction.load(tmp_path)
 
 

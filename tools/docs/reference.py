@@ -43,6 +43,10 @@ def pages() -> dict[str, str]:
             groups[_group(found.__module__)].append(_entry("warprrf", name, found))
     for model in _models():
         groups["rf.fields"].append(_entry(model.__module__, model.__name__, model))
+        options = _options(model)
+        groups["rf.fields"].append(
+            _entry(options.__module__, options.__name__, options) + "\n   :no-members:"
+        )
     written = {
         f"reference/{key.replace('.', '-')}.rst": "\n\n".join([_title(title), words, *groups[key]]) + "\n"
         for key, (title, words) in GROUPS.items()
@@ -85,6 +89,13 @@ def _models() -> list[type]:
     for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         importlib.import_module(found.name)
     return sorted(warprrf.RadioField.__subclasses__(), key=lambda c: c.__name__)
+
+
+def _options(model: Any) -> type:
+    """The dataclass of the options that a model's ``fit`` takes."""
+    annotation = inspect.signature(model.fit).parameters["options"].annotation
+    found: type = model.fit.__func__.__globals__[str(annotation).split(" ")[0]]
+    return found
 
 
 def _module_page(name: str, module: ModuleType) -> str:

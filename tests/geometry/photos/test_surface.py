@@ -135,11 +135,27 @@ def test_noise_around_a_plane_is_no_second_plane_but_a_poster_is():
     assert offsets == pytest.approx([0, 0.08], abs=1e-3)
 
 
-def test_detection_repeats_itself_for_a_seed():
+def test_rounding_and_a_point_more_or_less_decide_nothing():
+    """Eight weak planes in a cloud: draws follow from where points lie, not from their number or order."""
     rng = np.random.default_rng(4)
-    points, normals = rng.uniform(-1, 1, (3000, 3)) * [1, 1, 0.02], np.tile([0.0, 0, 1], (3000, 1))
-    a, b = (detect_planes(points, normals, seed=5) for _ in range(2))
-    assert [(p.offset, *p.normal) for p in a] == [(p.offset, *p.normal) for p in b]
+    points, normals = [rng.uniform(-3, 3, (4000, 3))], [rng.standard_normal((4000, 3))]
+    for _ in range(8):
+        normal = rng.standard_normal(3)
+        normal /= np.linalg.norm(normal)
+        flat = rng.uniform(-0.25, 0.25, (50, 2)) @ plane_axes(normal)
+        points.append(rng.uniform(-3, 3, 3) + flat + 0.003 * rng.standard_normal((50, 1)) * normal)
+        normals.append(normal + 0.15 * rng.standard_normal((50, 3)))
+    points, normals = np.concatenate(points), np.concatenate(normals)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def planes(points, normals):
+        return np.array([[*p.normal, p.offset] for p in detect_planes(points, normals)])
+
+    usual, back, less = planes(points, normals), slice(None, None, -1), slice(1, None)
+    assert len(usual) == 8
+    np.testing.assert_allclose(planes(points[back], normals[back]), usual, atol=1e-9)
+    np.testing.assert_allclose(planes(points[less], normals[less]), usual, atol=1e-9)
+    np.testing.assert_allclose(planes(points * (1 + 1e-7), normals), usual, atol=1e-5)
 
 
 def test_a_plane_is_empty_where_one_sees_through_it():

@@ -8,7 +8,7 @@ import pytest
 import views
 
 from warprrf.geometry.photos import sweep
-from warprrf.geometry.photos.cells import occupancy
+from warprrf.geometry.photos.cells import meeting, occupancy
 from warprrf.geometry.photos.config import PlaneConfig, SweepConfig
 from warprrf.geometry.photos.planes import Plane, aligned, plane_axes
 
@@ -148,6 +148,50 @@ def test_a_small_known_piece_grows_to_what_the_photos_show(views):
     assert proven.area() > 1.8 * piece.area()
     corner = np.array([[1.2, 1.2, 0.0], [-1.2, 1.2, 0], [1.2, -1.2, 0], [-1.2, -1.2, 0]])
     assert proven.covers(corner).mean() >= 0.75
+
+
+# ------------------------------------------------------------------------------------------------ edges
+
+
+def rectangle(normal, origin, first, second, cell=0.1):
+    """A plane patch through ``origin`` spanned by ``first`` and ``second`` (whole cells)."""
+    normal = np.asarray(normal, float)
+    axes = plane_axes(normal)
+    steps = [np.arange(cell / 2, np.linalg.norm(s), cell)[:, None] * (s / np.linalg.norm(s)) for s in
+             (np.asarray(first, float), np.asarray(second, float))]  # fmt: skip
+    points = (np.asarray(origin, float) + steps[0][:, None] + steps[1][None]).reshape(-1, 3)
+    uv = points @ axes.T
+    corner = uv.min(axis=0) - cell / 2
+    index = np.round((uv - corner) / cell - 0.5).astype(int)
+    occupied = np.zeros(index.max(axis=0) + 1, dtype=bool)
+    occupied[tuple(index.T)] = True
+    return Plane(normal, float(normal @ origin), np.zeros(0, int), 0.0, corner, cell, occupied)
+
+
+def test_wall_and_floor_reach_their_common_edge():
+    floor = rectangle([0, 0, 1], [0.2, 0, 0], [2, 0, 0], [0, 2, 0])  # stops 20 cm short of the wall
+    wall = rectangle([1, 0, 0], [0, 0, 0.2], [0, 2, 0], [0, 0, 2])  # and the wall 20 cm above the floor
+    floor2, wall2 = meeting([floor, wall])
+    assert floor2.covers(np.array([[0.05, 1.0, 0], [0.15, 0.5, 0]])).all()
+    assert wall2.covers(np.array([[0, 1.0, 0.05]])).all()
+    assert not floor2.covers(np.array([[-0.15, 1.0, 0]])).any()  # nor through the wall
+    assert floor2.area() == pytest.approx(floor.area() + 0.2 * 2, rel=0.1)
+
+
+def test_the_faces_of_a_pillar_end_at_its_edge():
+    front = rectangle([0, -1, 0], [-0.5, 0, 0], [1.2, 0, 0], [0, 0, 2])  # true to x = 0.5, hangs over to 0.7
+    side = rectangle([1, 0, 0], [0.5, 0, 0], [0, 1, 0], [0, 0, 2])
+    front2, side2 = meeting([front, side])
+    assert not front2.covers(np.array([[0.65, 0, 1.0]])).any()
+    assert front2.covers(np.array([[0.45, 0, 1.0], [-0.45, 0, 1]])).all()
+    assert side2.occupied.sum() == side.occupied.sum()
+
+
+def test_a_thin_screen_does_not_cut_the_floor_it_stands_on():
+    floor = rectangle([0, 0, 1], [-2, 0, 0], [4, 0, 0], [0, 2, 0])
+    sides = [rectangle([s, 0, 0], [0.1 * s, 0.5, 0], [0, 1, 0], [0, 0, 2]) for s in (1, -1)]
+    floor2, *_ = meeting([floor, *sides])
+    assert floor2.occupied.sum() == floor.occupied.sum()
 
 
 def test_nearly_level_weak_planes_become_level_and_tilted_ones_stay():

@@ -62,16 +62,15 @@ class WholePath:
 
     def arrays(self, values: dict[str, np.ndarray]) -> dict[str, wp.array]:
         return {
-            k: wp.array(v, dtype=DTYPES.get(k, wp.float64), requires_grad=True, device="cpu")
-            for k, v in values.items()
+            k: wp.array(v, dtype=DTYPES.get(k, wp.float64), requires_grad=True) for k, v in values.items()
         }
 
     def record(self, values: dict[str, np.ndarray]) -> tuple[wp.Tape, wp.array, dict[str, wp.array]]:
-        raster = Rasterizer(device="cpu", blending=self.blending, real=wp.float64)
+        raster = Rasterizer(blending=self.blending, real=wp.float64)
         a = self.arrays(values)
-        loss = wp.zeros(1, dtype=wp.float64, requires_grad=True, device="cpu")
-        target = wp.array(self.target, dtype=wp.float64, device="cpu")
-        weight = wp.array(self.interior, dtype=wp.float64, device="cpu")
+        loss = wp.zeros(1, dtype=wp.float64, requires_grad=True)
+        target = wp.array(self.target, dtype=wp.float64)
+        weight = wp.array(self.interior, dtype=wp.float64)
         with wp.Tape() as tape:
             if self.spoil is not None:  # recorded first, so it runs last, when the gradient is complete
                 wrong = a[self.spoil]
@@ -90,7 +89,6 @@ class WholePath:
                 decibel_loss,
                 dim=self.interior.shape,
                 inputs=[image.features, image.alpha, image.depth, target, weight, loss],
-                device="cpu",
             )
         return tape, loss, a
 
@@ -163,6 +161,7 @@ def margins(values: dict[str, np.ndarray], camera: Camera, blending: Blending) -
     return closest
 
 
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("seed", range(SCENES))
 def test_whole_path_gradients_match_finite_differences_to_1e_6(seed):
     path = WholePath(seed)
@@ -183,13 +182,13 @@ def test_a_step_over_a_cutoff_moves_a_pixel_by_one_faint_layer_at_most(seed):
     """Pixels at a threshold: the image jumps there, by no more than alpha_min times the pair's contrast, or than the
     light left at the early exit."""
     path = WholePath(seed)
-    raster = Rasterizer(device="cpu", blending=path.blending, real=wp.float64)
+    raster = Rasterizer(blending=path.blending, real=wp.float64)
     rng = np.random.default_rng(seed)
     features, background = rng.random((COUNT, CHANNELS)), rng.random(CHANNELS)
 
     def image(values):
         a = path.arrays(values)
-        table = wp.array(features, dtype=wp.float64, device="cpu")
+        table = wp.array(features, dtype=wp.float64)
         return raster.rasterize(
             a["means"], a["quaternions"], a["scales"], a["opacities"], table, path.camera, background
         ).features.numpy()
@@ -221,8 +220,8 @@ def test_a_second_backward_on_the_tape_adds_the_same_gradients_again():
 
 def test_gradients_handed_to_the_tape_can_be_used_again():
     path = WholePath(4)
-    raster = Rasterizer(device="cpu", blending=path.blending, real=wp.float64)
-    seed = wp.array(np.random.default_rng(0).normal(size=path.target.shape), dtype=wp.float64, device="cpu")
+    raster = Rasterizer(blending=path.blending, real=wp.float64)
+    seed = wp.array(np.random.default_rng(0).normal(size=path.target.shape), dtype=wp.float64)
     kept = seed.numpy().copy()
     found = []
     for _ in range(2):

@@ -1,1 +1,13 @@
-"""Stage 1: from photo files to Gaussians, a mesh and its planar patches, in metres."""
+"""Stage 1: from photo files to Gaussians, a mesh and its planar patches, in metres.
+
+In the order in which :func:`warprrf.reconstruct` runs them:
+
+- ``photo_files``, ``sfm``: image files to camera poses and sparse points; ``sparse`` brings both to metres.
+- ``initialise``: the points cleaned (``points``), planes found among them (``planes``), the cells of each plane that
+  hold a surface (``cells``), corrected and completed by comparing photos (``sweep``), covered with Gaussians
+  (``initial_gaussians``).
+- ``refine``: Gaussians moved until they render the photos (``photo_loss``, ``densify``).
+- ``fusion``: depth maps fused to a mesh, snapped to planes (``snapping``), made whole (``completion``).
+
+All settings are in ``config``.
+"""

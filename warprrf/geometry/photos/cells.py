@@ -1,4 +1,4 @@
-"""Which cells of a plane hold a surface: where its points lie, where nobody looks through, where photos were taken of."""
+"""Which cells of a plane hold a surface: where its points lie, where nobody looks through, where planes meet."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from warprrf.geometry.mesh import Mesh
@@ -14,6 +15,9 @@ from warprrf.geometry.photos.planes import Plane, dilate
 from warprrf.geometry.splats.camera import Camera
 
 PARALLEL = np.cos(np.radians(10.0))  # planes that face alike
+REACH_CELLS = 3  # a gap at an inner corner up to this wide is closed, an overhang of any width cut
+NEAR_M = 0.5  # cells this close to the other plane tell on which side of it they stand
+INNER, OUTER = 0.8, 0.6  # share of them that has to be on one side
 
 
 def occupancy(
@@ -130,4 +134,39 @@ def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera], *, min_views:
         seen = visible_from(surface, plane.cells(), plane.normal, cameras)
         occupied[plane.occupied] = seen.sum(axis=1) >= min_views
         result.append(replace(plane, occupied=occupied))
+    return result
+
+
+def meeting(planes: Sequence[Plane]) -> list[Plane]:
+    """``planes`` with cells added at inner corners and removed beyond outer ones.
+
+    Photos prove little right at an edge. Two planes that stand on each other's front side form an inner corner (wall
+    and floor), and both reach up to their common line. Two that stand on each other's back side form an outer corner
+    (the faces of a pillar), and neither goes past it.
+    """
+    wide = [plane.widened(REACH_CELLS) for plane in planes]
+    grown = [dilate(plane.occupied, REACH_CELLS) for plane in wide]
+    result = []
+    for a, plane in enumerate(wide):
+        occupied, beyond = plane.occupied.copy(), np.zeros_like(plane.occupied)
+        centres = plane.cells(np.ones_like(occupied))
+        for b, other in enumerate(wide):
+            if a == b or abs(other.normal @ plane.normal) > 0.5:
+                continue
+            height = other.distance(centres).reshape(occupied.shape)
+            along = other.covers(centres, grown[b]).reshape(occupied.shape)
+            cells = other.cells()
+            mine = height[occupied & along & (np.abs(height) < NEAR_M)]
+            theirs = plane.distance(cells[plane.covers(cells, grown[a])])
+            theirs = theirs[np.abs(theirs) < NEAR_M]
+            if len(mine) < 3 or len(theirs) < 3:
+                continue
+            if min((mine > 0).mean(), (theirs > 0).mean()) > INNER:
+                strip = along & (height > -0.25 * plane.cell_m) & (height < REACH_CELLS * plane.cell_m)
+                for _ in range(REACH_CELLS):  # towards the other plane only
+                    higher = ndimage.maximum_filter(np.where(occupied, height, -np.inf), 3, mode="nearest")
+                    occupied |= strip & (higher > height + 0.02)
+            elif min((mine < 0).mean(), (theirs < 0).mean()) > OUTER:
+                beyond |= along & (height > 0.25 * plane.cell_m) & (height < NEAR_M)
+        result.append(replace(plane, occupied=occupied & ~beyond))
     return result

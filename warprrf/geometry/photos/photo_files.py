@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,8 +13,11 @@ from warprrf.device import require
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 MIN_PHOTOS = 3
 
+Photos = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+"""A folder of photos, or image files."""
 
-def find_photos(photos: Any) -> dict[str, Path]:
+
+def find_photos(photos: Photos) -> dict[str, Path]:
     """Photo name to file, sorted by name, for a folder or a sequence of image files.
 
     A name is the path below the folder (or below the files' common folder), with forward slashes. Hidden files of a
@@ -25,7 +27,7 @@ def find_photos(photos: Any) -> dict[str, Path]:
         ValueError: if the folder or files do not exist, or too few photos are there.
     """
     if isinstance(photos, str | os.PathLike):
-        root = Path(photos)
+        root = Path(photos).absolute()
         if not root.is_dir():
             raise ValueError(
                 f"photos: {root} is not a folder; expected a folder of photos or a list of image files"
@@ -40,7 +42,7 @@ def find_photos(photos: Any) -> dict[str, Path]:
         parents = {str(p.resolve().parent) for p in files}
         root = Path(os.path.commonpath(parents)) if parents else Path()
         files = [p.resolve() for p in files]
-    named = {p.relative_to(root).as_posix(): p.resolve() for p in files}
+    named = {p.relative_to(root).as_posix(): p for p in files}
     if len(named) < MIN_PHOTOS:
         raise ValueError(
             f"photos: got {len(named)} photos in {root}, expected at least {MIN_PHOTOS} "
@@ -75,7 +77,7 @@ def check_photos(named: Mapping[str, Path]) -> None:
         )
 
 
-def match_names(argument: str, wanted: Any, names: Sequence[str]) -> list[str]:
+def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> list[str]:
     """Full photo names of ``wanted``: each is a name, or a file name that only one of ``names`` has.
 
     Raises:

@@ -151,12 +151,12 @@ def detect_planes(
     points = check_array("points", points, (None, 3))
     normals = check_array("normals", normals, (len(points), 3))
     weight = np.ones(len(points)) if weights is None else check_array("weights", weights, (len(points),))
-    rng = np.random.default_rng(seed)
     free = np.arange(len(points))
     found: list[Plane] = []
     misses = 0
     while len(found) < config.max_planes and weight[free].sum() >= config.min_points and misses < 3:
-        plane = _best_plane(points[free], normals[free], weight[free], config, rng)
+        salt = seed + 1000 * (len(found) + misses)
+        plane = _best_plane(points[free], normals[free], weight[free], config, salt)
         if plane is None or weight[free[plane.inliers]].sum() < config.min_points:
             misses += 1
             continue
@@ -168,13 +168,29 @@ def detect_planes(
     return _merged(points, weight, found, config)
 
 
+def drawn_by_place(points: np.ndarray, weight: np.ndarray, count: int, salt: int) -> np.ndarray:
+    """Indices of up to ``count`` points drawn without replacement, each by its weight.
+
+    A point's luck is a hash of where it lies (to a millimetre) and of ``salt``: it does not depend on the other points,
+    their number or their order, so that what rounding does to one of them changes one draw, not all.
+    """
+    x, y, z = np.floor(points * 1000.0).astype(np.int64).astype(np.uint64).T
+    with np.errstate(over="ignore"):
+        luck = x * np.uint64(0x9E3779B97F4A7C15) + y * np.uint64(0xC2B2AE3D27D4EB4F)
+        luck += z * np.uint64(0x165667B19E3779F9) + np.uint64(salt) * np.uint64(0x27D4EB2F165667C5)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):  # mixer of SplitMix64
+            luck = (luck ^ (luck >> np.uint64(shift))) * np.uint64(factor)
+        luck ^= luck >> np.uint64(31)
+    uniform = ((luck >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
+    return np.argsort(-np.log(uniform) / np.maximum(weight, 1e-300), kind="stable")[:count]
+
+
 def _best_plane(
-    points: np.ndarray, normals: np.ndarray, weight: np.ndarray, config: PlaneConfig, rng: np.random.Generator
+    points: np.ndarray, normals: np.ndarray, weight: np.ndarray, config: PlaneConfig, salt: int
 ) -> Plane | None:
     """The plane of most weight among hypotheses through single points, the best of them refined."""
-    share = weight / weight.sum()
-    seeds = rng.choice(len(points), size=min(config.hypotheses, len(points)), replace=False, p=share)
-    drawn = rng.choice(len(points), size=min(config.scored_points, len(points)), replace=False)
+    seeds = drawn_by_place(points, weight, config.hypotheses, salt)
+    drawn = drawn_by_place(points, np.ones(len(points)), config.scored_points, salt)
     n, d = normals[seeds], (points[seeds] * normals[seeds]).sum(axis=1)
     near = np.abs(points[drawn] @ n.T - d) < 3 * config.distance_m
     score = weight[drawn] @ (near & (normals[drawn] @ n.T > config.cosine))

@@ -22,10 +22,13 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress, require
-from warprrf.geometry.photos.photo_files import MIN_PHOTOS, check_photos, find_photos, some
+from warprrf.geometry.photos.photo_files import MIN_PHOTOS, Photos, check_photos, find_photos, some
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.splats.camera import Camera
 from warprrf.steps import Attempt, Steps
+
+VERSIONS = {"features": 1, "matches": 1, "model": 1}
+"""Of the steps: counted up by whoever changes what a step computes."""
 
 CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
 
@@ -39,7 +42,7 @@ MATCH_BATCH = 400
 
 
 def structure_from_motion(
-    photos: Any,
+    photos: Photos,
     *,
     workspace: str | os.PathLike[str],
     max_features: int = 2400,
@@ -96,11 +99,11 @@ def structure_from_motion(
     with Steps(folder, progress=progress) as steps, _quiet(colmap):
         colmap.set_random_seed(seed)
         inputs = [list(named), list(named.values()), max_features, camera_model, colmap.__version__]
-        steps.run("features", features, version=1, inputs=inputs, outputs=["features.db"])
+        steps.run("features", features, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
         inputs = [steps.key("features"), pairs, seed]
-        steps.run("matches", matches, version=1, inputs=inputs, outputs=["matches.db"])
+        steps.run("matches", matches, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
         inputs = [steps.key("matches"), seed]
-        found = steps.run("model", model, version=1, inputs=inputs, outputs=["model"])
+        found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _sparse_model(colmap.Reconstruction(str(folder / "model")), list(named))
         return replace(result, other_models=tuple(found["other_models"]))
 
@@ -141,17 +144,10 @@ def _quiet(colmap: ModuleType) -> Iterator[None]:
         colmap.logging.minloglevel = before
 
 
-def _linked(folder: Path, named: Mapping[str, Path]) -> Path:
-    """``folder`` with the photos under their names, which is where COLMAP looks for them."""
-    shutil.rmtree(folder, ignore_errors=True)
-    for name, path in named.items():
-        link = folder / name
-        link.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            link.symlink_to(path)
-        except OSError:  # a file system without links
-            shutil.copyfile(path, link)
-    return folder
+def _root(named: Mapping[str, Path]) -> Path:
+    """The folder that photos' names are relative to, which is where COLMAP looks for them."""
+    name, path = next(iter(named.items()))
+    return path.parents[name.count("/")]
 
 
 def _copied(source: Path, target: Path) -> Path:
@@ -176,7 +172,7 @@ def _extract(
     """Features of the photos, into ``features.db``."""
     max_features, camera_model = settings
     names = list(named)
-    images = _linked(attempt.folder / "images", named)
+    images = _root(named)
     working = attempt.folder / "features.db"
     working.unlink(missing_ok=True)
     colmap.Database.open(str(working)).close()
@@ -288,7 +284,7 @@ def _map(
 ) -> list[int]:
     """Poses and points from the matches, into the folder ``model``; returns how many photos smaller models hold."""
     working = _copied(folder / "matches.db", attempt.folder / "matches.db")
-    images, report = _linked(attempt.folder / "images", named), attempt.progress
+    images, report = _root(named), attempt.progress
     options = colmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.num_threads = 1  # sums in a fixed order: the same poses every time

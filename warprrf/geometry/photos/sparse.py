@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.device import check_array
 from warprrf.geometry.photos.photo_files import match_names, some
@@ -71,7 +71,7 @@ class SparseModel:
         )
 
 
-def align_to_known(sparse: SparseModel, known_positions: Mapping[str, Any]) -> SparseModel:
+def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]) -> SparseModel:
     """``sparse`` in metres and world axes, by the similarity that best meets surveyed camera positions.
 
     Args:
@@ -122,7 +122,7 @@ def assume_scale(sparse: SparseModel) -> SparseModel:
     return transformed(sparse, scale, rotation, -scale * rotation @ positions.mean(axis=0))
 
 
-def fit_similarity(source: Any, target: Any) -> tuple[float, np.ndarray, np.ndarray]:
+def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale ``s``, rotation ``R`` (3, 3) and shift ``t`` (3,) that minimise ``sum |s R source + t - target|^2``.
 
     Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),

@@ -4,11 +4,11 @@ A pair is one Gaussian seen in one pixel of one receiver, with its blending weig
 Gaussian; a row is one Gaussian's stretch of them. Every sum has one owner, so that a launch split over threads gives
 the same bits as one thread: rows own their contributions and gradients, pixels own their power and loss.
 
-    row:    c_e = w_e A(b_p . a_g)               A = exp, max(0, .), or the identity (delay and angle channels)
+    row:    c_e = w_e u_g A(b_p . a_g)           A = exp, max(0, .), or the identity (delay and angle channels), u: unit
     pixel:  P_p = F_p sum_e c_e + X_p            F: solid angle and spreading loss, X: explicit line of sight
             u_p = (10 log10(P_p + N0) - lo) / (hi - lo)
     loss:   0.8 mean |u - t| + 0.2 (1 - mean SSIM(u, t))
-    adjoint, row:  dL/da_g = sum_e (dL/dP_p F_p) w_e A'(b_p . a_g) b_p
+    adjoint, row:  dL/da_g = sum_e (dL/dP_p F_p) w_e u_g A'(b_p . a_g) b_p
 
 ``b_p`` are the 16 real harmonics of the pixel's ray direction, shared by all its Gaussians and by all receivers.
 SSIM is that of :mod:`warprrf.kernels.ssim`, zero beyond the poles, periodic in azimuth.
@@ -62,15 +62,17 @@ def build(real: Any) -> SimpleNamespace:
         row_start: wp.array(dtype=int),
         pair_direction: wp.array(dtype=int),
         pair_weight: wp.array(dtype=real),
+        unit: wp.array(dtype=real),
         basis: wp.array(dtype=vec16),
         coefficients: wp.array(dtype=vec16),
         contribution: wp.array(dtype=real),
     ):
-        """``w_e A(b_p . a_g)`` of every pair of a row."""
+        """``w_e u_g A(b_p . a_g)`` of every pair of a row."""
         row = offset + wp.tid()
         a = coefficients[row_gaussian[row]]
+        u = unit[row_gaussian[row]]
         for e in range(row_start[row], row_start[row + 1]):
-            contribution[e] = pair_weight[e] * gain(wp.dot(a, basis[pair_direction[e]]), kind)
+            contribution[e] = pair_weight[e] * u * gain(wp.dot(a, basis[pair_direction[e]]), kind)
 
     @wp.kernel(module="unique", enable_backward=False)
     def pixel_sums(
@@ -162,6 +164,7 @@ def build(real: Any) -> SimpleNamespace:
         pair_pixel: wp.array(dtype=int),
         pair_direction: wp.array(dtype=int),
         pair_weight: wp.array(dtype=real),
+        unit: wp.array(dtype=real),
         basis: wp.array(dtype=vec16),
         contribution: wp.array(dtype=real),
         pixel_adjoint: wp.array(dtype=real),
@@ -169,9 +172,10 @@ def build(real: Any) -> SimpleNamespace:
     ):
         """``dL/da_g`` of the row's Gaussian: no other row of the batch has the same one."""
         row = offset + wp.tid()
+        u = unit[row_gaussian[row]]
         total = vec16(real(0.0))
         for e in range(row_start[row], row_start[row + 1]):
-            slope = pair_weight[e]
+            slope = pair_weight[e] * u
             if kind == EXPONENTIAL:
                 slope = contribution[e]
             elif kind == CLAMPED and contribution[e] <= real(0.0):

@@ -2,9 +2,9 @@
 
 A pixel's pairs lie front to back in ``pair_of_pixel``. With response ``r_e`` of its Gaussian on the pixel's ray
 
-    alpha_e = min(o_g r_e, alpha_max)     T_e = prod_{before} (1 - alpha)     w_e = alpha_e T_e u_g
+    alpha_e = min(o_g r_e, alpha_max)     T_e = prod_{before} (1 - alpha)     w_e = alpha_e T_e
 
-and, with contributions ``c_e = w_e A_e`` to the pixel's sum C and v = dL/dC,
+and, with contributions ``c_e = w_e u_g A_e`` to the pixel's sum C and v = dL/dC,
 
     dL/do_g = sum_e v r_e (c_e / alpha_e - (C - C_<=e) / (1 - alpha_e)),      zero where alpha is clamped.
 """
@@ -28,7 +28,6 @@ def build(real: Any) -> SimpleNamespace:
         pair_of_pixel: wp.array(dtype=int),
         pair_gaussian: wp.array(dtype=int),
         pair_response: wp.array(dtype=real),
-        pair_unit: wp.array(dtype=real),
         opacity: wp.array(dtype=real),
         weight: wp.array(dtype=real),
     ):
@@ -38,7 +37,7 @@ def build(real: Any) -> SimpleNamespace:
         for j in range(pixel_start[p], pixel_start[p + 1]):
             e = pair_of_pixel[j]
             alpha = wp.min(opacity[pair_gaussian[e]] * pair_response[e], alpha_max)
-            weight[e] = alpha * left * pair_unit[e]
+            weight[e] = alpha * left
             left = left * (real(1.0) - alpha)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 from pathlib import Path
@@ -50,16 +49,3 @@ def read(path: str | os.PathLike[str], kind: str = FORMAT) -> tuple[dict[str, np
         return tensors, json.loads(metadata["header"])
     except (KeyError, json.JSONDecodeError) as error:
         raise ValueError(f"{name}: corrupt header: {error}") from error
-
-
-def fingerprint(*parts: Any) -> str:
-    """Digest of everything that a fit's result depends on; parts are dataclasses, arrays, or plain values."""
-    digest = hashlib.sha256()
-    for part in parts:
-        for value in vars(part).values() if hasattr(part, "__dataclass_fields__") else [part]:
-            if isinstance(value, np.ndarray):
-                digest.update(f"{value.dtype} {value.shape}".encode())
-                digest.update(np.ascontiguousarray(value).tobytes())
-            else:
-                digest.update(repr(value).encode())
-    return digest.hexdigest()

@@ -1,12 +1,15 @@
 """Loss and adjoint of the field fit against NumPy and finite differences, in float64."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
 
 from warprrf.kernels.ssim import RADIUS, WINDOW
-from warprrf.rf.fields.harmonic.batches import Problem
-from warprrf.rf.fields.harmonic.fitting import Layer, Rates, Target, fit_layer
+from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer
+from warprrf.rf.fields.harmonic.options import Rates
+from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.targets import weighted_means
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.spectrum import pixel_directions
@@ -112,12 +115,12 @@ def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray)
 def test_loss_and_gradient_against_numpy_and_finite_differences(kind: str, with_unit: bool) -> None:
     problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
     unit = np.random.default_rng(7).uniform(0.5, 2.0, len(problem.seen)) if with_unit else None
-    target = gain_target(problem, unit=unit)
+    target = replace(gain_target(problem, unit=unit), kind=kind)
     if kind == "signed":
         mask = (np.random.default_rng(8).random(target.image.shape) < 0.7).astype(float)
-        target = Target(image=target.image, initial=target.initial, unit=unit, mask=mask)
+        target = Target(image=target.image, initial=target.initial, kind=kind, unit=unit, mask=mask)
     table = coefficients_for(problem, kind)
-    layer = Layer(problem, target, kind)
+    layer = Layer(problem, target)
 
     def loss(values: np.ndarray) -> float:
         return layer.step(0, problem.upload(values, problem.kernels.vec16))
@@ -150,7 +153,7 @@ def test_gradient_does_not_depend_on_how_launches_are_split(monkeypatch: pytest.
     import warprrf.device as device
 
     problem = Problem(synthetic_transport(receivers=4), batch=4)
-    layer = Layer(problem, gain_target(problem), "exp")
+    layer = Layer(problem, gain_target(problem))
     table = problem.upload(coefficients_for(problem, "exp"), problem.kernels.vec16)
     results = []
     for smallest in (1, 10**9):
@@ -165,11 +168,11 @@ def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign() -> N
     """Kingma and Ba 2015: after bias correction the first update is rate * g / |g|."""
     problem = Problem(synthetic_transport(), batch=3, precision=np.float64)
     target = gain_target(problem)
-    layer = Layer(problem, target, "exp")
+    layer = Layer(problem, target)
     start = np.zeros((len(problem.seen), 16))
     layer.step(0, problem.upload(start, problem.kernels.vec16))
     gradient = layer.gradient.numpy()
-    state = fit_layer(problem, target, "exp", steps=1, rates=Rates(0.3, 0.01, 0.0, 0.0))
+    state = fit_layer(problem, target, steps=1, rates=Rates(0.3, 0.01, 0.0, 0.0))
     assert state.coefficients[:, 0] == pytest.approx(-0.3 * np.sign(gradient[:, 0]), rel=1e-6)
     assert state.coefficients[:, 1:] == pytest.approx(-0.01 * np.sign(gradient[:, 1:]), rel=1e-6)
 
@@ -177,7 +180,7 @@ def test_adams_first_step_is_the_learning_rate_against_the_gradients_sign() -> N
 @pytest.mark.parametrize(("degree", "count"), [(0, 1), (1, 4), (2, 9), (3, 16)])
 def test_coefficients_above_the_degree_stay_zero(degree: int, count: int) -> None:
     problem = Problem(synthetic_transport(), batch=3)
-    state = fit_layer(problem, gain_target(problem), "exp", steps=4, degree=degree)
+    state = fit_layer(problem, gain_target(problem), steps=4, degree=degree)
     assert state.coefficients[:, :count].all()
     assert not state.coefficients[:, count:].any()
 
@@ -186,7 +189,7 @@ def test_the_ridge_holds_a_gaussian_at_its_start() -> None:
     problem = Problem(synthetic_transport(), batch=3)
     target = gain_target(problem)
     free, held = (
-        fit_layer(problem, target, "exp", steps=60, rates=Rates(0.05, 0.05, ridge, ridge)).coefficients
+        fit_layer(problem, target, steps=60, rates=Rates(0.05, 0.05, ridge, ridge)).coefficients
         for ridge in (0.0, 1e6)
     )
     assert np.abs(free).max() > 0.5

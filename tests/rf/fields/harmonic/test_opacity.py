@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.rf.fields.harmonic.batches import Problem
 from warprrf.rf.fields.harmonic.field import HarmonicField
 from warprrf.rf.fields.harmonic.fitting import Layer, Target
 from warprrf.rf.fields.harmonic.opacity import Listed, OpacityTraining, list_responses
+from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 
 SHAPE = (12, 24)
@@ -83,7 +83,7 @@ def test_gradient_by_opacity_against_finite_differences(with_unit: bool) -> None
     def loss(values: np.ndarray) -> tuple[float, np.ndarray]:
         everyone = np.zeros(9)
         everyone[problem.seen] = values
-        layer = Layer(problem, target, "exp", OpacityTraining(problem, listed, everyone, unit))
+        layer = Layer(problem, target, OpacityTraining(problem, listed, everyone))
         return layer.step(0, coefficients), layer.opacity_gradient
 
     start = opacities[problem.seen]

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -33,24 +34,20 @@ from warprrf.rf.em.absorption import Air, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields import files as field_files
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.fields.harmonic import transport as _transport
-from warprrf.rf.fields.harmonic.batches import Problem, harmonics
-from warprrf.rf.fields.harmonic.checkpoint import Checkpoint
-from warprrf.rf.fields.harmonic.fitting import KINDS, Rates, fit_layer
+from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
+from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
-from warprrf.rf.fields.harmonic.single_bounce import FieldOptions, SingleBounce
+from warprrf.rf.fields.harmonic.problem import Problem, harmonics
+from warprrf.rf.fields.harmonic.single_bounce import SingleBounce
 from warprrf.rf.fields.harmonic.targets import targets
-from warprrf.rf.fields.harmonic.transport import Transport
+from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.receivers import check_receiver
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
+from warprrf.steps import digest
 
-if TYPE_CHECKING:
-    from warprrf.rf.fields.harmonic.store import StoredTransport
-    from warprrf.rf.spectra.dataset import SpectrumDataset
-
-STEPS = 300  # optimiser steps; twice as many change the test PSNR by less than 0.1 dB
 CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that are nearly right
 CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
@@ -105,21 +102,11 @@ class HarmonicField(RadioField):
         ds: SpectrumDataset,
         model: str = "rf3dgs+",
         *,
-        transmittance: str = "product",
-        interaction_point: str = "centre",
-        gain: str = "exp",
-        sh_degree: int = 3,
-        top_k: int = _transport.TOP_K,
-        line_of_sight: str | None = None,
-        iterations: int = STEPS,
-        batch: int = 10,
-        rates: Rates | None = None,
-        transport: Transport | StoredTransport | None = None,
-        train_opacity: bool = False,
-        checkpoint: str | os.PathLike[str] | None = None,
-        seed: int = 0,
+        options: FieldOptions | None = None,
+        transport: Transport | None = None,
         device: Any = None,
         progress: Progress | None = None,
+        **settings: Any,
     ) -> HarmonicField:
         """Fit a radio field to the spectra of ``ds``.
 
@@ -128,133 +115,54 @@ class HarmonicField(RadioField):
                 discs first.
             ds: training set.
             model: ``"rf3dgs+"`` or ``"rf3dgs"``.
-            transmittance: ``"product"`` of (1 - alpha), or the paper's ``"exp"`` of minus the sum of alphas.
-            interaction_point: ``"centre"`` of the dominant Gaussian (the paper),
-                ``"peak"``, ``"expected"``, ``"mesh"``.
-            gain: ``"exp"`` of the harmonics or ``"linear"``, clamped at zero.
-            sh_degree: 0 to 3.
-            top_k: Gaussians kept per pixel.
-            line_of_sight: None (the paper: surfaces must carry it), or ``"explicit"``: Friis gain where the mesh lets
-                the transmitter be seen, spread by the data set's beam.
-            iterations: optimiser steps of the gain layer, ``batch`` receivers each.
-            batch: receivers per step.
-            rates: learning rates and ridge.
-            transport: blending weights of ``ds.receivers``, if they were computed before; stored ones are fitted from
-                disk (:func:`warprrf.rf.fields.harmonic.store.store_transport`).
-            train_opacity: also train the opacities with the gain, as RF-3DGS does; the field then has Gaussians of its
-                own opacities. Needs the ``product`` transmittance.
-            checkpoint: file to save progress to and go on from; removed when the fit is done.
-            seed: of the batches.
+            options: what the field computes and how it is fitted.
+            transport: blending weights of ``ds.receivers``, if they were computed before.
             device: where to compute.
             progress: called with the stages ``"transport"`` and ``"fit"``.
+            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`, in place of those of
+                ``options``: ``gain="linear"``, ``iterations=600``, ``seed=1``, ...
 
         Raises:
-            TypeError: if ``geometry`` has no Gaussians and is no mesh.
-            ValueError: for an unknown option, receivers that are not inside the scene, spectra without power, or a
-                checkpoint of another fit.
+            TypeError: if ``geometry`` has no Gaussians and is no mesh, or for an unknown option.
+            ValueError: for an option's value that is not allowed, receivers that are not inside the scene, spectra
+                without power, or a checkpoint of another fit.
         """
-        options = FieldOptions(
-            model, transmittance, interaction_point, gain, int(sh_degree), int(top_k), line_of_sight
-        )
-        if not isinstance(iterations, int | np.integer) or iterations < 0:
-            raise ValueError(f"iterations: got {iterations!r}, expected a whole number of steps, 0 or more")
+        chosen = FieldOptions.of(options, {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
-        check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), mesh)
-        if mesh is None and (line_of_sight == "explicit" or interaction_point == "mesh"):
+        receivers = np.asarray(ds.receivers, np.float64)
+        check_receiver("ds.receivers", receivers, mesh)
+        if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError(
                 'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
             )
-        images = check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float64)
-        shape = (images.shape[1], images.shape[2])
-        seen = transport
-        if seen is None:
-            seen = _transport.transport(
-                gaussians, ds.receivers, shape, range_db=ds.range_db, rule=transmittance, top_k=top_k,
-                device=device, progress=progress,
-            )  # fmt: skip
-        _check_transport(seen, np.asarray(ds.receivers, np.float64), shape, transmittance)
+        images = check_array("ds.path_gain", ds.path_gain, (len(receivers), None, None), np.float64)
         blank = cls(
             gaussians=gaussians,
             mesh=mesh,
             transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
             frequency_hz=float(ds.frequency_hz),
-            shape=shape,
+            shape=images.shape[1:],  # type: ignore[arg-type]
             floor=float(ds.floor),
             range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
             beam_sigma_rad=float(ds.beam_sigma_rad),
-            options=options,
+            options=replace(chosen, checkpoint=None),
             layers={},
             gain_unit=1.0,
             delay_unit=1.0,
             air=getattr(ds, "air", None),
             device=device,
         )
-        listed = None
-        if train_opacity:
-            if not isinstance(seen, Transport):
-                raise ValueError(
-                    "transport: got weights stored on disk together with train_opacity=True, which makes weights anew; "
-                    "expected weights in memory, or None"
-                )
-            listed = list_responses(gaussians, seen, ds.range_db, device=device, progress=progress)
-            seen = listed.transport
+        seen = blank._seen_from(receivers, transport, progress)
         ready = time.perf_counter()
-        plan = targets(blank.law, ds, images, seen)
-        problem = Problem(seen, batch=batch, seed=seed, device=device)
-        steps = {
-            n: int(iterations) if n == "gain" else min(CHANNEL_STEPS, int(iterations)) for n in plan.layers
+        trained = _train(blank, ds, images, seen, checkpoint=chosen.checkpoint, progress=progress)
+        report = {
+            "receivers": len(images),
+            "transport_time_s": 0.0 if transport is not None else ready - started,
+            "fit_time_s": time.perf_counter() - ready,
+            **trained.report,
         }
-        learned = Rates() if rates is None else rates
-        identity = field_files.fingerprint(
-            options, learned, seed, batch, steps, seen, train_opacity, *plan.layers.values()
-        )
-        saver = Checkpoint(checkpoint, identity)
-        layers, losses, done = {}, {}, 0
-        for name, target in plan.layers.items():
-            kept, opacity = saver.state(name), None
-            if listed is not None and name == "gain":
-                before = None if kept is None else kept.opacity
-                opacity = OpacityTraining(problem, listed, gaussians.opacities, target.unit, before)
-            state = fit_layer(
-                problem, target, options.gain if name == "gain" else "signed", steps=steps[name],
-                degree=options.sh_degree, rates=learned if name == "gain" else CHANNEL_RATES,
-                state=kept, each=saver.saving(name), opacity=opacity,
-                progress=_shifted(progress, done, sum(steps.values())),
-            )  # fmt: skip
-            done += steps[name]
-            everyone = np.zeros((len(gaussians), _kernels.COEFFICIENTS), np.float32)
-            everyone[:, 0] = plan.unseen[name]
-            unit = 1.0 if target.unit is None else target.unit[:, None]
-            everyone[problem.seen] = state.coefficients * unit
-            layers[name], losses[name] = everyone, [float(loss) for loss in state.losses]
-            if listed is not None and opacity is not None:
-                trained = np.array(gaussians.opacities, np.float32)
-                trained[problem.seen] = opacity.opacities
-                gaussians = replace(gaussians, opacities=trained)
-                # Channels are blended with the opacities that the gain has found.
-                problem = Problem(listed.with_opacities(trained), batch=batch, seed=seed, device=device)
-        saver.remove()
-        return replace(
-            blank,
-            gaussians=gaussians,
-            layers=layers,
-            gain_unit=plan.gain_unit,
-            delay_unit=plan.delay_unit,
-            report={
-                "receivers": len(images),
-                "transport_time_s": 0.0 if transport is not None else ready - started,
-                "fit_time_s": time.perf_counter() - ready,
-                "pairs_per_pixel": seen.pairs / (len(images) * shape[0] * shape[1]),
-                "weight_dropped_mean": seen.dropped[1],
-                "gaussians": len(gaussians),
-                "gaussians_seen": len(problem.seen),
-                "iterations": int(iterations),
-                "seed": int(seed),
-                "train_opacity": bool(train_opacity),
-                "losses": losses,
-            },
-        )
+        return replace(trained, report=report)
 
     def with_gas(self, gas: Any = True) -> HarmonicField:
         """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
@@ -343,13 +251,13 @@ class HarmonicField(RadioField):
             layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
             if "gain" not in layers or any(t.shape != (len(parts["means"]), 16) for t in layers.values()):
                 raise ValueError("its coefficients do not fit its Gaussians")
-            plain = {name: header[name] for name in _PLAIN}
+            plain, options = {name: header[name] for name in _PLAIN}, header["options"]
             return cls(
                 **{**plain, "shape": tuple(plain["shape"]), "range_db": tuple(plain["range_db"])},
                 gaussians=Gaussians(**parts),
                 mesh=mesh,
                 transmitter=tensors["transmitter"],
-                options=FieldOptions(**header["options"]),
+                options=FieldOptions(**{**options, "rates": Rates(**options.get("rates", {}))}),
                 layers=layers,
                 air=Air.from_attributes(header),
                 report=header["report"],
@@ -370,9 +278,26 @@ class HarmonicField(RadioField):
             self.shape,
             self.frequency_hz,
             self.beam_sigma_rad,
-            self.device,
             self.air,
+            self.device,
         )
+
+    def _seen_from(
+        self, receivers: np.ndarray, seen: Transport | None, progress: Progress | None
+    ) -> Transport:
+        """Blending weights of ``receivers`` (R, 3): ``seen`` if given, once it is sure that they are theirs."""
+        rule = self.options.transmittance
+        if seen is None:
+            return transport(
+                self.gaussians, receivers, self.shape, range_db=self.range_db, rule=rule, top_k=self.options.top_k,
+                device=self.device, progress=progress,
+            )  # fmt: skip
+        if seen.shape != self.shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
+            raise ValueError(
+                f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
+                f"expected those of exactly the {len(receivers)} receivers asked for, shape {self.shape}, rule {rule!r}"
+            )
+        return seen
 
     def _blend(self, name: str, seen: Transport) -> np.ndarray:
         """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
@@ -400,12 +325,7 @@ class HarmonicField(RadioField):
         """Spectrum at one receiver and what it was made of."""
         receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
         source = self._transmitter(transmitter)
-        if seen is None:
-            seen = _transport.transport(
-                self.gaussians, receiver[None], self.shape, range_db=self.range_db,
-                rule=self.options.transmittance, top_k=self.options.top_k, device=self.device,
-            )  # fmt: skip
-        _check_transport(seen, receiver[None], self.shape, self.options.transmittance)
+        seen = self._seen_from(receiver[None], seen, None)
         law = self.law
         visible, friis = law.line_of_sight(receiver, source)
         lengths = law.lengths(seen, source)
@@ -474,17 +394,82 @@ def _geometry(geometry: Any) -> tuple[Gaussians, Mesh | None]:
     return gaussians, mesh
 
 
-def _check_transport(
-    seen: Transport | StoredTransport, receivers: np.ndarray, shape: tuple[int, int], rule: str
-) -> None:
-    if seen.shape != shape or seen.rule != rule or not np.array_equal(seen.receivers, receivers):
-        raise ValueError(
-            f"transport: got weights of {len(seen.receivers)} receivers, shape {seen.shape}, rule {seen.rule!r}; "
-            f"expected those of exactly the {len(receivers)} receivers asked for, shape {shape}, rule {rule!r}"
-        )
+def _train(
+    blank: HarmonicField,
+    ds: SpectrumDataset,
+    images: np.ndarray,
+    seen: Transport,
+    *,
+    checkpoint: str | os.PathLike[str] | None,
+    progress: Progress | None,
+) -> HarmonicField:
+    """``blank`` with layers that are fitted to ``images`` (R, H, W), and a report of losses and sizes."""
+    options, gaussians, device = blank.options, blank.gaussians, blank.device
+    listed = None
+    if options.train_opacity:
+        listed = list_responses(gaussians, seen, ds.range_db, device=device, progress=progress)
+        seen = listed.transport
+    plan = targets(blank.law, ds, images, seen)
+    problem = Problem(seen, batch=options.batch, seed=options.seed, device=device)
+    channel_steps = min(CHANNEL_STEPS, options.iterations)
+    total = options.iterations + (len(plan.layers) - 1) * channel_steps
+    kept = Checkpoint(checkpoint, digest(options, seen, plan.layers))
+    layers, losses, done = {}, {}, 0
+    for name, target in plan.layers.items():
+        is_gain, state, opacity = name == "gain", kept.states.get(name), None
+        steps = options.iterations if is_gain else channel_steps
+        if listed is not None and is_gain:
+            before = None if state is None else state.opacity
+            opacity = OpacityTraining(problem, listed, gaussians.opacities, before)
+        state = fit_layer(
+            problem, target, steps=steps, rates=options.rates if is_gain else CHANNEL_RATES,
+            degree=options.sh_degree, opacity=opacity, state=state,
+            each=_told(kept, name, steps, progress, (done, total)),
+        )  # fmt: skip
+        done += steps
+        everyone = np.zeros((len(gaussians), _kernels.COEFFICIENTS), np.float32)
+        everyone[:, 0] = plan.unseen[name]
+        unit = 1.0 if target.unit is None else target.unit[:, None]
+        everyone[problem.seen] = state.coefficients * unit
+        layers[name], losses[name] = everyone, [float(loss) for loss in state.losses]
+        if listed is not None and opacity is not None:
+            trained = np.array(gaussians.opacities, np.float32)
+            trained[problem.seen] = opacity.opacities
+            gaussians = replace(gaussians, opacities=trained)
+            # Channels are blended with the opacities that the gain has found.
+            seen_now = listed.with_opacities(trained)
+            problem = Problem(seen_now, batch=options.batch, seed=options.seed, device=device)
+    kept.remove()
+    report = {
+        "pairs_per_pixel": seen.pairs / images.size,
+        "weight_dropped_mean": seen.dropped[1],
+        "gaussians": len(gaussians),
+        "gaussians_seen": len(problem.seen),
+        "iterations": options.iterations,
+        "seed": options.seed,
+        "train_opacity": options.train_opacity,
+        "losses": losses,
+    }
+    return replace(
+        blank,
+        gaussians=gaussians,
+        layers=layers,
+        gain_unit=plan.gain_unit,
+        delay_unit=plan.delay_unit,
+        report=report,
+    )
 
 
-def _shifted(progress: Progress | None, done: int, total: int) -> Progress | None:
-    if progress is None:
-        return None
-    return lambda stage, step, _: progress(stage, done + step, total)
+def _told(
+    kept: Checkpoint, name: str, steps: int, progress: Progress | None, place: tuple[int, int]
+) -> Callable[[int, Callable[[], State]], None]:
+    """What follows each step of layer ``name``: progress, ``place`` being the steps before it and in all, and now and
+    then the checkpoint."""
+
+    def each(done: int, state: Callable[[], State]) -> None:
+        if progress is not None:
+            progress("fit", place[0] + done, place[1])
+        if kept.path is not None and (done % SAVED_EVERY == 0 or done == steps):
+            kept.save(name, state())
+
+    return each

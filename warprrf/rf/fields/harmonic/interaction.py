@@ -15,7 +15,6 @@ import numpy as np
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.harmonic.store import StoredTransport
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.spectrum import pixel_directions
 
@@ -43,7 +42,7 @@ class Lengths:
 
 
 def interaction_points(
-    seen: Transport | StoredTransport,
+    seen: Transport,
     gaussians: Gaussians,
     kind: str,
     *,

@@ -20,7 +20,7 @@ from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import blend_weights
 from warprrf.kernels.radio import opacity as _kernels
-from warprrf.rf.fields.harmonic.batches import Problem
+from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport, cutoffs
 
 THINNED = 0.5  # of each opacity, while lists are made
@@ -47,12 +47,11 @@ class Listed:
 
     def with_opacities(self, opacities: np.ndarray) -> Transport:
         """The weights that other opacities (N,) give."""
-        start, gaussian = self.transport.start, self.transport.gaussian
-        alpha = np.minimum(opacities[gaussian] * self.response.astype(np.float64), self.alpha_max)
+        seen = self.transport
+        alpha = np.minimum(opacities[seen.gaussian] * self.response.astype(np.float64), self.alpha_max)
         cumulated = np.concatenate([[0.0], np.cumsum(np.log1p(-alpha))])
-        pixel = np.repeat(np.arange(len(start) - 1), np.diff(start))
-        left = np.exp(cumulated[:-1] - cumulated[start[pixel]])
-        return replace(self.transport, weight=(alpha * left).astype(np.float32))
+        left = np.exp(cumulated[:-1] - cumulated[seen.start[seen.pixel]])
+        return replace(seen, weight=(alpha * left).astype(np.float32))
 
 
 def list_responses(
@@ -71,12 +70,7 @@ def list_responses(
         seen: weights of the receivers, whose interaction points are kept; made with the ``product`` rule.
         range_db: range of the data set's dB images.
         top_k: Gaussians kept per pixel, those of largest thinned weight.
-
-    Raises:
-        ValueError: for weights of another rule.
     """
-    if seen.rule != "product":
-        raise ValueError(f"train_opacity: got transmittance {seen.rule!r}, expected 'product'")
     rules = cutoffs(range_db)
     thin = replace(gaussians, opacities=(THINNED * gaussians.opacities).astype(np.float32))
     blending = Blending(THINNED * rules.alpha_min, rules.alpha_max, THINNED_LEFT, "product")
@@ -117,17 +111,11 @@ class OpacityTraining:
         problem: of the transport of ``listed``.
         listed: responses.
         opacities: to start from, of all Gaussians, shape ``(N,)``.
-        unit: what each Gaussian's blended value is multiplied by, shape ``(G,)``; None for one.
         state: logits and Adam's moments to go on from, shape ``(3, G)``.
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        listed: Listed,
-        opacities: np.ndarray,
-        unit: np.ndarray | None = None,
-        state: np.ndarray | None = None,
+        self, problem: Problem, listed: Listed, opacities: np.ndarray, state: np.ndarray | None = None
     ) -> None:
         self.problem, self.kernels = problem, _kernels.build(problem.real)
         self.alpha_max = problem.real(listed.alpha_max)
@@ -135,50 +123,40 @@ class OpacityTraining:
         self.state = np.stack([np.log(first / (1 - first)), np.zeros_like(first), np.zeros_like(first)])
         if state is not None:
             self.state = np.array(state, np.float64)
-        everyone = replace(listed.transport, weight=listed.response)
+        responses = replace(listed.transport, weight=listed.response)
         self.pairs = []
         for batch in problem.batches:
-            owner = batch.pair_owner()
+            owner = np.repeat(batch.row_gaussian.numpy(), np.diff(batch.row_start.numpy()))
             response = np.empty(len(owner), np.float32)
-            response[batch.pair_of_pixel.numpy()] = everyone.subset(batch.receivers).weight
-            own = np.ones(len(owner)) if unit is None else unit[owner]
-            self.pairs.append(
-                (
-                    wp.array(owner.astype(np.int32), dtype=int, device=problem.device),
-                    problem.upload(response),
-                    problem.upload(own),
-                )
-            )
-        self._pair_adjoint = wp.zeros(
-            max(len(b.pair_pixel) for b in problem.batches), dtype=problem.real, device=problem.device
+            response[batch.pair_of_pixel.numpy()] = responses.subset(batch.receivers).weight
+            own = wp.array(owner.astype(np.int32), dtype=int, device=problem.device)
+            self.pairs.append((own, problem.upload(response)))
+        largest = max(len(b.pair_pixel) for b in problem.batches)
+        self._weight, self._pair_adjoint = (
+            wp.zeros(largest, dtype=problem.real, device=problem.device) for _ in range(2)
         )
-        self.refresh()
+        self._opacity = problem.upload(self.opacities)
 
     @property
     def opacities(self) -> np.ndarray:
         """Opacities of the Gaussians seen, shape ``(G,)``."""
         return np.asarray(1.0 / (1.0 + np.exp(-self.state[0])))
 
-    def refresh(self) -> None:
-        """Put the opacities on the device."""
-        self._opacity = self.problem.upload(self.opacities)
-
-    def weights(self, index: int, out: wp.array) -> None:
-        """Blending weights of batch ``index`` into ``out``, pair by pair."""
+    def weights(self, index: int) -> wp.array:
+        """Blending weights of batch ``index`` as the opacities now are, pair by pair."""
         p, batch = self.problem, self.problem.batches[index]
-        owner, response, unit = self.pairs[index]
         p.launch(
             self.kernels.blend, len(batch.pixel_start) - 1, self.alpha_max, batch.pixel_start, batch.pair_of_pixel,
-            owner, response, unit, self._opacity, out,
+            *self.pairs[index], self._opacity, self._weight,
         )  # fmt: skip
+        return self._weight
 
     def gradient(self, index: int, contribution: wp.array, total: wp.array, adjoint: wp.array) -> np.ndarray:
         """Derivative of the loss by each opacity of batch ``index``, shape ``(G,)``."""
         p, batch = self.problem, self.problem.batches[index]
-        owner, response, _ = self.pairs[index]
         p.launch(
             self.kernels.blend_adjoint, len(batch.pixel_start) - 1, self.alpha_max, batch.pixel_start,
-            batch.pair_of_pixel, owner, response, self._opacity, contribution, total, adjoint, self._pair_adjoint,
+            batch.pair_of_pixel, *self.pairs[index], self._opacity, contribution, total, adjoint, self._pair_adjoint,
         )  # fmt: skip
         out = wp.zeros(len(p.seen), dtype=p.real, device=p.device)
         p.launch(
@@ -199,4 +177,4 @@ class OpacityTraining:
         )
         low, high = np.log(LEAST / (1 - LEAST)), np.log(MOST / (1 - MOST))
         self.state = np.stack([np.clip(logits, low, high), first, second])
-        self.refresh()
+        self._opacity = self.problem.upload(self.opacities)

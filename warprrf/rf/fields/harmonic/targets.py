@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warprrf.rf.fields.harmonic.fitting import Target
 from warprrf.rf.fields.harmonic.single_bounce import SingleBounce
 from warprrf.rf.fields.harmonic.transport import Transport
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles, to_db
-
-if TYPE_CHECKING:
-    from warprrf.rf.fields.harmonic.store import StoredTransport
-    from warprrf.rf.spectra.dataset import SpectrumDataset
 
 Y00 = 0.28209479177387814  # harmonic of degree 0
 DARK = 0.1  # a pixel below the floor counts as this share of it where logarithms are averaged
@@ -37,9 +33,7 @@ class Targets:
     delay_unit: float
 
 
-def targets(
-    law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Transport | StoredTransport
-) -> Targets:
+def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Transport) -> Targets:
     """What to fit the spectra ``images`` (R, H, W) of ``ds`` with.
 
     Raises:
@@ -70,6 +64,7 @@ def targets(
     layers = {
         "gain": Target(
             image=np.clip((to_db(images, floor) - low) / (high - low), 0.0, 1.0),
+            kind=law.options.gain,
             initial=start / Y00 if exponential else np.full(len(start), 1.0 / Y00),
             unit=None if exponential else np.exp(start),
             # in units of the floor, so that float32 works near one
@@ -94,6 +89,7 @@ def targets(
                 middle = float(np.median(image[mask]))
                 mean = weighted_means(seen, image, mask)[1]
                 layers[name] = Target(
+                    kind="signed",
                     image=np.where(mask, image, 0.0),
                     initial=np.where(np.isnan(mean), middle, mean) / Y00,
                     mask=mask,
@@ -103,7 +99,7 @@ def targets(
 
 
 def weighted_means(
-    transport: Transport | StoredTransport, values: np.ndarray, where: np.ndarray
+    transport: Transport, values: np.ndarray, where: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Per Gaussian seen by ``transport``: its index, and the mean of ``values`` over the pixels ``where`` that see it.
 
@@ -111,12 +107,11 @@ def weighted_means(
     """
     seen = transport.seen
     total, summed = np.zeros(len(seen)), np.zeros(len(seen))
-    for chosen, part in transport.parts():
-        local = np.searchsorted(seen, part.gaussian)
-        pixel = np.repeat(np.arange(len(part.start) - 1), np.diff(part.start))
-        met = where[chosen].ravel()
-        weight = part.weight * met[pixel]
+    for r in range(len(transport.receivers)):  # one at a time: what lies between is as large as the weights
+        part = transport.subset([r])
+        local, met = np.searchsorted(seen, part.gaussian), where[r].ravel()[part.pixel]
+        weight = part.weight * met
+        value = np.where(met, values[r].ravel()[part.pixel], 0.0)
         total += np.bincount(local, weights=weight, minlength=len(seen))
-        value = np.where(met, values[chosen].ravel(), 0.0)[pixel]
         summed += np.bincount(local, weights=weight * value, minlength=len(seen))
     return seen, np.divide(summed, total, out=np.full(len(seen), np.nan), where=total > 0)

@@ -4,14 +4,11 @@ Geometry does not change while the radio part is learned, so the weights of a vi
 pixels-by-Gaussians matrix, and every fit and every model reuses them. Radio needs other cutoffs than photos: an image
 60 dB deep shows what an opacity clamp of 0.99 leaks through a wall (-20 dB), so :func:`cutoffs` derives them from the
 data set's range.
-
-:func:`transport` keeps the weights in memory; :mod:`warprrf.rf.fields.harmonic.store` keeps them on disk, a file a receiver,
-for as many receivers as the disk holds. Whoever fits takes either.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,7 +19,7 @@ from warprrf.device import Progress, check_array
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
-from warprrf.geometry.splats.render import blend_weights
+from warprrf.geometry.splats.render import BlendWeights, blend_weights
 from warprrf.rf.spectra.spectrum import check_shape
 
 TRANSMITTANCE = ("product", "exp")
@@ -82,7 +79,13 @@ class Transport:
         Raises:
             ValueError: if it is none of these receivers.
         """
-        return self.subset([index_of(self.receivers, receiver)])
+        position = check_array("receiver", receiver, (3,))
+        found = np.flatnonzero((self.receivers == position).all(axis=1))
+        if len(found) == 0:
+            raise ValueError(
+                f"receiver: got {position.tolist()}, which is none of the {len(self.receivers)} here"
+            )
+        return self.subset(found[:1])
 
     @property
     def pairs(self) -> int:
@@ -94,9 +97,10 @@ class Transport:
         """Gaussians that any receiver sees, ascending."""
         return np.unique(self.gaussian)
 
-    def parts(self) -> Iterator[tuple[np.ndarray, Transport]]:
-        """The receivers in portions that fit into memory, with their indices: here all at once."""
-        yield np.arange(len(self.receivers)), self
+    @property
+    def pixel(self) -> np.ndarray:
+        """Pixel of each pair, counted through all receivers, shape ``(E,)`` int32."""
+        return np.repeat(np.arange(len(self.start) - 1, dtype=np.int32), np.diff(self.start))
 
     @property
     def pixel_weight(self) -> np.ndarray:
@@ -142,90 +146,6 @@ def transport(
     Raises:
         ValueError: for positions that are not finite, an unknown rule, or a ``top_k`` below 1.
     """
-    view, positions = viewing(gaussians, receivers, shape, range_db, rule, top_k, device)
-    pieces = []
-    for i in range(len(positions)):
-        pieces.append(view(i))
-        if progress is not None:
-            progress("transport", i + 1, len(positions))
-    return joined(positions, view.shape, rule, pieces)
-
-
-@dataclass(frozen=True)
-class View:
-    """What one receiver sees: the arrays of :class:`Transport` for it alone.
-
-    Attributes:
-        counts: pairs of each pixel, shape ``(H * W,)``.
-        gaussian, weight: of each pair, shape ``(E,)`` int32 and float32.
-        dominant, expected_range: shape ``(H, W)`` int32 and float32.
-        dropped: weight that top-K left out, shape ``(H, W)`` float32.
-    """
-
-    counts: np.ndarray
-    gaussian: np.ndarray
-    weight: np.ndarray
-    dominant: np.ndarray
-    expected_range: np.ndarray
-    dropped: np.ndarray
-
-
-@dataclass(frozen=True)
-class Viewing:
-    """Computes the :class:`View` of each of some receivers; see :func:`transport` for what goes in."""
-
-    gaussians: Gaussians
-    positions: np.ndarray
-    shape: tuple[int, int]
-    blending: Blending
-    top_k: int
-    device: Any
-
-    def __call__(self, receiver: int) -> View:
-        """The view of receiver number ``receiver``."""
-        rows, columns = self.shape
-        seen = blend_weights(
-            self.gaussians,
-            Camera.spherical(columns, rows, position=self.positions[receiver]),
-            top_k=self.top_k,
-            blending=self.blending,
-            device=self.device,
-        )
-        weight = np.asarray(seen.weight, dtype=np.float64)
-        index = np.asarray(seen.index)
-        listed = (index >= 0) & (weight > 0)
-        total = np.sum(weight, axis=-1, where=listed, initial=0.0)
-        dropped = np.asarray(seen.dropped, dtype=np.float64)
-        keep = listed & (weight > MIN_WEIGHT * total[..., None])
-        kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
-        scale = np.divide(total + dropped, kept, out=np.zeros_like(kept), where=kept > 0)
-        expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
-        return View(
-            counts=np.count_nonzero(keep, axis=-1).ravel(),
-            gaussian=index[keep].astype(np.int32),
-            weight=(weight * scale[..., None])[keep].astype(np.float32),
-            dominant=np.where(kept > 0, np.asarray(seen.dominant), -1).astype(np.int32),
-            expected_range=np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0).astype(
-                np.float32
-            ),
-            dropped=dropped.astype(np.float32),
-        )
-
-
-def viewing(
-    gaussians: Gaussians,
-    receivers: Any,
-    shape: tuple[int, int],
-    range_db: Any,
-    rule: str,
-    top_k: int,
-    device: Any,
-) -> tuple[Viewing, np.ndarray]:
-    """The checked arguments of :func:`transport`, and the receivers' positions.
-
-    Raises:
-        ValueError: naming the argument that does not fit.
-    """
     positions = check_array("receivers", receivers, (None, 3))
     if len(positions) == 0:
         raise ValueError("receivers: got none, expected at least one position")
@@ -233,34 +153,47 @@ def viewing(
         raise ValueError(f"rule: got {rule!r}, expected one of {', '.join(TRANSMITTANCE)}")
     if not isinstance(top_k, int | np.integer) or top_k < 1:
         raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    rows, columns = check_shape(shape)
     blending = cutoffs(range_db, rule)
-    return Viewing(gaussians, positions, check_shape(shape), blending, int(top_k), device), positions
-
-
-def joined(receivers: np.ndarray, shape: tuple[int, int], rule: str, views: Sequence[View]) -> Transport:
-    """The views of ``receivers`` (R, 3) as one :class:`Transport`."""
-    dropped = [(float(v.dropped.max()), float(v.dropped.mean(dtype=np.float64))) for v in views]
+    views = []
+    for i, position in enumerate(positions):
+        camera = Camera.spherical(columns, rows, position=position)
+        views.append(
+            _kept(blend_weights(gaussians, camera, top_k=int(top_k), blending=blending, device=device))
+        )
+        if progress is not None:
+            progress("transport", i + 1, len(positions))
+    counts, gaussian, weight, dominant, expected, dropped = zip(*views, strict=True)
     return Transport(
-        shape=shape,
-        receivers=receivers,
-        start=np.concatenate([[0], np.cumsum(np.concatenate([v.counts for v in views]))]).astype(np.int64),
-        gaussian=np.concatenate([v.gaussian for v in views]),
-        weight=np.concatenate([v.weight for v in views]),
-        dominant=np.stack([v.dominant for v in views]),
-        expected_range=np.stack([v.expected_range for v in views]),
+        shape=(rows, columns),
+        receivers=positions,
+        start=np.concatenate([[0], np.cumsum(np.concatenate(counts))]).astype(np.int64),
+        gaussian=np.concatenate(gaussian),
+        weight=np.concatenate(weight),
+        dominant=np.stack(dominant),
+        expected_range=np.stack(expected),
         rule=rule,
-        dropped=(max(d[0] for d in dropped), float(np.mean([d[1] for d in dropped]))),
+        dropped=(float(np.max([d.max() for d in dropped])), float(np.mean([d.mean() for d in dropped]))),
     )
 
 
-def index_of(receivers: np.ndarray, receiver: Any) -> int:
-    """Which of ``receivers`` (R, 3) lies at ``receiver`` (3,) [m].
-
-    Raises:
-        ValueError: if none does.
-    """
-    position = check_array("receiver", receiver, (3,))
-    found = np.flatnonzero((receivers == position).all(axis=1))
-    if len(found) == 0:
-        raise ValueError(f"receiver: got {position.tolist()}, which is none of the {len(receivers)} here")
-    return int(found[0])
+def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
+    """Pairs a pixel (H * W,), Gaussians and weights (E,), dominant Gaussian and mean range (H, W) of one receiver, and
+    the weight (H, W) that top-K left out."""
+    weight, index = np.asarray(seen.weight, dtype=np.float64), np.asarray(seen.index)
+    listed = (index >= 0) & (weight > 0)
+    total = np.sum(weight, axis=-1, where=listed, initial=0.0)
+    dropped = np.asarray(seen.dropped, dtype=np.float64)
+    keep = listed & (weight > MIN_WEIGHT * total[..., None])
+    kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
+    scale = np.divide(total + dropped, kept, out=np.zeros_like(kept), where=kept > 0)
+    expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
+    expected = np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0)
+    return (
+        np.count_nonzero(keep, axis=-1).ravel(),
+        index[keep].astype(np.int32),
+        (weight * scale[..., None])[keep].astype(np.float32),
+        np.where(kept > 0, np.asarray(seen.dominant), -1).astype(np.int32),
+        expected.astype(np.float32),
+        dropped,
+    )

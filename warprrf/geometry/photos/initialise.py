@@ -1,4 +1,4 @@
-"""What refinement starts from: the sparse points cleaned, their planes found, completed and covered with Gaussians."""
+"""Before the refinement: sparse points cleaned, their planes found, completed and covered with Gaussians."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.geometry.photos.cells import occupancy, seen_cells
+from warprrf.geometry.photos.cells import meeting, occupancy, seen_cells
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
 from warprrf.geometry.photos.planes import Plane, aligned
@@ -19,7 +19,7 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 
 
-def start_of(
+def initialise(
     sparse: SparseModel,
     cameras: Mapping[str, Camera],
     images: Sequence[np.ndarray],
@@ -76,7 +76,7 @@ def start_of(
                 levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
                 report("planes", 3 + k, 5)
             planes = joined(planes, levels, config.sweep)
-    planes = seen_cells(planes, list(sparse.cameras.values()))
+    planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
     gaussians = initial_gaussians(
         points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
     )

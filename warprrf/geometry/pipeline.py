@@ -14,29 +14,31 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import ArrayLike
+
 from warprrf.device import Progress
 from warprrf.geometry import geometry_files as files
+from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
-from warprrf.geometry.photos.photo_files import find_photos, match_names, read_photo
+from warprrf.geometry.photos.initialise import initialise
+from warprrf.geometry.photos.photo_files import Photos, find_photos, match_names, read_photo
 from warprrf.geometry.photos.refine import refine
-from warprrf.geometry.photos.sfm import structure_from_motion
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale
-from warprrf.geometry.photos.start import start_of
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {"start": 1, "refined": 1, "surface": 1}
-"""Of the steps after structure from motion: counted up by whoever changes what a step computes."""
+VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 1, "surface": 1}
+"""Of all steps: counted up by whoever changes what a step computes."""
 
 
 def reconstruct(
-    photos: Any,
+    photos: Photos,
     *,
     workspace: str | os.PathLike[str],
-    known_positions: Mapping[str, Any] | None = None,
+    known_positions: Mapping[str, ArrayLike] | None = None,
     held_out: Sequence[str] = (),
     iterations: int | None = None,
     config: ReconstructionConfig | None = None,
@@ -73,7 +75,7 @@ def reconstruct(
     if known_positions is not None:
         match_names("known_positions", known_positions, list(named))
 
-    sparse = structure_from_motion(
+    sparse = sfm.structure_from_motion(
         photos,
         workspace=workspace,
         max_features=config.max_features,
@@ -117,8 +119,8 @@ def _steps(
     cameras = {name: sparse.cameras[name] for name in fitted}
     photos = cache(lambda: [read_photo(photo) for photo in fitted.values()])
 
-    def start(attempt: Attempt) -> files.Arrays:
-        planes, gaussians = start_of(
+    def initial(attempt: Attempt) -> files.Arrays:
+        planes, gaussians = initialise(
             sparse, cameras, photos(), config=config, seed=seed, progress=attempt.progress, device=device
         )
         return files.of_planes(planes) | files.of_gaussians(gaussians)
@@ -144,9 +146,9 @@ def _steps(
         return files.of_patches(patches)
 
     settings = [config.max_reprojection_error, config.planes, config.sweep, config.gaussians, seed]
-    first = _kept(steps, "start", start, [sparse, list(fitted), list(fitted.values()), *settings])
+    first = _kept(steps, "initial", initial, [sparse, list(fitted), list(fitted.values()), *settings])
     planes = files.to_planes(first)
-    gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("start"), config.refine]))
+    gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
     photos.cache_clear()
     inputs = [steps.key("refined"), config.surface, config.completion]
     return gaussians, files.to_patches(_kept(steps, "surface", surface, inputs))

@@ -1,0 +1,116 @@
+"""One runner: options are the command's, figures go to files, what was asked stands beside what was measured."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import __main__ as command
+from benchmarks import targets
+from benchmarks.report import Report, columns_table
+from benchmarks.runner import Benchmark, Job, option
+from benchmarks.targets import TARGETS, Target, compared, found
+
+
+@pytest.mark.parametrize("name", command.NAMES)
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        command.main([name, "--help"])
+    assert end.value.code == 0
+    said = capsys.readouterr().out
+    assert "examples:" in said and f"python -m benchmarks {name}" in said and "--out" in said
+
+
+@dataclass(frozen=True)
+class _Options:
+    """Options of a benchmark that measures nothing."""
+
+    count: int = option(3, "a number")
+    names: tuple[str, ...] = option(("a", "b"), "some names")
+    every: int | None = option(None, "one in so many", kind=int)
+    quick: bool = option(False, "a flag")
+    hidden: float = 0.5
+
+
+def _run(options: _Options, job: Job) -> Report:
+    if options.count < 0:
+        raise ValueError("count: got a negative number,\n expected one of at least 0")
+    figures = {"options": vars(options), "seed": job.seed, "value": math.nan, "count": options.count}
+    return Report("nothing", figures, "some text")
+
+
+@pytest.fixture
+def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = Benchmark("nothing", _Options, _run, "examples:")
+    monkeypatch.setitem(command.NAMES, "nothing", ("nowhere", "measures nothing"))
+    monkeypatch.setattr(command, "benchmark", lambda name: one)
+    monkeypatch.setitem(TARGETS, "nothing", (Target("count", "the count", 2.0),))
+
+
+def test_options_of_the_command_reach_the_benchmark_and_its_figures_the_files(
+    nothing: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "nothing",
+        "--out",
+        str(tmp_path),
+        "--count",
+        "2",
+        "--names",
+        "x",
+        "--quick",
+        "--seed",
+        "7",
+        "--quiet",
+    ]
+    assert command.main([*words, "--every", "5"]) == 0
+    kept = json.loads((tmp_path / "nothing.json").read_text())
+    assert kept["options"] == {"count": 2, "names": ["x"], "every": 5, "quick": True, "hidden": 0.5}
+    assert (kept["seed"], kept["value"]) == (7, None)
+    text = (tmp_path / "nothing.md").read_text()
+    assert text.startswith("some text") and "| the count | at most 2 | 2 | met |" in text
+    assert "nothing.md" in capsys.readouterr().out
+    assert command.main(["nothing", "--out", str(tmp_path), "--quiet"]) == 0  # defaults
+    assert "| the count | at most 2 | 3 | NOT met |" in (tmp_path / "nothing.md").read_text()
+
+
+def test_bad_input_is_one_line_and_status_two(nothing: None, tmp_path: Path, capsys: Any) -> None:
+    assert command.main(["nothing", "--out", str(tmp_path), "--count", "-1", "--quiet"]) == 2
+    assert capsys.readouterr().err == (
+        "python -m benchmarks: error: count: got a negative number, expected one of at least 0\n"
+    )
+
+
+def test_figures_are_found_by_their_path() -> None:
+    figures = {
+        "rows": [{"n": 1, "x": 2.0}, {"n": 2, "x": 3.0, "ok": True}],
+        "a": {"99.9": 4, "b.c": {"d": 5}},
+    }
+    assert found(figures, "rows.n=2.x") == 3.0
+    assert found(figures, "rows.n=2&ok=True.x") == 3.0
+    assert found(figures, "a.99.9") == 4.0 and found(figures, "a.b.c.d") == 5.0
+    for path in ("rows.n=3.x", "rows.n=1.y", "a.none", "rows", "rows.n=2.ok"):
+        assert found(figures, path) is None
+
+
+def test_a_bound_is_met_from_its_own_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds = (
+        Target("a", "most", 1.0, unit="m"),
+        Target("b", "least", 1.0, at_least=True),
+        Target("c", "none", 1.0),
+    )
+    monkeypatch.setitem(targets.TARGETS, "x", bounds)
+    assert [line[3] for line in compared("x", {"a": 1.0, "b": 1.0})] == ["met", "met"]
+    assert [line[3] for line in compared("x", {"a": 1.1, "b": 0.9})] == ["NOT met", "NOT met"]
+    assert compared("x", {"a": 1.1})[0] == ["most", "at most 1 m", "1.1 m", "NOT met"]
+
+
+def test_columns_that_no_row_fills_are_left_out() -> None:
+    columns = (("a", "A", "{:.1f}"), ("b", "B", "{}"), ("c", "C", "{}"))
+    text = columns_table(columns, [{"a": 1.0, "b": None}, {"c": "x"}])
+    assert text.splitlines() == ["| A | C |", "| --- | --- |", "| 1.0 | - |", "| - | x |"]
