@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_topology import connected_pieces
@@ -127,8 +127,13 @@ def _halved(feature: np.ndarray, size: np.ndarray, o: ColourGrouping) -> np.ndar
     side = (feature - mean) @ axis > 0
     if side.all() or not side.any():
         return one
-    start = np.stack([feature[~side].mean(axis=0), feature[side].mean(axis=0)])
-    label = kmeans2(feature, start, minit="matrix", iter=20)[1].astype(np.int64)
+    label = side.astype(np.int64)
+    for _ in range(20):  # Lloyd's steps, with weights, which SciPy's do without
+        centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
+        nearest = cdist(feature, centre).argmin(axis=1)
+        if (nearest == label).all() or nearest.all() or not nearest.any():
+            break
+        label = nearest
     share = size[label == 1].sum() / size.sum()
     if not 0.03 < share < 0.97:
         return one
