@@ -20,3 +20,11 @@ def device(request):
     """Warp's default device while a test runs: the CPU, and again a GPU where there is one."""
     with wp.ScopedDevice(request.param):
         yield request.param
+
+
+@pytest.fixture(params=["blocks", "reference"])
+def each_form(request, monkeypatch):
+    """The rasteriser in each of its forms: blocks of pixels, and a thread per pixel as on a GPU."""
+    from warprrf.geometry.splats.rasterizer import Rasterizer
+
+    monkeypatch.setitem(Rasterizer.__init__.__kwdefaults__, "per_pixel", request.param == "reference")

@@ -19,8 +19,10 @@ CHOICES = {
     "rule": (0, 1),
     "width": (1, 4),
 }  # what builders of kernels are asked for
+FOR_A_CPU_ALONE = "warprrf.kernels.raster.blocks"  # a GPU blends by `reference`
 MODULES = sorted(
-    m.name for m in pkgutil.walk_packages(warprrf.kernels.__path__, "warprrf.kernels.") if not m.ispkg
+    {m.name for m in pkgutil.walk_packages(warprrf.kernels.__path__, "warprrf.kernels.") if not m.ispkg}
+    - {FOR_A_CPU_ALONE}
 )
 
 

@@ -87,7 +87,7 @@ from warprrf.rf.spectra import lookups as lookups
 
 # == kept ==
 from warprrf.geometry.splats.gaussian_rays import GaussianRays as GaussianRays
-from warprrf.geometry.splats.rasterizer import Blending as Blending
+from warprrf.geometry.splats.blending import Blending as Blending
 from warprrf.geometry.splats.rasterizer import Rasterizer as Rasterizer
 from warprrf.geometry.splats.render import BlendWeights as BlendWeights
 from warprrf.geometry.splats.render import blend_weights as blend_weights

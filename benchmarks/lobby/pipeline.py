@@ -28,7 +28,6 @@ from benchmarks.report import Report
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.files import write_arrays, write_atomically, write_json
 from warprrf.geometry import pipeline as stage_1
-from warprrf.geometry.floor_plan import section
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import read_photo
@@ -382,7 +381,7 @@ class Lobby:
             "test_blocked": blocked,
             "transmitter": np.asarray(test.transmitter),
             "range_db": np.asarray(test.range_db),
-            "section": section(mesh.vertices, mesh.faces, SECTION_HEIGHT_M),
+            "section": mesh.cross_section(SECTION_HEIGHT_M),
             "spectrum_receivers": np.asarray(test.receivers)[chosen],
             "spectrum_blocked": blocked[chosen],
             "spectrum_truth": to_db(np.asarray(test.path_gain)[chosen], test.floor).astype(np.float32),

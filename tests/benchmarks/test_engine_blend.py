@@ -90,7 +90,7 @@ def test_torch_gradcheck_passes_and_a_planted_wrong_adjoint_fails(monkeypatch):
         return interop.rasterize(*v[:5], cam, v[5], blending=smooth)
 
     assert torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-6, rtol=1e-6)
-    Function = interop._functions().rasterize
+    Function = interop._Rasterize
     right = Function.backward
 
     def wrong(ctx, *incoming):

@@ -15,7 +15,6 @@ import warprrf as wr
 from benchmarks.lobby import pipeline, seeds
 from benchmarks.runner import Job, execute
 from warprrf.files import write_json
-from warprrf.geometry.floor_plan import section
 from warprrf.geometry.splats.discs import discs_on_mesh
 
 SIZES = pipeline.Sizes(steps=20, train=6, test=4)
@@ -171,15 +170,6 @@ def test_missing_data_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"photos.*benchmarks data"):
         whole(tmp_path / "out", tmp_path)
     assert not (tmp_path / "out").exists()
-
-
-def test_section_of_a_box_is_its_outline() -> None:
-    corners = np.array([[x, y, z] for x in (0.0, 4.0) for y in (0.0, 3.0) for z in (0.0, 2.0)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    lines = section(corners, faces, 1.2)
-    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * (4 + 3))
-    assert section(corners, faces, 2.5).shape == (0, 2, 2)
 
 
 def test_spread_over_seeds_is_that_of_the_reports() -> None:

@@ -136,3 +136,10 @@ def test_winding_number_counts_the_solids_around_a_point():
     )
     number = mesh.winding_number([[0.1, 0.2, 0.3], [2.5, 0.1, 0.2], [9, 0, 0]])
     np.testing.assert_allclose(number, [2, 1, 0], atol=1e-12)
+
+
+def test_the_cross_section_of_a_box_is_its_outline():
+    mesh = Mesh(*box((0, 0, 0), (4, 3, 2)))
+    lines = mesh.cross_section(1.2)
+    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(2 * (4 + 3))
+    assert mesh.cross_section(2.5).shape == (0, 2, 2)

@@ -641,6 +641,16 @@ def _plane_wave() -> str:
     return markdown(("elements", *(f"{d:g} m" for d in away)), lines)
 
 
+@entry("benchmarks")
+def _benchmarks() -> str:
+    sys.path.append(str(ROOT))
+    from benchmarks.__main__ import NAMES as commands
+
+    return markdown(
+        ("`python -m benchmarks`", ""), [(f"`{name}`", line) for name, (_, line) in commands.items()]
+    )
+
+
 # ------------------------------------------------------------------------------------------------- the README
 
 

@@ -215,6 +215,20 @@ class Mesh:
         """Distance from each of ``points`` (N, 3) [m] to the surface [m], shape ``(N,)``."""
         return self.closest(points, device=device).distance
 
+    def cross_section(self, height: float) -> np.ndarray:
+        """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
+        above = self.triangles[:, :, 2] > height
+        cut = (above.sum(axis=1) % 3) > 0
+        corners, above = self.triangles[cut], above[cut]
+        ends = []
+        for first, second in ((0, 1), (1, 2), (2, 0)):
+            a, b = corners[:, first], corners[:, second]
+            crosses = above[:, first] != above[:, second]
+            share = np.where(crosses, (height - a[:, 2]) / np.where(crosses, b[:, 2] - a[:, 2], 1.0), np.nan)
+            ends.append(a[:, :2] + share[:, None] * (b - a)[:, :2])
+        points = np.stack(ends, axis=1)  # exactly two of the three edges cross
+        return points[~np.isnan(points[:, :, 0])].reshape(-1, 2, 2)
+
     def winding_number(self, points: Any) -> np.ndarray:
         """Solid angle that the faces subtend at each of ``points`` (N, 3), over 4 pi, shape ``(N,)``.
 

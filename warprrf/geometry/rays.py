@@ -7,6 +7,7 @@ float64 from the plane of that face (:mod:`warprrf.kernels.rays.mesh`), so the t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -43,6 +44,7 @@ _RAYS_A_THREAD = 4_096
 _LONGEST = 1e18
 
 
+@dataclass(eq=False, repr=False)
 class Hit:
     """What rays met, one entry a ray. Normals and points are computed when first asked for.
 
@@ -51,19 +53,11 @@ class Hit:
         face: Index of the face, shape ``(N,)``, int32; -1 where nothing was met.
     """
 
-    def __init__(
-        self,
-        t: np.ndarray,
-        face: np.ndarray,
-        face_normals: np.ndarray,
-        origins: np.ndarray,
-        directions: np.ndarray,
-    ) -> None:
-        self.t = t
-        self.face = face
-        self._face_normals = face_normals
-        self._origins = origins
-        self._directions = directions
+    t: np.ndarray
+    face: np.ndarray
+    _face_normals: np.ndarray
+    _origins: np.ndarray
+    _directions: np.ndarray
 
     def __repr__(self) -> str:
         return f"Hit({np.count_nonzero(self.valid)} of {len(self.t)} rays met a face)"
@@ -84,9 +78,8 @@ class Hit:
     def point(self) -> np.ndarray:
         """Point met [m], shape ``(N, 3)``, float64; NaN where nothing was met."""
         t = np.where(self.valid, self.t, np.nan)[:, None]
-        return self._origins + t * (
-            self._directions / np.linalg.norm(self._directions, axis=1, keepdims=True)
-        )
+        length = np.linalg.norm(self._directions, axis=1, keepdims=True)
+        return self._origins + t * (self._directions / length)
 
 
 class RaySearch:

@@ -20,21 +20,10 @@ C1, C2 = 0.01**2, 0.03**2  # the paper's constants for a range of one
 
 
 @cache
-def build(real: Any) -> SimpleNamespace:
-    """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
+def _filters(real: Any) -> tuple[Any, Any]:
+    """The kernels that average over the window, along rows and along columns."""
     vec3 = wp.types.vector(3, real)
     window = wp.constant(wp.types.vector(len(WINDOW), real)(*WINDOW))
-    c1 = wp.constant(real(C1))
-    c2 = wp.constant(real(C2))
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def moments(
-        offset: int, image: wp.array(dtype=real), target: wp.array(dtype=real), out: wp.array(dtype=vec3)
-    ):
-        """The products (u, u^2, u t) whose window averages SSIM compares."""
-        p = offset + wp.tid()
-        u = image[p]
-        out[p] = vec3(u, u * u, u * target[p])
 
     @wp.kernel(module="unique", enable_backward=False)
     def filter_rows(
@@ -77,6 +66,25 @@ def build(real: Any) -> SimpleNamespace:
             if r >= 0 and r < height:
                 total += window[k] * source[p + (k - wp.static(RADIUS)) * stride]
         out[p] = total
+
+    return filter_rows, filter_columns
+
+
+@cache
+def build(real: Any) -> SimpleNamespace:
+    """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
+    vec3 = wp.types.vector(3, real)
+    c1 = wp.constant(real(C1))
+    c2 = wp.constant(real(C2))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def moments(
+        offset: int, image: wp.array(dtype=real), target: wp.array(dtype=real), out: wp.array(dtype=vec3)
+    ):
+        """The products (u, u^2, u t) whose window averages SSIM compares."""
+        p = offset + wp.tid()
+        u = image[p]
+        out[p] = vec3(u, u * u, u * target[p])
 
     @wp.kernel(module="unique", enable_backward=False)
     def slopes(
@@ -132,6 +140,7 @@ def build(real: Any) -> SimpleNamespace:
         p = offset + wp.tid()
         out[p] = slope(image[p], target[p], filtered[p], absolute_share, ssim_share)
 
+    filter_rows, filter_columns = _filters(real)
     return SimpleNamespace(
         adjoint=adjoint,
         filter_columns=filter_columns,

@@ -52,7 +52,7 @@ def test_friis():
     )
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("order", [1, 2, 4])
 def test_box_paths_are_the_image_lattice_to_1e_9(order):
     points = receivers(20)
     paths = trace_paths(room(), transmitter=TX, receivers=points, frequency_hz=F, mirror_order=order)

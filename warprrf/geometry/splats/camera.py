@@ -125,6 +125,14 @@ class Camera:
         return uv, distance
 
 
+def check_camera(cam: Any) -> None:
+    """Raise TypeError unless ``cam`` is a :class:`Camera`."""
+    if not isinstance(cam, Camera):
+        raise TypeError(
+            f"cam: got {type(cam).__name__}, expected warprrf.Camera (Camera.pinhole or Camera.spherical)"
+        )
+
+
 def _check_size(width: int, height: int) -> None:
     for name, value in (("width", width), ("height", height)):
         if not isinstance(value, int | np.integer) or value < 1:

@@ -10,7 +10,7 @@ import warp as wp
 
 from warprrf.device import check_array, resolve
 from warprrf.geometry.splats.blending import RADIO, Blending
-from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Rasterizer
 
@@ -121,7 +121,4 @@ def blend_weights(
 def _check(g: Any, cam: Any) -> None:
     if not isinstance(g, Gaussians):
         raise TypeError(f"g: got {type(g).__name__}, expected warprrf.Gaussians")
-    if not isinstance(cam, Camera):
-        raise TypeError(
-            f"cam: got {type(cam).__name__}, expected warprrf.Camera (Camera.pinhole or Camera.spherical)"
-        )
+    check_camera(cam)

@@ -1,8 +1,8 @@
 """Rasteriser and rays inside torch: functions of tensors that autograd differentiates, computed by our Warp kernels.
 
-The only module of the geometry that knows torch; it is imported when a function is called
-(``pip install "warprrf[baselines]"``). Work runs on the tensors' own device in their own precision, float32 or float64.
-Derivatives are of first order; asking for a second one raises torch's error instead of returning zeros.
+The only module of the geometry that knows torch, without which it cannot be imported (``pip install
+"warprrf[baselines]"``). Work runs on the tensors' own device in their own precision, float32 or float64. Derivatives
+are of first order; asking for a second one raises torch's error instead of returning zeros.
 """
 
 from __future__ import annotations
@@ -10,20 +10,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import nullcontext
-from functools import cache, wraps
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 import warp as wp
 
-from warprrf.device import require, resolve
-from warprrf.geometry.splats.camera import Camera
+from warprrf.device import resolve
+from warprrf.geometry.splats.blending import Blending
+from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
-from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
+from warprrf.geometry.splats.rasterizer import Rasterizer
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
-if TYPE_CHECKING:
+try:
     import torch
+    from torch.autograd.function import once_differentiable
+except ModuleNotFoundError as error:
+    raise ImportError('torch is not installed: pip install "warprrf[baselines]"') from error
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -53,20 +56,15 @@ def rasterize(
         Features ``(H, W, C)``, alpha ``(H, W)`` and depth ``(H, W)``: the blended mean range [m], 0 where alpha is 0.
 
     Raises:
-        ImportError: without torch.
         TypeError, ValueError: naming the argument that does not fit.
     """
-    if not isinstance(cam, Camera):
-        raise TypeError(f"cam: got {type(cam).__name__}, expected warprrf.Camera")
-    torch = require("torch", "baselines")
+    check_camera(cam)
     _check_gaussians(means, quaternions, scales, opacities)
     _check("features", features, (len(means), None), means)
     if background is None:
         background = torch.zeros(features.shape[1], dtype=means.dtype, device=means.device)
     _check("background", background, (features.shape[1],), means)
-    return _functions().rasterize.apply(
-        cam, blending, means, quaternions, scales, opacities, features, background
-    )
+    return _Rasterize.apply(cam, blending, means, quaternions, scales, opacities, features, background)
 
 
 def colors(means: torch.Tensor, sh: torch.Tensor, cam: Camera) -> torch.Tensor:
@@ -74,16 +72,14 @@ def colors(means: torch.Tensor, sh: torch.Tensor, cam: Camera) -> torch.Tensor:
     differentiable in both tensors.
 
     Raises:
-        ImportError: without torch.
         TypeError, ValueError: naming the argument that does not fit.
     """
-    if not isinstance(cam, Camera):
-        raise TypeError(f"cam: got {type(cam).__name__}, expected warprrf.Camera")
+    check_camera(cam)
     _check("means", means, (None, 3), None)
     _check("sh", sh, (len(means), None, None), means)
     if sh.shape[1] not in COEFFICIENTS.values():
         raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
-    return _functions().colors.apply(cam, means, sh)
+    return _Colors.apply(cam, means, sh)
 
 
 def ray_transmittance(
@@ -100,12 +96,11 @@ def ray_transmittance(
     :meth:`warprrf.GaussianRays.transmittance`; differentiable in the four tensors, not in the points.
 
     Raises:
-        ImportError: without torch.
         TypeError, ValueError: naming the argument that does not fit.
     """
     _check_gaussians(means, quaternions, scales, opacities)
     query: Any = ("transmit_with_adjoint", (a, b), {}, blending)
-    return _functions().rays.apply(query, means, quaternions, scales, opacities)[0]
+    return _Rays.apply(query, means, quaternions, scales, opacities)[0]
 
 
 def ray_hits(
@@ -124,17 +119,15 @@ def ray_hits(
     :meth:`warprrf.GaussianRays.hits`; all but the index differentiable in the four tensors, not in the rays.
 
     Raises:
-        ImportError: without torch.
         TypeError, ValueError: naming the argument that does not fit.
     """
     _check_gaussians(means, quaternions, scales, opacities)
     query: Any = ("trace_with_adjoint", (origins, directions, k), {"order": order}, blending)
-    t, alpha, weight, left, index = _functions().rays.apply(query, means, quaternions, scales, opacities)
+    t, alpha, weight, left, index = _Rays.apply(query, means, quaternions, scales, opacities)
     return index, t, alpha, weight, left
 
 
 def _check_gaussians(means: Any, quaternions: Any, scales: Any, opacities: Any) -> None:
-    torch = require("torch", "baselines")
     _check("means", means, (None, 3), None)
     n = len(means)
     _check("quaternions", quaternions, (n, 4), means)
@@ -158,7 +151,6 @@ def _check(
     name: str, tensor: Any, shape: tuple[int | None, ...], like: torch.Tensor | None
 ) -> tuple[float, float]:
     """Refuse what is not a tensor of such numbers; returns the lowest and the highest (0 and 1 if it is empty)."""
-    torch = require("torch", "baselines")
     if not isinstance(tensor, torch.Tensor):
         raise TypeError(f"{name}: got {type(tensor).__name__}, expected a torch.Tensor")
     if tensor.dtype not in (torch.float32, torch.float64):
@@ -182,126 +174,124 @@ def _check(
     return low, high
 
 
-@cache
-def _functions() -> SimpleNamespace:
-    """The ``torch.autograd.Function`` classes; made when first used, because torch is imported then."""
-    import torch
-    from torch.autograd.function import once_differentiable
+def _raster(tensor: torch.Tensor, blending: Blending | None = None) -> Rasterizer:
+    real = wp.float64 if tensor.dtype == torch.float64 else wp.float32
+    return Rasterizer(device=resolve(str(tensor.device)), blending=blending, real=real)
 
-    def raster(tensor: torch.Tensor, blending: Blending | None = None) -> Rasterizer:
-        real = wp.float64 if tensor.dtype == torch.float64 else wp.float32
-        return Rasterizer(device=resolve(str(tensor.device)), blending=blending, real=real)
 
-    def shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
-        """The tensor's memory as a Warp array, without a gradient yet."""
-        return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
+def _shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
+    """The tensor's memory as a Warp array, without a gradient yet."""
+    return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 
-    def seed(arrays: tuple[wp.array, ...], incoming: tuple[torch.Tensor | None, ...]) -> None:
-        """Let torch's gradients be those of the arrays; the adjoint reads them and nothing writes them."""
-        for array, gradient in zip(arrays, incoming, strict=True):
-            array.grad = None if gradient is None else shared(gradient, array.dtype)
 
-    def gradients(arrays: tuple[wp.array, ...], wanted: tuple[bool, ...], adjoint: Any) -> list[Any]:
-        """What ``adjoint`` adds to new gradients of ``arrays``; None for those that nobody wants."""
-        for array, want in zip(arrays, wanted, strict=True):
-            array.grad = wp.zeros_like(array, requires_grad=False) if want else None
-        adjoint()
-        return [
-            wp.to_torch(array.grad, requires_grad=False) if array.requires_grad else None for array in arrays
-        ]
+def _seed(arrays: tuple[wp.array, ...], incoming: tuple[torch.Tensor | None, ...]) -> None:
+    """Let torch's gradients be those of the arrays; the adjoint reads them and nothing writes them."""
+    for array, gradient in zip(arrays, incoming, strict=True):
+        array.grad = None if gradient is None else _shared(gradient, array.dtype)
 
-    def stream_of(tensor: torch.Tensor | None) -> Any:
-        """On a GPU, what is launched inside goes to torch's current stream, behind what made the tensor."""
-        if tensor is None or not tensor.is_cuda:
-            return nullcontext()
-        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
 
-    def in_stream(static: Function) -> Function:
-        """A forward or backward in the stream of the first tensor among its arguments, if there is one: gradients of
-        outputs that nobody used are None."""
+def _gradients(arrays: tuple[wp.array, ...], wanted: tuple[bool, ...], adjoint: Any) -> list[Any]:
+    """What ``adjoint`` adds to new gradients of ``arrays``; None for those that nobody wants."""
+    for array, want in zip(arrays, wanted, strict=True):
+        array.grad = wp.zeros_like(array, requires_grad=False) if want else None
+    adjoint()
+    return [wp.to_torch(array.grad, requires_grad=False) if array.requires_grad else None for array in arrays]
 
-        @wraps(static)
-        def run(*arguments: Any) -> Any:
-            first = next((a for a in arguments if isinstance(a, torch.Tensor)), None)
-            with stream_of(first):
-                return static(*arguments)
 
-        return cast("Function", run)
+def _stream_of(tensor: torch.Tensor | None) -> Any:
+    """On a GPU, what is launched inside goes to torch's current stream, behind what made the tensor."""
+    if tensor is None or not tensor.is_cuda:
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(tensor.device)))
 
-    class Rasterize(torch.autograd.Function):
-        @staticmethod
-        @in_stream
-        def forward(ctx: Any, cam: Camera, blending: Blending | None, *tensors: torch.Tensor) -> Any:
-            r = raster(tensors[0], blending)
-            types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
-            inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
-            image, ctx.adjoint = r.blend_with_adjoint(
-                r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam),
-                inputs[4],
-                inputs[5],
-                gradients=False,
-            )
-            ctx.inputs, ctx.outputs = inputs, (image.features, image.alpha, image.depth)
-            out = tuple(wp.to_torch(array, requires_grad=False) for array in ctx.outputs)
-            ctx.save_for_backward(*tensors, *out)  # the adjoint reads both
-            ctx.set_materialize_grads(False)
-            return out
 
-        @staticmethod
-        @once_differentiable
-        @in_stream
-        def backward(ctx: Any, *incoming: torch.Tensor | None) -> Any:
-            _ = ctx.saved_tensors  # raises if an input or an output was changed in place since forward
-            seed(ctx.outputs, incoming)
-            return None, None, *gradients(ctx.inputs, ctx.needs_input_grad[2:], ctx.adjoint)
+def _in_stream(static: Function) -> Function:
+    """A forward or backward in the stream of the first tensor among its arguments, if there is one: gradients of
+    outputs that nobody used are None."""
 
-    class Colors(torch.autograd.Function):
-        @staticmethod
-        @in_stream
-        def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
-            r = raster(means)
-            inputs = (shared(means, r.vector(3)), shared(sh, r.real))
-            out = wp.zeros((len(means), sh.shape[2]), dtype=r.real, device=r.device)
-            origin = r.colors_into(*inputs, cam, out)
-            ctx.inputs, ctx.out = inputs, out
-            ctx.adjoint = lambda: r.colors_adjoint(*inputs, origin, out)
-            ctx.save_for_backward(means, sh)
-            return wp.to_torch(out, requires_grad=False).clone()
+    @wraps(static)
+    def run(*arguments: Any) -> Any:
+        first = next((a for a in arguments if isinstance(a, torch.Tensor)), None)
+        with _stream_of(first):
+            return static(*arguments)
 
-        @staticmethod
-        @once_differentiable
-        @in_stream
-        def backward(ctx: Any, incoming: torch.Tensor) -> Any:
-            _ = ctx.saved_tensors  # raises if an input was changed in place since forward
-            seed((ctx.out,), (incoming.clone(),))  # Warp's own adjoint zeroes what it has read
-            return None, *gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
+    return cast("Function", run)
 
-    class Rays(torch.autograd.Function):
-        @staticmethod
-        @in_stream
-        def forward(ctx: Any, query: tuple[str, tuple[Any, ...], Any, Any], *tensors: torch.Tensor) -> Any:
-            method, arguments, options, blending = query
-            r = raster(tensors[0])
-            types = (r.vector(3), r.vector(4), r.vector(3), r.real)
-            ctx.inputs = tuple(shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
-            rays = GaussianRays(ctx.inputs, blending=blending)
-            found, ctx.adjoint = getattr(rays, method)(*arguments, **options)
-            hits = not isinstance(found, wp.array)
-            ctx.outputs = found.outputs if hits else (found,)
-            ctx.save_for_backward(*tensors)
-            kind = tensors[0].dtype
-            out = [wp.to_torch(a, requires_grad=False).to(kind, copy=True) for a in ctx.outputs]
-            if hits:
-                out.append(wp.to_torch(found.index).clone())
-                ctx.mark_non_differentiable(out[-1])
-            return tuple(out)
 
-        @staticmethod
-        @once_differentiable
-        @in_stream
-        def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
-            _ = ctx.saved_tensors  # raises if an input was changed in place since forward
-            seed(ctx.outputs, tuple(g.double() for g in incoming[: len(ctx.outputs)]))
-            return None, *gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    @_in_stream
+    def forward(ctx: Any, cam: Camera, blending: Blending | None, *tensors: torch.Tensor) -> Any:
+        r = _raster(tensors[0], blending)
+        types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
+        inputs = tuple(_shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
+        image, ctx.adjoint = r.blend_with_adjoint(
+            r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam),
+            inputs[4],
+            inputs[5],
+            gradients=False,
+        )
+        ctx.inputs, ctx.outputs = inputs, (image.features, image.alpha, image.depth)
+        out = tuple(wp.to_torch(array, requires_grad=False) for array in ctx.outputs)
+        ctx.save_for_backward(*tensors, *out)  # the adjoint reads both
+        ctx.set_materialize_grads(False)
+        return out
 
-    return SimpleNamespace(rasterize=Rasterize, colors=Colors, rays=Rays)
+    @staticmethod
+    @once_differentiable
+    @_in_stream
+    def backward(ctx: Any, *incoming: torch.Tensor | None) -> Any:
+        _ = ctx.saved_tensors  # raises if an input or an output was changed in place since forward
+        _seed(ctx.outputs, incoming)
+        return None, None, *_gradients(ctx.inputs, ctx.needs_input_grad[2:], ctx.adjoint)
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    @_in_stream
+    def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
+        r = _raster(means)
+        inputs = (_shared(means, r.vector(3)), _shared(sh, r.real))
+        out = wp.zeros((len(means), sh.shape[2]), dtype=r.real, device=r.device)
+        origin = r.colors_into(*inputs, cam, out)
+        ctx.inputs, ctx.out = inputs, out
+        ctx.adjoint = lambda: r.colors_adjoint(*inputs, origin, out)
+        ctx.save_for_backward(means, sh)
+        return wp.to_torch(out, requires_grad=False).clone()
+
+    @staticmethod
+    @once_differentiable
+    @_in_stream
+    def backward(ctx: Any, incoming: torch.Tensor) -> Any:
+        _ = ctx.saved_tensors  # raises if an input was changed in place since forward
+        _seed((ctx.out,), (incoming.clone(),))  # Warp's own adjoint zeroes what it has read
+        return None, *_gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)
+
+
+class _Rays(torch.autograd.Function):
+    @staticmethod
+    @_in_stream
+    def forward(ctx: Any, query: tuple[str, tuple[Any, ...], Any, Any], *tensors: torch.Tensor) -> Any:
+        method, arguments, options, blending = query
+        r = _raster(tensors[0])
+        types = (r.vector(3), r.vector(4), r.vector(3), r.real)
+        ctx.inputs = tuple(_shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
+        rays = GaussianRays(ctx.inputs, blending=blending)
+        found, ctx.adjoint = getattr(rays, method)(*arguments, **options)
+        hits = not isinstance(found, wp.array)
+        ctx.outputs = found.outputs if hits else (found,)
+        ctx.save_for_backward(*tensors)
+        kind = tensors[0].dtype
+        out = [wp.to_torch(a, requires_grad=False).to(kind, copy=True) for a in ctx.outputs]
+        if hits:
+            out.append(wp.to_torch(found.index).clone())
+            ctx.mark_non_differentiable(out[-1])
+        return tuple(out)
+
+    @staticmethod
+    @once_differentiable
+    @_in_stream
+    def backward(ctx: Any, *incoming: torch.Tensor) -> Any:
+        _ = ctx.saved_tensors  # raises if an input was changed in place since forward
+        _seed(ctx.outputs, tuple(g.double() for g in incoming[: len(ctx.outputs)]))
+        return None, *_gradients(ctx.inputs, ctx.needs_input_grad[1:], ctx.adjoint)

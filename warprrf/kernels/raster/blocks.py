@@ -1,7 +1,8 @@
 """Blending on a CPU, 4 x 4 pixels at a time: :mod:`.reference` with one Warp vector per number of its pixels.
 
 A CPU's wide registers hold a block's numbers, so the loops over a vector's elements become one or two instructions
-each. A block is a tile of its own, with tile size ``BLOCK``. Kernels are one thread per block.
+each. A block is a tile of its own, with tile size ``BLOCK``, and has one thread. Loops over a block's pixels run to
+``view.tile``: to a constant they would be unrolled, and its vectors taken apart into single numbers.
 """
 
 from functools import cache
@@ -25,8 +26,42 @@ VECTORISED = {
 
 
 @cache
+def exponential(real: Any) -> Any:
+    """exp(-q/2) of a block's numbers, for one scalar type."""
+    lanes = wp.types.vector(LANES, real)
+
+    if real is wp.float32:
+
+        @wp.func
+        def response(q: lanes):
+            """exp(-q/2) for 0 <= q <= 80: (Taylor of exp(-q/32), degree 5)^16; absolute error below 1e-6."""
+            x = q * real(-0.03125)
+            p = lanes(real(1.0 / 24.0)) + x * real(1.0 / 120.0)
+            p = lanes(real(1.0 / 6.0)) + wp.cw_mul(x, p)
+            p = lanes(real(0.5)) + wp.cw_mul(x, p)
+            p = lanes(real(1.0)) + wp.cw_mul(x, p)
+            p = lanes(real(1.0)) + wp.cw_mul(x, p)
+            p = wp.cw_mul(p, p)
+            p = wp.cw_mul(p, p)
+            p = wp.cw_mul(p, p)
+            return wp.cw_mul(p, p)
+
+    else:
+
+        @wp.func
+        def response(q: lanes):
+            """exp(-q/2)."""
+            out = lanes()
+            for i in range(wp.static(LANES)):
+                out[i] = wp.exp(real(-0.5) * q[i])
+            return out
+
+    return response
+
+
+@cache
 def lane_functions(real: Any) -> SimpleNamespace:
-    """What Warp's vectors lack, for ``wp.float32`` or ``wp.float64``: comparisons, choices, a quick exponential."""
+    """What Warp's vectors lack, for ``wp.float32`` or ``wp.float64``: comparisons, choices, sums, a quick exponential."""
     lanes = wp.types.vector(LANES, real)
     integers = wp.types.vector(LANES, int)
     name = real.__name__
@@ -98,32 +133,6 @@ def lane_functions(real: Any) -> SimpleNamespace:
         """Sum of the numbers, in whatever order is quickest."""
         ...
 
-    if real is wp.float32:
-
-        @wp.func
-        def response(q: lanes):
-            """exp(-q/2) for 0 <= q <= 80: (Taylor of exp(-q/32), degree 5)^16; absolute error below 1e-6."""
-            x = q * real(-0.03125)
-            p = lanes(real(1.0 / 24.0)) + x * real(1.0 / 120.0)
-            p = lanes(real(1.0 / 6.0)) + wp.cw_mul(x, p)
-            p = lanes(real(0.5)) + wp.cw_mul(x, p)
-            p = lanes(real(1.0)) + wp.cw_mul(x, p)
-            p = lanes(real(1.0)) + wp.cw_mul(x, p)
-            p = wp.cw_mul(p, p)
-            p = wp.cw_mul(p, p)
-            p = wp.cw_mul(p, p)
-            return wp.cw_mul(p, p)
-
-    else:
-
-        @wp.func
-        def response(q: lanes):
-            """exp(-q/2)."""
-            out = lanes()
-            for i in range(wp.static(LANES)):
-                out[i] = wp.exp(real(-0.5) * q[i])
-            return out
-
     return SimpleNamespace(
         any_positive=any_positive,
         where_positive=where_positive,
@@ -131,7 +140,7 @@ def lane_functions(real: Any) -> SimpleNamespace:
         total=total,
         lower=lower,
         higher=higher,
-        response=response,
+        response=exponential(real),
     )
 
 
@@ -141,8 +150,8 @@ def block_functions(real: Any) -> SimpleNamespace:
     lanes = wp.types.vector(LANES, real)
     Splat = splat_of(real)
     of = lane_functions(real)
-    response = of.response
-    higher = of.higher
+    sums_of_one = wp.types.vector(SUMS, real)
+    response, higher, total = of.response, of.higher, of.total
     least = 1.0e-30 if real is wp.float32 else 1.0e-250
 
     @wp.func
@@ -153,9 +162,9 @@ def block_functions(real: Any) -> SimpleNamespace:
         b = lanes()
         c = lanes()
         inside = lanes()
-        for i in range(wp.static(BLOCK)):  # axes a and b are those of a column, c of a row
+        for i in range(view.tile):  # axes a and b are those of a column, c of a row
             ray = pixel_ray(view, x0 + i, y0 + i)
-            for j in range(wp.static(BLOCK)):
+            for j in range(view.tile):
                 a[wp.static(BLOCK) * j + i] = real(ray[0])
                 b[wp.static(BLOCK) * j + i] = real(ray[1])
                 c[wp.static(BLOCK) * i + j] = real(ray[2])
@@ -180,7 +189,29 @@ def block_functions(real: Any) -> SimpleNamespace:
             return transmittance - wp.cw_mul(transmittance, alpha)
         return wp.cw_mul(transmittance, response(real(2.0) * alpha))
 
-    return SimpleNamespace(rays=rays, meet=meet, behind=behind)
+    @wp.func
+    def pair_sums(
+        slope: lanes, q: lanes, y1: lanes, y2: lanes, h0: lanes, h1: lanes, h2: lanes, weight: lanes
+    ):
+        """What a Gaussian's pairs add to its sums, those of features excepted."""
+        bent = wp.cw_mul(slope, q)
+        p1 = wp.cw_mul(slope, y1) - h1
+        p2 = wp.cw_mul(slope, y2) - h2
+        s = sums_of_one()
+        s[0] = total(bent)
+        s[1] = total(p1)
+        s[2] = total(p2)
+        s[3] = total(wp.cw_mul(bent - real(2.0) * h0, q))
+        s[4] = total(wp.cw_mul(bent - h0, y1) - wp.cw_mul(h1, q))
+        s[5] = total(wp.cw_mul(bent - h0, y2) - wp.cw_mul(h2, q))
+        s[6] = total(wp.cw_mul(p1 - h1, y1))
+        s[7] = total(wp.cw_mul(p1, y2) - wp.cw_mul(h2, y1))
+        s[8] = total(h0)
+        s[wp.static(OF_OPACITY)] = total(slope)
+        s[wp.static(OF_WEIGHT)] = total(weight)
+        return s
+
+    return SimpleNamespace(rays=rays, meet=meet, behind=behind, pair_sums=pair_sums)
 
 
 @cache
@@ -255,7 +286,7 @@ def build_blend(real: Any, width: int) -> Any:
             owner = number_where_positive(weight - best, k, owner)
             peak = where_positive(weight - best, t, peak)
             best = higher(best, weight)
-        for i in range(wp.static(LANES)):
+        for i in range(view.tile * view.tile):
             x = x0 + i % wp.static(BLOCK)
             y = y0 + i / wp.static(BLOCK)
             if x < view.width and y < view.height:
@@ -283,13 +314,8 @@ def build_adjoint(real: Any, width: int) -> Any:
     sums_of_one = wp.types.vector(SUMS, real)
     Splat = splat_of(real)
     of, block = lane_functions(real), block_functions(real)
-    any_positive, where_positive, response, total = (
-        of.any_positive,
-        of.where_positive,
-        of.response,
-        of.total,
-    )
-    rays, meet, behind = block.rays, block.meet, block.behind
+    any_positive, where_positive, response, total = of.any_positive, of.where_positive, of.response, of.total
+    rays, meet, behind, pair_sums = block.rays, block.meet, block.behind, block.pair_sums
     lower, higher = of.lower, of.higher
     least = 1.0e-30 if real is wp.float32 else 1.0e-250
 
@@ -325,7 +351,7 @@ def build_adjoint(real: Any, width: int) -> Any:
         of_weight = lanes()
         of_range = lanes()
         rest = lanes()
-        for i in range(wp.static(LANES)):
+        for i in range(view.tile * view.tile):
             x = x0 + i % wp.static(BLOCK)
             y = y0 + i / wp.static(BLOCK)
             if x < view.width and y < view.height:
@@ -369,24 +395,9 @@ def build_adjoint(real: Any, width: int) -> Any:
             h0 = splat.lift * wp.cw_mul(pull, g0)
             h1 = splat.tilt * wp.cw_mul(pull, g1)
             h2 = splat.tilt * wp.cw_mul(pull, g2)
-            bent = wp.cw_mul(slope, q)
-            p1 = wp.cw_mul(slope, y1) - h1
-            p2 = wp.cw_mul(slope, y2) - h2
-            s = sums_of_one()
-            s[0] = total(bent)
-            s[1] = total(p1)
-            s[2] = total(p2)
-            s[3] = total(wp.cw_mul(bent - real(2.0) * h0, q))
-            s[4] = total(wp.cw_mul(bent - h0, y1) - wp.cw_mul(h1, q))
-            s[5] = total(wp.cw_mul(bent - h0, y2) - wp.cw_mul(h2, q))
-            s[6] = total(wp.cw_mul(p1 - h1, y1))
-            s[7] = total(wp.cw_mul(p1, y2) - wp.cw_mul(h2, y1))
-            s[8] = total(h0)
-            s[wp.static(OF_OPACITY)] = total(slope)
-            s[wp.static(OF_WEIGHT)] = total(weight)
-            wanted = of_features * weight
+            s = pair_sums(slope, q, y1, y2, h0, h1, h2, weight)
             for i in range(wp.static(width)):
-                s[wp.static(OF_FEATURES) + i] = wanted[i]
+                s[wp.static(OF_FEATURES) + i] = total(wp.cw_mul(of_features[i], weight))
             sums[part, k] = sums[part, k] + s
 
     return blend_adjoint
@@ -439,13 +450,13 @@ def build_strongest(real: Any) -> Any:
             weight = wp.cw_mul(alpha, transmittance)
             transmittance = behind(transmittance, alpha, rules.rule)
             total += weight
-            for i in range(wp.static(LANES)):
+            for i in range(view.tile * view.tile):
                 if weight[i] > real(0.0):
                     x = x0 + i % wp.static(BLOCK)
                     y = y0 + i / wp.static(BLOCK)
                     t = splat.reach * g0[i] * inverse[i] * wp.sqrt(a[i] * a[i] + b[i] * b[i] + c[i] * c[i])
                     kept[i] = keep_weight(index, weight_out, range_out, y, x, kept[i], k, weight[i], t)
-        for i in range(wp.static(LANES)):
+        for i in range(view.tile * view.tile):
             x = x0 + i % wp.static(BLOCK)
             y = y0 + i / wp.static(BLOCK)
             if x < view.width and y < view.height:

@@ -33,6 +33,24 @@ def behind(transmittance: Any, alpha: Any, rule: int):
     return transmittance * wp.exp(-alpha)
 
 
+@wp.func
+def pair_sums(s: Any, slope: Any, q: Any, y1: Any, y2: Any, h0: Any, h1: Any, h2: Any, weight: Any):
+    """``s`` with what a pair adds to its Gaussian's sums, beside those of features; see :mod:`.project`."""
+    two = type(q)(2.0)
+    s[0] = slope * q
+    s[1] = slope * y1 - h1
+    s[2] = slope * y2 - h2
+    s[3] = slope * q * q - two * h0 * q
+    s[4] = slope * q * y1 - h0 * y1 - h1 * q
+    s[5] = slope * q * y2 - h0 * y2 - h2 * q
+    s[6] = slope * y1 * y1 - two * h1 * y1
+    s[7] = slope * y1 * y2 - h1 * y2 - h2 * y1
+    s[8] = h0
+    s[wp.static(OF_OPACITY)] = slope
+    s[wp.static(OF_WEIGHT)] = weight
+    return s
+
+
 @cache
 def build_blend(real: Any, width: int) -> Any:
     """The kernel that blends ``width`` channels (1 to 4) at once, for ``wp.float32`` or ``wp.float64``."""
@@ -185,17 +203,7 @@ def build_adjoint(real: Any, width: int) -> Any:
                 h0 = splat.lift * pull * g0
                 h1 = splat.tilt * pull * g1
                 h2 = splat.tilt * pull * g2
-                s[0] = slope * q
-                s[1] = slope * y1 - h1
-                s[2] = slope * y2 - h2
-                s[3] = slope * q * q - real(2.0) * h0 * q
-                s[4] = slope * q * y1 - h0 * y1 - h1 * q
-                s[5] = slope * q * y2 - h0 * y2 - h2 * q
-                s[6] = slope * y1 * y1 - real(2.0) * h1 * y1
-                s[7] = slope * y1 * y2 - h1 * y2 - h2 * y1
-                s[8] = h0
-                s[wp.static(OF_OPACITY)] = slope
-                s[wp.static(OF_WEIGHT)] = weight
+                s = pair_sums(s, slope, q, y1, y2, h0, h1, h2, weight)
                 wp.atomic_add(sums, part, k, s)
                 transmittance = behind(transmittance, alpha, rules.rule)
 

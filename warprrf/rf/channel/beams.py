@@ -27,6 +27,7 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
+from warprrf.rf.em.waves import carrier_phase
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles, pixel_directions
 
 MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user gains; a few are usual
@@ -99,7 +100,7 @@ class Codebook:
         """Mean |w^T h|^2 of every beam for waves of ``powers`` (..., L) and independent phases, shape ``(..., B)``."""
         values = np.asarray(powers, dtype=np.float64)
         d = np.asarray(directions, dtype=np.float64)
-        return self._summed(d, values * self.array.gain(d), _squared)
+        return self._summed(d, values * self.array.gain(d), squared)
 
     def _summed(
         self, d: np.ndarray, values: np.ndarray, measure: Callable[[np.ndarray], np.ndarray]
@@ -107,7 +108,7 @@ class Codebook:
         """Sum of ``values`` (..., L) times ``measure`` of what each beam receives of unit waves along ``d`` (L, 3)."""
         rows = values.reshape(int(np.prod(values.shape[:-1])), len(d))
         total = np.zeros((len(rows), len(self)), dtype=values.dtype)
-        for part in _chunks(len(d), sum(len(f) for f in self.factors)):
+        for part in chunks(len(d), sum(len(f) for f in self.factors)):
             waves = [measure(w) for w in self._waves(d[part])]
             for out, row in zip(total, rows, strict=True):
                 weighted = waves[-1] * row[part]
@@ -175,6 +176,12 @@ def steering_codebook(
     return Codebook(array, (response.conj() / np.linalg.norm(response, axis=1, keepdims=True),))
 
 
+Source = PathArrays | Spectrum
+"""Where predicted power comes from and how much: :class:`Paths` of one receiver or several, or a :class:`Spectrum`."""
+Ends = PlanarArray | Codebook | None
+"""Beams of one end: those given, an array's DFT codebook, or a single isotropic element."""
+
+
 @dataclass(frozen=True)
 class BeamChoice:
     """Pairs of beams, best first, of one receiver ``(K,)`` or several ``(R, K)``.
@@ -190,18 +197,20 @@ class BeamChoice:
     gain: np.ndarray
 
 
-def beam_gains(source: Any, tx_array: Any = None, rx_array: Any = None) -> np.ndarray:
+def beam_gains(source: Source, tx_array: Ends = None, rx_array: Ends = None) -> np.ndarray:
     """Predicted mean |w_r^T H w_t|^2 of every pair of beams; arguments and errors as for :func:`select_beams`.
 
     Returns:
         Shape ``(Br, Bt)`` or ``(R, Br, Bt)``.
     """
-    tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
-    found = [_pair_gains(rays, tx, rx) for rays in _rays(source, tx)]
-    return np.stack(found) if _several(source) else found[0]
+    tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
+    found = [_pair_gains(rays, tx, rx) for rays in rays_of(source, tx)]
+    return np.stack(found) if isinstance(source, PathArrays) and source.batched else found[0]
 
 
-def select_beams(source: Any, tx_array: Any = None, rx_array: Any = None, *, count: int = 1) -> BeamChoice:
+def select_beams(
+    source: Source, tx_array: Ends = None, rx_array: Ends = None, *, count: int = 1
+) -> BeamChoice:
     """The pairs of beams with the largest predicted mean gain: no pilot is sent.
 
     A spectrum is taken as powers at pixel centres. For beams narrower than its pixels give paths, whose line of sight
@@ -222,13 +231,13 @@ def select_beams(source: Any, tx_array: Any = None, rx_array: Any = None, *, cou
     """
     if isinstance(count, bool) or int(count) != count or count < 1:
         raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
-    tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
+    tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     rows = []
-    for rays in _rays(source, tx):
+    for rays in rays_of(source, tx):
         gains = _pair_gains(rays, tx, rx)
-        best = _largest(gains.ravel(), int(count))
+        best = np.argsort(-gains, axis=None, kind="stable")[: int(count)]
         rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
-    if not _several(source):
+    if not (isinstance(source, PathArrays) and source.batched):
         return BeamChoice(*rows[0])
     return BeamChoice(*(np.stack(column) for column in zip(*rows, strict=True)))
 
@@ -254,7 +263,7 @@ class MultiUserChoice:
 
 
 def select_beams_multiuser(
-    sources: Any, tx_array: Any = None, rx_array: Any = None, *, noise: float
+    sources: Source | Iterable[Source], tx_array: Ends = None, rx_array: Ends = None, *, noise: float
 ) -> MultiUserChoice:
     """Beams for several users at once, so that the sum of their predicted rates is large.
 
@@ -272,9 +281,9 @@ def select_beams_multiuser(
     """
     if not (np.isfinite(noise) and noise > 0):
         raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")
-    tx, rx = _codebook("tx_array", tx_array), _codebook("rx_array", rx_array)
-    given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
-    gains = [_pair_gains(rays, tx, rx) for source in given for rays in _rays(source, tx)]
+    tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
+    given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
+    gains = [_pair_gains(rays, tx, rx) for source in given for rays in rays_of(source, tx)]
     if not gains:
         raise ValueError("sources: got none, expected a spectrum or paths for every user")
     served = _search(gains, noise * len(gains))
@@ -332,10 +341,10 @@ def _sum_rates(
     return rates
 
 
-_Rays = tuple[np.ndarray | None, np.ndarray, np.ndarray]
+Rays = tuple[np.ndarray | None, np.ndarray, np.ndarray]
 
 
-def _rays(source: Any, tx: Codebook) -> Iterator[_Rays]:
+def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
     """Departure (None if it does not matter), arrival and power of what reaches each receiver of ``source``."""
     directed = tx.array.elements > 1 or not _isotropic(tx.array)
     if isinstance(source, PathArrays):
@@ -361,40 +370,33 @@ def _rays(source: Any, tx: Codebook) -> Iterator[_Rays]:
         raise TypeError(f"source: got {type(source).__name__}, expected a Spectrum or Paths")
 
 
-def _pair_gains(rays: _Rays, tx: Codebook, rx: Codebook) -> np.ndarray:
+def _pair_gains(rays: Rays, tx: Codebook, rx: Codebook) -> np.ndarray:
     departure, arrival, power = rays
     if departure is None:
-        return rx.power(arrival, power)[:, None] * _squared(tx.weights[:, 0])
+        return rx.power(arrival, power)[:, None] * squared(tx.weights[:, 0])
     if rx.array.elements == 1:
-        return tx.power(departure, power * rx.array.gain(arrival))[None] * _squared(rx.weights[:, :1])
+        return tx.power(departure, power * rx.array.gain(arrival))[None] * squared(rx.weights[:, :1])
     total = np.zeros((len(rx), len(tx)))
-    for part in _chunks(len(power), len(rx) + len(tx)):
-        received = _squared(rx.amplitude(arrival[part]))
-        total += (received * power[part]) @ _squared(tx.amplitude(departure[part])).T
+    for part in chunks(len(power), len(rx) + len(tx)):
+        received = squared(rx.amplitude(arrival[part]))
+        total += (received * power[part]) @ squared(tx.amplitude(departure[part])).T
     return total
 
 
 def _steps(turns: np.ndarray, count: int) -> np.ndarray:
-    """exp(2 pi j turns n) of ``count`` elements n about their middle, shape ``(count, L)``, by products."""
-    waves = np.empty((count, len(turns)), dtype=complex)
-    waves[0] = np.exp(-2j * np.pi * turns * (0.5 * (count - 1)))
-    done = 1
-    while done < count:
-        more = min(done, count - done)
-        np.multiply(waves[:more], np.exp(2j * np.pi * turns * done), out=waves[done : done + more])
-        done += more
-    return waves
+    """exp(2 pi j turns n) of ``count`` elements n about their middle, shape ``(count, L)``."""
+    return carrier_phase(np.arange(count)[:, None] - 0.5 * (count - 1), -turns)
 
 
 def _dft(count: int, oversampling: int) -> np.ndarray:
     """Beams ``(oversampling count, count)`` of a line of elements about its centre."""
     beams = oversampling * count
     frequency = (np.arange(beams) + 0.5) / beams - 0.5
-    place = np.arange(count) - 0.5 * (count - 1)
-    return np.exp(-2j * np.pi * frequency[:, None] * place) / np.sqrt(count)
+    return _steps(-frequency, count).T / np.sqrt(count)
 
 
-def _codebook(name: str, value: Any) -> Codebook:
+def codebook_of(name: str, value: Ends) -> Codebook:
+    """The beams of an end; ``name`` is the argument that ``value`` came by."""
     if value is None:
         return Codebook(ISOTROPIC, (np.ones((1, 1), dtype=complex),))
     if isinstance(value, PlanarArray):
@@ -418,22 +420,12 @@ def _isotropic(array: PlanarArray) -> bool:
     return isinstance(array.pattern, str) and array.pattern == "isotropic"
 
 
-def _several(source: Any) -> bool:
-    return isinstance(source, PathArrays) and source.batched
-
-
-def _largest(values: np.ndarray, count: int) -> np.ndarray:
-    """Indices of the ``count`` largest, largest first; the lower index first among equals."""
-    count = min(count, len(values))
-    least = np.partition(values, len(values) - count)[len(values) - count]
-    near = np.flatnonzero(values >= least)
-    return near[np.argsort(-values[near], kind="stable")][:count]
-
-
-def _squared(values: np.ndarray) -> np.ndarray:
+def squared(values: np.ndarray) -> np.ndarray:
+    """Squared moduli of complex ``values``."""
     return values.real**2 + values.imag**2
 
 
-def _chunks(count: int, width: int) -> Iterator[slice]:
+def chunks(count: int, width: int) -> Iterator[slice]:
+    """Stretches of ``count`` paths whose ``width`` numbers each fit a cache together."""
     step = max(1, _TERMS // max(width, 1))
     return (slice(k, k + step) for k in range(0, count, step))

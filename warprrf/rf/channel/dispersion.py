@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 
 from warprrf import device as _device
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -21,7 +22,6 @@ COHERENCE = 0.5
 
 _STEPS = 16  # trials of the correlation over the shortest period that it can have
 _MOST_PERIODS = 4096  # searched for the first crossing
-_HALVINGS = 60
 
 
 @dataclass(frozen=True)
@@ -132,11 +132,7 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
         shifts = step * np.arange(begin, begin + 257)
         below = np.flatnonzero(over(shifts) <= 0)
         if len(below):
-            low, high = shifts[below[0] - 1], shifts[below[0]]
-            for _ in range(_HALVINGS):
-                middle = 0.5 * (low + high)
-                low, high = (middle, high) if over(middle) > 0 else (low, middle)
-            return float(high)
+            return float(brentq(over, shifts[below[0] - 1], shifts[below[0]], xtol=1e-9))
     return float("inf")
 
 

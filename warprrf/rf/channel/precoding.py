@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from warprrf.rf.channel.beams import _chunks, _codebook, _rays, _squared
+from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
 
@@ -38,7 +38,9 @@ LEAST_APART = 1e-9
 ROUNDING = 1e-13
 
 
-def transmit_covariance(sources: Any, tx_array: Any, rx_array: Any = None, *, rx: Any = None) -> np.ndarray:
+def transmit_covariance(
+    sources: Source | Iterable[Source], tx_array: Ends, rx_array: Ends = None, *, rx: Any = None
+) -> np.ndarray:
     """Mean of h* h^T of every user over independent phases of its paths, shape ``(U, N, N)``, complex.
 
     It takes 16 U N^2 bytes: 4 MB for four users of 256 elements.
@@ -53,9 +55,9 @@ def transmit_covariance(sources: Any, tx_array: Any, rx_array: Any = None, *, rx
         TypeError, ValueError: as for :func:`~warprrf.rf.channel.beams.select_beams`; for beams that do not fit the
             users.
     """
-    tx, book = _codebook("tx_array", tx_array).array, _codebook("rx_array", rx_array)
-    given: Iterable[Any] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
-    rays = [found for source in given for found in _rays(source, _codebook("tx_array", tx_array))]
+    tx, book = codebook_of("tx_array", tx_array).array, codebook_of("rx_array", rx_array)
+    given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
+    rays = [found for source in given for found in rays_of(source, codebook_of("tx_array", tx_array))]
     if not rays:
         raise ValueError("sources: got none, expected a spectrum or paths for every user")
     beams = np.zeros(len(rays), int) if rx is None and len(book) == 1 else np.asarray(rx)
@@ -66,9 +68,9 @@ def transmit_covariance(sources: Any, tx_array: Any, rx_array: Any = None, *, rx
     found = np.zeros((len(rays), tx.elements, tx.elements), dtype=complex)
     for total, (departure, arrival, power), beam in zip(found, rays, beams, strict=True):
         own = book.beam(int(beam))
-        for part in _chunks(len(power), tx.elements):
+        for part in chunks(len(power), tx.elements):
             toward = arrival[part]
-            received = _squared(book.array.response(toward, 1.0) @ own) * book.array.gain(toward)
+            received = squared(book.array.response(toward, 1.0) @ own) * book.array.gain(toward)
             if departure is None:  # a single isotropic element
                 total += (received * power[part]).sum()
                 continue
@@ -127,7 +129,7 @@ def precoded_sinr(channels: Any, weights: Any, *, noise: float) -> np.ndarray:
         )
     w = _unit(w)
     if h.ndim == 2:
-        heard = _squared(h @ w.T)
+        heard = squared(h @ w.T)
     else:
         heard = np.einsum("vn,unm,vm->uv", w.conj(), h, w, optimize=True).real
     signal = np.diag(heard)

@@ -18,7 +18,6 @@ import numpy as np
 from warprrf import device as _device
 from warprrf.device import Progress
 from warprrf.files import write_atomically
-from warprrf.geometry.floor_plan import section
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.maps.links import Links
 from warprrf.rf.receivers import ON_A_WALL_M
@@ -340,7 +339,7 @@ def radio_map(
         beam_sigma_rad=float(o.beam_sigma_rad),
         transmit_power_dbm=float(o.transmit_power_dbm),
         noise_power_dbm=o.noise_power_dbm,
-        outline=section(mesh.vertices, mesh.faces, float(height)),
+        outline=mesh.cross_section(float(height)),
         **layers,
     )
 

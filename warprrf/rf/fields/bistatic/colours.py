@@ -2,100 +2,94 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_topology import connected_pieces
 from warprrf.geometry.splats.gaussians import Gaussians
 
-LARGE_PIECE_M2 = 1.5  # a piece of a patch this large is a group of its own
-SMALLEST_GROUP_M2 = 0.5
-SMALLEST_SHEET_M2 = 0.2
-COLOUR_CELL_M = 0.4  # colours are averaged over cells of this size
-CHROMA_STEP = 0.05  # log chromaticities that differ by less look alike
-LUMINANCE_STEP = 0.3  # and log luminances
 Y00 = 0.28209479177387814  # harmonic of degree 0
 
 
+@dataclass(frozen=True)
+class ColourGrouping:
+    """What is told apart by colour. Colours are in steps: log chromaticity over ``chroma``, log luminance over
+    ``luminance``.
+
+    Attributes:
+        cell_m: colours are averaged over cells of this size.
+        sheet_m2: smaller connected pieces of a patch count as one.
+        piece_m2: a piece of one colour of a patch this large is a group of its own.
+        group_m2: smaller groups, from which nothing is learned, join the one that looks most like them.
+        chroma: log chromaticities that differ by less look alike.
+        luminance: and log luminances, which are also shade.
+        apart: least distance of two colours of one sheet, and in standard deviations within each.
+        alike: a small piece this near to a large one's colour joins it.
+        curved: pieces off all patches this near are one.
+        rest: small pieces that look like no large one are one this near.
+    """
+
+    cell_m: float = 0.4
+    sheet_m2: float = 0.2
+    piece_m2: float = 1.5
+    group_m2: float = 0.5
+    chroma: float = 0.05
+    luminance: float = 0.3
+    apart: tuple[float, float] = (1.2, 4.0)
+    alike: float = 1.0
+    curved: float = 2.0
+    rest: float = 4.0
+
+
 def colour_groups(
-    mesh: Mesh, patch: np.ndarray, gaussians: Gaussians
+    mesh: Mesh, patch: np.ndarray, gaussians: Gaussians, options: ColourGrouping | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Groups of faces by patch and photo colour; the material that each is taken for, and its look.
+    """Groups of faces by patch and photo colour.
 
     A patch is split into its connected sheets (other things in the same plane), and a sheet where its colour changes:
     such pieces are the groups. Each large one is taken for a material of its own: grey stone and grey paint look alike.
     Small pieces join the large one that looks most like them, if any does, else each other. Chromaticity counts more
     than luminance, which is also shade.
+
+    Args:
+        mesh: F faces.
+        patch: planar patch of each, -1 for none, shape ``(F,)``.
+        gaussians: of the same reconstruction.
+        options: what is told apart.
+
+    Returns:
+        The group of each face, shape ``(F,)``; the material that each group is taken for, shape ``(G,)``; and its
+        colour in steps, shape ``(G, 4)``.
     """
-    centre, area = mesh.triangles.mean(axis=1), mesh.areas
-    colour = np.log(np.clip(gaussians.sh[:, 0, :].astype(np.float64) * Y00 + 0.5, 0.01, 1.0))
-    face = mesh.closest(gaussians.means).face
-    weight = gaussians.opacities * np.sort(gaussians.scales, axis=1)[:, 1:].prod(axis=1)
-    sheet = _sheets(mesh, patch)
-    key = np.column_stack([sheet, np.floor((centre - mesh.bounds[0]) / COLOUR_CELL_M).astype(np.int64)])
-    unit = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
-    count = int(unit.max()) + 1
-    total = np.bincount(unit[face], weight, minlength=count)
-    mean = np.stack(
-        [np.bincount(unit[face], weight * colour[:, k], minlength=count) for k in range(3)], axis=1
-    )
-    size = np.bincount(unit, area, minlength=count) + 1e-9
-    known = total > 1e-9
-    mean[known] = mean[known] / total[known, None]
-    owner = np.full(count, -1)
+    o = options or ColourGrouping()
+    sheet = _sheets(mesh, patch, o)
+    place = np.floor((mesh.triangles.mean(axis=1) - mesh.bounds[0]) / o.cell_m).astype(np.int64)
+    unit = np.unique(np.column_stack([sheet, place]), axis=0, return_inverse=True)[1].reshape(-1)
+    owner = np.full(int(unit.max()) + 1, -1)
     owner[unit] = sheet
-    for p in np.unique(owner):  # a unit without Gaussians looks like its sheet
-        seen = (owner == p) & known
-        usual = mean[seen] if seen.any() else mean[known]
-        mean[(owner == p) & ~known] = np.average(
-            usual, axis=0, weights=size[seen] if seen.any() else size[known]
-        )
-    luminance = mean.mean(axis=1, keepdims=True)
-    feature = np.concatenate([(mean - luminance) / CHROMA_STEP, luminance / LUMINANCE_STEP], axis=1)
-
-    piece = np.zeros(count, np.int64)
-    looks: list[np.ndarray] = []
-    sizes: list[float] = []
-    for p in np.unique(owner):
-        own = np.flatnonzero(owner == p)
-        split = _clusters(feature[own], size[own]) if p >= 0 else _linkage(feature[own], size[own], 2.0)
-        for k in range(split.max() + 1):
-            part = own[split == k]
-            piece[part] = len(looks)
-            looks.append(np.average(feature[part], axis=0, weights=size[part]))
-            sizes.append(float(size[part].sum()) if p >= 0 else 0.0)
-    look, area_of = np.array(looks), np.array(sizes)
-    large = np.flatnonzero(area_of >= LARGE_PIECE_M2)
-    group = np.full(len(look), -1)
-    group[large] = np.arange(len(large))
-    small = np.flatnonzero(group < 0)
-    if len(large) and len(small):
-        gap = np.linalg.norm(look[small][:, None] - look[large][None], axis=2)
-        alike = gap.min(axis=1) < 1.0
-        group[small[alike]] = gap.argmin(axis=1)[alike]
-    rest = np.flatnonzero(group < 0)
-    if len(rest):
-        group[rest] = len(large) + _linkage(look[rest], np.maximum(area_of[rest], 1e-3), 4.0)
-    real = np.bincount(piece[unit], area, minlength=len(group))
-    while len(np.unique(group)) > 1:  # too small to learn from: join what looks most like it
-        whole = np.bincount(group, real)
-        tiny = np.flatnonzero((whole > 0) & (whole < SMALLEST_GROUP_M2))
-        if len(tiny) == 0:
-            break
-        centre_of: np.ndarray = np.stack([np.bincount(group, real * look[:, k]) for k in range(4)], axis=1)
-        centre_of = centre_of / np.maximum(whole, 1e-12)[:, None]
-        g = tiny[whole[tiny].argmin()]
-        gap = np.where(whole > 0, np.linalg.norm(centre_of - centre_of[g], axis=1), np.inf)
-        gap[g] = np.inf
-        group[group == g] = gap.argmin()
-    group = np.unique(group, return_inverse=True)[1].reshape(-1)
-    return piece[unit].astype(np.int32), group.astype(np.int32), look
+    size = np.bincount(unit, mesh.areas) + 1e-9
+    feature = _colours(unit[mesh.closest(gaussians.means).face], owner, size, gaussians, o)
+    piece = np.zeros(len(owner), np.int64)
+    for s in np.unique(owner):
+        own = np.flatnonzero(owner == s)
+        split = _halved(feature[own], size[own], o) if s >= 0 else _joined(feature[own], o.curved)
+        piece[own] = split + (piece.max() + 1 if s > owner.min() else 0)
+    area = np.bincount(piece, size)
+    colour = np.stack([np.bincount(piece, size * channel) for channel in feature.T], axis=1) / area[:, None]
+    flat = np.bincount(piece, size * (owner >= 0))
+    material = _alike(colour, flat, area, o)
+    return piece[unit].astype(np.int32), material.astype(np.int32), colour
 
 
-def _sheets(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
+def _sheets(mesh: Mesh, patch: np.ndarray, o: ColourGrouping) -> np.ndarray:
     """Connected pieces of each patch, shape ``(F,)``, its crumbs together; -1 off all patches."""
     piece = connected_pieces(mesh, patch)
-    crumb = np.bincount(piece, mesh.areas)[piece] < SMALLEST_SHEET_M2
+    crumb = np.bincount(piece, mesh.areas)[piece] < o.sheet_m2
     key = np.where(crumb, patch + int(piece.max()) + 1, piece)
     sheet = np.full(len(patch), -1)
     own = patch >= 0
@@ -103,61 +97,90 @@ def _sheets(mesh: Mesh, patch: np.ndarray) -> np.ndarray:
     return sheet
 
 
-def _clusters(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Cluster of each row: halved as long as the halves are clearly apart."""
-    label = _two_means(feature, size)
-    if label.any():
-        one, two = label == 0, label == 1
-        first = _clusters(feature[one], size[one])
-        label[one] = first
-        label[two] = first.max() + 1 + _clusters(feature[two], size[two])
-    return label
+def _colours(
+    unit: np.ndarray, owner: np.ndarray, size: np.ndarray, gaussians: Gaussians, o: ColourGrouping
+) -> np.ndarray:
+    """Colour of each unit in steps, shape ``(U, 4)``: the mean of its Gaussians', who stand at ``unit``; of one without
+    any that of its sheet, or of all."""
+    count = len(owner)
+    weight = gaussians.opacities * np.sort(gaussians.scales, axis=1)[:, 1:].prod(axis=1)
+    log = np.log(np.clip(gaussians.sh[:, 0, :].astype(np.float64) * Y00 + 0.5, 0.01, 1.0))
+    total = np.bincount(unit, weight, minlength=count)
+    known = total > 1e-9
+    mean = np.stack([np.bincount(unit, weight * channel, minlength=count) for channel in log.T], axis=1)
+    mean[known] = mean[known] / total[known, None]
+    for s in np.unique(owner[~known]):
+        seen = (owner == s) & known
+        seen = seen if seen.any() else known
+        mean[(owner == s) & ~known] = np.average(mean[seen], axis=0, weights=size[seen])
+    luminance = mean.mean(axis=1, keepdims=True)
+    return np.concatenate([(mean - luminance) / o.chroma, luminance / o.luminance], axis=1)
 
 
-def _two_means(feature: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """0 or 1 for each row: two clusters if they are clearly apart, else one."""
-    if len(feature) < 4 or size.sum() < 0.5:
-        return np.zeros(len(feature), np.int64)
+def _halved(feature: np.ndarray, size: np.ndarray, o: ColourGrouping) -> np.ndarray:
+    """Cluster of each row: halved by two means as long as the halves are clearly apart."""
+    one = np.zeros(len(feature), np.int64)
+    if len(feature) < 4 or size.sum() < o.group_m2:
+        return one
     mean = np.average(feature, axis=0, weights=size)
     axis = np.linalg.svd((feature - mean) * np.sqrt(size)[:, None], full_matrices=False)[2][0]
-    label = ((feature - mean) @ axis > 0).astype(np.int64)
-    for _ in range(20):
-        if label.min() == label.max():
-            return np.zeros(len(feature), np.int64)
+    side = (feature - mean) @ axis > 0
+    if side.all() or not side.any():
+        return one
+    label = side.astype(np.int64)
+    for _ in range(20):  # Lloyd's steps, with weights, which SciPy's do without
         centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
-        new = np.linalg.norm(feature[:, None] - centre, axis=2).argmin(axis=1)
-        if (new == label).all():
+        nearest = cdist(feature, centre).argmin(axis=1)
+        if (nearest == label).all() or nearest.all() or not nearest.any():
             break
-        label = new
-    gap = centre[1] - centre[0]
-    apart = np.linalg.norm(gap)
-    along = (feature - centre[label]) @ (gap / apart)
-    inner = np.sqrt(np.average(along**2, weights=size))
+        label = nearest
     share = size[label == 1].sum() / size.sum()
-    return (
-        label
-        if apart > 1.2 and apart > 4.0 * inner and 0.03 < share < 0.97
-        else np.zeros(len(feature), np.int64)
-    )
+    if not 0.03 < share < 0.97:
+        return one
+    centre = np.stack([np.average(feature[label == k], axis=0, weights=size[label == k]) for k in (0, 1)])
+    gap = np.linalg.norm(centre[1] - centre[0])
+    along = (feature - centre[label]) @ (centre[1] - centre[0]) / max(gap, 1e-12)
+    if gap <= max(o.apart[0], o.apart[1] * np.sqrt(np.average(along**2, weights=size))):
+        return one
+    for k in (0, 1):
+        own = label == k
+        one[own] = _halved(feature[own], size[own], o) + (one.max() + 1 if k else 0)
+    return one
 
 
-def _linkage(centres: np.ndarray, weights: np.ndarray, step: float) -> np.ndarray:
-    """Clusters by repeatedly joining the two nearest weighted means until they are ``step`` apart."""
-    label = np.arange(len(centres))
-    c, w = centres.copy(), weights.astype(float).copy() + 1e-9
-    alive = np.ones(len(c), bool)
-    gap = np.linalg.norm(c[:, None] - c[None], axis=2)
-    np.fill_diagonal(gap, np.inf)
-    while alive.sum() > 1:
-        i, j = np.unravel_index(gap.argmin(), gap.shape)
-        if gap[i, j] > step:
-            break
-        c[i] = (w[i] * c[i] + w[j] * c[j]) / (w[i] + w[j])
-        w[i] += w[j]
-        alive[j] = False
-        label[label == j] = i
-        gap[j], gap[:, j] = np.inf, np.inf
-        gap[i] = np.where(alive, np.linalg.norm(c - c[i], axis=1), np.inf)
-        gap[i, i] = np.inf
-        gap[:, i] = gap[i]
-    return np.unique(label, return_inverse=True)[1].reshape(-1)
+def _joined(colour: np.ndarray, distance: float) -> np.ndarray:
+    """Clusters whose centres are at least ``distance`` apart, shape ``(N,)``, from 0 on."""
+    if len(colour) < 2:
+        return np.zeros(len(colour), np.int64)
+    return np.asarray(fcluster(linkage(colour, "centroid"), distance, "distance"), np.int64) - 1
+
+
+def _alike(colour: np.ndarray, flat: np.ndarray, area: np.ndarray, o: ColourGrouping) -> np.ndarray:
+    """Material that each piece is taken for, numbered without gaps, shape ``(G,)``.
+
+    Args:
+        colour: of the pieces, shape ``(G, 4)``.
+        flat: area on patches, shape ``(G,)`` [m^2].
+        area: in all.
+    """
+    large = np.flatnonzero(flat >= o.piece_m2)
+    material = np.full(len(colour), -1)
+    material[large] = np.arange(len(large))
+    small = np.flatnonzero(material < 0)
+    if len(large) and len(small):
+        distance, nearest = cKDTree(colour[large]).query(colour[small])
+        material[small] = np.where(distance < o.alike, nearest, -1)
+    rest = np.flatnonzero(material < 0)
+    material[rest] = len(large) + _joined(colour[rest], o.rest)
+    while True:  # too small to learn from: join what looks most like it
+        material = np.unique(material, return_inverse=True)[1].reshape(-1)
+        whole = np.bincount(material, area)
+        tiny = int(whole.argmin())
+        if len(whole) < 2 or whole[tiny] >= o.group_m2:
+            return material
+        centre = (
+            np.stack([np.bincount(material, area * channel) for channel in colour.T], axis=1) / whole[:, None]
+        )
+        gap = np.linalg.norm(centre - centre[tiny], axis=1)
+        gap[tiny] = np.inf
+        material[material == tiny] = gap.argmin()

@@ -10,8 +10,10 @@ import warp as wp
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 
+pytestmark = pytest.mark.usefixtures("each_form")
+
 SCENES = 60
-COUNT, CHANNELS = 6, 2
+COUNT, CHANNELS = 6, 5  # five channels take two launches
 DTYPES = {"means": wp.vec3d, "quaternions": wp.vec4d, "scales": wp.vec3d}
 # Relative step of the central differences; with one Richardson step their error is of order h^4 plus rounding / h.
 STEP = 1e-5
@@ -48,7 +50,7 @@ class WholePath:
             "quaternions": rng.normal(size=(COUNT, 4)),
             "scales": np.exp(rng.uniform(np.log(0.08), np.log(0.6), (COUNT, 3))),
             "opacities": rng.uniform(0.1, 1.0, COUNT),
-            "sh": rng.normal(size=(COUNT, 4, CHANNELS)) * 0.1,
+            "sh": rng.normal(size=(COUNT, 16, CHANNELS)) * 0.1,
             "background": rng.uniform(0.1, 1, CHANNELS),
         }
         self.camera = random_camera(rng, spherical=seed % 2 == 0)

@@ -13,6 +13,8 @@ from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.geometry.splats.render import render
 
+pytestmark = pytest.mark.usefixtures("each_form")
+
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 SMOOTH = Blending(alpha_min=1e-6, alpha_max=1.0, transmittance_min=-0.5)
 ORIGIN = (0.0, 0.0, 0.0)

@@ -252,7 +252,7 @@ def test_torch_gradcheck_passes_and_a_planted_wrong_adjoint_fails(monkeypatch):
     assert (hits(*values)[0] < 10).all()  # all places are taken: no infinity meets gradcheck
     for function in (passed, hits):
         assert torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-7, rtol=1e-6)
-    Function = interop._functions().rays
+    Function = interop._Rays
     right = Function.backward
 
     def wrong(ctx, *incoming):

@@ -1,0 +1,93 @@
+"""Anything that is linear in path powers is predicted, with its Jacobian, by one function: here a delay profile."""
+
+import copy
+import pickle
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.materials import Layout
+from warprrf.rf.fields.bistatic.render import path_powers
+from warprrf.rf.fields.bistatic.response import jacobian, predict, respond
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.transport import ReceiverView
+
+F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
+TX, RX = np.array([0.8, 0.9, 2.2]), np.array([4.2, 3.1, 1.2])
+
+
+@dataclass(frozen=True)
+class DelayProfile:
+    """Power by delay, summed over all directions."""
+
+    edges_s: np.ndarray
+
+    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
+        ray = np.arange(len(view.hits.face))
+        length = np.linalg.norm(view.hits.points(ray) - view.transport.transmitter, axis=1)
+        tap = np.digitize((length + view.hits.range_m.numpy()) / SPEED_OF_LIGHT, self.edges_s) - 1
+        return np.where((tap >= 0) & (tap < len(self.edges_s) - 1), tap, -1), len(self.edges_s) - 1
+
+    def of_bins(self, power: np.ndarray) -> np.ndarray:
+        return power.astype(np.float32)
+
+    def of_paths(self, view: ReceiverView) -> np.ndarray:
+        tap = np.digitize(view.paths.length_m / SPEED_OF_LIGHT, self.edges_s) - 1
+        return (tap[:, None] == np.arange(len(self.edges_s) - 1)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def field() -> BistaticField:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+    )
+    scene = RadioScene(mesh, part, [SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box")])
+    ds = exact_spectra(scene, RX[None], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    return BistaticField.prior(scene, ds, terms=Terms(mirror_order=1))
+
+
+def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
+    view, profile = field.view(RX), DelayProfile(np.arange(0.0, 50e-9, 2e-9))
+    response = respond(view, profile, field.terms.lobes, field.floor)
+    found = predict(response, field.parameters) * field.floor
+    powers = path_powers(view, field.materials, None)
+    tap, count = profile.bins(view)
+    expected = np.bincount(tap[tap >= 0], powers.single[tap >= 0], minlength=count)
+    expected += powers.mirror @ profile.of_paths(view)
+    assert (expected > 0).sum() >= 5
+    # three components resolve the Fresnel curves to a few parts in a thousand
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-3 * expected.max())
+    assert found.sum() == pytest.approx(expected.sum(), rel=0.01)
+
+
+def test_its_jacobian_is_that_of_differences(field: BistaticField) -> None:
+    view, profile = field.view(RX), DelayProfile(np.arange(0.0, 50e-9, 2e-9))
+    response = respond(view, profile, field.terms.lobes, field.floor)
+    layout = Layout(*field.parameters.log_weight.shape, indirect=False, gain=True)
+    x = layout.pack(replace(field.parameters, log_gain=0.1))
+    values, table, index = jacobian(response, layout.unpack(x), layout)
+    np.testing.assert_allclose(values, predict(response, layout.unpack(x)), rtol=1e-5)
+    for row, place in zip(table, index, strict=True):
+        step = 0.02 * (np.arange(layout.size) == place)
+        slope = (
+            predict(response, layout.unpack(x + step)) - predict(response, layout.unpack(x - step))
+        ) / 0.04
+        allowed = 0.1 if place % layout.stride == layout.lobes else 0.02  # that of permittivity is a table's
+        assert np.abs(row - slope).max() <= allowed * np.abs(slope).max() + 1e-5 * values.max()
+
+
+def test_a_used_field_is_copied_and_pickled_without_what_it_traced(field: BistaticField) -> None:
+    expected = field.spectrum(RX).path_gain
+    for again in (copy.deepcopy(field), pickle.loads(pickle.dumps(field))):
+        assert len(again.surface.transports) == 0
+        np.testing.assert_array_equal(again.spectrum(RX).path_gain, expected)
+
+
+def test_what_was_traced_for_old_transmitters_goes(field: BistaticField) -> None:
+    for x in np.linspace(0.5, 1.5, 8):
+        field.spectrum(RX, [x, 0.9, 2.2])
+    assert len(field.surface.transports) <= 4

@@ -1,0 +1,145 @@
+"""The image method against brute force over all chains: pruning loses nothing, and what is found is a path."""
+
+import itertools
+
+import numpy as np
+import pytest
+from radio_scenes import box_mesh, joined
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
+from warprrf.rf.paths import images as images_module
+from warprrf.rf.paths.images import MirrorImages
+from warprrf.rf.paths.mirror_paths import exact_paths, zone_paths
+
+TX = np.array([0.2, -0.1, 0.3])
+
+
+def shards(seed, count, sizes=(0.3, 1.0, 3.0)):
+    """Triangles and rectangles of all sizes and directions about the transmitter, each a patch of its own."""
+    rng = np.random.default_rng(seed)
+    vertices, faces = [], []
+    for k in range(count):
+        centre = rng.normal(0, 2.0, 3)
+        a, b = rng.normal(0, rng.choice(sizes), (2, 3))
+        corners = [centre - a - b, centre + a - b, centre + a + b, centre - a + b]
+        vertices += corners
+        faces += [[4 * k, 4 * k + 1, 4 * k + 2]] + ([[4 * k, 4 * k + 2, 4 * k + 3]] if k % 3 else [])
+    return Mesh(np.array(vertices), np.array(faces))
+
+
+def brute_force(patches, transmitter, receiver, order):
+    """All chains, each image made and unfolded in NumPy: their patches and points where nothing stands between."""
+    n, d, mesh = patches.normal, patches.offset, patches.mesh
+    found = {}
+    for chain in itertools.product(range(len(patches)), repeat=order):
+        if any(a == b for a, b in itertools.pairwise(chain)):
+            continue
+        sources = [transmitter]
+        for p in chain:
+            sources.append(sources[-1] - 2 * (n[p] @ sources[-1] - d[p]) * n[p])
+        points, here = [], receiver
+        for p, image in zip(chain[::-1], sources[:0:-1], strict=True):
+            side, depth = n[p] @ here - d[p], n[p] @ image - d[p]
+            if side * depth >= 0:
+                break
+            here = here + side / (side - depth) * (image - here)
+            points.append(here)
+        else:
+            points = np.array(points[::-1])
+            if not patches.contains(np.array(chain), points).all():
+                continue
+            stops = np.concatenate([[transmitter], points, [receiver]])
+            if mesh.visible(stops[:-1], stops[1:]).all():
+                found[chain] = points
+    return found
+
+
+@pytest.mark.parametrize(("order", "count", "scenes"), [(1, 30, 4), (2, 14, 6), (3, 7, 6)])
+@pytest.mark.parametrize("block", [None, 5], ids=["kept", "in-blocks"])
+def test_pruning_loses_no_path_of_brute_force(order, count, scenes, block, monkeypatch):
+    if block:
+        monkeypatch.setattr(images_module, "MOST_KEPT", 0)
+        monkeypatch.setattr(images_module, "BLOCK", block)
+    total = 0
+    for seed in range(scenes):
+        patches = planar_patches(shards(seed, count, (0.3, 1.0, 3.0) if order < 3 else (2.0, 5.0)))
+        assert len(patches) == count
+        points = np.random.default_rng(seed + 100).normal(0, 1.5, (5, 3))
+        images = MirrorImages(patches, TX)
+        paths = exact_paths(images, points, order)
+        for r, point in enumerate(points):
+            expected = brute_force(patches, TX, point, order)
+            mine = np.flatnonzero((paths.receiver == r) & (paths.order == order))
+            assert {tuple(paths.patch[k, :order].tolist()) for k in mine} == set(expected)
+            for k in mine:
+                np.testing.assert_allclose(
+                    paths.point[k, :order], expected[tuple(paths.patch[k, :order].tolist())], atol=1e-9
+                )
+            total += len(mine)
+    assert total >= 5
+
+
+def test_a_point_alone_and_among_many_has_the_same_paths():
+    patches = planar_patches(shards(3, 40))
+    points = np.random.default_rng(5).normal(0, 3.0, (100, 3))
+    images = MirrorImages(patches, TX)
+    together = exact_paths(images, points, 2)
+    for r in range(0, 100, 9):
+        alone = exact_paths(images, points[r][None], 2)
+        np.testing.assert_array_equal(alone.patch, together.patch[together.receiver == r])
+        np.testing.assert_array_equal(alone.length_m, together.length_m[together.receiver == r])
+
+
+def test_every_path_obeys_the_law_of_reflection_and_its_length_is_that_of_its_legs():
+    mesh, _ = joined(box_mesh([-3, -2, -1], [4, 3, 2], inward=True), box_mesh([1, 0, -1], [2, 1, 0.2]))
+    patches = planar_patches(mesh)
+    points = np.random.default_rng(6).uniform([-2.8, -1.8, 0.5], [3.8, 2.8, 1.8], (4, 3))
+    paths = exact_paths(MirrorImages(patches, TX), points, 4)
+    assert np.bincount(paths.order).min() >= 4
+    for k in range(len(paths)):
+        order = paths.order[k]
+        stops = np.concatenate([[TX], paths.point[k, :order], [points[paths.receiver[k]]]])
+        legs = np.diff(stops, axis=0)
+        lengths = np.linalg.norm(legs, axis=1)
+        assert paths.length_m[k] == pytest.approx(lengths.sum(), rel=1e-14)
+        for j, p in enumerate(paths.patch[k, :order]):
+            n = patches.normal[p]
+            before, after = legs[j] / lengths[j], legs[j + 1] / lengths[j + 1]
+            np.testing.assert_allclose(after, before - 2 * (before @ n) * n, atol=1e-10)
+            assert paths.cosine[k, j] == pytest.approx(abs(before @ n), abs=1e-12)
+
+
+def test_soft_blocking_finds_what_hard_blocking_does_where_zones_are_free():
+    mesh = Mesh(*box_mesh([-3, -2, -1], [4, 3, 2], inward=True))
+    patches = planar_patches(mesh)
+    points = np.random.default_rng(7).uniform([-2.5, -1.5, -0.5], [3.5, 2.5, 1.5], (6, 3))
+    images = MirrorImages(patches, TX, slack_m=0.1)
+    hard, soft = exact_paths(images, points, 2), zone_paths(images, points, 2, 1e-5, 1e-4)
+    whole = soft.subset(np.flatnonzero(soft.share == 1.0))
+    assert len(whole) >= 0.95 * len(hard)
+
+    def rows(paths):
+        return {(int(r), *p.tolist()) for r, p in zip(paths.receiver, paths.patch, strict=True)}
+
+    assert rows(whole) <= rows(hard) <= rows(soft)
+
+
+def test_patches_with_a_back_mirror_on_their_front_alone():
+    mesh = Mesh(*box_mesh([-3, -2, -1], [4, 3, 2], inward=True))
+    found = planar_patches(mesh)
+    point = np.array([[1.0, 1.0, 0.0]])
+    for sign, expected in ((1.0, 6), (-1.0, 0)):
+        given = PlanarPatches.from_planes(
+            mesh, found.face_patch, sign * found.normal, sign * found.offset, tolerance_m=1e-5
+        )
+        assert np.bincount(exact_paths(MirrorImages(given, TX), point, 1).order, minlength=2)[1] == expected
+
+
+def test_no_points_and_no_patches():
+    patches = planar_patches(shards(1, 3))
+    assert len(exact_paths(MirrorImages(patches, TX), np.zeros((0, 3)), 2)) == 0
+    none = PlanarPatches.from_planes(
+        patches.mesh, np.full(len(patches.mesh.faces), -1), np.zeros((0, 3)), np.zeros(0), tolerance_m=1e-5
+    )
+    assert exact_paths(MirrorImages(none, TX), np.array([[9.0, 9, 9]]), 3).order.tolist() == [0]
