@@ -6,6 +6,9 @@ import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M
+from warprrf.rf.paths.images import MirrorImages
+from warprrf.rf.paths.mirror_paths import zone_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
 EPSILON_0 = 8.8541878128e-12
@@ -83,3 +86,9 @@ def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, 
         aod=np.stack([f.aod for f in found]), line_of_sight=[f.line_of_sight for f in found], beam_sigma_rad=sigma,
         engine="exact",
     )  # fmt: skip
+
+
+def mirror_paths(surface, transmitter, receivers, wavelength_m, order):
+    """Line of sight and mirror paths on a field's surface, softly blocked."""
+    images = MirrorImages(surface.patches, transmitter, slack_m=MIRROR_SLACK_M)
+    return zone_paths(images, receivers, order, wavelength_m, surface.skin_m)
