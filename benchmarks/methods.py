@@ -419,7 +419,5 @@ METHODS: dict[str, Method] = {
     "zero": Method(_zero, "bistatic", untaught=True, note="our mesh, every surface taken for the prior"),
 }
 """Every method by its name."""
-OURS = ("bistatic", "bistatic-quick")
-"""Our own model."""
 AFTER = {"sionna-calibrated": "bistatic"}
 """Methods that are given the seconds of another one's run, and so come after it."""

@@ -8,11 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from benchmarks.data import VERSIONS, DataOptions, Geometry, checked, files
 from benchmarks.evaluation import comparison, report
-from benchmarks.evaluation.paper_law import law_reach, paper_law_spectra
+from benchmarks.evaluation.paper_law import paper_law_spectra
 from benchmarks.evaluation.protocol import SCALES, SPLITS, TRUTHS, Scale, Setting, plan, truth_of
 from benchmarks.evaluation.runs import sweep
 from benchmarks.machine import machine
@@ -22,8 +20,6 @@ from benchmarks.runner import Benchmark, Job, option
 from warprrf.files import write_atomically, write_text
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.steps import Attempt, Steps, digest
-
-GAUSSIANS_DRAWN = 400  # that stand for all where the reach of the paper's law is found
 
 HELP = """\
 Every method on the same receivers: bistatic, RF-3DGS+ and RF-3DGS (opacity frozen and trained), NeRF2, a conditional
@@ -149,8 +145,6 @@ def run(kind: str, options: Options, job: Job) -> Report:
         "rows": summary,
         "published": [dict(row) for row in report.PUBLISHED],
         "finding": comparison.paper_finding(summary),
-        "law_reach": _law_reach(setting, place),
-        "ahead": comparison.ours_against_all(summary),
         "data": about,
         "effort": asdict(scale.effort),
         "machine": machine(job.device),
@@ -175,14 +169,6 @@ def _paper_law(steps: Steps, place: Geometry, exact: Path) -> Path:
         "paper-law", make, version=VERSIONS["exact"], inputs=[exact, place.scene_key], outputs=(file.name,)
     )
     return file
-
-
-def _law_reach(setting: Setting, place: Geometry) -> dict[str, float] | None:
-    """What the paper's law can be worth to Gaussians drawn at random, over all receivers of the first truth."""
-    data, known = SpectrumDataset.load(setting.files[0][1]), place.reconstruction
-    centres = np.asarray(known.gaussians.means, float)
-    drawn = np.random.default_rng(0).choice(len(centres), min(GAUSSIANS_DRAWN, len(centres)), replace=False)
-    return law_reach(known.mesh, centres[drawn], data.receivers, data.transmitter, device=place.device)
 
 
 def _about(scale: Scale, setting: Setting) -> tuple[dict[str, Any], dict[tuple[str, str], tuple[int, ...]]]:

@@ -1,7 +1,4 @@
-"""What the kept runs come to: the better variant of each, means over seeds, and how methods stand to each other.
-
-Two comparisons: the paper's finding, RF-3DGS+ ahead of RF-3DGS, and ours against the best of the others.
-"""
+"""What the kept runs come to: the better variant of each, means over seeds, and the paper's finding."""
 
 from __future__ import annotations
 
@@ -12,17 +9,10 @@ import numpy as np
 
 from benchmarks.evaluation.protocol import TRUTHS
 from benchmarks.evaluation.runs import SPREAD
-from benchmarks.methods import OURS
 from benchmarks.report import Row
 
 PAIRS = {"rf3dgs+": "rf3dgs", "rf3dgs+alpha": "rf3dgs-alpha"}
 """What the paper's finding compares: with lengths, and without."""
-AHEAD = (
-    ("psnr_db", 1), ("ssim", 1), ("rmse_db", -1), ("direction_within_3deg", 1), ("beam_gain_loss_db", -1),
-    ("psnr_db_blocked", 1), ("ssim_blocked", 1), ("rmse_db_blocked", -1), ("direction_within_3deg_blocked", 1),
-    ("beam_gain_loss_db_blocked", -1),
-)  # fmt: skip
-"""Figures in which ours is compared with the best of the others, and the sign of better."""
 
 
 def summarise(rows: Iterable[Row]) -> list[Row]:
@@ -83,40 +73,3 @@ def paper_finding(rows: Sequence[Row]) -> list[Row]:
     return sorted(
         found, key=lambda line: (line["opacity"], order.index(line["truth"]), line["split"], line["count"])
     )
-
-
-def ours_against_all(rows: Sequence[Row]) -> list[Row]:
-    """Ours less the best of the others in each figure, a row a truth, split, count and one of :data:`OURS`.
-
-    ``train_ratio`` and ``spectrum_ratio`` are how many times faster than RF-3DGS+ ours is.
-    """
-    found = []
-    for ours in (row for row in rows if row["method"] in OURS):
-        place = (ours["truth"], ours["split"], ours["count"])
-        others = [
-            row
-            for row in rows
-            if (row["truth"], row["split"]) == place[:2]
-            and row["count"] in (0, ours["count"])
-            and row["method"] not in OURS
-        ]
-        line: Row = dict(zip(("truth", "split", "count"), place, strict=True)) | {"ours": ours["method"]}
-        for key, sign in AHEAD:
-            rated = [row for row in others if row.get(key) is not None]
-            if ours.get(key) is None or not rated:
-                continue
-            best = max(rated, key=lambda row: sign * float(row[key]))
-            margin = float(ours[key]) - float(best[key])
-            line[key] = {
-                "ours": ours[key],
-                "best": best[key],
-                "method": best["method"],
-                "margin": margin,
-                "ahead": bool(sign * margin >= 0),
-            }
-        plus = next((row for row in others if row["method"] == "rf3dgs+"), None)
-        if plus is not None:
-            line["train_ratio"] = plus["train_s"] / ours["train_s"]
-            line["spectrum_ratio"] = plus["seconds_per_spectrum"] / ours["seconds_per_spectrum"]
-        found.append(line)
-    return found

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.evaluation.comparison import AHEAD
 from benchmarks.evaluation.plots import law_bars, sparsity_curves, spectra_grid, speed_against_error
 from benchmarks.evaluation.protocol import TRUTHS, Run
 from benchmarks.evaluation.runs import pictures_of
@@ -106,9 +105,7 @@ def markdown(kind: str, found: dict[str, Any]) -> str:
         for key, name in (("psnr_db", "PSNR [dB]"), ("ssim", "SSIM")):
             parts += [f"### {name}: mean (least to most over the test receivers)", _curve_table(rows, key)]
     if found["finding"]:
-        parts += ["### RF-3DGS+ against RF-3DGS", _finding_text(found["finding"], found["law_reach"])]
-    if found["ahead"]:
-        parts += ["### Ours against all", _ahead_text(found["ahead"])]
+        parts += ["### RF-3DGS+ against RF-3DGS", _finding_text(found["finding"])]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -201,7 +198,7 @@ def _curve_table(rows: Sequence[Row], key: str) -> str:
     return table(["truth", "method", *map(str, counts)], lines)
 
 
-def _finding_text(finding: Sequence[Row], reach: Row | None) -> str:
+def _finding_text(finding: Sequence[Row]) -> str:
     lines = []
     for row in finding:
         psnr, blocked, ssim = row["psnr_db"], row["psnr_db_blocked"], row["ssim"]
@@ -230,79 +227,7 @@ def _finding_text(finding: Sequence[Row], reach: Row | None) -> str:
             f"mean ({min(own):+.2f} to {max(own):+.2f})."
         )
     verdict = " ".join(said) + " Published: ahead on all of them."
-    return "\n\n".join(
-        [table(head, lines), verdict, f"{LAW_TEXT} {_law_worth(finding)} {_reach_text(reach)}".strip()]
-    )
-
-
-def _reach_text(reach: Row | None) -> str:
-    """How little lengths can add to a function of the direction."""
-    if reach is None:
-        return ""
-    return (
-        f"In this room the factor has little to give either way: over the receivers that a Gaussian sees, "
-        f"20 log10(l_prev + l_vd) varies by {reach['varies_db']:.1f} dB (standard deviation, median of "
-        f"{reach['points']:.0f} Gaussians), and spherical harmonics of degree {reach['degree']:.0f} of the direction, "
-        f"which both models have, stand in for all but {reach['left_db']:.1f} dB of it."
-    )
-
-
-def _law_worth(finding: Sequence[Row]) -> str:
-    """What changes where the targets obey the paper's law, on the sets that both truths have."""
-    known = {(r["truth"], r["split"], r["count"], r["opacity"]): r["psnr_db"]["difference"] for r in finding}
-    both = [
-        (difference, known["exact", *place])
-        for (truth, *place), difference in known.items()
-        if truth == "paper-law" and ("exact", *place) in known
-    ]
-    if not both:
-        return ""
-    law, exact = np.mean(both, axis=0)
-    left = (
-        "so that the paper's finding holds where its law does."
-        if law > 0
-        else "so that RF-3DGS+ is not ahead even there; what is left of the difference cannot be the law's."
-    )
-    return (
-        "`paper's law` are targets whose scattering was given that factor path by path, everything else the same: it "
-        f"moves the difference by {law - exact:+.2f} dB in the mean, from {exact:+.2f} to {law:+.2f} dB, {left}"
-    )
-
-
-def _ahead_text(ahead: Sequence[Row]) -> str:
-    names = {key: name for key, name, _ in COLUMNS}
-    titles = [
-        f"{names[k.removesuffix('_blocked')]}, blocked" if k.endswith("_blocked") else names[k]
-        for k, _ in AHEAD
-    ]
-    lines = []
-    for row in ahead:
-        cells = []
-        for key, _ in AHEAD:
-            r = row.get(key)
-            form = "{:+.3f}" if key.startswith("ssim") else "{:+.0%}" if "within" in key else "{:+.2f}"
-            cells.append("-" if r is None else f"{form.format(r['margin'])} ({METHODS[r['method']][0]})")
-        ratios = [cell(row.get(k), "{:.2g}") for k in ("train_ratio", "spectrum_ratio")]
-        where = TRUTHS[row["truth"]] + ("" if row["split"] == "random" else ", region")
-        lines.append([where, str(row["count"]), METHODS[row["ours"]][0], *cells, *ratios])
-    behind = [
-        f"{METHODS[row['ours']][0]}, {TRUTHS[row['truth']]}, {row['split']}, {row['count']} receivers: {title} behind "
-        f"{METHODS[row[key]['method']][0]}"
-        for row in ahead
-        for (key, _), title in zip(AHEAD, titles, strict=True)
-        if row.get(key) is not None and not row[key]["ahead"]
-    ]
-    verdict = "Behind no other method in any figure." if not behind else "Behind: " + "; ".join(behind) + "."
-    head = [
-        "truth",
-        "receivers",
-        "ours",
-        *titles,
-        "trains faster than RF-3DGS+, times",
-        "infers faster, times",
-    ]
-    text = "Ours less the best of the other methods in each figure, which is named."
-    return "\n\n".join([text, table(head, lines), verdict])
+    return "\n\n".join([table(head, lines), verdict, LAW_TEXT])
 
 
 # ------------------------------------------------------------------------------------------------------ pictures

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,13 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     assert end.value.code == 0
     said = capsys.readouterr().out
     assert "examples:" in said and f"python -m benchmarks {name}" in said and "--out" in said
+
+
+def test_the_library_never_imports_a_benchmark() -> None:
+    code = "import sys, warprrf; [getattr(warprrf, n) for n in dir(warprrf)]; print(*sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "warprrf.rf.simulate" in out.split()
+    assert not [name for name in out.split() if name.split(".")[0] == "benchmarks"]
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class WholePath:
             "sh": rng.normal(size=(COUNT, 16, CHANNELS)) * 0.1,
             "background": rng.uniform(0.1, 1, CHANNELS),
         }
-        self.camera = random_camera(rng, spherical=seed % 2 == 0)
+        self.camera = random_camera(rng, self.values["means"], spherical=seed % 2 == 0)
         self.blending = Blending(
             alpha_max=0.95, transmittance_min=0.02, rule=("product", "exp")[seed // 2 % 2]
         )
@@ -122,14 +122,19 @@ class WholePath:
         return out
 
 
-def random_camera(rng: np.random.Generator, *, spherical: bool) -> Camera:
+def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: bool) -> Camera:
+    """A panorama amid the Gaussians, or a photo that shows two of their means at least."""
     if spherical:
         return Camera.spherical(18, 9, position=rng.uniform(-0.3, 0.3, 3))
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    rotation *= np.sign(np.linalg.det(rotation))
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, rotation @ rng.uniform(-0.3, 0.3, 3)
-    return Camera.pinhole(17, 11, fx=7.0, fy=8.0, cx=8.0, cy=6.0, world_to_camera=pose)
+    while True:
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        rotation *= np.sign(np.linalg.det(rotation))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, rotation @ rng.uniform(-0.3, 0.3, 3)
+        camera = Camera.pinhole(17, 11, fx=7.0, fy=8.0, cx=8.0, cy=6.0, world_to_camera=pose)
+        pixels, _ = camera.project(means)
+        if ((pixels > 0) & (pixels < (17, 11))).all(axis=1).sum() >= 2:
+            return camera
 
 
 def margins(values: dict[str, np.ndarray], camera: Camera, blending: Blending) -> np.ndarray:
@@ -168,6 +173,7 @@ def margins(values: dict[str, np.ndarray], camera: Camera, blending: Blending) -
 def test_whole_path_gradients_match_finite_differences_to_1e_6(seed):
     path = WholePath(seed)
     assert path.interior.mean() > 0.5  # the scene is mostly away from decisions
+    assert np.linalg.norm(path.gradients()["means"]) > 1e-3  # and something is seen
     errors = path.errors()
     assert max(errors.values()) < 1e-6, errors
 

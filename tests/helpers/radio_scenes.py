@@ -6,6 +6,9 @@ import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M
+from warprrf.rf.paths.images import MirrorImages
+from warprrf.rf.paths.mirror_paths import zone_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
 EPSILON_0 = 8.8541878128e-12
@@ -96,3 +99,9 @@ def is_wound_alike(vertices, faces):
     index = np.unique(np.round(vertices, 5), axis=0, return_inverse=True)[1].reshape(-1)[faces]
     edges = [(int(f[k]), int(f[k - 1])) for f in index for k in range(3)]
     return len(set(edges)) == len(edges) and {(b, a) for a, b in edges} == set(edges)
+
+
+def mirror_paths(surface, transmitter, receivers, wavelength_m, order):
+    """Line of sight and mirror paths on a field's surface, softly blocked."""
+    images = MirrorImages(surface.patches, transmitter, slack_m=MIRROR_SLACK_M)
+    return zone_paths(images, receivers, order, wavelength_m, surface.skin_m)

@@ -17,6 +17,7 @@ from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
+from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
 from warprrf.steps import Steps, digest
@@ -32,7 +33,7 @@ _TRIES = 200
 
 
 def simulate(
-    scene: Any,
+    scene: Scene,
     *,
     transmitter: Any,
     receivers: Any,
@@ -82,26 +83,16 @@ def simulate(
     """
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
-    grid = check_shape(shape)
-    for name, value, least in (("depth", depth, 0), ("samples", samples, 1)):
-        if isinstance(value, bool) or int(value) != value or value < least:
-            raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+    sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
     points = _device.check_array("receivers", receivers, (None, 3))
-    if len(points) == 0:
-        raise ValueError("receivers: got none, expected at least one position")
     source = _device.check_array("transmitter", transmitter, (3,))
     frequency = check_frequency(frequency_hz)
     table = surface_table(scene.materials, frequency)
     air = air_of(gas, frequency)
     check_positions(scene, source, points, device=device)
 
-    common: dict[str, Any] = {
-        "transmitter": source,
-        "frequency_hz": frequency,
-        "shape": grid,
-        "beam_sigma_rad": beam_sigma_rad,
-    }
-    sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
+    common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
+    common |= {"shape": check_shape(shape), "beam_sigma_rad": beam_sigma_rad}
     versions = _versions(engine)
     running: ExactEngine | SionnaEngine | None = None
 
@@ -114,14 +105,13 @@ def simulate(
         return running.receive(point)
 
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
-    inputs = digest(engine, common, air, surfaces, None if engine == "exact" else (sampling, versions))
+    solver = (sampling, _versions(engine, solver_only=True)) if engine == "sionna" else None
+    inputs = digest(engine, common, air, surfaces, solver)
     results = []
     for k, point in enumerate(points):
-        if progress is not None:
-            progress("simulate", k, len(points))
         results.append(receive(point) if workspace is None else _kept(workspace, inputs, point, receive))
-    if progress is not None:
-        progress("simulate", len(points), len(points))
+        if progress is not None:
+            progress("simulate", k + 1, len(points))
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
     if engine == "exact":
         settings = {"depth": 1, "sub_pixels": SUB_PIXELS}
@@ -152,6 +142,8 @@ def check_positions(
     Raises:
         ValueError: naming the first such position.
     """
+    if len(receivers) == 0:
+        raise ValueError("receivers: got none, expected at least one position")
     mesh = as_mesh(scene)
     points = np.concatenate([transmitter[None], receivers])
     low, high = mesh.bounds
@@ -176,7 +168,7 @@ def check_positions(
 
 
 def sample_receivers(
-    scene: Any,
+    scene: Scene,
     n: int,
     *,
     z: tuple[float, float] = (0.8, 2.2),
@@ -219,8 +211,9 @@ def sample_receivers(
     )
 
 
-def _versions(engine: str) -> dict[str, str]:
-    packages = {"warprrf": "warprrf", "warp": "warp-lang", "numpy": "numpy"}
+def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:
+    """Versions of the packages that compute, or of Sionna RT's alone: what is kept outlives an update of ours."""
+    packages = {} if solver_only else {"warprrf": "warprrf", "warp": "warp-lang", "numpy": "numpy"}
     if engine == "sionna":
         packages |= {"sionna_rt": "sionna-rt", "mitsuba": "mitsuba", "drjit": "drjit"}
     found = {}

@@ -12,7 +12,6 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
@@ -193,34 +192,6 @@ def test_map_of_a_furnished_room_has_a_hole(found: RadioMap) -> None:
     for name in ("total_path_gain", "best_path_gain", "delay_spread_s", "best_beam_gain"):
         np.testing.assert_array_equal(np.isnan(getattr(found, name)), inside)
     assert (found.total_path_gain[found.free] >= 0.999999 * found.best_path_gain[found.free]).all()
-
-
-@pytest.mark.usefixtures("device")
-def test_all_chains_of_mirrors_are_tried(scene: RadioScene) -> None:
-    tree = MirrorTree(Surface.of(scene), TX, 3)
-    for order in (1, 2, 3):
-        rows, chains, points = tree.candidates(PLACES, order)
-        found = {(int(r), int(c)): p for r, c, p in zip(rows, chains, points, strict=True)}
-        expected = {}
-        for r, place in enumerate(PLACES):
-            for c in range(len(tree.levels[order - 1].depth)):
-                here, link, way = place, c, []
-                for level in reversed(tree.levels[:order]):
-                    p = level.patch[link, -1]
-                    side = tree.normal[p] @ here - tree.offset[p]
-                    here = here + side / (side + level.depth[link]) * (level.image[link] - here)
-                    if side <= 1e-9 or (here < tree.low[p] - 0.1).any() or (here > tree.high[p] + 0.1).any():
-                        break
-                    way.insert(0, here)
-                    link = level.parent[link]
-                else:
-                    expected[r, c] = np.array(way)
-        assert len(expected) > 0
-        assert list(found) == sorted(expected)
-        for pair, way in expected.items():
-            np.testing.assert_allclose(found[pair], way, atol=1e-9)
-        wanted = {"rows": rows[::2], "chains": chains[::2]}
-        np.testing.assert_array_equal(tree.candidates(PLACES, order, **wanted)[2], points[::2])
 
 
 def test_file_round_trip(found: RadioMap, tmp_path: Path) -> None:

@@ -29,16 +29,24 @@ COEFFICIENTS = 16
 EXPONENT_LIMIT = 60.0  # nepers: keeps a runaway gain finite in float32; 260 dB off the median gain
 
 
+PER_NEPER = 10.0 / np.log(10.0)  # dB per unit of natural logarithm of power
+
+
 @cache
 def build(real: Any) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
+    types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}
+    forward, adjoint = _forward(real), _adjoints(real)
+    return SimpleNamespace(**types, **forward, **adjoint, adam=_adam(real))
+
+
+def _forward(real: Any) -> dict[str, Any]:
+    """From coefficients to contributions, sums and images."""
     vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(COEFFICIENTS, real)
     limit = wp.constant(real(EXPONENT_LIMIT))
-    per_neper = wp.constant(real(10.0 / np.log(10.0)))  # dB per unit of natural logarithm of power
-
+    per_neper = wp.constant(real(PER_NEPER))
     harmonics = _sh.build(real).basis
-    slope_of = _ssim.build(real).slope
 
     @wp.kernel(module="unique", enable_backward=False)
     def evaluate_basis(offset: int, directions: wp.array(dtype=vec3), out: wp.array(dtype=vec16)):
@@ -108,6 +116,40 @@ def build(real: Any) -> SimpleNamespace:
         u = (per_neper * wp.log(power + floor) - low) / (high - low)
         image[p] = u
         moments[p] = vec3(u, u * u, u * target[p])
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def predict(
+        offset: int,
+        kind: int,
+        start: wp.array(dtype=int),
+        gaussian: wp.array(dtype=int),
+        weight: wp.array(dtype=real),
+        basis: wp.array(dtype=vec16),
+        coefficients: wp.array(dtype=vec16),
+        out: wp.array(dtype=real),
+    ):
+        """Blended gain of one receiver's pixel from its pairs."""
+        p = offset + wp.tid()
+        total = real(0.0)
+        for e in range(start[p], start[p + 1]):
+            total += weight[e] * gain(wp.dot(coefficients[gaussian[e]], basis[p]), kind)
+        out[p] = total
+
+    return {
+        "evaluate_basis": evaluate_basis,
+        "contributions": contributions,
+        "pixel_sums": pixel_sums,
+        "to_image": to_image,
+        "predict": predict,
+    }
+
+
+def _adjoints(real: Any) -> dict[str, Any]:
+    """From the loss back to coefficients."""
+    vec3 = wp.types.vector(3, real)
+    vec16 = wp.types.vector(COEFFICIENTS, real)
+    per_neper = wp.constant(real(PER_NEPER))
+    slope_of = _ssim.build(real).slope
 
     @wp.kernel(module="unique", enable_backward=False)
     def loss_adjoint(
@@ -183,6 +225,17 @@ def build(real: Any) -> SimpleNamespace:
             total += (pixel_adjoint[pair_pixel[e]] * slope) * basis[pair_direction[e]]
         gradient[row_gaussian[row]] = total
 
+    return {
+        "loss_adjoint": loss_adjoint,
+        "absolute_adjoint": absolute_adjoint,
+        "coefficient_adjoint": coefficient_adjoint,
+    }
+
+
+def _adam(real: Any) -> Any:
+    """The step of the coefficients."""
+    vec16 = wp.types.vector(COEFFICIENTS, real)
+
     @wp.kernel(module="unique", enable_backward=False)
     def adam(
         offset: int,
@@ -214,34 +267,4 @@ def build(real: Any) -> SimpleNamespace:
         coefficients[i] = a
         gradient[i] = vec16(real(0.0))
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def predict(
-        offset: int,
-        kind: int,
-        start: wp.array(dtype=int),
-        gaussian: wp.array(dtype=int),
-        weight: wp.array(dtype=real),
-        basis: wp.array(dtype=vec16),
-        coefficients: wp.array(dtype=vec16),
-        out: wp.array(dtype=real),
-    ):
-        """Blended gain of one receiver's pixel from its pairs."""
-        p = offset + wp.tid()
-        total = real(0.0)
-        for e in range(start[p], start[p + 1]):
-            total += weight[e] * gain(wp.dot(coefficients[gaussian[e]], basis[p]), kind)
-        out[p] = total
-
-    return SimpleNamespace(
-        absolute_adjoint=absolute_adjoint,
-        adam=adam,
-        coefficient_adjoint=coefficient_adjoint,
-        contributions=contributions,
-        evaluate_basis=evaluate_basis,
-        loss_adjoint=loss_adjoint,
-        pixel_sums=pixel_sums,
-        predict=predict,
-        to_image=to_image,
-        vec16=vec16,
-        vec3=vec3,
-    )
+    return adam

@@ -28,7 +28,7 @@ from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_
 _RECEIVERS_PER_FLUSH = 20
 
 
-def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
+def load_sionna_scene(scene: Scene | str | os.PathLike[str], *, frequency_hz: float) -> Any:
     """Open a scene in Sionna RT with its table of materials, scattering patterns included.
 
     Sionna's own ``load_scene`` knows no patterns (every material is Lambertian) and takes what it can from the XML.
@@ -50,7 +50,7 @@ def load_sionna_scene(scene: Any, *, frequency_hz: float) -> Any:
     if isinstance(scene, str | os.PathLike):
         scene = Scene.load(scene)
     frequency = check_frequency(frequency_hz)
-    if getattr(scene, "xml_path", None) is None:
+    if scene.xml_path is None:
         raise ValueError(
             "scene: got one without an XML file, which Sionna needs; use Scene.load or engine='exact'"
         )
@@ -126,6 +126,12 @@ class Sampling:
     refraction: bool = False
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        for name, least in (("depth", 0), ("samples", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or int(value) != value or value < least:
+                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+
 
 class SionnaEngine:
     """Sionna RT for one transmitter.
@@ -147,7 +153,7 @@ class SionnaEngine:
 
     def __init__(
         self,
-        scene: Any,
+        scene: Scene,
         *,
         transmitter: Any,
         frequency_hz: float,

@@ -17,7 +17,7 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.geometry.planar_patches import PlanarPatches
-from warprrf.kernels.radio import images as kernels
+from warprrf.kernels.radio import mirrors as kernels
 
 ALL_SPACE = 2.0  # a sine that stands for no cone
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept

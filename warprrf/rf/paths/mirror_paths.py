@@ -114,7 +114,7 @@ def zone_paths(
     Returns:
         Rows by order. Those with less than :data:`LEAST_SHARE` of their field are left out.
     """
-    zone = _Zone(images.patches, images.transmitter, wavelength_m, skin_m, images.device)
+    zone = ZoneRays(images.patches, images.transmitter, wavelength_m, skin_m, images.device)
     parts = [_described(images.patches, images.transmitter, receivers, zone.line_of_sight(receivers), order)]
     for k in range(1, order + 1):
         row, patch, point = images.candidates(receivers, k)
@@ -128,8 +128,8 @@ def zone_paths(
     return _joined(parts)
 
 
-class _Zone:
-    """Rays that fill Fresnel zones."""
+class ZoneRays:
+    """Rays that fill Fresnel zones on a surface with a skin; see :func:`zone_paths`."""
 
     def __init__(
         self, patches: PlanarPatches, source: np.ndarray, wavelength_m: float, skin_m: float, device: Any

@@ -4,15 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.half_spaces import fresnel_curves
-from warprrf.rf.fields.bistatic.chains import chain_reflection, turns
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.specular import specular_paths
 from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
 from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.paths.polarisation import chain_reflection, turns
 from warprrf.rf.paths.trace import MirrorTracer
 
 F = 300e9
@@ -132,7 +131,7 @@ def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: f
     which moves them by a centimetre.
     """
     mesh, _ = joined(box_mesh([0, 0, 0], [5, 4, 3], inward=True))
-    alone = specular_paths(_surface(mesh), TX, RX[None], 1e-3, order=2)
+    alone = mirror_paths(_surface(mesh), TX, RX[None], 1e-3, 2)
     order = np.flatnonzero(alone.order == 2)
     over = alone.point[order]
     pick = order[np.flatnonzero((np.abs(over[:, 0, 2]) < 1e-9) & (np.abs(over[:, 1, 0] - 5.0) < 1e-9))[0]]
@@ -146,7 +145,7 @@ def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: f
         [corner - 0.3 * up, corner + 0.3 * up, corner - across + 0.3 * up, corner - across - 0.3 * up]
     )
     both, _ = joined((mesh.vertices, mesh.faces), (plate, np.array([[0, 1, 2], [0, 2, 3]])))
-    found = specular_paths(_surface(both), TX, RX[None], 1e-3, order=2)
+    found = mirror_paths(_surface(both), TX, RX[None], 1e-3, 2)
     same = (found.order == 2) & (np.abs(found.length_m - alone.length_m[pick]) < 1e-9)
     same &= found.arrival @ alone.arrival[pick] > 1 - 1e-12
     assert alone.share[pick] == 1.0

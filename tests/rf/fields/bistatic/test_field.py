@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
 
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -18,7 +18,6 @@ from warprrf.rf.fields.bistatic.materials import Layout, Parameters
 from warprrf.rf.fields.bistatic.rays import RayGrid
 from warprrf.rf.fields.bistatic.response import Response, SpectrumPixels, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.scattering import scatter
-from warprrf.rf.fields.bistatic.specular import specular_paths
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import trace
@@ -214,7 +213,7 @@ def test_element_at_the_transmitter_is_bounded(field: BistaticField) -> None:
 
 def test_transmitter_in_a_patchs_plane_has_no_mirror_there(scene: RadioScene) -> None:
     surface = Surface.of(scene)
-    found = specular_paths(surface, np.array([0.5, 0.5, 2.4]), np.array([[4.0, 3.0, 2.0]]), WAVELENGTH)
+    found = mirror_paths(surface, np.array([0.5, 0.5, 2.4]), np.array([[4.0, 3.0, 2.0]]), WAVELENGTH, 1)
     top = np.flatnonzero((np.abs(surface.plane_offset - 2.4) < 1e-6) & (surface.plane_normal[:, 2] > 0.9))
     assert len(top) == 1
     assert not np.isin(found.patch[:, 0], top).any()

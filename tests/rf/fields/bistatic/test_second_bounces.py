@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
 
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -12,7 +12,6 @@ from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import regroup
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
-from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
 from warprrf.rf.fields.bistatic.response import (
     Response,
     SpectrumPixels,
@@ -21,7 +20,6 @@ from warprrf.rf.fields.bistatic.response import (
     respond,
     with_further_bounces,
 )
-from warprrf.rf.fields.bistatic.specular import specular_paths
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import trace
@@ -41,7 +39,7 @@ def test_a_room_shows_as_many_images_as_its_lattice_has() -> None:
     mesh, part = joined(box_mesh([0, 0, 0], ROOM, inward=True))
     surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
     receivers = np.array([[4.1, 3.2, 1.3], [2.2, 0.7, 0.6]])
-    found = specular_paths(surface, TX, receivers, WAVELENGTH, order=3)
+    found = mirror_paths(surface, TX, receivers, WAVELENGTH, 3)
     for r, receiver in enumerate(receivers):
         for order, count in ((0, 1), (1, 6), (2, 18), (3, 38)):  # |i| + |j| + |k| = n has 4 n^2 + 2 solutions
             own = found.subset(np.flatnonzero((found.receiver == r) & (found.order == order)))
@@ -55,29 +53,12 @@ def test_a_room_shows_as_many_images_as_its_lattice_has() -> None:
             assert np.allclose(np.sort(own.length_m), np.sort(lattice), rtol=1e-12)
 
 
-def test_mirror_points_lie_on_their_patches_and_obey_the_law_of_reflection() -> None:
-    mesh, part = joined(box_mesh([0, 0, 0], ROOM, inward=True))
-    surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
-    found = specular_paths(surface, TX, np.array([[4.1, 3.2, 1.3]]), WAVELENGTH, order=3)
-    for k in np.flatnonzero(found.order == 3):
-        stops = np.vstack([TX, found.point[k], [4.1, 3.2, 1.3]])
-        legs = np.diff(stops, axis=0)
-        legs /= np.linalg.norm(legs, axis=1, keepdims=True)
-        for b in range(3):
-            normal = surface.plane_normal[found.patch[k, b]]
-            assert normal @ stops[b + 1] == pytest.approx(surface.plane_offset[found.patch[k, b]], abs=1e-12)
-            turned = legs[b] - 2 * (legs[b] @ normal) * normal
-            assert np.allclose(turned, legs[b + 1], atol=1e-12)
-            assert found.cosine[k, b] == pytest.approx(abs(legs[b] @ normal), rel=1e-12)
-
-
-def test_a_tree_of_no_patches_is_empty() -> None:
+def test_a_surface_too_small_for_a_mirror_has_line_of_sight_alone() -> None:
     vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
     mesh, part = joined((vertices, np.array([[0, 1, 2]])))
     surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
-    assert len(surface.plane_offset) == 0  # too small for a mirror
-    assert MirrorTree(surface, TX, 3).order == 0
-    assert len(specular_paths(surface, TX, np.array([[1.0, 1, 1]]), WAVELENGTH, order=3)) == 1
+    assert len(surface.plane_offset) == 0
+    assert len(mirror_paths(surface, TX, np.array([[1.0, 1, 1]]), WAVELENGTH, 3)) == 1
 
 
 def plane(z: float, up: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,11 @@
 """The bistatic radio field: line of sight, mirrors, scattering lobes and what they light further, on frozen geometry.
 
-``field`` is the field: it asks ``sight`` what a receiver sees, composes spectra of its ``terms``, and has ``paths`` and
-``files``. A ``surface`` is met by rays (``bounces``), reached by way of mirrors (``specular``, ``mirror_tree``,
-``mirror_light``) and lit by other surfaces (``second_bounce``). ``training`` fits it: groups of surfaces (``fit``),
-which of them are of one material (``grouping``), what differs within a group (``residuals``), and its error
-(``uncertainty``).
+It is three things. ``transport`` is what receivers see of a ``surface`` (its groups by ``colours``), whatever the
+materials: ``rays``, mirror paths (:mod:`warprrf.rf.paths`, ``mirror_light``), and how ``elements`` illuminate each
+other. ``materials`` are the parameters of the ``terms`` that are modelled, and the residual. ``render`` makes path
+powers and spectra of the two, with ``scattering``; ``response`` predicts any measurement that is linear in path powers,
+with its Jacobian.
+
+``field`` holds them, with ``paths``, ``links`` and ``files``. ``training`` fits it: groups of surfaces (``fit``), which
+of them are of one material (``grouping``), what differs within a group (``residuals``), its error (``uncertainty``).
 """

@@ -37,7 +37,12 @@ def write(parts: dict[str, Any], path: str | os.PathLike[str]) -> None:
         tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(parts["errors"]).items()}
     header = {name: parts[name] for name in _PLAIN}
     header |= {"model": "bistatic", "terms": asdict(parts["terms"]), "report": parts["report"]}
-    header |= {"log_gain": p.log_gain, "group_names": s.group_names, "skin_m": s.skin_m}
+    header |= {
+        "log_gain": p.log_gain,
+        "group_names": s.group_names,
+        "skin_m": s.skin_m,
+        "two_sided": s.two_sided,
+    }
     header |= {} if parts["air"] is None else parts["air"].attributes
     field_files.write(path, tensors, header)
 
@@ -51,6 +56,7 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
             group_names=tuple(header["group_names"]),
             skin_m=float(header["skin_m"]),
+            two_sided=bool(header.get("two_sided", False)),
             **{name: tensors[f"surface/{filed}"] for name, filed in _SURFACE.items()},
         )
         parameters = Parameters(

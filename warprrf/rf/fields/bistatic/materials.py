@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warprrf.rf.em.half_spaces import fresnel_curves
-from warprrf.rf.fields.bistatic.chains import chain_reflection
 from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.paths.polarisation import chain_reflection
 
 
 @dataclass(frozen=True)

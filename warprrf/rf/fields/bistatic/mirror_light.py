@@ -14,9 +14,12 @@ import numpy as np
 import warp as wp
 
 from warprrf.rf.fields.bistatic.materials import Parameters, mirror_share
-from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
 from warprrf.rf.fields.bistatic.rays import NEAREST_M, Hits, Illumination, RayGrid
-from warprrf.rf.fields.bistatic.specular import unobstructed
+from warprrf.rf.paths.images import MirrorImages
+from warprrf.rf.paths.mirror_paths import ZoneRays
+
+MIRROR_SLACK_M = 0.1
+"""How far beside its faces a patch may still mirror [m]: outlines of a reconstructed mesh are torn."""
 
 
 @dataclass(frozen=True)
@@ -48,35 +51,31 @@ class MirrorLight:
 
     def __init__(self, grid: RayGrid, transmitter: np.ndarray) -> None:
         self.surface = s = grid.surface
-        self.tree = MirrorTree(s, transmitter, 1)
-        if not self.tree.levels:
-            self._first, self._chains = np.zeros(len(s.mesh.faces) + 1, int), np.zeros(0, int)
-            self._face = np.zeros(0, int)
-            return
-        flat = s.mesh.face_normals
-        normal = np.where(((s.normal * flat).sum(axis=1) < 0)[:, None], -s.normal, s.normal)
+        self._image = s.images(transmitter)[0]
         centre = s.mesh.triangles.mean(axis=1)
-        face, chain, point = self.tree.candidates(centre, 1, device=grid.device)
-        level = self.tree.levels[0]
-        # light must come from in front of the face, and not from the patch that it belongs to
-        facing = ((point[:, 0] - centre[face]) * normal[face]).sum(axis=1) > 0
-        facing &= s.patch[face] != level.patch[chain, 0]
-        face, chain, point = face[facing], chain[facing], point[facing]
-        free = unobstructed(
-            s, self.tree, centre[face], chain, point, grid.device, s.skin_m * normal[face]
-        )  # fmt: skip
-        face, chain = face[free], chain[free]
-        way = level.image[chain] - centre[face]
+        images = MirrorImages(s.patches, transmitter, slack_m=MIRROR_SLACK_M, device=grid.device)
+        face, patch, point = images.candidates(centre, 1)
+        # Light must come from in front of the face, of either side if it has two, and not from its own patch.
+        normal = np.where(((s.normal * s.mesh.face_normals).sum(axis=1) < 0)[:, None], -s.normal, s.normal)[
+            face
+        ]
+        side = ((point[:, 0] - centre[face]) * normal).sum(axis=1)
+        normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
+        own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != patch[:, 0]))
+        face, patch, point, normal = face[own], patch[own], point[own], normal[own]
+        rays = ZoneRays(s.patches, images.transmitter, 0.0, s.skin_m, grid.device)
+        free = rays.reached(centre[face], patch, point, s.skin_m * normal)
+        face, patch, normal = face[free], patch[free, 0], normal[free]
+        way = self._image[patch] - centre[face]
         length = np.linalg.norm(way, axis=1)
-        toward = way / length[:, None]
-        patch = level.patch[chain, 0]
+        toward = way / np.maximum(length, 1e-12)[:, None]
         self._face, self._patch = face, patch
         self._cosine = np.abs((toward * s.plane_normal[patch]).sum(axis=1))
-        cos_in = np.maximum((toward * normal[face]).sum(axis=1), 0.0)
+        cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
         share = s.mesh.areas[face] / s.element_area[s.element[face]]
         self._irradiance = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
-        order = np.lexsort((chain, face))
-        self._chains = chain[order]
+        order = np.lexsort((patch, face))
+        self._lit_by = patch[order]
         self._first = np.searchsorted(face[order], np.arange(len(s.mesh.faces) + 1))
 
     def irradiance(self, p: Parameters) -> np.ndarray:
@@ -107,16 +106,15 @@ class MirrorLight:
         if len(row) == 0:
             none = np.zeros(0, int)
             return _packed(tracer, none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
-        level, chain = self.tree.levels[0], self._chains[pair]
+        patch = self._lit_by[pair]
         normal = s.normal[face]
         turned = (s.mesh.face_normals[face] * direction).sum(axis=1) > 0
         normal = np.where(turned[:, None], -normal, normal)[row]
         look = -direction[row]
-        way = level.image[chain] - points[row]
+        way = self._image[patch] - points[row]
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-9)[:, None]
         cos_in = (normal * toward).sum(axis=1)
-        patch = level.patch[chain, 0]
         k = np.flatnonzero(cos_in > 0)
         cos_s = np.maximum((normal[k] * look[k]).sum(axis=1), 0.0)
         high = cos_s + tracer.half_width

@@ -52,6 +52,7 @@ class Surface:
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
+        two_sided: whether mirrors have two sides; False: only that of ``plane_normal``, of a surface that photos saw.
         transports: what was traced on it last, by transmitter and grid.
     """
 
@@ -72,6 +73,7 @@ class Surface:
     element_group: np.ndarray
     group_names: tuple[str, ...]
     skin_m: float
+    two_sided: bool = False
     transports: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
@@ -104,6 +106,7 @@ class Surface:
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
         if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
+            patches = found
             patch, planes = found.face_patch, (found.normal, found.offset)
             normal = _normals(found)
             group, sort, colour = colour_groups(mesh, patch, gaussians)
@@ -126,12 +129,13 @@ class Surface:
                 group = np.asarray(material, np.int32)
                 names = tuple(m.name for m in geometry.materials)
             sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
+        sides = patches.two_sided
         mesh, parent = _split_long(mesh)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=sort, colour=colour, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            group_names=tuple(names), skin_m=skin, **_elements(mesh, patch, group, element_m),
+            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group, element_m),
         )  # fmt: skip
 
     def on_device(self, device: Any) -> Any:
@@ -148,17 +152,11 @@ class Surface:
         return self._uploaded.get(str(where), upload)
 
     @cached_property
-    def patch_boxes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners of every patch's faces, ``(P, 3)`` each [m]."""
-        low, high = (
-            np.full((len(self.plane_offset), 3), np.inf),
-            np.full((len(self.plane_offset), 3), -np.inf),
-        )
-        own = self.patch >= 0
-        corner = self.mesh.triangles[own]
-        np.minimum.at(low, self.patch[own], corner.min(axis=1))
-        np.maximum.at(high, self.patch[own], corner.max(axis=1))
-        return low, high
+    def patches(self) -> PlanarPatches:
+        """Its patches, of the split mesh."""
+        return PlanarPatches.from_planes(
+            self.mesh, self.patch, self.plane_normal, self.plane_offset, tolerance_m=self.skin_m, two_sided=self.two_sided
+        )  # fmt: skip
 
     def images(self, transmitter: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Image of ``transmitter`` (3,) in every patch's plane, ``(P, 3)``, and its height over it, ``(P,)`` [m]."""

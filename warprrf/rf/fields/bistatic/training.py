@@ -19,7 +19,6 @@ from warprrf.rf.fields.bistatic.render import render, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
 from warprrf.rf.fields.bistatic.response import SpectrumPixels, respond, with_further_bounces
-from warprrf.rf.fields.bistatic.specular import MOST_MIRRORS
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
@@ -257,7 +256,7 @@ def trace(
     started = time.perf_counter()
     surface = Surface.of(geometry)
     receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
-    order = MOST_MIRRORS if mirror_order is None else mirror_order
+    order = 3 if mirror_order is None else mirror_order
     terms = Terms(mirror_order=order, sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels)
     frequency_hz, air = float(ds.frequency_hz), getattr(ds, "air", None)
     transport = Transport.of(

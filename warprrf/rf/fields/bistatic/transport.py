@@ -17,12 +17,12 @@ import numpy as np
 from warprrf.cache import Cache
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.elements import LIFT_M, ElementLinks
-from warprrf.rf.fields.bistatic.mirror_light import MirrorLight, MirrorLit
-from warprrf.rf.fields.bistatic.mirror_tree import MirrorTree
+from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M, MirrorLight, MirrorLit
 from warprrf.rf.fields.bistatic.rays import Hits, Illumination, RayGrid
-from warprrf.rf.fields.bistatic.specular import SpecularPaths, specular_paths
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.paths.images import MirrorImages
+from warprrf.rf.paths.mirror_paths import MirrorPaths, zone_paths
 from warprrf.rf.spectra.spectrum import unit_beams
 
 MIRROR_SUB_PIXELS = 2
@@ -69,7 +69,7 @@ class ReceiverView:
     receivers: np.ndarray
     hits: Hits
     light: Illumination
-    paths: SpecularPaths
+    paths: MirrorPaths
     beams: np.ndarray | None = field(default=None, repr=False)
     mirror_lit: MirrorLit | None = None
     mirror_shown: MirrorShown | None = None
@@ -169,22 +169,22 @@ class Transport:
         """What the transmitter sends to the surface by way of one mirror."""
         return self._made.get("mirror light", lambda: MirrorLight(self._tracing, self.transmitter))
 
-    def mirror_tree(self, order: int) -> MirrorTree | None:
-        """Chains of mirrors that the transmitter may be seen in; None where one mirror is the most."""
-        if order < 2:
-            return None
-        return self._made.get(("mirrors", order), lambda: MirrorTree(self.surface, self.transmitter, order))
+    @property
+    def images(self) -> MirrorImages:
+        """Images of the transmitter in the surface's mirrors."""
 
-    def paths(self, receivers: np.ndarray, order: int) -> SpecularPaths:
+        def make() -> MirrorImages:
+            return MirrorImages(
+                self.surface.patches, self.transmitter, slack_m=MIRROR_SLACK_M, device=self.grid.device
+            )
+
+        return self._made.get("images", make)
+
+    def paths(self, receivers: np.ndarray, order: int) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) with at most ``order`` reflections."""
-        return specular_paths(
-            self.surface, self.transmitter, receivers, self.wavelength_m, order=order, tree=self.mirror_tree(order),
-            device=self.grid.device,
-        )  # fmt: skip
+        return zone_paths(self.images, receivers, order, self.wavelength_m, self.surface.skin_m)
 
-    def view(
-        self, receivers: np.ndarray, terms: Terms, *, paths: SpecularPaths | None = None
-    ) -> ReceiverView:
+    def view(self, receivers: np.ndarray, terms: Terms, *, paths: MirrorPaths | None = None) -> ReceiverView:
         """What ``receivers``, (3,) or (R, 3) [m], see, as far as ``terms`` want it.
 
         Args:
