@@ -655,17 +655,26 @@ def _benchmarks() -> str:
 
 
 def readme() -> str:
-    """README's table between its markers."""
-    rows = read("bistatic")["rows"]
-    lines = []
-    for method in ("bistatic", "rf3dgs+", "nearest", "mean"):
-        cells = [NAMES[method] + (" (ours)" if method == "bistatic" else "")]
-        for truth in TRUTHS:
-            for count in (10, 50, 400):
-                found = _find(rows, truth=truth, n_train=count, method=method)
-                cells.append(show(found and found["psnr_db"]))
-        lines.append(cells)
-    head = ["PSNR [dB]", *(f"{t}, {c} spectra" for t in TRUTHS.values() for c in (10, 50, 400))]
+    """README's table between its markers: the main job's methods on both truths, mean and spread over seeds."""
+    rows = {row["key"]: row for row in read("lobby_seeds")["rows"]}
+
+    def cell(method: str, group: str, figure: str, form: str) -> str:
+        row = rows[f"{group}.{method}.{figure}"]
+        scale = 100.0 if "%" in form else 1.0
+        shown = form.replace("%", "").format(scale * row["mean"]) + " ± "
+        return shown + form.replace("%", "").format(scale * row["spread"]) + (" %" if "%" in form else "")
+
+    columns = (
+        ("PSNR", "psnr_db", "{:.1f}"),
+        ("within 3°", "direction_within_3deg", "{:.0f}%"),
+        ("within 3°, blocked", "direction_within_3deg_blocked", "{:.0f}%"),
+    )
+    groups = {"methods": TRUTHS["exact"], "methods_sionna": TRUTHS["sionna"]}
+    lines = [
+        [NAMES[method], *(cell(method, group, figure, form) for group in groups for _, figure, form in columns)]
+        for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "mean")
+    ]
+    head = ["50 spectra", *(f"{truth}: {name}" for truth in groups.values() for name, *_ in columns)]
     return f"{MARKERS[0]}\n{markdown(head, lines)}\n{MARKERS[1]}"
 
 
