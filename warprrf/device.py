@@ -208,3 +208,25 @@ def check_array(
         bad = int(np.count_nonzero(~np.isfinite(array)))
         raise ValueError(f"{name}: got {bad} values that are NaN or infinite, expected finite numbers")
     return array
+
+
+def check_count(name: str, value: Any, least: int = 1) -> int:
+    """``value`` as a whole number of at least ``least``.
+
+    Raises:
+        ValueError: otherwise, naming the argument.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+    return int(value)
+
+
+def check_positive(name: str, value: Any, what: str = "number") -> float:
+    """``value`` as a finite number above zero; ``what`` says of what kind it is.
+
+    Raises:
+        ValueError: otherwise, naming the argument.
+    """
+    if value is None or not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{name}: got {value!r}, expected a positive {what}")
+    return float(value)

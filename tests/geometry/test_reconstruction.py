@@ -275,7 +275,7 @@ def test_damaged_files_are_refused_and_survive_a_failed_save(whole, tmp_path):
             whole[3].save(tmp_path)
     assert path.read_bytes() == good and len(list(tmp_path.iterdir())) == 1
     path.write_bytes(good[: len(good) // 2])
-    with pytest.raises(ValueError, match="damaged"):
+    with pytest.raises(ValueError, match="corrupt"):
         Reconstruction.load(tmp_path)
 
 

@@ -21,29 +21,10 @@ from scipy.spatial import cKDTree
 
 from warprrf.geometry.mesh import Mesh
 
-
-@dataclass(frozen=True)
-class PatchConfig:
-    """When faces share a plane.
-
-    Attributes:
-        noise_m: Standard deviation of the vertices' position errors [m]. None: estimated from the mesh, see
-            :func:`vertex_noise`; it is never taken below the spacing of float32 numbers at its coordinates.
-        flat_m: Corners may lie this far from their patch's plane [m], and six standard deviations more.
-        flat_rad: Faces may be turned this much against their patch [rad], and by three standard deviations over the
-            faces' heights more.
-    """
-
-    noise_m: float | None = None
-    flat_m: float = 1e-5
-    flat_rad: float = 1.4e-3
-
-    def __post_init__(self) -> None:
-        for name in ("flat_m", "flat_rad"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected a positive number")
-        if self.noise_m is not None and not (np.isfinite(self.noise_m) and self.noise_m >= 0):
-            raise ValueError(f"noise_m: got {self.noise_m!r}, expected a length of at least 0, or None")
+FLAT_M = 1e-5
+"""Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
+FLAT_RAD = 1.4e-3
+"""Faces may be turned this much against their patch [rad], and by three standard deviations over their heights more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +133,12 @@ class PlanarPatches:
         return inside
 
 
-def planar_patches(mesh: Mesh, groups: Any = None, config: PatchConfig | None = None) -> PlanarPatches:
+def planar_patches(mesh: Mesh, groups: Any = None) -> PlanarPatches:
     """The planar patches of ``mesh``.
 
     Args:
         mesh: Any triangle mesh; faces that share an edge at one place are neighbours, whatever their vertices' indices.
         groups: Index of what must not share a patch, for each face, shape ``(F,)``; materials, say.
-        config: When faces share a plane.
 
     Returns:
         Patches, largest first. Faces with hardly any area that fit no neighbour have none.
@@ -169,7 +149,6 @@ def planar_patches(mesh: Mesh, groups: Any = None, config: PatchConfig | None = 
     Warns:
         UserWarning: if faces at one place are of different groups: the first is taken.
     """
-    config = config or PatchConfig()
     count = len(mesh.faces)
     group = np.full(count, -1, np.int32) if groups is None else np.asarray(groups, np.int32)
     if group.shape != (count,):
@@ -182,8 +161,8 @@ def planar_patches(mesh: Mesh, groups: Any = None, config: PatchConfig | None = 
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
     once &= ~_is_sliver(corner, height, rounding)
     pairs = _neighbours(corner, np.flatnonzero(once))
-    noise = vertex_noise(mesh, pairs, rounding) if config.noise_m is None else max(config.noise_m, rounding)
-    faces = _Faces(mesh, group, height, config.flat_m + 6.0 * noise, config.flat_rad, 3.0 * noise)
+    noise = vertex_noise(mesh, pairs, rounding)
+    faces = _Faces(mesh, group, height, FLAT_M + 6.0 * noise, 3.0 * noise)
     piece = _pieces(faces, once, pairs)
     return _assembled(faces, piece, first)
 
@@ -224,12 +203,11 @@ class _Faces:
     group: np.ndarray
     height: np.ndarray
     distance_m: float
-    angle_rad: float
     sway_m: float
 
     def turn_limit(self, height: np.ndarray) -> np.ndarray:
         """Greatest angle to a patch of a face of this height [rad]."""
-        return self.angle_rad + self.sway_m / np.maximum(height, 1e-300)
+        return FLAT_RAD + self.sway_m / np.maximum(height, 1e-300)
 
     def gap(self, face: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Largest distance of the corners of each face from its plane [m], shape ``(N,)``."""

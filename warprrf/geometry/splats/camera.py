@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import check_array
+from warprrf.device import check_array, check_count, check_positive
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,7 @@ class Camera:
         """
         _check_size(width, height)
         for name, value in (("fx", fx), ("fy", fy)):
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name}: got {value!r}, expected a positive focal length in pixels")
+            check_positive(name, value, "focal length in pixels")
         for name, value in (("cx", cx), ("cy", cy)):
             if not np.isfinite(value):
                 raise ValueError(f"{name}: got {value!r}, expected a finite pixel coordinate")
@@ -144,5 +143,4 @@ def check_camera(cam: Any) -> None:
 
 def _check_size(width: int, height: int) -> None:
     for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name}: got {value!r}, expected a whole number of pixels of at least 1")
+        check_count(name, value)

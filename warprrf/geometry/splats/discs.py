@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from warprrf.device import check_count
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 
@@ -27,8 +28,7 @@ def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, opacity: float = 0.999, se
     Raises:
         ValueError: for a count below 1, or an opacity outside (0, 1].
     """
-    if not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
+    check_count("count", count)
     if not 0 < opacity <= 1:
         raise ValueError(f"opacity: got {opacity!r}, expected a number in (0, 1]")
     rng = np.random.default_rng(seed)

@@ -20,7 +20,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.device import DeviceLike, check_array, launch, resolve
+from warprrf.device import DeviceLike, check_array, check_count, launch, resolve
+from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.tape import active_tape, gradient, record
@@ -197,15 +198,14 @@ class GaussianRays:
         self, origins: ArrayLike, directions: ArrayLike, k: int, order: str, *, requires_grad: bool
     ) -> tuple[Traced, Callable[[], None]]:
         start, toward = _pairs("origins", origins, "directions", directions)
-        if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
-            raise ValueError(f"k: got {k!r}, expected a whole number of at least 1")
+        places = check_count("k", k)
         if order not in ORDERS:
             raise ValueError(f"order: got {order!r}, expected one of {', '.join(ORDERS)}")
         still = int(np.count_nonzero(np.linalg.norm(toward, axis=1) == 0))
         if still:
             raise ValueError(f"directions: got {still} of length zero, expected directions")
         count, on = _rows(start, toward), self.device
-        shape = (count, int(k))
+        shape = (count, places)
         real = {"dtype": wp.float64, "device": on}
         found = Traced(
             wp.full(shape, -1, dtype=int, device=on),
@@ -263,19 +263,12 @@ class GaussianRays:
 
 def _pairs(first_name: str, first: Any, second_name: str, second: Any) -> tuple[np.ndarray, np.ndarray]:
     """Two arrays of float64 rows, one or N of each."""
-    one, other = (
-        np.atleast_2d(check_array(name, value))
-        for name, value in ((first_name, first), (second_name, second))
-    )
-    for name, array in ((first_name, one), (second_name, other)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
+    named = (first_name, first), (second_name, second)
+    one, other = check_rows(*named)
+    for (name, _), array in zip(named, (one, other), strict=True):
+        check_array(name, array)
         if np.abs(array).max(initial=0.0) > LARGEST:
             raise ValueError(f"{name}: got numbers above {LARGEST:g}, expected metres")
-    if len(one) != len(other) and 1 not in (len(one), len(other)):
-        raise ValueError(
-            f"{second_name}: got {len(other)} for {len(one)} {first_name}, expected as many, or one of either"
-        )
     return one, other
 
 

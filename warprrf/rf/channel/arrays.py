@@ -64,9 +64,7 @@ class PlanarArray:
 
     def __post_init__(self) -> None:
         for name in ("rows", "cols"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least 1")
+            _device.check_count(name, getattr(self, name))
         spacing = _device.check_array("spacing", self.spacing)
         if spacing.shape not in ((), (2,)) or (spacing <= 0).any():
             raise ValueError(f"spacing: got {self.spacing!r}, expected one or two positive numbers")
@@ -229,8 +227,7 @@ def plane_wave_error(
         ValueError: for a distance or wavelength that is not positive.
     """
     for name, value in (("distance_m", distance_m), ("wavelength_m", wavelength_m)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: got {value!r}, expected a positive number of metres")
+        _device.check_positive(name, value, "number of metres")
     d = _device.check_array("direction", direction, (3,))
     unit = d / np.linalg.norm(d)
     plane = array.response(unit, wavelength_m)

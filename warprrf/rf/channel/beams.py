@@ -140,9 +140,8 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
         ValueError: for a polarised array, or oversampling below 1.
     """
     _unpolarised("array", array)
-    if isinstance(oversampling, bool) or int(oversampling) != oversampling or oversampling < 1:
-        raise ValueError(f"oversampling: got {oversampling!r}, expected a whole number of at least 1")
-    return Codebook(array, (_dft(array.cols, int(oversampling)), _dft(array.rows, int(oversampling))))
+    times = _device.check_count("oversampling", oversampling)
+    return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
 
 
 def steering_codebook(
@@ -172,12 +171,9 @@ def steering_codebook(
         raise ValueError(f"{name}: got a vector of length zero, expected ones with a length")
     if points is None:
         response = array.response(v / length, 1.0)
-    elif wavelength_m is None or not (np.isfinite(wavelength_m) and wavelength_m > 0):
-        raise ValueError(
-            f"wavelength_m: got {wavelength_m!r}, expected a positive number of metres with points"
-        )
     else:
-        response = array.spherical_response(v, wavelength_m)
+        wavelength = _device.check_positive("wavelength_m", wavelength_m, "number of metres with points")
+        response = array.spherical_response(v, wavelength)
     return Codebook(array, (response.conj() / np.linalg.norm(response, axis=1, keepdims=True),))
 
 
@@ -234,13 +230,12 @@ def select_beams(
         ValueError: for a polarised array, a count below 1, or a spectrum without departure angles for a transmitting
             array.
     """
-    if isinstance(count, bool) or int(count) != count or count < 1:
-        raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
+    most = _device.check_count("count", count)
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     rows = []
     for rays in rays_of(source, tx):
         gains = _pair_gains(rays, tx, rx)
-        best = np.argsort(-gains, axis=None, kind="stable")[: int(count)]
+        best = np.argsort(-gains, axis=None, kind="stable")[:most]
         rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
     if not (isinstance(source, PathArrays) and source.batched):
         return BeamChoice(*rows[0])
@@ -284,8 +279,7 @@ def select_beams_multiuser(
     Raises:
         TypeError, ValueError: as for :func:`select_beams`; without users, or for noise that is not positive.
     """
-    if not (np.isfinite(noise) and noise > 0):
-        raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")
+    _device.check_positive("noise", noise, "share of the transmitted power")
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
     gains = [_pair_gains(rays, tx, rx) for source in given for rays in rays_of(source, tx)]

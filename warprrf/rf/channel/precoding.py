@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
+from warprrf.device import check_positive
 from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -185,5 +186,4 @@ def _checked(channels: ArrayLike, allow_dark: bool = False) -> np.ndarray:
 
 
 def _check_noise(noise: float) -> None:
-    if not (np.isfinite(noise) and noise > 0):
-        raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")
+    check_positive("noise", noise, "share of the transmitted power")

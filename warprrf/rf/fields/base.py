@@ -13,10 +13,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf import tensor_files
 from warprrf.device import DeviceLike, Progress, check_array
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
-from warprrf.rf.fields import files as field_files
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
@@ -81,7 +81,7 @@ class RadioField(ABC):
             FileNotFoundError: if there is no such file.
             ValueError: if it is corrupt, or no radio field.
         """
-        model = field_files.read(path)[1].get("model")
+        model = tensor_files.read(path)[1].get("model")
         found = cls.models["bistatic" if model == "bistatic" else "rf3dgs+"]  # which reads rf3dgs too
         return found.load(path, device=device)
 

@@ -81,11 +81,8 @@ class Scan:
         if not (np.isfinite(self.noise) and self.noise >= 0):
             raise ValueError(f"noise: got {self.noise!r}, expected a linear power of at least 0")
         for name in ("iterations", "snapshots"):
-            value = getattr(self, name)
-            if value != int(value) or value < 1:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least 1")
-        if not (np.isfinite(self.tolerance) and self.tolerance > 0):
-            raise ValueError(f"tolerance: got {self.tolerance!r}, expected a positive number")
+            _device.check_count(name, getattr(self, name))
+        _device.check_positive("tolerance", self.tolerance)
 
 
 class Deembedded(NamedTuple):
@@ -258,8 +255,7 @@ def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) 
     Directions in which the antenna is more than ``limit_db`` below its peak come out empty: dividing there would only
     blow up noise and leakage. The total path gain is then that of the directions that are left.
     """
-    if not (np.isfinite(limit_db) and limit_db > 0):
-        raise ValueError(f"limit_db: got {limit_db!r}, expected a positive number of decibels")
+    _device.check_positive("limit_db", limit_db, "number of decibels")
     told = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
     path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=told)
     source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)

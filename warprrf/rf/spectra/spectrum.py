@@ -196,8 +196,7 @@ def spread_paths(
     rows, columns = check_shape(shape)
     d = _device.check_array("directions", directions, (None, 3))
     power = _device.check_array("powers", powers, (len(d),))
-    if not (np.isfinite(sigma) and sigma > 0):
-        raise ValueError(f"sigma: got {sigma!r}, expected a positive beam width in radians")
+    _device.check_positive("sigma", sigma, "beam width in radians")
     if (power < 0).any():
         raise ValueError(f"powers: got {int((power < 0).sum())} negative path gains, expected linear power")
     lit = np.flatnonzero(power > 0)

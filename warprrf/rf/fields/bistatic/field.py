@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.device import DeviceLike, Progress, check_array
+from warprrf.device import DeviceLike, Progress, check_array, check_count
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -249,8 +249,8 @@ class BistaticField(RadioField):
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
         """
-        if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
-            raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
+        if max_paths is not None:
+            check_count("max_paths", max_paths)
         positions = check_receiver("rx", rx, self.surface.mesh)
         found = []
         for position in np.atleast_2d(positions):

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.device import DeviceLike, Progress, check_array
+from warprrf.device import DeviceLike, Progress, check_array, check_count
 from warprrf.geometry.mesh import GeometryLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
@@ -140,10 +140,7 @@ class FitOptions:
     residuals: ResidualFit | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.iterations, int | np.integer) or self.iterations < 0:
-            raise ValueError(
-                f"iterations: got {self.iterations!r}, expected a whole number of steps, 0 or more"
-            )
+        check_count("iterations", self.iterations, 0)
         self.decided().terms()
 
     @classmethod

@@ -26,14 +26,14 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.device import DeviceLike, Progress, check_array
+from warprrf import tensor_files
+from warprrf.device import DeviceLike, Progress, check_array, check_count
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields import files as field_files
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
@@ -210,8 +210,8 @@ class HarmonicField(RadioField):
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
         """
-        if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
-            raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
+        if max_paths is not None:
+            check_count("max_paths", max_paths)
         positions = check_receiver("rx", rx, self.mesh)
         found = [
             replace(
@@ -237,7 +237,7 @@ class HarmonicField(RadioField):
         tensors["transmitter"] = self.transmitter
         header = {name: getattr(self, name) for name in _PLAIN}
         header |= {} if self.air is None else self.air.attributes
-        field_files.write(path, tensors, {**header, "options": asdict(self.options), "report": self.report})
+        tensor_files.write(path, tensors, {**header, "options": asdict(self.options), "report": self.report})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> HarmonicField:
@@ -247,7 +247,7 @@ class HarmonicField(RadioField):
             FileNotFoundError: if there is no such file.
             ValueError: if it is corrupt, or no radio field.
         """
-        tensors, header = field_files.read(path)
+        tensors, header = tensor_files.read(path)
         try:
             parts = {
                 n: tensors[f"gaussians/{n}"] for n in ("means", "quaternions", "scales", "opacities", "sh")

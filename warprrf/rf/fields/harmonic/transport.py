@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import DeviceLike, Progress, check_array
+from warprrf.device import DeviceLike, Progress, check_array, check_count
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
@@ -151,8 +151,7 @@ def transport(
         raise ValueError("receivers: got none, expected at least one position")
     if rule not in TRANSMITTANCE:
         raise ValueError(f"rule: got {rule!r}, expected one of {', '.join(TRANSMITTANCE)}")
-    if not isinstance(top_k, int | np.integer) or top_k < 1:
-        raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    check_count("top_k", top_k)
     rows, columns = check_shape(shape)
     blending = cutoffs(range_db, rule)
     views = []
