@@ -250,8 +250,15 @@ class Mesh:
         return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)
 
 
-def as_mesh(mesh_or_scene: Any) -> Mesh:
-    """The mesh of a scene, or the mesh itself.
+def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across each unit direction ``(N, 3)`` and each other."""
+    u = np.cross(direction, np.eye(3)[np.abs(direction).argmin(axis=1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, np.cross(direction, u)
+
+
+def as_mesh(mesh_or_scene: Any, name: str = "mesh_or_scene") -> Mesh:
+    """The mesh of a scene or reconstruction, or the mesh itself; ``name`` is the argument that it came by.
 
     Raises:
         TypeError: if it is neither.
@@ -261,7 +268,9 @@ def as_mesh(mesh_or_scene: Any) -> Mesh:
     mesh = getattr(mesh_or_scene, "mesh", None)
     if isinstance(mesh, Mesh):
         return mesh
-    raise TypeError(f"mesh_or_scene: got {type(mesh_or_scene).__name__}, expected a Mesh or a Scene")
+    raise TypeError(
+        f"{name}: got {type(mesh_or_scene).__name__}, expected a Mesh, a Scene or a Reconstruction"
+    )
 
 
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
