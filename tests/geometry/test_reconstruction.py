@@ -335,7 +335,7 @@ def test_splats_with_a_mesh_take_it_as_it_is(splats):
 
 def test_splats_alone_say_what_they_lack_when_it_is_needed(splats):
     rec = Reconstruction.from_files(splats / "g.ply")
-    assert rec.patches is None
+    assert not rec.has_mesh and rec.patches is None
     with pytest.raises(ValueError, match="has no mesh.*mesh=, or colmap="):
         _ = rec.mesh
     with pytest.raises(FileNotFoundError):

@@ -254,6 +254,13 @@ class Mesh:
         return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)
 
 
+def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across each unit direction ``(N, 3)`` and each other."""
+    u = np.cross(direction, np.eye(3)[np.abs(direction).argmin(axis=1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, np.cross(direction, u)
+
+
 class Geometry(Protocol):
     """Anything with a mesh: a Reconstruction, a Scene, planar patches, a fitted field's surface."""
 
@@ -266,8 +273,9 @@ GeometryLike: TypeAlias = Mesh | Geometry
 """What functions that need a room's surfaces take: a mesh or anything that has one."""
 
 
-def as_mesh(mesh_or_scene: GeometryLike) -> Mesh:
-    """The mesh of a scene, a reconstruction or anything else that has one, or the mesh itself.
+def as_mesh(mesh_or_scene: GeometryLike, name: str = "mesh_or_scene") -> Mesh:
+    """The mesh of a scene, a reconstruction or anything else that has one, or the mesh itself; ``name`` is
+    the argument that it came by.
 
     Raises:
         TypeError: if it is neither.
@@ -278,7 +286,7 @@ def as_mesh(mesh_or_scene: GeometryLike) -> Mesh:
     if isinstance(mesh, Mesh):
         return mesh
     raise TypeError(
-        f"mesh_or_scene: got {type(mesh_or_scene).__name__}, expected a Mesh, a Scene or anything else with a mesh"
+        f"{name}: got {type(mesh_or_scene).__name__}, expected a Mesh, a Scene or anything else with a mesh"
     )
 
 

@@ -14,11 +14,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh import Mesh, vectors_across
+from warprrf.geometry.mesh_topology import components
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
@@ -219,8 +218,7 @@ def _welded(mesh: Mesh, distance_m: float) -> np.ndarray:
     """Faces with vertices of one place given one index, shape ``(F, 3)``."""
     point, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     near = cKDTree(point).query_pairs(distance_m, output_type="ndarray")
-    link = coo_array((np.ones(len(near), bool), near.T), shape=(len(point), len(point)))
-    return connected_components(link, directed=False)[1][index.reshape(-1)][mesh.faces]
+    return components(len(point), near)[index.reshape(-1)][mesh.faces]
 
 
 def _first_at_place(corner: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -270,7 +268,7 @@ def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     # A face so slim that its normal says nothing joins its neighbours later, when it has a plane to be judged by.
     flat &= np.minimum(faces.height[big], faces.height[small]) > 8.0 * faces.sway_m
     flat &= faces.gap(small, n[big], offset[big]) <= faces.distance_m
-    piece = _components(len(mesh.faces), pairs[flat])
+    piece = components(len(mesh.faces), pairs[flat])
     piece = np.where(once, piece, -1)
     piece = _numbered(piece)
     own = np.flatnonzero(piece >= 0)
@@ -393,9 +391,7 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
     middle = middle / np.maximum(np.bincount(p, mesh.areas[own]), 1e-300)[:, None]
     x = 0.5 * (mesh.triangles[own] + np.roll(mesh.triangles[own], 1, axis=1)) - middle[p][:, None]
     for _ in range(2):
-        across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-        u = across / np.linalg.norm(across, axis=1, keepdims=True)
-        frame = np.stack([u, np.cross(normal, u), normal], axis=1)
+        frame = np.stack([*vectors_across(normal), normal], axis=1)
         # Midpoints of edges integrate squares over a triangle exactly.
         a, b, r = np.moveaxis(np.einsum("nij,nkj->nki", frame[p], x), 2, 0)
         weight = mesh.areas[own][:, None] / 3.0
@@ -408,11 +404,6 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
         normal = normal - np.einsum("pi,pij->pj", slope, frame[:, :2])
         normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     return normal, np.einsum("pi,pi->p", normal, middle)
-
-
-def _components(count: int, pairs: np.ndarray) -> np.ndarray:
-    link = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
-    return connected_components(link, directed=False)[1]
 
 
 def _numbered(label: np.ndarray) -> np.ndarray:

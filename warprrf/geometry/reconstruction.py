@@ -63,6 +63,11 @@ class Reconstruction:
         return f"Reconstruction({len(self.gaussians)} Gaussians, {faces}, {len(self.cameras)} cameras)"
 
     @property
+    def has_mesh(self) -> bool:
+        """Whether there is a mesh."""
+        return self._mesh is not None
+
+    @property
     def mesh(self) -> Mesh:
         """The surface.
 

@@ -280,13 +280,11 @@ def _echo(points: np.ndarray, plane: Plane, strong: Plane, config: PlaneConfig) 
     return sum(tuple(c) in cells for c in there) > len(here)
 
 
-def aligned(
-    planes: Sequence[Plane], points: np.ndarray, *, angle_rad: float = np.radians(3.0)
-) -> list[Plane]:
+def aligned(planes: Sequence[Plane], points: np.ndarray) -> list[Plane]:
     """``planes`` with weakly supported ones made exactly parallel or level, where their points allow it.
 
     Built rooms have few directions. A plane takes over the normal of a plane with five times its points, or the
-    vertical, within ``angle_rad`` of its own, if its points then lie hardly further from it.
+    vertical, within 3 degrees of its own, if its points then lie hardly further from it.
     """
     result: list[Plane] = []
     vertical = np.array([0.0, 0.0, 1.0])
@@ -294,7 +292,7 @@ def aligned(
         own = points[plane.inliers]
         strong = [q.normal for q in planes if len(q.inliers) >= 5 * len(plane.inliers)]
         directions = [s * n for n in (*strong, vertical) for s in (1.0, -1.0)]
-        directions = [n for n in directions if n @ plane.normal > np.cos(angle_rad)]
+        directions = [n for n in directions if n @ plane.normal > np.cos(np.radians(3.0))]
         best = plane
         for normal in sorted(directions, key=lambda n: -float(n @ plane.normal)):
             offset = float(np.median(own @ normal))

@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
@@ -159,7 +160,7 @@ class ZoneRays:
         way = self.source - receivers
         length = np.linalg.norm(way, axis=1)
         radius = self.radius(0.5 * length, 0.5 * length)
-        u, v = _across(way / np.maximum(length, 1e-12)[:, None])
+        u, v = vectors_across(way / np.maximum(length, 1e-12)[:, None])
         offset = self.samples[:, 0, None] * u[:, None] + self.samples[:, 1, None] * v[:, None]
         middle = (0.5 * (receivers + self.source))[:, None] + radius[:, None, None] * offset
         start = np.broadcast_to(receivers[:, None], middle.shape).reshape(-1, 3)
@@ -184,7 +185,7 @@ class ZoneRays:
             cosine = np.abs((along[:, k] * normal).sum(axis=1))
             across = np.cross(along[:, k], normal)
             size = np.linalg.norm(across, axis=1, keepdims=True)
-            across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), _across(normal)[0])
+            across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), vectors_across(normal)[0])
             further = np.cross(normal, across) / np.maximum(cosine, 0.05)[:, None]
             offset = self.samples[:, 0, None] * across[:, None] + self.samples[:, 1, None] * further[:, None]
             around[:, :, k] += radius[:, k, None, None] * offset
@@ -310,10 +311,3 @@ def _joined(parts: list[MirrorPaths]) -> MirrorPaths:
     return MirrorPaths(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(MirrorPaths)}
     )
-
-
-def _across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across each unit direction ``(N, 3)``."""
-    u = np.cross(direction, np.eye(3)[np.abs(direction).argmin(axis=1)])
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return u, np.cross(direction, u)

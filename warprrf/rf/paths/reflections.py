@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from warprrf import device as _device
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
+from warprrf.geometry.mesh_topology import components
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import MirrorPaths
@@ -237,6 +236,5 @@ def mesh_parts(mesh: Mesh) -> np.ndarray:
     corner = mesh.welded_faces
     ends = corner[:, [0, 1, 1, 2]].reshape(-1, 2)
     count = int(corner.max(initial=-1)) + 1
-    link = coo_array((np.ones(len(ends), bool), ends.T), shape=(count, count))
-    label = connected_components(link, directed=False)[1][corner[:, 0]]
+    label = components(count, ends)[corner[:, 0]]
     return np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1))

@@ -18,7 +18,7 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.cache import Cache
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -89,7 +89,7 @@ class Surface:
         return len(self.cell_element)
 
     @classmethod
-    def of(cls, geometry: GeometryLike, *, element_m: float = ELEMENT_M) -> Surface:
+    def of(cls, geometry: GeometryLike) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene (its materials become groups) or a bare Mesh; a
         Surface is returned as it is.
 
@@ -98,11 +98,7 @@ class Surface:
         """
         if isinstance(geometry, Surface):
             return geometry
-        mesh = geometry if isinstance(geometry, Mesh) else getattr(geometry, "mesh", None)
-        if not isinstance(mesh, Mesh):
-            raise TypeError(
-                f"geometry: got {type(geometry).__name__}, expected a Reconstruction, a Scene or a Mesh"
-            )
+        mesh = as_mesh(geometry, "geometry")
         material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
@@ -136,7 +132,7 @@ class Surface:
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=sort, colour=colour, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group, element_m),
+            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group),
         )  # fmt: skip
 
     def on_device(self, device: DeviceLike) -> Any:
@@ -165,10 +161,10 @@ class Surface:
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
 
 
-def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, element_m: float) -> dict[str, np.ndarray]:
+def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray) -> dict[str, np.ndarray]:
     """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice."""
     centre, area = mesh.triangles.mean(axis=1), mesh.areas
-    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / element_m).astype(np.int64)
+    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / ELEMENT_M).astype(np.int64)
     key = np.column_stack([group, patch, cells // CELLS])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     pieces, cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
