@@ -17,6 +17,12 @@ ALL_LAYERS = 128  # Gaussians that may share a pixel and count as seen: more hav
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
 NEEDS = {"mirror_1": ("mirror_2",), "diffuse_1": (*FURTHER, "residual")}
 """What goes with an effect, because it rests on it."""
+OPEN = {
+    "lobes": "only known materials or a fit tell which lobes matter",
+    "residual": "only a fit tells",
+    "indirect": "only a fit tells",
+}
+"""Effects that only a fit can tell about, and why."""
 COSTLY = (
     "scatter_mirror", "diffuse_2", "mirror_scatter", "mirror_2", "diffuse_1", "mirror_1", "diffraction", "transmission",
     "line_of_sight",
@@ -106,9 +112,10 @@ def effect_row(model: FullModel, name: str, kept: frozenset[str]) -> Effect:
     return Effect(name, image, total, dark[0], dark[1], stays, _reason(model, name, lost))
 
 
-def open_row(name: str, reason: str) -> Effect:
-    """The row of an effect that only a fit can tell about."""
-    return Effect(name, None, None, None, None, None, reason)
+def open_rows(known: set[str]) -> list[Effect]:
+    """Rows of the effects that are not ``known`` here."""
+    rows = {k: v for k, v in OPEN.items() if k not in known}
+    return [Effect(name, None, None, None, None, None, reason) for name, reason in rows.items()]
 
 
 def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
@@ -127,20 +134,22 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share >= 1e-4 or share == 0 else f"{100 * share:.0e} %"
 
 
-def gaussians_row(
-    gaussians: Gaussians, receivers: np.ndarray, shape: tuple[int, int], tolerance_db: float, device: Any
-) -> Effect:
-    """Gaussians with no blending weight at any receiver; what they could change is rendered, not assumed."""
+def change_of_unseen(
+    gaussians: Gaussians, receivers: np.ndarray, shape: tuple[int, int], device: Any
+) -> tuple[float, str]:
+    """What Gaussians with no blending weight at any of ``receivers`` (R, 3) could change [dB], and a few words on them.
+
+    It is rendered, not assumed.
+    """
     weights = transport(gaussians, receivers, shape, top_k=ALL_LAYERS, device=device)
-    seen = np.zeros(len(gaussians.means), bool)
-    seen[weights.gaussian] = True
-    marked = (~seen).astype(np.float32)[:, None]
-    share = 0.0
+    unseen = np.ones(len(gaussians.means), bool)
+    unseen[weights.gaussian] = False
+    marked, share = unseen.astype(np.float32)[:, None], 0.0
     for receiver in receivers:
         camera = Camera.spherical(shape[1], shape[0], position=receiver)
         share = max(share, float(render(gaussians, camera, marked, device=device).features.max()))
     change = float(-10.0 * np.log10(max(1.0 - share, 1e-12)))
-    return Effect(
-        "gaussians", change, change, None, None, change > tolerance_db,
-        f"{int((~seen).sum())} of {len(seen)}; blending gives them at most {_percent(share)} of a pixel",
-    )  # fmt: skip
+    return (
+        change,
+        f"{unseen.sum()} of {len(unseen)}; blending gives them at most {_percent(share)} of a pixel",
+    )

@@ -28,7 +28,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.receivers import check_receiver
-from warprrf.rf.relevance.choice import Effect, effect_row, gaussians_row, leave_out, open_row, rms
+from warprrf.rf.relevance.choice import Effect, change_of_unseen, effect_row, leave_out, open_rows, rms
 from warprrf.rf.relevance.model import OUTSIDE, FullModel, full_field, reduced_field, reduced_terms
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 
@@ -297,27 +297,24 @@ def relevances(
     places = np.atleast_2d(check_receiver("receivers", receivers, full.surface.mesh))
     tick: Progress = progress or (lambda stage, done, total: None)
     model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
+    found = [_choose(model, source, float(tolerance)) for tolerance in tolerances_db]
     gaussians = getattr(geometry, "gaussians", None)
-    found = []
-    for tolerance in tolerances_db:
-        one = _choose(model, source, float(tolerance))
-        if isinstance(gaussians, Gaussians):
-            row = gaussians_row(gaussians, places, full.shape, tolerance, device)
-            one = replace(one, effects=(*one.effects, row))
-        found.append(one)
+    if isinstance(gaussians, Gaussians):
+        change, reason = change_of_unseen(gaussians, places, full.shape, device)
+        rows = [
+            Effect("gaussians", change, change, None, None, change > f.tolerance_db, reason) for f in found
+        ]
+        found = [replace(f, effects=(*f.effects, row)) for f, row in zip(found, rows, strict=True)]
     tick("relevance", len(places) + 1, len(places) + 1)
     return found
 
 
 def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
     full = model.field
-    known = model.all if source != "assumed" else model.all - {f"lobe_{n}" for n in full.terms.lobes}
-    kept = model.all - frozenset(leave_out(model, known, tolerance_db))
-    effects = [effect_row(model, name, kept) for name in model.effects if name in known]
-    if source == "assumed":
-        effects.append(open_row("lobes", "only known materials or a fit tell which lobes matter"))
-    learned = (name for name in ("residual", "indirect") if name not in model.all)
-    effects += [open_row(name, "only a fit tells") for name in learned]
+    guessed = {f"lobe_{n}" for n in full.terms.lobes} if source == "assumed" else set()
+    kept = model.all - frozenset(leave_out(model, model.all - guessed, tolerance_db))
+    effects = [effect_row(model, name, kept) for name in model.effects if name not in guessed]
+    effects += open_rows({*model.all} if guessed else {*model.all, "lobes"})
     image_db, total_db = (rms(x) for x in model.loss(kept))
     return Relevance(
         source, full.frequency_hz, tolerance_db, model.floor, len(model.receivers), int(model.blocked.sum()),
