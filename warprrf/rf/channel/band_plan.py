@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.device import check_count
+
 LOW_HZ, HIGH_HZ = 252.72e9, 321.84e9
 """Edges of the band [Hz]."""
 UNIT_HZ = 2.16e9
@@ -51,9 +53,8 @@ class ThzChannel:
         Raises:
             ValueError: if ``count`` is not a whole number of at least 1.
         """
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
-        return self.low_hz + (np.arange(count) + 0.5) * (self.bandwidth_hz / count)
+        parts = check_count("count", count)
+        return self.low_hz + (np.arange(parts) + 0.5) * (self.bandwidth_hz / parts)
 
 
 def _plan() -> dict[int, ThzChannel]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import Progress, check_positive
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import BeamOperator
@@ -63,8 +63,7 @@ class LinkOptions:
 
     def __post_init__(self) -> None:
         sigma = self.beam_sigma_rad
-        if not (np.isfinite(sigma) and sigma > 0):
-            raise ValueError(f"beam_sigma_rad: got {sigma!r}, expected a positive beam width in radians")
+        check_positive("beam_sigma_rad", sigma, "beam width in radians")
         if self.mirror_order not in (None, 0, 1, 2, 3):
             raise ValueError(
                 f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None for the field's own"

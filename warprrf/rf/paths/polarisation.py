@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.spectrum import transverse_basis
 
 _PARALLEL = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
@@ -77,8 +78,7 @@ def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarr
         if k:
             other = across[:, k - 1]
         else:
-            other = np.cross(along[:, 0], np.eye(3)[np.abs(along[:, 0]).argmin(axis=1)])
-            other = other / np.linalg.norm(other, axis=1, keepdims=True)
+            other = vectors_across(along[:, 0])[0]
         own = across[:, k] / np.maximum(sine[:, k], _PARALLEL)
         across[:, k] = np.where(sine[:, k] > _PARALLEL, own, other)
     return along, across

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_array
+from warprrf.device import Progress, check_array, check_positive
 from warprrf.files import write_text
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.waves import check_frequency
@@ -232,8 +232,8 @@ class Setting:
             )  # fmt: skip
         elif isinstance(geometry, RadioField):
             raise TypeError(f"geometry: got a field of model {geometry.model!r}, expected a bistatic one")
-        if found.floor is not None and not (np.isfinite(found.floor) and found.floor > 0):
-            raise ValueError(f"floor: got {found.floor!r}, expected a path gain of more than 0")
+        if found.floor is not None:
+            check_positive("floor", found.floor, "path gain")
         for name in ("transmitter", "frequency_hz"):
             if getattr(found, name) is None:
                 raise ValueError(f"{name}: got None, expected it for anything but a fitted field")
@@ -283,8 +283,7 @@ def relevances(
 ) -> list[Relevance]:
     """:func:`relevance` at several tolerances, for little more than the time of one; arguments and errors as there."""
     for tolerance in tolerances_db:
-        if not (np.isfinite(tolerance) and tolerance > 0):
-            raise ValueError(f"tolerance_db: got {tolerance!r}, expected more than 0")
+        check_positive("tolerance_db", tolerance)
     asked = Setting(**setting).of(geometry)
     full, walls, source = full_field(
         geometry,

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 
-from warprrf.device import Progress
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict
 
@@ -163,7 +162,6 @@ def fit_groups(
     start: Parameters,
     area: np.ndarray,
     options: GroupFit | None = None,
-    progress: Progress | None = None,
 ) -> Fitted:
     """Levenberg-Marquardt on the groups' parameters.
 
@@ -172,7 +170,6 @@ def fit_groups(
         start: where the fit starts and the priors centre; ``log_indirect`` is set here if it is -inf.
         area: area of each group [m^2], shape ``(G,)``.
         options: what is free, and how far the fit goes.
-        progress: called as ``progress("fit", step, steps)``.
     """
     o = options or GroupFit()
     start, layout = start_of(readings, start, o)
@@ -202,8 +199,6 @@ def fit_groups(
                 break
             damping *= 5.0
         taken = step + 1
-        if progress is not None:
-            progress("fit", taken, o.steps)
         if not improved:
             break
         # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived.

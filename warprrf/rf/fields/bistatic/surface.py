@@ -17,7 +17,8 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.geometry.mesh import Mesh
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -88,7 +89,7 @@ class Surface:
         return len(self.cell_element)
 
     @classmethod
-    def of(cls, geometry: Any, *, element_m: float = ELEMENT_M) -> Surface:
+    def of(cls, geometry: GeometryLike) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene (its materials become groups) or a bare Mesh; a
         Surface is returned as it is.
 
@@ -97,12 +98,8 @@ class Surface:
         """
         if isinstance(geometry, Surface):
             return geometry
-        mesh = geometry if isinstance(geometry, Mesh) else getattr(geometry, "mesh", None)
-        if not isinstance(mesh, Mesh):
-            raise TypeError(
-                f"geometry: got {type(geometry).__name__}, expected a Reconstruction, a Scene or a Mesh"
-            )
-        material = getattr(geometry, "face_material", None)
+        mesh = as_mesh(geometry, "geometry")
+        material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
         if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
@@ -127,7 +124,7 @@ class Surface:
                 group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
             else:
                 group = np.asarray(material, np.int32)
-                names = tuple(m.name for m in geometry.materials)
+                names = tuple(m.name for m in materials)
             sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         sides = patches.two_sided
         mesh, parent = _split_long(mesh)
@@ -135,10 +132,10 @@ class Surface:
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=sort, colour=colour, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group, element_m),
+            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group),
         )  # fmt: skip
 
-    def on_device(self, device: Any) -> Any:
+    def on_device(self, device: DeviceLike) -> Any:
         """The kernels' view of this surface."""
         where = _device.resolve(device)
 
@@ -164,10 +161,10 @@ class Surface:
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
 
 
-def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, element_m: float) -> dict[str, np.ndarray]:
+def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray) -> dict[str, np.ndarray]:
     """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice."""
     centre, area = mesh.triangles.mean(axis=1), mesh.areas
-    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / element_m).astype(np.int64)
+    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / ELEMENT_M).astype(np.int64)
     key = np.column_stack([group, patch, cells // CELLS])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     pieces, cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
