@@ -224,9 +224,9 @@ class MapOptions(LinkOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_number("bandwidth_hz", self.bandwidth_hz, positive=True)
+        _device.check_positive("bandwidth_hz", self.bandwidth_hz)
         for name in ("transmit_power_dbm", "noise_figure_db"):
-            _check_number(name, getattr(self, name))
+            _check_finite(name, getattr(self, name))
 
     @property
     def noise_power_dbm(self) -> float:
@@ -235,9 +235,9 @@ class MapOptions(LinkOptions):
         return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
 
 
-def _check_number(name: str, value: float, *, positive: bool = False) -> None:
-    if not np.isfinite(value) or (positive and value <= 0):
-        raise ValueError(f"{name}: got {value!r}, expected a {'positive' if positive else 'finite'} number")
+def _check_finite(name: str, value: float) -> None:
+    if not np.isfinite(value):
+        raise ValueError(f"{name}: got {value!r}, expected a finite number")
 
 
 class LinkField(Protocol):
@@ -283,8 +283,8 @@ def radio_map(
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
     source = _device.check_array("transmitter", source, (3,))
-    _check_number("height", height)
-    _check_number("cell", cell, positive=True)
+    _check_finite("height", height)
+    _device.check_positive("cell", cell)
     low, high = mesh.bounds
     if not low[2] < height < high[2]:
         raise ValueError(
