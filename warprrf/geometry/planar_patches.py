@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from warprrf.geometry.mesh import Mesh, vectors_across
@@ -59,9 +60,9 @@ class PlanarPatches:
     def from_planes(
         cls,
         mesh: Mesh,
-        face_patch: Any,
-        normal: Any,
-        offset: Any,
+        face_patch: ArrayLike,
+        normal: ArrayLike,
+        offset: ArrayLike,
         *,
         tolerance_m: float,
         two_sided: bool = False,

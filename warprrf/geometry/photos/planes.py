@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from warprrf.device import check_array
@@ -136,7 +136,12 @@ def fit_plane(points: np.ndarray, weights: np.ndarray, normal: np.ndarray) -> tu
 
 
 def detect_planes(
-    points: Any, normals: Any, *, weights: Any = None, config: PlaneConfig | None = None, seed: int = 0
+    points: ArrayLike,
+    normals: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    config: PlaneConfig | None = None,
+    seed: int = 0,
 ) -> list[Plane]:
     """Planes among oriented points, the best supported first.
 

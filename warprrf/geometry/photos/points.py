@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from warprrf.device import check_array
@@ -24,10 +24,10 @@ def neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def clean_points(
-    points: Any,
+    points: ArrayLike,
     *,
-    reprojection_error: Any = None,
-    track_length: Any = None,
+    reprojection_error: ArrayLike | None = None,
+    track_length: ArrayLike | None = None,
     max_reprojection_error: float = 1.0,
 ) -> np.ndarray:
     """Which points to keep, shape ``(P,)`` bool: seen often enough, reprojected well, not far from all others.
@@ -54,7 +54,9 @@ def clean_points(
     return keep
 
 
-def estimate_normals(points: Any, viewpoints: Any, *, neighbour_count: int = NEIGHBOURS) -> np.ndarray:
+def estimate_normals(
+    points: ArrayLike, viewpoints: ArrayLike, *, neighbour_count: int = NEIGHBOURS
+) -> np.ndarray:
     """Unit normals from the neighbourhood of each point, turned to the side of ``viewpoints``, shape ``(P, 3)``.
 
     Args:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.device import Progress, check_array, launch, resolve
+from warprrf.device import DeviceLike, Progress, check_array, launch, resolve
 from warprrf.files import write_atomically
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import PARAMETERS, STATISTICS, Arrays, densified, opacity_and_scales
@@ -41,7 +41,7 @@ def refine(
     planes: Sequence[Plane] = (),
     progress: Progress | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> Gaussians:
     """Optimise Gaussians against photos.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.device import check_array, check_count, check_positive
 
@@ -37,7 +38,15 @@ class Camera:
 
     @classmethod
     def pinhole(
-        cls, width: int, height: int, *, fx: float, fy: float, cx: float, cy: float, world_to_camera: Any
+        cls,
+        width: int,
+        height: int,
+        *,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        world_to_camera: ArrayLike,
     ) -> Camera:
         """A pinhole camera without distortion.
 
@@ -62,7 +71,7 @@ class Camera:
         return cls("pinhole", int(width), int(height), pose, float(fx), float(fy), float(cx), float(cy))
 
     @classmethod
-    def spherical(cls, width: int, height: int, *, position: Any) -> Camera:
+    def spherical(cls, width: int, height: int, *, position: ArrayLike) -> Camera:
         """An equirectangular full-sphere camera at ``position`` (3,) [m], axes along the world's, z up."""
         _check_size(width, height)
         pose = np.eye(4)
@@ -107,7 +116,7 @@ class Camera:
             self.cy * sy,
         )
 
-    def project(self, points: Any) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates ``(N, 2)`` of world points ``(N, 3)``, and their depth along the optical axis ``(N,)`` [m]
         (range for a spherical camera). Pinhole coordinates are NaN behind the camera."""
         local = check_array("points", points, (None, 3)) @ self.rotation.T + self.world_to_camera[:3, 3]

@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
-from warprrf.device import check_array, check_count, launch, resolve
+from warprrf.device import DeviceLike, check_array, check_count, launch, resolve
 from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -90,7 +91,7 @@ class GaussianRays:
         gaussians: Gaussians | tuple[wp.array, wp.array, wp.array, wp.array],
         *,
         blending: Blending | None = None,
-        device: Any = None,
+        device: DeviceLike = None,
     ) -> None:
         self.blending = blending or RADIO
         if isinstance(gaussians, Gaussians):
@@ -140,7 +141,7 @@ class GaussianRays:
             scene.bvh = self._bvh.id
         self._scene = scene
 
-    def hits(self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak") -> RayHits:
+    def hits(self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak") -> RayHits:
         """The first ``k`` Gaussians along each ray.
 
         Args:
@@ -156,7 +157,7 @@ class GaussianRays:
         found = self._trace(origins, directions, k, order, requires_grad=False)[0]
         return RayHits(found.index.numpy(), *(array.numpy() for array in found.outputs))
 
-    def transmittance(self, a: Any, b: Any) -> np.ndarray:
+    def transmittance(self, a: ArrayLike, b: ArrayLike) -> np.ndarray:
         """Share of light that passes from ``a`` to ``b``, (N, 3) or (3,) each [m]; shape ``(N,)`` float64.
 
         A Gaussian counts whose response peaks strictly between the points; between two equal points nothing does.
@@ -167,7 +168,7 @@ class GaussianRays:
         values: np.ndarray = self._transmit(a, b, requires_grad=False)[0].numpy()
         return values
 
-    def trace(self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak") -> Traced:
+    def trace(self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak") -> Traced:
         """:meth:`hits` as Warp arrays, differentiable on an active tape in the parameters (not in the rays)."""
         tape = active_tape()
         found, adjoint = self._trace(origins, directions, k, order, requires_grad=tape is not None)
@@ -175,7 +176,7 @@ class GaussianRays:
             record(tape, adjoint, self.inputs, found.outputs)
         return found
 
-    def transmit(self, a: Any, b: Any) -> wp.array:
+    def transmit(self, a: ArrayLike, b: ArrayLike) -> wp.array:
         """:meth:`transmittance` as a Warp array, differentiable on an active tape in the parameters."""
         tape = active_tape()
         values, adjoint = self._transmit(a, b, requires_grad=tape is not None)
@@ -184,17 +185,17 @@ class GaussianRays:
         return values
 
     def trace_with_adjoint(
-        self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak"
+        self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak"
     ) -> tuple[Traced, Callable[[], None]]:
         """:meth:`trace` without a tape: the hits, and the function that adds the parameters' gradients."""
         return self._trace(origins, directions, k, order, requires_grad=True)
 
-    def transmit_with_adjoint(self, a: Any, b: Any) -> tuple[wp.array, Callable[[], None]]:
+    def transmit_with_adjoint(self, a: ArrayLike, b: ArrayLike) -> tuple[wp.array, Callable[[], None]]:
         """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients."""
         return self._transmit(a, b, requires_grad=True)
 
     def _trace(
-        self, origins: Any, directions: Any, k: int, order: str, *, requires_grad: bool
+        self, origins: ArrayLike, directions: ArrayLike, k: int, order: str, *, requires_grad: bool
     ) -> tuple[Traced, Callable[[], None]]:
         start, toward = _pairs("origins", origins, "directions", directions)
         places = check_count("k", k)
@@ -229,7 +230,9 @@ class GaussianRays:
 
         return found, adjoint
 
-    def _transmit(self, a: Any, b: Any, *, requires_grad: bool) -> tuple[wp.array, Callable[[], None]]:
+    def _transmit(
+        self, a: ArrayLike, b: ArrayLike, *, requires_grad: bool
+    ) -> tuple[wp.array, Callable[[], None]]:
         start, end = _pairs("a", a, "b", b)
         count, on = _rows(start, end), self.device
         values = wp.empty(count, dtype=wp.float64, device=on, requires_grad=requires_grad)

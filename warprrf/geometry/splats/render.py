@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
-from warprrf.device import check_array, check_count, resolve
+from warprrf.device import DeviceLike, check_array, check_count, resolve
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -58,9 +59,9 @@ class BlendWeights:
 def render(
     g: Gaussians,
     cam: Camera,
-    features: Any = None,
-    background: Any = 0.0,
-    device: Any = None,
+    features: ArrayLike | None = None,
+    background: ArrayLike = 0.0,
+    device: DeviceLike = None,
     *,
     blending: Blending | None = None,
 ) -> Rendering:
@@ -99,7 +100,7 @@ def render(
 
 
 def blend_weights(
-    g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: Any = None
+    g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: DeviceLike = None
 ) -> BlendWeights:
     """Blending weights of every pixel as a sparse matrix; geometry that is frozen needs them only once.
 

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
@@ -73,7 +74,7 @@ class Codebook:
         grid = h.reshape(*h.shape[:-1], self.array.cols, self.array.rows)
         return (across @ grid @ down.T).reshape(*h.shape[:-1], len(self))
 
-    def amplitude(self, directions: Any) -> np.ndarray:
+    def amplitude(self, directions: ArrayLike) -> np.ndarray:
         """w^T a of every beam for plane waves along world ``directions`` (L, 3), shape ``(B, L)``, complex.
 
         Elements' patterns count: |amplitude|^2 is the beam's power gain.
@@ -85,7 +86,7 @@ class Codebook:
             return parts[0] * size
         return (parts[0][:, None] * (parts[1] * size)[None]).reshape(len(self), len(d))
 
-    def superposed(self, directions: Any, gains: Any) -> np.ndarray:
+    def superposed(self, directions: ArrayLike, gains: ArrayLike) -> np.ndarray:
         """w^T h of every beam for plane waves of complex ``gains`` (..., L) along ``directions`` (L, 3).
 
         Returns:
@@ -96,7 +97,7 @@ class Codebook:
         size = np.sqrt(self.array.gain(d))
         return self._summed(d, values * size, lambda waves: waves)
 
-    def power(self, directions: Any, powers: Any) -> np.ndarray:
+    def power(self, directions: ArrayLike, powers: ArrayLike) -> np.ndarray:
         """Mean |w^T h|^2 of every beam for waves of ``powers`` (..., L) and independent phases, shape ``(..., B)``."""
         values = np.asarray(powers, dtype=np.float64)
         d = np.asarray(directions, dtype=np.float64)
@@ -144,7 +145,11 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
 
 
 def steering_codebook(
-    array: PlanarArray, directions: Any = None, *, points: Any = None, wavelength_m: float | None = None
+    array: PlanarArray,
+    directions: ArrayLike | None = None,
+    *,
+    points: ArrayLike | None = None,
+    wavelength_m: float | None = None,
 ) -> Codebook:
     """Beams conj(a) / |a| matched to plane waves along ``directions``, or to sources at ``points``.
 
@@ -285,7 +290,9 @@ def select_beams_multiuser(
     return MultiUserChoice(sent, received, signal_over_interference(gains, sent, received, noise))
 
 
-def signal_over_interference(gains: Sequence[Any], tx: Any, rx: Any, noise: float) -> np.ndarray:
+def signal_over_interference(
+    gains: Sequence[ArrayLike], tx: ArrayLike, rx: ArrayLike, noise: float
+) -> np.ndarray:
     """SINR of users [linear], shape ``(U,)``, power shared equally.
 
     Args:
@@ -293,7 +300,7 @@ def signal_over_interference(gains: Sequence[Any], tx: Any, rx: Any, noise: floa
         tx, rx: Beams of the users, shape ``(U,)``.
         noise: Noise power over the total transmitted power.
     """
-    heard = np.array([np.asarray(g)[r, np.asarray(tx)] for g, r in zip(gains, rx, strict=True)])
+    heard = np.array([np.asarray(g)[r, np.asarray(tx)] for g, r in zip(gains, np.asarray(rx), strict=True)])
     signal = np.diag(heard)
     return signal / (heard.sum(axis=1) - signal + noise * len(heard))
 

@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from warprrf.rf.em.absorption import Air, air_of
+from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
 
@@ -141,7 +141,7 @@ class PathArrays:
             )
         return self._taken(chosen)
 
-    def with_gas(self, gas: Any = True) -> Self:
+    def with_gas(self, gas: Gas = True) -> Self:
         """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
 
         Args:

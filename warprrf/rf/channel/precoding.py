@@ -23,9 +23,9 @@ known channel is the covariance of rank one:
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
 from warprrf.device import check_positive
@@ -40,7 +40,7 @@ ROUNDING = 1e-13
 
 
 def transmit_covariance(
-    sources: Source | Iterable[Source], tx_array: Ends, rx_array: Ends = None, *, rx: Any = None
+    sources: Source | Iterable[Source], tx_array: Ends, rx_array: Ends = None, *, rx: ArrayLike | None = None
 ) -> np.ndarray:
     """Mean of h* h^T of every user over independent phases of its paths, shape ``(U, N, N)``, complex.
 
@@ -81,7 +81,7 @@ def transmit_covariance(
     return found
 
 
-def precoders(channels: Any, method: str = "slnr", *, noise: float) -> np.ndarray:
+def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.ndarray:
     """Weights that serve all users at once, unit norm each, shape ``(U, N)``, complex: user u is sent ``weights[u]``.
 
     Args:
@@ -110,7 +110,7 @@ def precoders(channels: Any, method: str = "slnr", *, noise: float) -> np.ndarra
     return _apart(best) if method == "zf" else best
 
 
-def precoded_sinr(channels: Any, weights: Any, *, noise: float) -> np.ndarray:
+def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> np.ndarray:
     """SINR of every user [linear], shape ``(U,)``, the power shared equally.
 
     Args:
@@ -167,7 +167,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def _checked(channels: Any, allow_dark: bool = False) -> np.ndarray:
+def _checked(channels: ArrayLike, allow_dark: bool = False) -> np.ndarray:
     h = np.asarray(channels, dtype=complex)
     if h.ndim not in (2, 3) or 0 in h.shape or (h.ndim == 3 and h.shape[1] != h.shape[2]):
         raise ValueError(f"channels: got shape {h.shape}, expected channels (U, N) or covariances (U, N, N)")

@@ -31,6 +31,7 @@ from math import factorial
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
@@ -71,7 +72,7 @@ class LinkOptions(TypedDict, total=False):
 
 def frequency_response(
     paths: PathArrays,
-    frequencies_hz: Any,
+    frequencies_hz: ArrayLike,
     *,
     amplitude: str = "carrier",
     method: str = "auto",

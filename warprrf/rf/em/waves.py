@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.device import check_array
 
@@ -23,6 +24,6 @@ def check_frequency(frequency_hz: Any) -> float:
     return value
 
 
-def carrier_phase(frequency_hz: Any, tau: Any) -> np.ndarray:
+def carrier_phase(frequency_hz: Any, tau: ArrayLike) -> np.ndarray:
     """exp(-j 2 pi f tau); whole turns are dropped before the exponential, since f tau reaches 1e4 and more."""
     return np.exp(-2j * np.pi * np.mod(np.asarray(frequency_hz) * np.asarray(tau), 1.0))

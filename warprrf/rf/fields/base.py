@@ -11,11 +11,12 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.device import Progress, check_array
-from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.absorption import Air
+from warprrf.device import DeviceLike, Progress, check_array
+from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
@@ -43,7 +44,7 @@ class RadioField(ABC):
     shape: tuple[int, int]
     mesh: Mesh | None
     air: Air | None
-    device: Any
+    device: DeviceLike
     report: dict[str, Any]
     models: ClassVar[dict[str, type[RadioField]]] = {}
 
@@ -53,7 +54,9 @@ class RadioField(ABC):
         """Name of the model."""
 
     @classmethod
-    def fit(cls, geometry: Any, ds: SpectrumDataset, model: str = "bistatic", **options: Any) -> RadioField:
+    def fit(
+        cls, geometry: GeometryLike, ds: SpectrumDataset, model: str = "bistatic", **options: Any
+    ) -> RadioField:
         """Fit a radio field to the spectra of ``ds``.
 
         Args:
@@ -71,7 +74,7 @@ class RadioField(ABC):
         return cls.models[model].fit(geometry, ds, model, **options)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> RadioField:
+    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> RadioField:
         """Read a field that :meth:`save` wrote.
 
         Raises:
@@ -83,7 +86,7 @@ class RadioField(ABC):
         return found.load(path, device=device)
 
     @abstractmethod
-    def with_gas(self, gas: Any = True) -> Self:
+    def with_gas(self, gas: Gas = True) -> Self:
         """The same field with the absorption of ``gas`` over every path's length, in place of what it had.
 
         Args:
@@ -95,17 +98,19 @@ class RadioField(ABC):
         """
 
     @abstractmethod
-    def spectrum(self, rx: Any, transmitter: Any = None) -> Spectrum:
+    def spectrum(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> Spectrum:
         """The spatial spectrum at ``rx`` (3,) [m]."""
 
     @abstractmethod
-    def paths(self, rx: Any, transmitter: Any = None, max_paths: int | None = None) -> Paths:
+    def paths(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
+    ) -> Paths:
         """Propagation paths at ``rx`` (3,) or (R, 3) [m]."""
 
     def links(
         self,
-        rx: Any,
-        transmitter: Any = None,
+        rx: ArrayLike,
+        transmitter: ArrayLike | None = None,
         *,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         shape: tuple[int, int] | None = None,
@@ -149,7 +154,7 @@ class RadioField(ABC):
         )
 
     def radio_map(
-        self, height: float, cell: float = 0.25, transmitter: Any = None, **options: Any
+        self, height: float, cell: float = 0.25, transmitter: ArrayLike | None = None, **options: Any
     ) -> RadioMap:
         """Links over a floor plan, at ``height`` [m] in cells of ``cell`` [m].
 

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.kernels.radio import mirrors as kernels
 
@@ -58,7 +60,12 @@ class MirrorImages:
     """
 
     def __init__(
-        self, patches: PlanarPatches, transmitter: Any, *, slack_m: float | None = None, device: Any = None
+        self,
+        patches: PlanarPatches,
+        transmitter: ArrayLike,
+        *,
+        slack_m: float | None = None,
+        device: DeviceLike = None,
     ) -> None:
         self.patches = patches
         self.transmitter = np.asarray(transmitter, float)

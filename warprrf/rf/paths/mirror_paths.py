@@ -10,10 +10,10 @@ approximation of a partly covered zone), so that power falls with its square.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 
+from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.paths.images import MirrorImages
@@ -133,7 +133,12 @@ class ZoneRays:
     """Rays that fill Fresnel zones on a surface with a skin; see :func:`zone_paths`."""
 
     def __init__(
-        self, patches: PlanarPatches, source: np.ndarray, wavelength_m: float, skin_m: float, device: Any
+        self,
+        patches: PlanarPatches,
+        source: np.ndarray,
+        wavelength_m: float,
+        skin_m: float,
+        device: DeviceLike,
     ) -> None:
         self.patches, self.source, self.wavelength_m = patches, source, wavelength_m
         self.skin_m, self.device = skin_m, device
@@ -234,7 +239,7 @@ def _unobstructed(
     ends: np.ndarray,
     patch: np.ndarray,
     point: np.ndarray,
-    device: Any,
+    device: DeviceLike,
 ) -> np.ndarray:
     """Whether every leg of each path is free, shape ``(L,)``; the mirrors' own faces, true to a tolerance, are not met."""
     stops = stops_of(source, point, ends)

@@ -10,6 +10,7 @@ from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
 from warprrf.cache import Cache
+from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions
 
 EVEN_SUB_PIXELS = 4  # square root of the directions that stand for a whole pixel's even power
@@ -22,7 +23,7 @@ class BeamOperator:
     the rows for each frequency. Sums are kept.
     """
 
-    def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
+    def __init__(self, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None) -> None:
         rows, columns = self.shape = shape
         directions = sub_pixel_directions(shape, EVEN_SUB_PIXELS)[0].reshape(rows, columns, -1, 3)[:, 0]
         even = np.full(directions.shape[1], 1.0 / directions.shape[1])
@@ -81,7 +82,7 @@ class BeamOperator:
 _OPERATORS = Cache(8)
 
 
-def beam_operator(shape: tuple[int, int], sigma: float, device: Any = None) -> BeamOperator:
+def beam_operator(shape: tuple[int, int], sigma: float, device: DeviceLike = None) -> BeamOperator:
     """The beam of width ``sigma`` [rad] on a grid of ``shape``; the last few are kept."""
     key = shape, sigma, str(device)
     return _OPERATORS.get(key, lambda: BeamOperator(shape, sigma, device=device))

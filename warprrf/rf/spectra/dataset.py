@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
@@ -13,7 +13,7 @@ from warprrf import device as _device
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
-from warprrf.rf.spectra.antenna import DeembedOptions, deembed
+from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
 from warprrf.rf.spectra.spectrum import Spectrum, check_shape, default_floor, to_db
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
@@ -96,17 +96,17 @@ class SpectrumDataset:
     def from_spectra(
         cls,
         *,
-        receivers: Any,
-        transmitter: Any,
+        receivers: np.ndarray,
+        transmitter: np.ndarray,
         frequency_hz: float,
-        path_gain: Any,
-        delay_s: Any,
-        aod: Any,
-        line_of_sight: Any,
+        path_gain: np.ndarray,
+        delay_s: np.ndarray,
+        aod: np.ndarray,
+        line_of_sight: np.ndarray,
         beam_sigma_rad: float,
         engine: str,
         seed: int = 0,
-        role: Any = None,
+        role: Sequence[str] | np.ndarray | None = None,
         floor: float | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> SpectrumDataset:
@@ -126,7 +126,7 @@ class SpectrumDataset:
             engine=engine,
             polarisation=POLARISATION,
             seed=seed,
-            role=assign_roles(len(gain), seed=seed) if role is None else role,
+            role=assign_roles(len(gain), seed=seed) if role is None else np.asarray(role),
             line_of_sight=line_of_sight,
             attributes=dict(attributes or {}),
         )
@@ -207,7 +207,7 @@ class SpectrumDataset:
 
     def deembed(
         self,
-        pattern: Any,
+        pattern: Pattern,
         *,
         boresight_gain_dbi: float | None = None,
         noise: float = 0.0,

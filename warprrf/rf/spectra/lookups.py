@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.device import check_array, check_positive
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -34,7 +34,7 @@ class Lookup:
     note: str
     _predict: Callable[[np.ndarray], Spectrum] = field(repr=False)
 
-    def __call__(self, receiver: Any) -> Spectrum:
+    def __call__(self, receiver: ArrayLike) -> Spectrum:
         """The predicted spectrum at ``receiver`` (3,) [m].
 
         Raises:

@@ -15,8 +15,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
 BEAM_SIGMA_RAD = float(np.deg2rad(2.0))
@@ -96,7 +98,7 @@ def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.nd
     return directions, np.repeat(pixel_solid_angles(shape) / count, columns * count)
 
 
-def directions_from_angles(zenith: Any, azimuth: Any) -> np.ndarray:
+def directions_from_angles(zenith: ArrayLike, azimuth: ArrayLike) -> np.ndarray:
     """Unit vectors, shape ``(..., 3)``, of zenith in [0, pi] and azimuth in (-pi, pi] [rad]."""
     zenith, azimuth = np.broadcast_arrays(np.asarray(zenith, float), np.asarray(azimuth, float))
     return np.stack(
@@ -104,14 +106,14 @@ def directions_from_angles(zenith: Any, azimuth: Any) -> np.ndarray:
     )
 
 
-def angles_from_directions(directions: Any) -> tuple[np.ndarray, np.ndarray]:
+def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Zenith in [0, pi] and azimuth in (-pi, pi] [rad] of vectors ``(..., 3)`` of any length."""
     d = np.asarray(directions, dtype=np.float64)
     azimuth = np.arctan2(d[..., 1], d[..., 0])
     return np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]), np.where(azimuth == -np.pi, np.pi, azimuth)
 
 
-def transverse_basis(directions: Any) -> np.ndarray:
+def transverse_basis(directions: ArrayLike) -> np.ndarray:
     """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
     zenith, azimuth = angles_from_directions(directions)
     up = np.stack(
@@ -121,7 +123,7 @@ def transverse_basis(directions: Any) -> np.ndarray:
     return np.stack([up, around], axis=-2)
 
 
-def pixel_of(directions: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def pixel_of(directions: ArrayLike, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the pixel that each direction ``(..., 3)`` falls in."""
     rows, columns = check_shape(shape)
     zenith, azimuth = angles_from_directions(directions)
@@ -129,7 +131,7 @@ def pixel_of(directions: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.nd
     return row, np.floor((azimuth + np.pi) * columns / (2.0 * np.pi)).astype(np.int64) % columns
 
 
-def to_db(path_gain: Any, floor: float) -> np.ndarray:
+def to_db(path_gain: ArrayLike, floor: float) -> np.ndarray:
     """10 log10(P + N0) [dB], of linear path gain and the noise floor N0."""
     return 10.0 * np.log10(np.asarray(path_gain, dtype=np.float64) + floor)
 
@@ -161,14 +163,24 @@ class SpreadPaths(NamedTuple):
 
 
 def spread(
-    directions: Any, powers: Any, shape: tuple[int, int], sigma: float = BEAM_SIGMA_RAD, *, device: Any = None
+    directions: ArrayLike,
+    powers: ArrayLike,
+    shape: tuple[int, int],
+    sigma: float = BEAM_SIGMA_RAD,
+    *,
+    device: DeviceLike = None,
 ) -> np.ndarray:
     """Path gains spread by the receiver beam, shape ``(H, W)``, float64; sums to ``powers.sum()``. See spread_paths."""
     return spread_paths(directions, powers, shape, sigma, device=device).path_gain
 
 
 def spread_paths(
-    directions: Any, powers: Any, shape: tuple[int, int], sigma: float = BEAM_SIGMA_RAD, *, device: Any = None
+    directions: ArrayLike,
+    powers: ArrayLike,
+    shape: tuple[int, int],
+    sigma: float = BEAM_SIGMA_RAD,
+    *,
+    device: DeviceLike = None,
 ) -> SpreadPaths:
     """Path gains spread by the receiver beam, and each pixel's strongest path.
 
@@ -221,7 +233,12 @@ def spread_paths(
 
 
 def strongest_rays(
-    directions: wp.array, power: np.ndarray, shape: tuple[int, int], sigma: float, *, device: Any = None
+    directions: wp.array,
+    power: np.ndarray,
+    shape: tuple[int, int],
+    sigma: float,
+    *,
+    device: DeviceLike = None,
 ) -> np.ndarray:
     """The ray that gives each pixel the most through the receiver beam, shape ``(H, W)`` int32; -1 where none does.
 

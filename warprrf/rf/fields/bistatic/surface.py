@@ -17,7 +17,8 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.geometry.mesh import Mesh, as_mesh
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -94,7 +95,7 @@ class Surface:
         return len(self.cell_element)
 
     @classmethod
-    def of(cls, geometry: Any) -> Surface:
+    def of(cls, geometry: GeometryLike) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene (its materials become groups) or a bare Mesh; a
         Surface is returned as it is.
 
@@ -104,7 +105,7 @@ class Surface:
         if isinstance(geometry, Surface):
             return geometry
         mesh = as_mesh(geometry, "geometry")
-        material = getattr(geometry, "face_material", None)
+        material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
         if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
@@ -126,7 +127,7 @@ class Surface:
                 group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
             else:
                 group = np.asarray(material, np.int32)
-                names = tuple(m.name for m in geometry.materials)
+                names = tuple(m.name for m in materials)
             sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         sides = patches.two_sided
         mesh, parent = _split_long(mesh)
@@ -137,7 +138,7 @@ class Surface:
             group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group),
         )  # fmt: skip
 
-    def on_device(self, device: Any) -> Any:
+    def on_device(self, device: DeviceLike) -> Any:
         """The kernels' view of this surface."""
         where = _device.resolve(device)
 

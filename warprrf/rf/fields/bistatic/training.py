@@ -10,7 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.device import Progress, check_array, check_count
+from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.geometry.mesh import GeometryLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import Regrouping, regroup
@@ -230,12 +231,12 @@ class TrainingViews:
 
 
 def trace(
-    geometry: Any,
+    geometry: GeometryLike,
     ds: SpectrumDataset,
     *,
     mirror_order: int | None = None,
     sub_pixels: int | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> TrainingViews:
     """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
@@ -284,12 +285,12 @@ class Trained:
 
 
 def train(
-    geometry: Any,
+    geometry: GeometryLike,
     ds: SpectrumDataset,
     options: FitOptions,
     *,
     transport: TrainingViews | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Trained:
     """Fit materials to the spectra of ``ds``; arguments and errors as for :meth:`BistaticField.fit`."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from warprrf.cache import Cache
+from warprrf.device import DeviceLike
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.elements import LIFT_M, ElementLinks
 from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M, MirrorLight, MirrorLit
@@ -139,7 +139,7 @@ class Transport:
         *,
         beam_sigma_rad: float | None = None,
         loss_per_m: float = 0.0,
-        device: Any = None,
+        device: DeviceLike = None,
     ) -> Transport:
         """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few of a surface are kept."""
         place = np.asarray(transmitter, np.float64).tobytes()

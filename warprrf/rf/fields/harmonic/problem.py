@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.fields.harmonic.transport import Transport
@@ -50,7 +51,7 @@ class Problem:
         *,
         batch: int = 10,
         seed: int = 0,
-        device: Any = None,
+        device: DeviceLike = None,
         precision: Any = np.float32,
     ) -> None:
         self.transport = transport
@@ -105,7 +106,7 @@ class Problem:
         return Batch(receivers, len(first), pair_weight=self.upload(part.weight[order]), **on_device)
 
 
-def harmonics(shape: tuple[int, int], real: Any, device: Any) -> wp.array:
+def harmonics(shape: tuple[int, int], real: Any, device: DeviceLike) -> wp.array:
     """The 16 real harmonics at every pixel's direction, shape ``(H * W,)`` of 16-vectors, on the device."""
     kernels = _kernels.build(real)
     kind = np.float64 if real is wp.float64 else np.float32
