@@ -457,7 +457,7 @@ class FullModel:
             ("diffuse_2", setup_s, {"diffuse_order": 3}),
         ):
             alone = replace(f, terms=replace(f.terms, **{**ONE_BOUNCE, **terms}))
-            bare = replace(view, mirror_lit=None, mirror_shown=None)
+            bare = replace(view, mirror_illumination=None, mirror_shown=None)
             self.seconds[name] = share + clock(partial(_further_image, alone, bare))
 
 

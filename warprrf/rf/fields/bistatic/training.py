@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
@@ -170,7 +170,7 @@ class FitOptions:
             found = replace(found, quick=False, **found._given(QUICK, QUICK))
         return found
 
-    def _given(self, values: dict[str, Any], names: Any) -> dict[str, Any]:
+    def _given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         """Of ``values`` those of ``names`` that are None here."""
         return {name: values[name] for name in names if getattr(self, name) is None}
 
