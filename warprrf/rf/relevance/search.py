@@ -163,8 +163,7 @@ class Relevance:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON, in one go."""
-        text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
-        write_text(path, text)
+        write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Relevance:
