@@ -210,7 +210,7 @@ def check_array(
     return array
 
 
-def check_count(name: str, value: Any, least: int = 1) -> int:
+def check_count(name: str, value: object, least: int = 1) -> int:
     """``value`` as a whole number of at least ``least``.
 
     Raises:
@@ -221,7 +221,7 @@ def check_count(name: str, value: Any, least: int = 1) -> int:
     return int(value)
 
 
-def check_positive(name: str, value: Any, what: str = "number") -> float:
+def check_positive(name: str, value: float | None, what: str = "number") -> float:
     """``value`` as a finite number above zero; ``what`` says of what kind it is.
 
     Raises:

@@ -42,7 +42,7 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
     write_atomically(path, write)
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
+def write_json(path: str | os.PathLike[str], value: object) -> None:
     """Write `value` as strict JSON: arrays become lists, NaN and infinities null."""
     write_text(path, json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -132,7 +131,7 @@ class PlanarPatches:
         return inside
 
 
-def planar_patches(mesh: Mesh, groups: Any = None) -> PlanarPatches:
+def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches:
     """The planar patches of ``mesh``.
 
     Args:

@@ -68,7 +68,7 @@ class ReceivedPaths:
 
 @dataclass(frozen=True)
 class DiffusePaths:
-    """Diffuse paths of one receiver, one per direction that meets a lit surface.
+    """Diffuse paths of one receiver, one per direction that meets an illuminated surface.
 
     Attributes:
         direction: Direction of arrival, shape ``(L, 3)``.
@@ -137,7 +137,7 @@ class ExactEngine:
         ]
 
     def diffuse(self, receiver: np.ndarray) -> DiffusePaths:
-        """Diffuse paths of one receiver (3,), one per direction that meets a lit surface."""
+        """Diffuse paths of one receiver (3,), one per direction that meets an illuminated surface."""
         grid = _sub_pixel_grid(self.shape, self.sub_pixels, str(self.device))
         mesh, count = self.tracer.mesh, len(grid.solid_angles)
         radiance = wp.zeros(count, dtype=wp.float64, device=self.device)
@@ -159,14 +159,14 @@ class ExactEngine:
         ]
         _device.launch(scatter_to_receiver, count, inputs, device=self.device)
         power = radiance.numpy() * grid.solid_angles
-        lit = np.flatnonzero(power > 0)
-        direction, power, reach = grid.directions[lit], power[lit], range_m.numpy()[lit]
+        positive = np.flatnonzero(power > 0)
+        direction, power, reach = grid.directions[positive], power[positive], range_m.numpy()[positive]
         if self.air is not None:
             way = receiver + reach[:, None] * direction - self.tracer.transmitter
             power = power * self.air.transmittance(
                 self.tracer.frequency_hz, np.linalg.norm(way, axis=1) + reach
             )
-        return DiffusePaths(direction, power, reach, lit)
+        return DiffusePaths(direction, power, reach, positive)
 
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""

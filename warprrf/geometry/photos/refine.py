@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -147,7 +146,7 @@ class _Refinement:
         self.log_scales = self.shaped("log_scales", wp.vec3, (n,))
         self.sh = self.shaped("sh", float, (n, self.widths["sh"] // 3, 3))
 
-    def shaped(self, name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+    def shaped(self, name: str, dtype: type, shape: tuple[int, ...]) -> wp.array:
         """A view of a parameter's flat array as vectors or a table, with one of its gradient as its gradient."""
         view, grad = (
             wp.array(ptr=flat.ptr, dtype=dtype, shape=shape, device=flat.device, copy=False)

@@ -8,7 +8,6 @@ centres lie at +0.5. A spherical image has zenith ``(i + 0.5) pi / H`` in row i 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -133,7 +132,7 @@ class Camera:
         return uv, distance
 
 
-def check_camera(cam: Any) -> None:
+def check_camera(cam: object) -> None:
     """Raise TypeError unless ``cam`` is a :class:`Camera`."""
     if not isinstance(cam, Camera):
         raise TypeError(

@@ -246,7 +246,7 @@ class GaussianRays:
 
         return values, adjoint
 
-    def _chain(self, kernel: Any, count: int, inputs: list[Any]) -> None:
+    def _chain(self, kernel: wp.Kernel, count: int, inputs: list[Any]) -> None:
         """Run a hit-wise adjoint, then add its sums to the gradients of the parameters."""
         if count == 0 or len(self) == 0:
             return
@@ -261,7 +261,9 @@ class GaussianRays:
         )  # fmt: skip
 
 
-def _pairs(first_name: str, first: Any, second_name: str, second: Any) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(
+    first_name: str, first: ArrayLike, second_name: str, second: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
     """Two arrays of float64 rows, one or N of each."""
     named = (first_name, first), (second_name, second)
     one, other = check_rows(*named)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -84,7 +83,7 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def __getitem__(self, chosen: Any) -> Gaussians:
+    def __getitem__(self, chosen: slice | np.ndarray) -> Gaussians:
         """The Gaussians that an index array, mask or slice selects."""
         return Gaussians(
             self.means[chosen],

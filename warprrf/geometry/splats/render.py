@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -118,7 +117,7 @@ def blend_weights(
     return BlendWeights(indices, weights, ranges, dominant, alpha, dropped)
 
 
-def _check(g: Any, cam: Any) -> None:
+def _check(g: object, cam: object) -> None:
     if not isinstance(g, Gaussians):
         raise TypeError(f"g: got {type(g).__name__}, expected warprrf.Gaussians")
     check_camera(cam)

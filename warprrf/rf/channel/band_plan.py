@@ -10,7 +10,6 @@ IEEE IMS 2019), 49 to 51 and 66 below it (S. Lee et al., IEEE JSSC 54(12), 2019)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -72,7 +71,7 @@ THZ_CHANNELS: dict[int, ThzChannel] = _plan()
 """All channels by number."""
 
 
-def thz_channel(number: Any) -> ThzChannel:
+def thz_channel(number: int) -> ThzChannel:
     """The channel of CHNL_ID ``number``.
 
     Raises:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,7 +62,7 @@ class Codebook:
         across, down = np.divmod(index, len(self.factors[1]))
         return np.kron(self.factors[0][across], self.factors[1][down])
 
-    def received(self, channel: Any) -> np.ndarray:
+    def received(self, channel: ArrayLike) -> np.ndarray:
         """w^T h of every beam for channels ``(..., N)``, shape ``(..., B)``."""
         h = np.asarray(channel)
         if h.shape[-1:] != (self.array.elements,):
@@ -357,16 +356,16 @@ def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
             yield departure if directed else None, kept.arrival, kept.power
     elif isinstance(source, Spectrum):
         power = np.asarray(source.path_gain, np.float64)
-        lit = power > 0
+        positive = power > 0
         departure = None
         if directed:
             if source.aod is None:
                 raise ValueError(
                     "source: got a spectrum without aod, expected departure angles with a tx_array"
                 )
-            lit &= np.isfinite(source.aod).all(axis=-1)
-            departure = directions_from_angles(source.aod[lit][:, 0], source.aod[lit][:, 1])
-        yield departure, pixel_directions(source.shape)[lit], power[lit]
+            positive &= np.isfinite(source.aod).all(axis=-1)
+            departure = directions_from_angles(source.aod[positive][:, 0], source.aod[positive][:, 1])
+        yield departure, pixel_directions(source.shape)[positive], power[positive]
     else:
         raise TypeError(f"source: got {type(source).__name__}, expected a Spectrum or Paths")
 

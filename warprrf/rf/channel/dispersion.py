@@ -144,9 +144,9 @@ def _weights(power: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarra
         raise ValueError(f"power: got shape {p.shape} for values of shape {v.shape}, expected the same")
     if (p < 0).any():
         raise ValueError("power: got negative values, expected linear power")
-    lit = p > 0
-    if not np.isfinite(v[lit]).all():
+    positive = p > 0
+    if not np.isfinite(v[positive]).all():
         raise ValueError("values: got NaN or infinite ones where there is power")
     total = p.sum(axis=-1, keepdims=True)
     share = np.divide(p, total, out=np.full(p.shape, np.nan), where=total > 0)
-    return share, np.where(lit, v, 0.0)
+    return share, np.where(positive, v, 0.0)

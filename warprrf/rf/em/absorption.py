@@ -37,7 +37,7 @@ class Air:
     pressure_hpa: float = PRESSURE_HPA
     water_vapour_g_m3: float = WATER_VAPOUR_G_M3
 
-    def attenuation_db_per_m(self, frequency_hz: Any) -> Any:
+    def attenuation_db_per_m(self, frequency_hz: ArrayLike) -> Any:
         """Specific attenuation [dB/m], shape as ``frequency_hz``; see :func:`gas_attenuation_db_per_m`."""
         return gas_attenuation_db_per_m(frequency_hz, **vars(self))
 
@@ -97,7 +97,7 @@ def air_of(gas: Gas, frequency_hz: float | None = None) -> Air | None:
 
 
 def gas_attenuation_db_per_m(
-    frequency_hz: Any,
+    frequency_hz: ArrayLike,
     *,
     temperature_k: float = TEMPERATURE_K,
     pressure_hpa: float = PRESSURE_HPA,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
@@ -60,9 +60,9 @@ class BeamOperator:
         """The transposed map of ``images`` (H, W, ...)."""
         return self._apply(self._backward, images, np.float32 if quick else np.float64)
 
-    def _apply(self, matrices: np.ndarray, images: np.ndarray, real: Any) -> np.ndarray:
+    def _apply(self, matrices: np.ndarray, images: np.ndarray, real: DTypeLike) -> np.ndarray:
         rows, columns = self.shape
-        flat = np.asarray(images, real).reshape(rows, columns, -1)
+        flat: np.ndarray = np.asarray(images, real).reshape(rows, columns, -1)
         count = flat.shape[2]
         x = np.moveaxis(rfft(flat, axis=1), 1, 0)
         product = matrices.astype(real, copy=False) @ np.concatenate([x.real, x.imag], axis=2)

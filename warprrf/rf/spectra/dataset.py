@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.em.absorption import Air
@@ -169,7 +170,7 @@ class SpectrumDataset:
         """10 log10(P + N0) [dB], shape ``(R, H, W)``, float64."""
         return to_db(self.path_gain, self.floor)
 
-    def subset(self, indices: Any) -> SpectrumDataset:
+    def subset(self, indices: ArrayLike) -> SpectrumDataset:
         """The receivers named by ``indices`` (whole numbers or a mask); floor and range stay those of the whole set."""
         chosen = np.asarray(indices)
         if chosen.dtype == bool:
