@@ -95,7 +95,7 @@ def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.
     """
     if method not in METHODS:
         raise ValueError(f"method: got {method!r}, expected one of {', '.join(METHODS)}")
-    _check_noise(noise)
+    check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels)
     if h.ndim == 2:
         if method == "slnr":
@@ -121,7 +121,7 @@ def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> n
     Raises:
         ValueError: naming the argument.
     """
-    _check_noise(noise)
+    check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels, allow_dark=True)
     w = np.asarray(weights, dtype=complex)
     if w.shape != h.shape[:2] or not (np.isfinite(w).all() and w.any(axis=1).all()):
@@ -183,7 +183,3 @@ def _checked(channels: ArrayLike, allow_dark: bool = False) -> np.ndarray:
             f"channels: users {dark.tolist()} get no power; expected some for all, leave them out"
         )
     return h
-
-
-def _check_noise(noise: float) -> None:
-    check_positive("noise", noise, "share of the transmitted power")

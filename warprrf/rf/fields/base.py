@@ -138,9 +138,9 @@ class RadioField(ABC):
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         if (np.linalg.norm(receivers - source, axis=1) == 0).any():
             raise ValueError("rx: got the transmitter's own position; expected them apart")
-        return self._links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
+        return self.trace_links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
 
-    def _links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked: from paths, one receiver at a time."""
         if options.mirror_order is not None:
             raise ValueError(

@@ -49,7 +49,8 @@ class LinkOptions:
     """How links are found.
 
     Attributes:
-        beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
+        beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
+            array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
         shape: rows and columns of the grid that rays fill; None for the model's default.
         mirror_order: most reflections on a mirror path, 0 to 3; None for the field's own.
         progress: called as ``progress("links", done, total)``.

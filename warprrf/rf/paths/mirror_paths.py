@@ -174,7 +174,7 @@ class ZoneRays:
     def mirror_share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Share of each path's rays that arrive; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
         count, order = patch.shape
-        legs = np.diff(_stops(self.source, point, ends), axis=1)
+        legs = np.diff(stops_of(self.source, point, ends), axis=1)
         lengths = np.linalg.norm(legs, axis=2)
         along = legs / np.maximum(lengths, 1e-12)[..., None]
         before = np.cumsum(lengths, axis=1)[:, :-1]
@@ -242,7 +242,7 @@ def _unobstructed(
     device: DeviceLike,
 ) -> np.ndarray:
     """Whether every leg of each path is free, shape ``(L,)``; the mirrors' own faces, true to a tolerance, are not met."""
-    stops = _stops(source, point, ends)
+    stops = stops_of(source, point, ends)
     free = np.ones(len(patch), bool)
     for k in range(patch.shape[1] + 1):
         own = np.flatnonzero(free)
@@ -282,7 +282,7 @@ def _described(
 ) -> MirrorPaths:
     """Rows of paths of one order (receiver, patch, point, share), what they lack of ``columns`` filled up."""
     row, patch, point, share = (a[found[3] >= LEAST_SHARE] for a in found)
-    stops = _stops(source, point, receivers[row])
+    stops = stops_of(source, point, receivers[row])
     legs = np.diff(stops, axis=1)
     lengths = np.linalg.norm(legs, axis=2)
     along = legs / np.maximum(lengths, 1e-12)[..., None]
@@ -302,7 +302,7 @@ def _described(
     )
 
 
-def _stops(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
+def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Transmitter, mirror points and receiver of each path, shape ``(L, k + 2, 3)``."""
     return np.concatenate([np.broadcast_to(source, (len(ends), 1, 3)), point, ends[:, None]], axis=1)
 

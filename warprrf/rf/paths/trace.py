@@ -17,7 +17,7 @@ from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths
+from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
 
@@ -131,12 +131,11 @@ class MirrorTracer:
         Raises:
             ValueError: on another order or shape, NaN, or a receiver at the transmitter's place.
         """
-        if isinstance(mirror_order, bool) or mirror_order != int(mirror_order) or mirror_order < 0:
-            raise ValueError(f"mirror_order: got {mirror_order!r}, expected a whole number of at least 0")
+        order = _device.check_count("mirror_order", mirror_order, 0)
         points = _device.check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():
             raise ValueError("receivers: got a receiver at the transmitter's place, expected them apart")
-        return exact_paths(self.images, points, int(mirror_order))
+        return exact_paths(self.images, points, order)
 
     def _reflected(self, found: MirrorPaths, receivers: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
         """Jones matrices ``(L, 2, 2)``, None for a bare mesh, and amplitudes ``(L,)``, both without the delay's phase."""
@@ -153,14 +152,7 @@ class MirrorTracer:
                 cos, self.table.permittivity[material], self.table.thickness_m[material], self.wavelength_m
             )
             smooth = np.sqrt(1.0 - self.table.scattering[material] ** 2)
-            stops = np.concatenate(
-                [
-                    np.broadcast_to(self.transmitter, (len(own), 1, 3)),
-                    found.point[own, :order],
-                    receivers[found.receiver[own], None],
-                ],
-                axis=1,
-            )
+            stops = stops_of(self.transmitter, found.point[own, :order], receivers[found.receiver[own]])
             normal, turn = self.patches.normal[patch], found.turn[own, :order]
             jones[own] = jones_matrices(stops, normal, turn, smooth * te, smooth * tm)
             phase[own] = np.where(te == 0, 1.0, te / np.where(te == 0, 1.0, np.abs(te))).prod(axis=1)

@@ -48,11 +48,7 @@ def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     gap = np.linalg.norm(centre - surface.element_centre[surface.element], axis=1)
     order = np.lexsort((gap, surface.element))
     first = order[np.searchsorted(surface.element[order], np.arange(len(surface.element_area)))]
-    normal = np.where(
-        ((surface.normal[first] * surface.mesh.face_normals[first]).sum(axis=1) < 0)[:, None],
-        -surface.normal[first],
-        surface.normal[first],
-    )
+    normal = surface.front_normal[first]
     return centre[first] + LIFT_M * normal, normal
 
 

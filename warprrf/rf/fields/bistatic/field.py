@@ -290,7 +290,8 @@ class BistaticField(RadioField):
         key = transport.transmitter.tobytes()
         return self._sent.get(key, lambda: sent_radiance(transport, self.materials))
 
-    def _links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+        """:meth:`links` at positions that were checked, several at a time."""
         transport = self.transport(transmitter)
         tracer = LinkTracer(transport, self.materials, self.sent_radiance(transport), options, self.shape)
         return options.in_batches(receivers, tracer.batch, tracer)

@@ -94,15 +94,13 @@ class Fitted:
 
     Attributes:
         parameters: the fitted parameters.
-        covariance: of the free ones (Laplace), shape ``(F, F)``; see ``layout``.
-        layout: which ones are free.
+        covariance: of the free ones (Laplace), shape ``(F, F)``; see :class:`Layout`.
         losses: objective after each step, per reading [dB^2].
         steps: steps taken.
     """
 
     parameters: Parameters
     covariance: np.ndarray
-    layout: Layout
     losses: list[float]
     steps: int
 
@@ -210,7 +208,7 @@ def fit_groups(
         losses.append(current / weight / count)
         if fall < o.tolerance and honest and (np.abs(move) < o.longest).all():
             break
-    return Fitted(layout.unpack(vector), np.linalg.inv(hessian), layout, losses, taken)
+    return Fitted(layout.unpack(vector), np.linalg.inv(hessian), losses, taken)
 
 
 def _normal_equations(

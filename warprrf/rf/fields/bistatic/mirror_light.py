@@ -56,9 +56,7 @@ class MirrorLight:
         images = MirrorImages(s.patches, transmitter, slack_m=MIRROR_SLACK_M, device=grid.device)
         face, patch, point = images.candidates(centre, 1)
         # Light must come from in front of the face, of either side if it has two, and not from its own patch.
-        normal = np.where(((s.normal * s.mesh.face_normals).sum(axis=1) < 0)[:, None], -s.normal, s.normal)[
-            face
-        ]
+        normal = s.front_normal[face]
         side = ((point[:, 0] - centre[face]) * normal).sum(axis=1)
         normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
         own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != patch[:, 0]))

@@ -78,6 +78,12 @@ class Surface:
     transports: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
+    @cached_property
+    def front_normal(self) -> np.ndarray:
+        """``normal`` on the side that each face is wound for, shape ``(F, 3)``."""
+        behind = (self.normal * self.mesh.face_normals).sum(axis=1, keepdims=True) < 0
+        return np.where(behind, -self.normal, self.normal)
+
     @property
     def groups(self) -> int:
         """Number of groups."""
@@ -105,7 +111,7 @@ class Surface:
         if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
             patches = found
             patch, planes = found.face_patch, (found.normal, found.offset)
-            normal = _normals(found)
+            normal = _on_patches(found, smoothed_normals(found.mesh, 3))
             group, sort, colour = colour_groups(mesh, patch, gaussians)
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
@@ -116,10 +122,7 @@ class Surface:
             patch = order[patches.face_patch].astype(np.int32)
             planes = patches.normal[large], patches.offset[large]
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
-            normal, skin = mesh.face_normals.copy(), max(TRUE_SKIN_M, patches.tolerance_m)
-            flat = patches.face_patch >= 0
-            whole = patches.normal[patches.face_patch[flat]]
-            normal[flat] = np.where((whole * normal[flat]).sum(axis=1, keepdims=True) < 0, -whole, whole)
+            normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
             if material is None:
                 group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
             else:
@@ -218,11 +221,11 @@ def _split_long(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     return Mesh(vertices, np.concatenate(done_faces)), np.concatenate(done_parent)
 
 
-def _normals(patches: PlanarPatches) -> np.ndarray:
-    """Normal of each face: of its patch, on the side that it is wound for, else smoothed, shape ``(F, 3)``."""
-    mesh, own = patches.mesh, patches.face_patch >= 0
-    normal = smoothed_normals(mesh, 3)
+def _on_patches(patches: PlanarPatches, normal: np.ndarray) -> np.ndarray:
+    """``normal`` (F, 3), but of its patch where a face has one, on the side that the face is wound for."""
+    own = patches.face_patch >= 0
     flat = patches.normal[patches.face_patch[own]]
-    turned = (flat * mesh.face_normals[own]).sum(axis=1) < 0
-    normal[own] = np.where(turned[:, None], -flat, flat)
-    return normal
+    turned = (flat * patches.mesh.face_normals[own]).sum(axis=1, keepdims=True) < 0
+    result = normal.copy()
+    result[own] = np.where(turned, -flat, flat)
+    return result

@@ -15,7 +15,7 @@ from warprrf.geometry.mesh import GeometryLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import Regrouping, regroup
-from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters
+from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.render import render, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
@@ -526,8 +526,7 @@ class _Training:
         rounds = self.choose.rounds if rounds is None else rounds
         if not terms.after_first_bounce:
             rounds = 1
-        layout = Layout(*start.log_weight.shape, indirect=False, gain=False)
-        fit = Fitted(start, np.zeros((0, 0)), layout, [], 0)
+        fit = Fitted(start, np.zeros((0, 0)), [], 0)
         for _ in range(rounds):
             follow = bool(self.material.max() < self.choose.few_materials)
             readings = self._readings(terms, fit, chosen, follow=follow)
