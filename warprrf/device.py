@@ -16,13 +16,17 @@ from functools import cache
 from itertools import pairwise
 from threading import RLock
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike, DTypeLike
 
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default: it would announce devices and every compiled module
     wp.config.log_level = wp.LOG_ERROR
+
+DeviceLike: TypeAlias = str | wp.Device | None
+"""A Warp device or its name (``"cpu"``, ``"cuda:0"``); ``None``: Warp's preferred one, CUDA where there is a GPU."""
 
 Progress = Callable[[str, int, int], None]
 """``progress(stage, done, total)``: called by long work; the library itself never prints."""
@@ -33,7 +37,7 @@ MIN_SPLIT = 256
 PIECES_PER_THREAD = 4
 
 
-def resolve(device: Any = None) -> wp.Device:
+def resolve(device: DeviceLike = None) -> wp.Device:
     """The Warp device that ``device`` names (``None``: Warp's preferred one, CUDA where there is a GPU).
 
     Raises:
@@ -78,10 +82,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def launch(
-    kernel: Any,
+    kernel: wp.Kernel,
     dim: int,
     inputs: Sequence[Any],
-    device: Any = None,
+    device: DeviceLike = None,
     *,
     grain: int = MIN_SPLIT,
     pieces: int | None = None,
@@ -97,8 +101,8 @@ def launch(
     """
     if dim <= 0:
         return
-    device = resolve(device)
-    if device.is_cuda:
+    where = resolve(device)
+    if where.is_cuda:
         bounds: Sequence[int] = [0, dim]
     elif cuts is not None:
         bounds = cuts
@@ -111,15 +115,15 @@ def launch(
         bounds = [dim * k // count for k in range(count + 1)]
     arguments = [bounds[0], *inputs]
     with building:
-        kernel.module.load(device, block_dim=256 if device.is_cuda else 1)
+        kernel.module.load(where, block_dim=256 if where.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
     if len(bounds) == 2:
-        wp.launch(kernel, dim=size, inputs=arguments, device=device, record_tape=False, **extra)
+        wp.launch(kernel, dim=size, inputs=arguments, device=where, record_tape=False, **extra)
         return
     # Arguments are packed once; a piece differs in its offset and length.
     whole = wp.launch(
-        kernel, dim=size, inputs=arguments, device=device, record_tape=False, record_cmd=True, **extra
+        kernel, dim=size, inputs=arguments, device=where, record_tape=False, record_cmd=True, **extra
     )
     _issue(_cut(whole, bounds))
 
@@ -167,9 +171,9 @@ def require(module: str, extra: str) -> ModuleType:
 
 def check_array(
     name: str,
-    value: Any,
+    value: ArrayLike | wp.array,
     shape: tuple[int | None, ...] | None = None,
-    dtype: Any = np.float64,
+    dtype: DTypeLike = np.float64,
     finite: bool = True,
 ) -> np.ndarray:
     """``value`` (NumPy, Warp, torch or nested lists) as a contiguous NumPy array of ``shape`` and ``dtype``.
@@ -204,3 +208,25 @@ def check_array(
         bad = int(np.count_nonzero(~np.isfinite(array)))
         raise ValueError(f"{name}: got {bad} values that are NaN or infinite, expected finite numbers")
     return array
+
+
+def check_count(name: str, value: object, least: int = 1) -> int:
+    """``value`` as a whole number of at least ``least``.
+
+    Raises:
+        ValueError: otherwise, naming the argument.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+    return int(value)
+
+
+def check_positive(name: str, value: float | None, what: str = "number") -> float:
+    """``value`` as a finite number above zero; ``what`` says of what kind it is.
+
+    Raises:
+        ValueError: otherwise, naming the argument.
+    """
+    if value is None or not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{name}: got {value!r}, expected a positive {what}")
+    return float(value)

@@ -42,10 +42,9 @@ def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray])
     write_atomically(path, write)
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
+def write_json(path: str | os.PathLike[str], value: object) -> None:
     """Write `value` as strict JSON: arrays become lists, NaN and infinities null."""
-    text = json.dumps(plain(value), indent=1, allow_nan=False)
-    write_atomically(path, lambda file: file.write_text(text + "\n", encoding="utf-8"))
+    write_text(path, json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
 def plain(value: Any) -> Any:

@@ -32,7 +32,7 @@ from warprrf.files import plain, write_atomically, write_json
 HEARTBEAT_S = 5.0  # how much time of a killed attempt may go unrecorded
 
 
-def digest(*parts: Any) -> str:
+def digest(*parts: object) -> str:
     """SHA-256 [hex] of ``parts``, by value.
 
     A ``Path`` counts by the names and content of its files, an array by type, shape and content, a dataclass by its

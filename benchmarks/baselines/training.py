@@ -19,8 +19,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from benchmarks.baselines.images import SpectrumImages, path_gain_of
+from warprrf import tensor_files
 from warprrf.device import Progress, check_array, require
-from warprrf.rf.fields import files as field_files
 from warprrf.rf.spectra.spectrum import Spectrum
 from warprrf.steps import digest
 
@@ -118,7 +118,7 @@ def train(learner: Learner, how: Training, identity: str) -> list[float]:
     path = None if how.checkpoint is None else Path(how.checkpoint)
     losses: list[float] = []
     if path is not None and path.exists():
-        tensors, header = field_files.read(path, CHECKPOINT_FORMAT)
+        tensors, header = tensor_files.read(path, CHECKPOINT_FORMAT)
         if header.get("identity") != identity:
             raise ValueError(
                 f"checkpoint: {path} belongs to a training with other data or options; delete it or name another file"
@@ -135,7 +135,7 @@ def train(learner: Learner, how: Training, identity: str) -> list[float]:
         if how.progress is not None:
             how.progress("fit", i + 1, how.iterations)
         if path is not None and time.monotonic() - saved > CHECKPOINT_S:
-            field_files.write(
+            tensor_files.write(
                 path,
                 _state(learner.networks, learner.optimisers),
                 {"identity": identity, "losses": losses},
@@ -251,7 +251,7 @@ class ImageModel(ABC):
             "range_db": self.range_db,
             "report": self.report,
         }
-        field_files.write(path, tensors, header, FORMAT)
+        tensor_files.write(path, tensors, header, FORMAT)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> Any:
@@ -261,7 +261,7 @@ class ImageModel(ABC):
             FileNotFoundError: if there is no such file.
             ValueError: if it is corrupt, or another model's.
         """
-        tensors, header = field_files.read(path, FORMAT)
+        tensors, header = tensor_files.read(path, FORMAT)
         if header.get("model") != cls.__name__:
             raise ValueError(
                 f"{os.fspath(path)}: holds a {header.get('model')!r}, expected a {cls.__name__!r}"

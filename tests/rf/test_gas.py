@@ -221,7 +221,7 @@ def test_light_that_mirrors_throw_has_its_images_length(scene: RadioScene, dry: 
     views = [
         one.transport().on_grid((16, 32), 1, 1).view(SEEN, one.terms) for one in (field, field.with_gas())
     ]
-    before, after = (view.mirror_lit for view in views)
+    before, after = (view.mirror_illumination for view in views)
     point = views[0].hits.points(before.ray)
     normal, offset = surface.plane_normal[before.patch], surface.plane_offset[before.patch]
     image = TX - 2.0 * (normal @ TX - offset)[:, None] * normal

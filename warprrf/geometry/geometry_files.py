@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.files import write_atomically
+from warprrf import tensor_files
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -23,27 +22,12 @@ Arrays = dict[str, np.ndarray]
 
 def write(path: Path, arrays: Arrays, header: Mapping[str, Any] | None = None) -> None:
     """Write ``arrays`` by name, and ``header`` (plain values), to ``path``."""
-    from safetensors.numpy import save_file
-
-    whole = {name: np.ascontiguousarray(values) for name, values in arrays.items()}
-    metadata = {"header": json.dumps(header or {})}
-    write_atomically(path, lambda file: save_file(whole, file, metadata=metadata))
+    tensor_files.write(path, arrays, header or {}, None)
 
 
-def read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and header that :func:`write` wrote.
-
-    Raises:
-        ValueError: if the file is damaged or none of these.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {})["header"])
-            return {k: file.get_tensor(k) for k in file.keys()}, header  # noqa: SIM118 (not a mapping)
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is damaged or not ours: {error}; delete it, or restore it") from error
+def read(path: Path) -> tuple[Arrays, dict[str, Any]]:
+    """Arrays and header that :func:`write` wrote; errors as for :func:`warprrf.tensor_files.read`."""
+    return tensor_files.read(path, None)
 
 
 def of_gaussians(gaussians: Gaussians) -> Arrays:

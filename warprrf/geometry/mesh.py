@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces
 
@@ -50,7 +52,7 @@ class Mesh:
         ValueError: on a wrong shape, no faces, an index out of range, or vertices that are not finite.
     """
 
-    def __init__(self, vertices: Any, faces: Any) -> None:
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
         self.vertices: np.ndarray = _device.check_array("vertices", vertices, (None, 3)).copy()
         raw = _device.check_array("faces", faces, (None, 3), dtype=np.float64)
         self.faces: np.ndarray = raw.astype(np.int32)
@@ -137,11 +139,13 @@ class Mesh:
                 self._search = RaySearch(self.vertices, self.faces, self.face_normals, self.bounds)
             return self._search
 
-    def on_device(self, device: Any = None) -> wp.Mesh:
+    def on_device(self, device: DeviceLike = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""
         return self._rays.on_device(_device.resolve(device))[0]
 
-    def cast(self, origins: Any, directions: Any, *, device: Any = None, backend: str = "auto") -> Hit:
+    def cast(
+        self, origins: ArrayLike, directions: ArrayLike, *, device: DeviceLike = None, backend: str = "auto"
+    ) -> Hit:
         """The nearest surface along rays; one that passes through a ray's very start is not met.
 
         Args:
@@ -169,10 +173,10 @@ class Mesh:
 
     def visible(
         self,
-        a: Any,
-        b: Any,
+        a: ArrayLike,
+        b: ArrayLike,
         *,
-        device: Any = None,
+        device: DeviceLike = None,
         clearance: float = ENDPOINT_CLEARANCE,
         backend: str = "auto",
     ) -> np.ndarray:
@@ -193,7 +197,7 @@ class Mesh:
         where = _device.resolve(device)
         return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
-    def closest(self, points: Any, *, device: Any = None) -> Closest:
+    def closest(self, points: ArrayLike, *, device: DeviceLike = None) -> Closest:
         """The nearest point of the surface to each of ``points`` (N, 3) [m], in float64 once the face is known."""
         p = _device.check_array("points", points, (None, 3))
         where = _device.resolve(device)
@@ -211,7 +215,7 @@ class Mesh:
         nearest = _closest_on_triangles(p, self.triangles[index])
         return Closest(distance=np.linalg.norm(nearest - p, axis=1), point=nearest, face=index)
 
-    def distance(self, points: Any, *, device: Any = None) -> np.ndarray:
+    def distance(self, points: ArrayLike, *, device: DeviceLike = None) -> np.ndarray:
         """Distance from each of ``points`` (N, 3) [m] to the surface [m], shape ``(N,)``."""
         return self.closest(points, device=device).distance
 
@@ -229,7 +233,7 @@ class Mesh:
         points = np.stack(ends, axis=1)  # exactly two of the three edges cross
         return points[~np.isnan(points[:, :, 0])].reshape(-1, 2, 2)
 
-    def winding_number(self, points: Any) -> np.ndarray:
+    def winding_number(self, points: ArrayLike) -> np.ndarray:
         """Solid angle that the faces subtend at each of ``points`` (N, 3), over 4 pi, shape ``(N,)``.
 
         Of a closed mesh it is whole: how many of its parts, wound outward, a point lies in. Source: van Oosterom and
@@ -250,8 +254,28 @@ class Mesh:
         return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)
 
 
-def as_mesh(mesh_or_scene: Any) -> Mesh:
-    """The mesh of a scene, or the mesh itself.
+def vectors_across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across each unit direction ``(N, 3)`` and each other."""
+    u = np.cross(direction, np.eye(3)[np.abs(direction).argmin(axis=1)])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, np.cross(direction, u)
+
+
+class Geometry(Protocol):
+    """Anything with a mesh: a Reconstruction, a Scene, planar patches, a fitted field's surface."""
+
+    @property
+    def mesh(self) -> Mesh:
+        """Its surfaces."""
+
+
+GeometryLike: TypeAlias = Mesh | Geometry
+"""What functions that need a room's surfaces take: a mesh or anything that has one."""
+
+
+def as_mesh(mesh_or_scene: GeometryLike, name: str = "mesh_or_scene") -> Mesh:
+    """The mesh of a scene, a reconstruction or anything else that has one, or the mesh itself; ``name`` is
+    the argument that it came by.
 
     Raises:
         TypeError: if it is neither.
@@ -261,7 +285,9 @@ def as_mesh(mesh_or_scene: Any) -> Mesh:
     mesh = getattr(mesh_or_scene, "mesh", None)
     if isinstance(mesh, Mesh):
         return mesh
-    raise TypeError(f"mesh_or_scene: got {type(mesh_or_scene).__name__}, expected a Mesh or a Scene")
+    raise TypeError(
+        f"{name}: got {type(mesh_or_scene).__name__}, expected a Mesh, a Scene or anything else with a mesh"
+    )
 
 
 def _closest_on_triangles(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:

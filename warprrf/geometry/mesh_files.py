@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.device import check_array, require
 from warprrf.files import write_atomically
@@ -68,7 +69,9 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshFile:
     return MeshFile(vertices, faces, None if uv is None else np.asarray(uv, dtype=np.float64))
 
 
-def write_mesh(path: str | os.PathLike[str], vertices: Any, faces: Any, *, uv: Any = None) -> None:
+def write_mesh(
+    path: str | os.PathLike[str], vertices: ArrayLike, faces: ArrayLike, *, uv: ArrayLike | None = None
+) -> None:
     """Write a mesh (the suffix of ``path`` picks the format) to a temporary name, then move it into place.
 
     Args:

@@ -9,6 +9,13 @@ from scipy.sparse import csgraph
 from warprrf.geometry.mesh import Mesh
 
 
+def components(count: int, pairs: np.ndarray) -> np.ndarray:
+    """Number of the connected component of each of ``count`` things, of which ``pairs`` (N, 2) are linked, ``(count,)``."""
+    link = sparse.coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
+    found: np.ndarray = csgraph.connected_components(link, directed=False)[1]
+    return found
+
+
 def face_neighbours(faces: np.ndarray) -> np.ndarray:
     """The face across each edge, -1 at a border (and at edges of more than two faces), shape ``(F, 3)`` int64."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
@@ -26,9 +33,7 @@ def connected_pieces(mesh: Mesh, label: np.ndarray) -> np.ndarray:
     """Numbers of the connected pieces of faces that share a label, shape ``(F,)``; a face labelled -1 is a piece."""
     ring = face_neighbours(mesh.faces)
     face, side = np.nonzero((ring >= 0) & (label >= 0)[:, None] & (label[ring] == label[:, None]))
-    link = sparse.coo_matrix((np.ones(len(face)), (face, ring[face, side])), shape=(len(label),) * 2)
-    piece: np.ndarray = csgraph.connected_components(link, directed=False)[1]
-    return piece
+    return components(len(label), np.column_stack([face, ring[face, side]]))
 
 
 def smoothed_normals(mesh: Mesh, rounds: int) -> np.ndarray:

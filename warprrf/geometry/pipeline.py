@@ -16,7 +16,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from warprrf.device import Progress
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -44,7 +44,7 @@ def reconstruct(
     config: ReconstructionConfig | None = None,
     seed: int = 0,
     progress: Progress | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> Reconstruction:
     """Geometry of a static place from photos of it.
 
@@ -109,7 +109,7 @@ def _steps(
     fitted: Mapping[str, Path],
     config: ReconstructionConfig,
     seed: int,
-    device: Any,
+    device: DeviceLike,
 ) -> tuple[Gaussians, PlanarPatches]:
     """The steps after structure from motion: planes and Gaussians to start from, Gaussians refined, mesh and patches.
 

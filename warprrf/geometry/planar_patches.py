@@ -11,38 +11,18 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh import Mesh, vectors_across
+from warprrf.geometry.mesh_topology import components
 
-
-@dataclass(frozen=True)
-class PatchConfig:
-    """When faces share a plane.
-
-    Attributes:
-        noise_m: Standard deviation of the vertices' position errors [m]. None: estimated from the mesh, see
-            :func:`vertex_noise`; it is never taken below the spacing of float32 numbers at its coordinates.
-        flat_m: Corners may lie this far from their patch's plane [m], and six standard deviations more.
-        flat_rad: Faces may be turned this much against their patch [rad], and by three standard deviations over the
-            faces' heights more.
-    """
-
-    noise_m: float | None = None
-    flat_m: float = 1e-5
-    flat_rad: float = 1.4e-3
-
-    def __post_init__(self) -> None:
-        for name in ("flat_m", "flat_rad"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected a positive number")
-        if self.noise_m is not None and not (np.isfinite(self.noise_m) and self.noise_m >= 0):
-            raise ValueError(f"noise_m: got {self.noise_m!r}, expected a length of at least 0, or None")
+FLAT_M = 1e-5
+"""Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
+FLAT_RAD = 1.4e-3
+"""Faces may be turned this much against their patch [rad], and by three standard deviations over their heights more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +59,9 @@ class PlanarPatches:
     def from_planes(
         cls,
         mesh: Mesh,
-        face_patch: Any,
-        normal: Any,
-        offset: Any,
+        face_patch: ArrayLike,
+        normal: ArrayLike,
+        offset: ArrayLike,
         *,
         tolerance_m: float,
         two_sided: bool = False,
@@ -151,13 +131,12 @@ class PlanarPatches:
         return inside
 
 
-def planar_patches(mesh: Mesh, groups: Any = None, config: PatchConfig | None = None) -> PlanarPatches:
+def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches:
     """The planar patches of ``mesh``.
 
     Args:
         mesh: Any triangle mesh; faces that share an edge at one place are neighbours, whatever their vertices' indices.
         groups: Index of what must not share a patch, for each face, shape ``(F,)``; materials, say.
-        config: When faces share a plane.
 
     Returns:
         Patches, largest first. Faces with hardly any area that fit no neighbour have none.
@@ -168,7 +147,6 @@ def planar_patches(mesh: Mesh, groups: Any = None, config: PatchConfig | None = 
     Warns:
         UserWarning: if faces at one place are of different groups: the first is taken.
     """
-    config = config or PatchConfig()
     count = len(mesh.faces)
     group = np.full(count, -1, np.int32) if groups is None else np.asarray(groups, np.int32)
     if group.shape != (count,):
@@ -181,8 +159,8 @@ def planar_patches(mesh: Mesh, groups: Any = None, config: PatchConfig | None = 
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
     once &= ~_is_sliver(corner, height, rounding)
     pairs = _neighbours(corner, np.flatnonzero(once))
-    noise = vertex_noise(mesh, pairs, rounding) if config.noise_m is None else max(config.noise_m, rounding)
-    faces = _Faces(mesh, group, height, config.flat_m + 6.0 * noise, config.flat_rad, 3.0 * noise)
+    noise = vertex_noise(mesh, pairs, rounding)
+    faces = _Faces(mesh, group, height, FLAT_M + 6.0 * noise, 3.0 * noise)
     piece = _pieces(faces, once, pairs)
     return _assembled(faces, piece, first)
 
@@ -223,12 +201,11 @@ class _Faces:
     group: np.ndarray
     height: np.ndarray
     distance_m: float
-    angle_rad: float
     sway_m: float
 
     def turn_limit(self, height: np.ndarray) -> np.ndarray:
         """Greatest angle to a patch of a face of this height [rad]."""
-        return self.angle_rad + self.sway_m / np.maximum(height, 1e-300)
+        return FLAT_RAD + self.sway_m / np.maximum(height, 1e-300)
 
     def gap(self, face: np.ndarray, normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
         """Largest distance of the corners of each face from its plane [m], shape ``(N,)``."""
@@ -241,8 +218,7 @@ def _welded(mesh: Mesh, distance_m: float) -> np.ndarray:
     """Faces with vertices of one place given one index, shape ``(F, 3)``."""
     point, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     near = cKDTree(point).query_pairs(distance_m, output_type="ndarray")
-    link = coo_array((np.ones(len(near), bool), near.T), shape=(len(point), len(point)))
-    return connected_components(link, directed=False)[1][index.reshape(-1)][mesh.faces]
+    return components(len(point), near)[index.reshape(-1)][mesh.faces]
 
 
 def _first_at_place(corner: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -292,7 +268,7 @@ def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     # A face so slim that its normal says nothing joins its neighbours later, when it has a plane to be judged by.
     flat &= np.minimum(faces.height[big], faces.height[small]) > 8.0 * faces.sway_m
     flat &= faces.gap(small, n[big], offset[big]) <= faces.distance_m
-    piece = _components(len(mesh.faces), pairs[flat])
+    piece = components(len(mesh.faces), pairs[flat])
     piece = np.where(once, piece, -1)
     piece = _numbered(piece)
     own = np.flatnonzero(piece >= 0)
@@ -415,9 +391,7 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
     middle = middle / np.maximum(np.bincount(p, mesh.areas[own]), 1e-300)[:, None]
     x = 0.5 * (mesh.triangles[own] + np.roll(mesh.triangles[own], 1, axis=1)) - middle[p][:, None]
     for _ in range(2):
-        across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-        u = across / np.linalg.norm(across, axis=1, keepdims=True)
-        frame = np.stack([u, np.cross(normal, u), normal], axis=1)
+        frame = np.stack([*vectors_across(normal), normal], axis=1)
         # Midpoints of edges integrate squares over a triangle exactly.
         a, b, r = np.moveaxis(np.einsum("nij,nkj->nki", frame[p], x), 2, 0)
         weight = mesh.areas[own][:, None] / 3.0
@@ -430,11 +404,6 @@ def _fit(mesh: Mesh, own: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.nda
         normal = normal - np.einsum("pi,pij->pj", slope, frame[:, :2])
         normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     return normal, np.einsum("pi,pi->p", normal, middle)
-
-
-def _components(count: int, pairs: np.ndarray) -> np.ndarray:
-    link = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
-    return connected_components(link, directed=False)[1]
 
 
 def _numbered(label: np.ndarray) -> np.ndarray:

@@ -183,7 +183,7 @@ class RaySearch:
         scene, planes = self._embree(), _given(self._planes, wp.vec4d, cpu)
         count = max(len(o), len(d))
         t, face = np.empty(count), np.full(count, AGAIN, dtype=np.int32)
-        which: Any = slice(None)
+        which: slice | np.ndarray = slice(None)
         start = np.empty(0)
         while True:
             origin, toward = rows(o, which), rows(d, which)
@@ -315,7 +315,7 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
 
 
-def rows(array: np.ndarray, which: Any) -> np.ndarray:
+def rows(array: np.ndarray, which: slice | np.ndarray) -> np.ndarray:
     """Rows of an array that may hold one row for all."""
     return array if len(array) == 1 else array[which]
 
@@ -338,7 +338,7 @@ def check_rows(first: tuple[str, Any], second: tuple[str, Any]) -> tuple[np.ndar
     return arrays[0], arrays[1]
 
 
-def _given(array: np.ndarray, dtype: Any, device: wp.Device) -> wp.array:
+def _given(array: np.ndarray, dtype: type, device: wp.Device) -> wp.array:
     """``array`` for a kernel, without a copy on a CPU."""
     return wp.array(array, dtype=dtype, device=device, copy=False)
 

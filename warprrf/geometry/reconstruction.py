@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
@@ -61,6 +61,11 @@ class Reconstruction:
     def __repr__(self) -> str:
         faces = f"{len(self._mesh.faces)} triangles" if self._mesh is not None else "no mesh"
         return f"Reconstruction({len(self.gaussians)} Gaussians, {faces}, {len(self.cameras)} cameras)"
+
+    @property
+    def has_mesh(self) -> bool:
+        """Whether there is a mesh."""
+        return self._mesh is not None
 
     @property
     def mesh(self) -> Mesh:
@@ -143,7 +148,7 @@ class Reconstruction:
         *,
         config: ReconstructionConfig | None = None,
         progress: Progress | None = None,
-        device: Any = None,
+        device: DeviceLike = None,
     ) -> Reconstruction:
         """Your own splats: skips stage 1. Splats, mesh and poses must share one metric, z-up frame.
 

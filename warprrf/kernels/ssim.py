@@ -20,7 +20,7 @@ C1, C2 = 0.01**2, 0.03**2  # the paper's constants for a range of one
 
 
 @cache
-def _filters(real: Any) -> tuple[Any, Any]:
+def _filters(real: type) -> tuple[Any, Any]:
     """The kernels that average over the window, along rows and along columns."""
     vec3 = wp.types.vector(3, real)
     window = wp.constant(wp.types.vector(len(WINDOW), real)(*WINDOW))
@@ -71,7 +71,7 @@ def _filters(real: Any) -> tuple[Any, Any]:
 
 
 @cache
-def build(real: Any) -> SimpleNamespace:
+def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)
     c1 = wp.constant(real(C1))

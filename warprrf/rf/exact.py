@@ -14,19 +14,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.radio.scatter import scatter_to_receiver
-from warprrf.rf.em.absorption import air_of
+from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.fresnel import SurfaceTable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import MirrorTracer
+from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     angles_from_directions,
@@ -66,7 +68,7 @@ class ReceivedPaths:
 
 @dataclass(frozen=True)
 class DiffusePaths:
-    """Diffuse paths of one receiver, one per direction that meets a lit surface.
+    """Diffuse paths of one receiver, one per direction that meets an illuminated surface.
 
     Attributes:
         direction: Direction of arrival, shape ``(L, 3)``.
@@ -97,15 +99,15 @@ class ExactEngine:
 
     def __init__(
         self,
-        scene: Any,
+        scene: Scene,
         *,
-        transmitter: Any,
+        transmitter: ArrayLike,
         frequency_hz: float,
         shape: tuple[int, int],
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         sub_pixels: int = SUB_PIXELS,
-        gas: Any = False,
-        device: Any = None,
+        gas: Gas = False,
+        device: DeviceLike = None,
     ) -> None:
         if sub_pixels < 1:
             raise ValueError(f"sub_pixels: got {sub_pixels!r}, expected at least 1")
@@ -135,7 +137,7 @@ class ExactEngine:
         ]
 
     def diffuse(self, receiver: np.ndarray) -> DiffusePaths:
-        """Diffuse paths of one receiver (3,), one per direction that meets a lit surface."""
+        """Diffuse paths of one receiver (3,), one per direction that meets an illuminated surface."""
         grid = _sub_pixel_grid(self.shape, self.sub_pixels, str(self.device))
         mesh, count = self.tracer.mesh, len(grid.solid_angles)
         radiance = wp.zeros(count, dtype=wp.float64, device=self.device)
@@ -157,16 +159,16 @@ class ExactEngine:
         ]
         _device.launch(scatter_to_receiver, count, inputs, device=self.device)
         power = radiance.numpy() * grid.solid_angles
-        lit = np.flatnonzero(power > 0)
-        direction, power, reach = grid.directions[lit], power[lit], range_m.numpy()[lit]
+        positive = np.flatnonzero(power > 0)
+        direction, power, reach = grid.directions[positive], power[positive], range_m.numpy()[positive]
         if self.air is not None:
             way = receiver + reach[:, None] * direction - self.tracer.transmitter
             power = power * self.air.transmittance(
                 self.tracer.frequency_hz, np.linalg.norm(way, axis=1) + reach
             )
-        return DiffusePaths(direction, power, reach, lit)
+        return DiffusePaths(direction, power, reach, positive)
 
-    def receive(self, receiver: Any) -> ReceivedPaths:
+    def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         point = _device.check_array("receiver", receiver, (3,))
         specular = self.tracer.trace(point, 1).with_gas(self.air)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.device import check_array
 from warprrf.geometry.mesh import Mesh
@@ -12,7 +11,7 @@ from warprrf.geometry.mesh import Mesh
 ON_A_WALL_M = 1e-4  # a receiver nearer to the mesh than this sits in the wall
 
 
-def check_receiver(name: str, position: Any, mesh: Mesh | None) -> np.ndarray:
+def check_receiver(name: str, position: ArrayLike, mesh: Mesh | None) -> np.ndarray:
     """``position`` (3,) or (R, 3) [m] if spectra can be asked for there.
 
     Raises:

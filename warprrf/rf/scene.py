@@ -11,11 +11,11 @@ import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from warprrf.device import check_array
+from warprrf.device import DeviceLike, check_array
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.materials import Material, load_materials
@@ -37,9 +37,9 @@ class Scene:
         self,
         mesh: Mesh,
         materials: Sequence[Material],
-        face_material: Any,
+        face_material: ArrayLike,
         *,
-        face_object: Any = None,
+        face_object: ArrayLike | None = None,
         object_names: Sequence[str] = ("object",),
         xml_path: str | os.PathLike[str] | None = None,
     ) -> None:
@@ -144,7 +144,9 @@ class Scene:
             raise ValueError(f"name: got {name!r}, expected one of {', '.join(self.object_names)}")
         return np.flatnonzero(self.face_object == self.object_names.index(name))
 
-    def is_free(self, points: Any, *, clearance_m: float = 0.0, device: Any = None) -> np.ndarray:
+    def is_free(
+        self, points: ArrayLike, *, clearance_m: float = 0.0, device: DeviceLike = None
+    ) -> np.ndarray:
         """Whether points lie in the air of a room of closed solids, shape ``(N,)``, bool.
 
         A point is in the air if rays from it in three directions all first meet a surface from its outer side, and no

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.device import Progress
-from warprrf.geometry.mesh import as_mesh
-from warprrf.rf.em.absorption import air_of
+from warprrf.device import DeviceLike, Progress
+from warprrf.geometry.mesh import GeometryLike, as_mesh
+from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
@@ -35,8 +36,8 @@ _TRIES = 200
 def simulate(
     scene: Scene,
     *,
-    transmitter: Any,
-    receivers: Any,
+    transmitter: ArrayLike,
+    receivers: ArrayLike,
     frequency_hz: float,
     shape: tuple[int, int] = DEFAULT_SHAPE,
     engine: str = "exact",
@@ -45,12 +46,12 @@ def simulate(
     beam_sigma_rad: float = BEAM_SIGMA_RAD,
     refraction: bool = False,
     seed: int = 0,
-    gas: Any = False,
-    roles: Any = None,
+    gas: Gas = False,
+    roles: Sequence[str] | np.ndarray | None = None,
     floor: float | None = None,
     workspace: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> SpectrumDataset:
     """Spectra of one transmitter at many receivers.
 
@@ -122,7 +123,7 @@ def simulate(
         path_gain=np.stack([r.path_gain.astype(np.float32) for r in results]),
         delay_s=np.stack([r.delay_s for r in results]),
         aod=np.stack([r.aod.astype(np.float32) for r in results]),
-        line_of_sight=[r.line_of_sight for r in results],
+        line_of_sight=np.array([r.line_of_sight for r in results]),
         beam_sigma_rad=beam_sigma_rad,
         engine=engine,
         seed=seed,
@@ -135,7 +136,7 @@ def simulate(
 
 
 def check_positions(
-    scene: Any, transmitter: np.ndarray, receivers: np.ndarray, *, device: Any = None
+    scene: GeometryLike, transmitter: np.ndarray, receivers: np.ndarray, *, device: DeviceLike = None
 ) -> None:
     """Refuse positions outside the scene, on a surface, or in another solid than the transmitter's air.
 
@@ -174,7 +175,7 @@ def sample_receivers(
     z: tuple[float, float] = (0.8, 2.2),
     clearance: float = 0.3,
     seed: int,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> np.ndarray:
     """``n`` places drawn uniformly from the scene's air, shape ``(n, 3)`` [m]; a longer draw starts with a shorter one.
 

@@ -125,14 +125,14 @@ def visible_from(
     return seen
 
 
-def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera], *, min_views: int = 2) -> list[Plane]:
-    """``planes`` with only those occupied cells that at least ``min_views`` cameras see past all the others."""
+def seen_cells(planes: Sequence[Plane], cameras: Sequence[Camera]) -> list[Plane]:
+    """``planes`` with only those occupied cells that at least two cameras see past all the others."""
     surface = plane_mesh(planes)
     result = []
     for plane in planes:
         occupied = plane.occupied.copy()
         seen = visible_from(surface, plane.cells(), plane.normal, cameras)
-        occupied[plane.occupied] = seen.sum(axis=1) >= min_views
+        occupied[plane.occupied] = seen.sum(axis=1) >= 2
         result.append(replace(plane, occupied=occupied))
     return result
 

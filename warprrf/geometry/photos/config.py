@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from warprrf.device import check_positive
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 
@@ -46,8 +47,7 @@ class PlaneConfig:
     contested_m: float = 0.25
 
     def __post_init__(self) -> None:
-        if not self.distance_m > 0:
-            raise ValueError(f"distance_m: got {self.distance_m}, expected a positive length in metres")
+        check_positive("distance_m", self.distance_m, "length in metres")
 
     @property
     def cosine(self) -> float:
@@ -191,8 +191,7 @@ class SurfaceConfig:
     simplify_m: float = 0.25
 
     def __post_init__(self) -> None:
-        if not self.voxel_m > 0:
-            raise ValueError(f"voxel_m: got {self.voxel_m}, expected a positive length in metres")
+        check_positive("voxel_m", self.voxel_m, "length in metres")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_array
+from warprrf.device import DeviceLike, Progress, check_array
 from warprrf.geometry import o3d as o3d_package
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
@@ -34,7 +34,7 @@ def fuse_gaussians(
     planes: Sequence[Plane] = (),
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> PlanarPatches:
     """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first; planes
     known beforehand are what it is snapped to."""
@@ -60,7 +60,7 @@ def depth_maps(
     *,
     config: SurfaceConfig,
     progress: Progress,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> tuple[list[Camera], list[np.ndarray]]:
     """Smaller cameras spread over all ``cameras``, and the ranges that they see [m], 0 where no Gaussian is reliable."""
     chosen = np.linspace(0, len(cameras) - 1, min(len(cameras), config.views)).round().astype(int)

@@ -7,9 +7,9 @@ worst first, until the wanted number is reached. So bare walls take few Gaussian
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -30,9 +30,9 @@ ON_PLANE_M = 0.02  # a sparse point this close to an occupied cell gives way to 
 
 
 def initial_gaussians(
-    points: Any,
-    colors: Any,
-    normals: Any,
+    points: ArrayLike,
+    colors: ArrayLike,
+    normals: ArrayLike,
     planes: Sequence[Plane] = (),
     cameras: Sequence[Camera] = (),
     images: Sequence[np.ndarray] = (),

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.cells import meeting, occupancy, seen_cells
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
@@ -27,7 +26,7 @@ def initialise(
     config: ReconstructionConfig,
     seed: int = 0,
     progress: Progress | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> tuple[list[Plane], Gaussians]:
     """Planes of the sparse points, and the Gaussians that refinement starts from.
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
-from warprrf.device import launch
+from warprrf.device import DeviceLike, launch
 from warprrf.kernels import ssim as ssim_kernels
 
 
@@ -19,7 +17,7 @@ class PhotoLoss:
         real: scalar type of the images.
     """
 
-    def __init__(self, device: Any, ssim_share: float, real: Any = wp.float32) -> None:
+    def __init__(self, device: DeviceLike, ssim_share: float, real: type = wp.float32) -> None:
         self.device, self.ssim_share, self.real = device, ssim_share, real
         self.kernels = ssim_kernels.build(real)
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from warprrf.device import check_array
@@ -136,7 +136,12 @@ def fit_plane(points: np.ndarray, weights: np.ndarray, normal: np.ndarray) -> tu
 
 
 def detect_planes(
-    points: Any, normals: Any, *, weights: Any = None, config: PlaneConfig | None = None, seed: int = 0
+    points: ArrayLike,
+    normals: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    config: PlaneConfig | None = None,
+    seed: int = 0,
 ) -> list[Plane]:
     """Planes among oriented points, the best supported first.
 
@@ -275,13 +280,11 @@ def _echo(points: np.ndarray, plane: Plane, strong: Plane, config: PlaneConfig) 
     return sum(tuple(c) in cells for c in there) > len(here)
 
 
-def aligned(
-    planes: Sequence[Plane], points: np.ndarray, *, angle_rad: float = np.radians(3.0)
-) -> list[Plane]:
+def aligned(planes: Sequence[Plane], points: np.ndarray) -> list[Plane]:
     """``planes`` with weakly supported ones made exactly parallel or level, where their points allow it.
 
     Built rooms have few directions. A plane takes over the normal of a plane with five times its points, or the
-    vertical, within ``angle_rad`` of its own, if its points then lie hardly further from it.
+    vertical, within 3 degrees of its own, if its points then lie hardly further from it.
     """
     result: list[Plane] = []
     vertical = np.array([0.0, 0.0, 1.0])
@@ -289,7 +292,7 @@ def aligned(
         own = points[plane.inliers]
         strong = [q.normal for q in planes if len(q.inliers) >= 5 * len(plane.inliers)]
         directions = [s * n for n in (*strong, vertical) for s in (1.0, -1.0)]
-        directions = [n for n in directions if n @ plane.normal > np.cos(angle_rad)]
+        directions = [n for n in directions if n @ plane.normal > np.cos(np.radians(3.0))]
         best = plane
         for normal in sorted(directions, key=lambda n: -float(n @ plane.normal)):
             offset = float(np.median(own @ normal))

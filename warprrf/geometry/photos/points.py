@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from warprrf.device import check_array
@@ -13,6 +13,8 @@ from warprrf.geometry.photos.config import PlaneConfig
 from warprrf.geometry.photos.planes import Plane, detect_planes
 
 NEIGHBOURS = 16  # that a point is compared with
+MIN_TRACK_LENGTH = 3  # photos that see a point which is kept
+DEVIATIONS = 2.5  # by which an outlier is farther from its neighbours than others
 
 
 def neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -22,18 +24,16 @@ def neighbours(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def clean_points(
-    points: Any,
+    points: ArrayLike,
     *,
-    reprojection_error: Any = None,
-    track_length: Any = None,
+    reprojection_error: ArrayLike | None = None,
+    track_length: ArrayLike | None = None,
     max_reprojection_error: float = 1.0,
-    min_track_length: int = 3,
-    deviations: float = 2.5,
 ) -> np.ndarray:
     """Which points to keep, shape ``(P,)`` bool: seen often enough, reprojected well, not far from all others.
 
     A point is an outlier when its mean distance to its neighbours exceeds the average of that figure over all points
-    by ``deviations`` standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
+    by :data:`DEVIATIONS` standard deviations (Rusu et al., "Towards 3D point cloud based object maps", 2008).
 
     Args:
         points: shape ``(P, 3)``.
@@ -46,15 +46,17 @@ def clean_points(
         error = check_array("reprojection_error", reprojection_error, (len(points),))
         keep &= error <= max_reprojection_error
     if track_length is not None:
-        keep &= check_array("track_length", track_length, (len(points),)) >= min_track_length
+        keep &= check_array("track_length", track_length, (len(points),)) >= MIN_TRACK_LENGTH
     chosen = np.flatnonzero(keep)
     if len(chosen) > NEIGHBOURS:
         spacing = neighbours(points[chosen], NEIGHBOURS)[1].mean(axis=1)
-        keep[chosen[spacing > spacing.mean() + deviations * spacing.std()]] = False
+        keep[chosen[spacing > spacing.mean() + DEVIATIONS * spacing.std()]] = False
     return keep
 
 
-def estimate_normals(points: Any, viewpoints: Any, *, neighbour_count: int = NEIGHBOURS) -> np.ndarray:
+def estimate_normals(
+    points: ArrayLike, viewpoints: ArrayLike, *, neighbour_count: int = NEIGHBOURS
+) -> np.ndarray:
     """Unit normals from the neighbourhood of each point, turned to the side of ``viewpoints``, shape ``(P, 3)``.
 
     Args:

@@ -11,12 +11,11 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warprrf.device import Progress, check_array, launch, resolve
+from warprrf.device import DeviceLike, Progress, check_array, launch, resolve
 from warprrf.files import write_atomically
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import PARAMETERS, STATISTICS, Arrays, densified, opacity_and_scales
@@ -41,7 +40,7 @@ def refine(
     planes: Sequence[Plane] = (),
     progress: Progress | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> Gaussians:
     """Optimise Gaussians against photos.
 
@@ -147,7 +146,7 @@ class _Refinement:
         self.log_scales = self.shaped("log_scales", wp.vec3, (n,))
         self.sh = self.shaped("sh", float, (n, self.widths["sh"] // 3, 3))
 
-    def shaped(self, name: str, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+    def shaped(self, name: str, dtype: type, shape: tuple[int, ...]) -> wp.array:
         """A view of a parameter's flat array as vectors or a table, with one of its gradient as its gradient."""
         view, grad = (
             wp.array(ptr=flat.ptr, dtype=dtype, shape=shape, device=flat.device, copy=False)

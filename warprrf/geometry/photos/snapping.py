@@ -17,6 +17,7 @@ from warprrf.geometry.photos.config import PlaneConfig, SurfaceConfig
 from warprrf.geometry.photos.planes import Plane, detect_planes
 from warprrf.geometry.planar_patches import PlanarPatches
 
+LONGEST_MOVE_M = 0.15  # of a vertex to its plane
 FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
 
 
@@ -52,9 +53,9 @@ def find_patches(
     )
 
 
-def flattened(patches: PlanarPatches, *, limit_m: float = 0.15) -> PlanarPatches:
+def flattened(patches: PlanarPatches) -> PlanarPatches:
     """``patches`` of their mesh with the vertices of each moved onto its plane; where patches meet, onto their common
-    edge or corner. A move longer than ``limit_m`` is cut back to the nearest plane alone, or left undone."""
+    edge or corner. A move longer than :data:`LONGEST_MOVE_M` is cut back to the nearest plane alone, or left undone."""
     mesh, own = patches.mesh, np.flatnonzero(patches.face_patch >= 0)
     vertices = mesh.vertices.copy()
     corners = np.stack([mesh.faces[own].ravel(), np.repeat(patches.face_patch[own], 3)], axis=1)
@@ -73,7 +74,7 @@ def flattened(patches: PlanarPatches, *, limit_m: float = 0.15) -> PlanarPatches
         nearest, rows = np.abs(residual).argmin(axis=1), np.arange(len(which))
         single = residual[rows, nearest][:, None] * n[rows, nearest]
         for cut in (single, np.zeros_like(single)):
-            far = np.linalg.norm(move, axis=1) > limit_m
+            far = np.linalg.norm(move, axis=1) > LONGEST_MOVE_M
             move[far] = cut[far]
         vertices[which] = x + move
     return replace(patches, mesh=Mesh(vertices, mesh.faces))

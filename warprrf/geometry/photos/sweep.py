@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from warprrf.device import launch, resolve
+from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.cells import PARALLEL, plane_mesh, visible_from
 from warprrf.geometry.photos.config import SweepConfig
@@ -50,7 +49,7 @@ class GreyPhotos:
         cameras: Sequence[Camera],
         images: Sequence[np.ndarray],
         config: SweepConfig | None = None,
-        device: Any = None,
+        device: DeviceLike = None,
     ) -> GreyPhotos:
         """Photos ``(H, W, 3)`` in [0, 1] of ``cameras``."""
         where = resolve(device)

@@ -8,11 +8,11 @@ centres lie at +0.5. A spherical image has zenith ``(i + 0.5) pi / H`` in row i 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from warprrf.device import check_array
+from warprrf.device import check_array, check_count, check_positive
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,15 @@ class Camera:
 
     @classmethod
     def pinhole(
-        cls, width: int, height: int, *, fx: float, fy: float, cx: float, cy: float, world_to_camera: Any
+        cls,
+        width: int,
+        height: int,
+        *,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        world_to_camera: ArrayLike,
     ) -> Camera:
         """A pinhole camera without distortion.
 
@@ -46,8 +54,7 @@ class Camera:
         """
         _check_size(width, height)
         for name, value in (("fx", fx), ("fy", fy)):
-            if not (np.isfinite(value) and value > 0):
-                raise ValueError(f"{name}: got {value!r}, expected a positive focal length in pixels")
+            check_positive(name, value, "focal length in pixels")
         for name, value in (("cx", cx), ("cy", cy)):
             if not np.isfinite(value):
                 raise ValueError(f"{name}: got {value!r}, expected a finite pixel coordinate")
@@ -63,7 +70,7 @@ class Camera:
         return cls("pinhole", int(width), int(height), pose, float(fx), float(fy), float(cx), float(cy))
 
     @classmethod
-    def spherical(cls, width: int, height: int, *, position: Any) -> Camera:
+    def spherical(cls, width: int, height: int, *, position: ArrayLike) -> Camera:
         """An equirectangular full-sphere camera at ``position`` (3,) [m], axes along the world's, z up."""
         _check_size(width, height)
         pose = np.eye(4)
@@ -108,7 +115,7 @@ class Camera:
             self.cy * sy,
         )
 
-    def project(self, points: Any) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates ``(N, 2)`` of world points ``(N, 3)``, and their depth along the optical axis ``(N,)`` [m]
         (range for a spherical camera). Pinhole coordinates are NaN behind the camera."""
         local = check_array("points", points, (None, 3)) @ self.rotation.T + self.world_to_camera[:3, 3]
@@ -125,7 +132,7 @@ class Camera:
         return uv, distance
 
 
-def check_camera(cam: Any) -> None:
+def check_camera(cam: object) -> None:
     """Raise TypeError unless ``cam`` is a :class:`Camera`."""
     if not isinstance(cam, Camera):
         raise TypeError(
@@ -135,5 +142,4 @@ def check_camera(cam: Any) -> None:
 
 def _check_size(width: int, height: int) -> None:
     for name, value in (("width", width), ("height", height)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise ValueError(f"{name}: got {value!r}, expected a whole number of pixels of at least 1")
+        check_count(name, value)

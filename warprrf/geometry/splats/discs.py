@@ -7,30 +7,28 @@ from __future__ import annotations
 
 import numpy as np
 
+from warprrf.device import check_count
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 
 OVERSAMPLING = 8  # candidates per disc before thinning: enough to fill 95 % of the cells
 RADIUS = 0.75  # standard deviation of a disc in units of the mean spacing: leaves no holes, blurs little
 FLATNESS = 0.01  # thickness over radius
+OPACITY = 0.999
 
 
-def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, opacity: float = 0.999, seed: int = 0) -> Gaussians:
+def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, seed: int = 0) -> Gaussians:
     """About ``count`` flat Gaussians, evenly spread over ``mesh``, normals along its faces.
 
     Args:
         mesh: surface to cover.
         count: wanted number; a few per cent fewer come out.
-        opacity: of every disc, in (0, 1].
         seed: of the sampling.
 
     Raises:
-        ValueError: for a count below 1, or an opacity outside (0, 1].
+        ValueError: for a count below 1.
     """
-    if not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
-    if not 0 < opacity <= 1:
-        raise ValueError(f"opacity: got {opacity!r}, expected a number in (0, 1]")
+    check_count("count", count)
     rng = np.random.default_rng(seed)
     area = mesh.areas
     spacing = float(np.sqrt(area.sum() / count))
@@ -48,7 +46,7 @@ def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, opacity: float = 0.999, se
         means=points,
         quaternions=_turning_z_to(normal),
         scales=np.tile([radius, radius, FLATNESS * radius], (len(points), 1)),
-        opacities=np.full(len(points), opacity),
+        opacities=np.full(len(points), OPACITY),
         sh=np.zeros((len(points), 1, 3)),
     )
 

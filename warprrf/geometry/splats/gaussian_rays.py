@@ -18,8 +18,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
-from warprrf.device import check_array, launch, resolve
+from warprrf.device import DeviceLike, check_array, check_count, launch, resolve
+from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.tape import active_tape, gradient, record
@@ -89,7 +91,7 @@ class GaussianRays:
         gaussians: Gaussians | tuple[wp.array, wp.array, wp.array, wp.array],
         *,
         blending: Blending | None = None,
-        device: Any = None,
+        device: DeviceLike = None,
     ) -> None:
         self.blending = blending or RADIO
         if isinstance(gaussians, Gaussians):
@@ -139,7 +141,7 @@ class GaussianRays:
             scene.bvh = self._bvh.id
         self._scene = scene
 
-    def hits(self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak") -> RayHits:
+    def hits(self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak") -> RayHits:
         """The first ``k`` Gaussians along each ray.
 
         Args:
@@ -155,7 +157,7 @@ class GaussianRays:
         found = self._trace(origins, directions, k, order, requires_grad=False)[0]
         return RayHits(found.index.numpy(), *(array.numpy() for array in found.outputs))
 
-    def transmittance(self, a: Any, b: Any) -> np.ndarray:
+    def transmittance(self, a: ArrayLike, b: ArrayLike) -> np.ndarray:
         """Share of light that passes from ``a`` to ``b``, (N, 3) or (3,) each [m]; shape ``(N,)`` float64.
 
         A Gaussian counts whose response peaks strictly between the points; between two equal points nothing does.
@@ -166,7 +168,7 @@ class GaussianRays:
         values: np.ndarray = self._transmit(a, b, requires_grad=False)[0].numpy()
         return values
 
-    def trace(self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak") -> Traced:
+    def trace(self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak") -> Traced:
         """:meth:`hits` as Warp arrays, differentiable on an active tape in the parameters (not in the rays)."""
         tape = active_tape()
         found, adjoint = self._trace(origins, directions, k, order, requires_grad=tape is not None)
@@ -174,7 +176,7 @@ class GaussianRays:
             record(tape, adjoint, self.inputs, found.outputs)
         return found
 
-    def transmit(self, a: Any, b: Any) -> wp.array:
+    def transmit(self, a: ArrayLike, b: ArrayLike) -> wp.array:
         """:meth:`transmittance` as a Warp array, differentiable on an active tape in the parameters."""
         tape = active_tape()
         values, adjoint = self._transmit(a, b, requires_grad=tape is not None)
@@ -183,28 +185,27 @@ class GaussianRays:
         return values
 
     def trace_with_adjoint(
-        self, origins: Any, directions: Any, k: int = 16, *, order: str = "peak"
+        self, origins: ArrayLike, directions: ArrayLike, k: int = 16, *, order: str = "peak"
     ) -> tuple[Traced, Callable[[], None]]:
         """:meth:`trace` without a tape: the hits, and the function that adds the parameters' gradients."""
         return self._trace(origins, directions, k, order, requires_grad=True)
 
-    def transmit_with_adjoint(self, a: Any, b: Any) -> tuple[wp.array, Callable[[], None]]:
+    def transmit_with_adjoint(self, a: ArrayLike, b: ArrayLike) -> tuple[wp.array, Callable[[], None]]:
         """:meth:`transmit` without a tape: the values, and the function that adds the parameters' gradients."""
         return self._transmit(a, b, requires_grad=True)
 
     def _trace(
-        self, origins: Any, directions: Any, k: int, order: str, *, requires_grad: bool
+        self, origins: ArrayLike, directions: ArrayLike, k: int, order: str, *, requires_grad: bool
     ) -> tuple[Traced, Callable[[], None]]:
         start, toward = _pairs("origins", origins, "directions", directions)
-        if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
-            raise ValueError(f"k: got {k!r}, expected a whole number of at least 1")
+        places = check_count("k", k)
         if order not in ORDERS:
             raise ValueError(f"order: got {order!r}, expected one of {', '.join(ORDERS)}")
         still = int(np.count_nonzero(np.linalg.norm(toward, axis=1) == 0))
         if still:
             raise ValueError(f"directions: got {still} of length zero, expected directions")
         count, on = _rows(start, toward), self.device
-        shape = (count, int(k))
+        shape = (count, places)
         real = {"dtype": wp.float64, "device": on}
         found = Traced(
             wp.full(shape, -1, dtype=int, device=on),
@@ -229,7 +230,9 @@ class GaussianRays:
 
         return found, adjoint
 
-    def _transmit(self, a: Any, b: Any, *, requires_grad: bool) -> tuple[wp.array, Callable[[], None]]:
+    def _transmit(
+        self, a: ArrayLike, b: ArrayLike, *, requires_grad: bool
+    ) -> tuple[wp.array, Callable[[], None]]:
         start, end = _pairs("a", a, "b", b)
         count, on = _rows(start, end), self.device
         values = wp.empty(count, dtype=wp.float64, device=on, requires_grad=requires_grad)
@@ -243,7 +246,7 @@ class GaussianRays:
 
         return values, adjoint
 
-    def _chain(self, kernel: Any, count: int, inputs: list[Any]) -> None:
+    def _chain(self, kernel: wp.Kernel, count: int, inputs: list[Any]) -> None:
         """Run a hit-wise adjoint, then add its sums to the gradients of the parameters."""
         if count == 0 or len(self) == 0:
             return
@@ -258,21 +261,16 @@ class GaussianRays:
         )  # fmt: skip
 
 
-def _pairs(first_name: str, first: Any, second_name: str, second: Any) -> tuple[np.ndarray, np.ndarray]:
+def _pairs(
+    first_name: str, first: ArrayLike, second_name: str, second: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
     """Two arrays of float64 rows, one or N of each."""
-    one, other = (
-        np.atleast_2d(check_array(name, value))
-        for name, value in ((first_name, first), (second_name, second))
-    )
-    for name, array in ((first_name, one), (second_name, other)):
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
+    named = (first_name, first), (second_name, second)
+    one, other = check_rows(*named)
+    for (name, _), array in zip(named, (one, other), strict=True):
+        check_array(name, array)
         if np.abs(array).max(initial=0.0) > LARGEST:
             raise ValueError(f"{name}: got numbers above {LARGEST:g}, expected metres")
-    if len(one) != len(other) and 1 not in (len(one), len(other)):
-        raise ValueError(
-            f"{second_name}: got {len(other)} for {len(one)} {first_name}, expected as many, or one of either"
-        )
     return one, other
 
 

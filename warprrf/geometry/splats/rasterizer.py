@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as devices
-from warprrf.device import launch, resolve
+from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.splats.blending import RADIO as RADIO
 from warprrf.geometry.splats.blending import Blending as Blending
 from warprrf.geometry.splats.camera import Camera
@@ -97,9 +98,9 @@ class Rasterizer:
     def __init__(
         self,
         *,
-        device: Any = None,
+        device: DeviceLike = None,
         blending: Blending | None = None,
-        real: Any = wp.float32,
+        real: type = wp.float32,
         per_pixel: bool = False,
     ) -> None:
         self.device = resolve(device)
@@ -131,7 +132,7 @@ class Rasterizer:
         opacities: wp.array,
         features: wp.array,
         cam: Camera,
-        background: Any = None,
+        background: ArrayLike | None = None,
     ) -> Image:
         """Project and blend; differentiable on an active tape."""
         return self.blend(self.prepare(means, quaternions, scales, opacities, cam), features, background)
@@ -178,7 +179,7 @@ class Rasterizer:
         ids, starts = _listed(span, count, distance, view)
         return Prepared(cam, view, inputs, splats, ids, starts)
 
-    def blend(self, prepared: Prepared, features: wp.array, background: Any = None) -> Image:
+    def blend(self, prepared: Prepared, features: wp.array, background: ArrayLike | None = None) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
         tape = active_tape()
         behind = self._background(features, background)
@@ -191,7 +192,12 @@ class Rasterizer:
         return image
 
     def blend_with_adjoint(
-        self, prepared: Prepared, features: wp.array, background: Any = None, *, gradients: bool = True
+        self,
+        prepared: Prepared,
+        features: wp.array,
+        background: ArrayLike | None = None,
+        *,
+        gradients: bool = True,
     ) -> tuple[Image, Callable[[], wp.array]]:
         """Blend without a tape: the image, and the function that adds the inputs' gradients for the image's. It
         returns each Gaussian's summed blending weight.
@@ -222,7 +228,7 @@ class Rasterizer:
         with devices.building:
             return build(self.real, *arguments)
 
-    def _background(self, features: wp.array, background: Any) -> wp.array:
+    def _background(self, features: wp.array, background: ArrayLike | None) -> wp.array:
         if isinstance(background, wp.array):
             return background
         values = np.zeros(features.shape[1]) if background is None else np.asarray(background)
@@ -233,7 +239,7 @@ class Rasterizer:
         return [prepared.splats, prepared.ids, prepared.starts, prepared.view, self.blending.rules]
 
     def _launch_tiles(
-        self, kernel: Any, prepared: Prepared, inputs: list[Any], cuts: list[int] | None = None
+        self, kernel: wp.Kernel, prepared: Prepared, inputs: list[Any], cuts: list[int] | None = None
     ) -> None:
         """Launch a kernel over all tiles, cut at the tiles ``cuts``."""
         each = self.threads_per_tile

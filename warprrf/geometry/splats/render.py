@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
-from warprrf.device import check_array, resolve
+from warprrf.device import DeviceLike, check_array, check_count, resolve
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -58,9 +58,9 @@ class BlendWeights:
 def render(
     g: Gaussians,
     cam: Camera,
-    features: Any = None,
-    background: Any = 0.0,
-    device: Any = None,
+    features: ArrayLike | None = None,
+    background: ArrayLike = 0.0,
+    device: DeviceLike = None,
     *,
     blending: Blending | None = None,
 ) -> Rendering:
@@ -99,7 +99,7 @@ def render(
 
 
 def blend_weights(
-    g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: Any = None
+    g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: DeviceLike = None
 ) -> BlendWeights:
     """Blending weights of every pixel as a sparse matrix; geometry that is frozen needs them only once.
 
@@ -107,8 +107,7 @@ def blend_weights(
         TypeError, ValueError: naming the argument that does not fit.
     """
     _check(g, cam)
-    if not isinstance(top_k, int | np.integer) or top_k < 1:
-        raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    check_count("top_k", top_k)
     raster = Rasterizer(device=device, blending=blending)
     found = raster.strongest(raster.prepare(*raster.upload(g), cam), int(top_k))
     indices, weights, ranges, alpha = (array.numpy() for array in found)
@@ -118,7 +117,7 @@ def blend_weights(
     return BlendWeights(indices, weights, ranges, dominant, alpha, dropped)
 
 
-def _check(g: Any, cam: Any) -> None:
+def _check(g: object, cam: object) -> None:
     if not isinstance(g, Gaussians):
         raise TypeError(f"g: got {type(g).__name__}, expected warprrf.Gaussians")
     check_camera(cam)

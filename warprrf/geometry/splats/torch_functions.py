@@ -87,8 +87,8 @@ def ray_transmittance(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    a: Any,
-    b: Any,
+    a: torch.Tensor,
+    b: torch.Tensor,
     *,
     blending: Blending | None = None,
 ) -> torch.Tensor:
@@ -108,8 +108,8 @@ def ray_hits(
     quaternions: torch.Tensor,
     scales: torch.Tensor,
     opacities: torch.Tensor,
-    origins: Any,
-    directions: Any,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
     k: int = 16,
     *,
     order: str = "peak",
@@ -127,7 +127,9 @@ def ray_hits(
     return index, t, alpha, weight, left
 
 
-def _check_gaussians(means: Any, quaternions: Any, scales: Any, opacities: Any) -> None:
+def _check_gaussians(
+    means: torch.Tensor, quaternions: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor
+) -> None:
     _check("means", means, (None, 3), None)
     n = len(means)
     _check("quaternions", quaternions, (n, 4), means)
@@ -148,7 +150,7 @@ def _check_gaussians(means: Any, quaternions: Any, scales: Any, opacities: Any) 
 
 
 def _check(
-    name: str, tensor: Any, shape: tuple[int | None, ...], like: torch.Tensor | None
+    name: str, tensor: object, shape: tuple[int | None, ...], like: torch.Tensor | None
 ) -> tuple[float, float]:
     """Refuse what is not a tensor of such numbers; returns the lowest and the highest (0 and 1 if it is empty)."""
     if not isinstance(tensor, torch.Tensor):
@@ -179,7 +181,7 @@ def _raster(tensor: torch.Tensor, blending: Blending | None = None) -> Rasterize
     return Rasterizer(device=resolve(str(tensor.device)), blending=blending, real=real)
 
 
-def _shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
+def _shared(tensor: torch.Tensor, dtype: type) -> wp.array:
     """The tensor's memory as a Warp array, without a gradient yet."""
     return wp.from_torch(tensor.detach().contiguous(), dtype=dtype, requires_grad=False)
 

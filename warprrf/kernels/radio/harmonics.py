@@ -33,14 +33,14 @@ PER_NEPER = 10.0 / np.log(10.0)  # dB per unit of natural logarithm of power
 
 
 @cache
-def build(real: Any) -> SimpleNamespace:
+def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}
     forward, adjoint = _forward(real), _adjoints(real)
     return SimpleNamespace(**types, **forward, **adjoint, adam=_adam(real))
 
 
-def _forward(real: Any) -> dict[str, Any]:
+def _forward(real: type) -> dict[str, Any]:
     """From coefficients to contributions, sums and images."""
     vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(COEFFICIENTS, real)
@@ -144,7 +144,7 @@ def _forward(real: Any) -> dict[str, Any]:
     }
 
 
-def _adjoints(real: Any) -> dict[str, Any]:
+def _adjoints(real: type) -> dict[str, Any]:
     """From the loss back to coefficients."""
     vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(COEFFICIENTS, real)
@@ -232,7 +232,7 @@ def _adjoints(real: Any) -> dict[str, Any]:
     }
 
 
-def _adam(real: Any) -> Any:
+def _adam(real: type) -> Any:
     """The step of the coefficients."""
     vec16 = wp.types.vector(COEFFICIENTS, real)
 

@@ -11,13 +11,12 @@ and, with contributions ``c_e = w_e u_g A_e`` to the pixel's sum C and v = dL/dC
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
 
 @cache
-def build(real: Any) -> SimpleNamespace:
+def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
 
     @wp.kernel(module="unique", enable_backward=False)

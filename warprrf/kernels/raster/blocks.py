@@ -16,7 +16,7 @@ from warprrf.kernels.raster.reference import keep_weight
 from warprrf.kernels.raster.view import PRODUCT, Rules, View, pixel_ray
 
 BLOCK = 4  # pixels: blocks are BLOCK x BLOCK
-LANES = BLOCK * BLOCK
+PIXELS = BLOCK * BLOCK
 VECTORISED = {
     # Warp's loops over a vector's 16 numbers become one instruction each if they are not unrolled first, and if the
     # rest is not put together again from single numbers.
@@ -26,21 +26,21 @@ VECTORISED = {
 
 
 @cache
-def exponential(real: Any) -> Any:
+def exponential(real: type) -> Any:
     """exp(-q/2) of a block's numbers, for one scalar type."""
-    lanes = wp.types.vector(LANES, real)
+    per_pixel = wp.types.vector(PIXELS, real)
 
     if real is wp.float32:
 
         @wp.func
-        def response(q: lanes):
+        def response(q: per_pixel):
             """exp(-q/2) for 0 <= q <= 80: (Taylor of exp(-q/32), degree 5)^16; absolute error below 1e-6."""
             x = q * real(-0.03125)
-            p = lanes(real(1.0 / 24.0)) + x * real(1.0 / 120.0)
-            p = lanes(real(1.0 / 6.0)) + wp.cw_mul(x, p)
-            p = lanes(real(0.5)) + wp.cw_mul(x, p)
-            p = lanes(real(1.0)) + wp.cw_mul(x, p)
-            p = lanes(real(1.0)) + wp.cw_mul(x, p)
+            p = per_pixel(real(1.0 / 24.0)) + x * real(1.0 / 120.0)
+            p = per_pixel(real(1.0 / 6.0)) + wp.cw_mul(x, p)
+            p = per_pixel(real(0.5)) + wp.cw_mul(x, p)
+            p = per_pixel(real(1.0)) + wp.cw_mul(x, p)
+            p = per_pixel(real(1.0)) + wp.cw_mul(x, p)
             p = wp.cw_mul(p, p)
             p = wp.cw_mul(p, p)
             p = wp.cw_mul(p, p)
@@ -49,10 +49,10 @@ def exponential(real: Any) -> Any:
     else:
 
         @wp.func
-        def response(q: lanes):
+        def response(q: per_pixel):
             """exp(-q/2)."""
-            out = lanes()
-            for i in range(wp.static(LANES)):
+            out = per_pixel()
+            for i in range(wp.static(PIXELS)):
                 out[i] = wp.exp(real(-0.5) * q[i])
             return out
 
@@ -60,76 +60,76 @@ def exponential(real: Any) -> Any:
 
 
 @cache
-def lane_functions(real: Any) -> SimpleNamespace:
+def vector_functions(real: type) -> SimpleNamespace:
     """What Warp's vectors lack, for ``wp.float32`` or ``wp.float64``: comparisons, choices, sums, a quick exponential."""
-    lanes = wp.types.vector(LANES, real)
-    integers = wp.types.vector(LANES, int)
+    per_pixel = wp.types.vector(PIXELS, real)
+    integers = wp.types.vector(PIXELS, int)
     name = real.__name__
 
     @wp.func_native(f"""
     bool found = false;
-    for (int i = 0; i < {LANES}; ++i) found |= x[i] > wp::{name}(0);
+    for (int i = 0; i < {PIXELS}; ++i) found |= x[i] > wp::{name}(0);
     return found;
     """)
-    def any_positive(x: lanes) -> bool:  # type: ignore[valid-type, empty-body]
+    def any_positive(x: per_pixel) -> bool:  # type: ignore[valid-type, empty-body]
         """Whether a number is above zero."""
         ...
 
     @wp.func_native(f"""
-    wp::vec_t<{LANES}, wp::{name}> out;
-    for (int i = 0; i < {LANES}; ++i) {{
+    wp::vec_t<{PIXELS}, wp::{name}> out;
+    for (int i = 0; i < {PIXELS}; ++i) {{
         const wp::{name} yes = a[i], no = b[i];
         out[i] = x[i] > wp::{name}(0) ? yes : no;
     }}
     return out;
     """)
-    def where_positive(x: lanes, a: lanes, b: lanes) -> lanes:  # type: ignore[valid-type, empty-body]
+    def where_positive(x: per_pixel, a: per_pixel, b: per_pixel) -> per_pixel:  # type: ignore[valid-type, empty-body]
         """``a`` where x > 0, else ``b``."""
         ...
 
     @wp.func_native(f"""
-    wp::vec_t<{LANES}, wp::int32> out;
-    for (int i = 0; i < {LANES}; ++i) {{
+    wp::vec_t<{PIXELS}, wp::int32> out;
+    for (int i = 0; i < {PIXELS}; ++i) {{
         const wp::int32 no = b[i];
         out[i] = x[i] > wp::{name}(0) ? a : no;
     }}
     return out;
     """)
-    def number_where_positive(x: lanes, a: int, b: integers) -> integers:  # type: ignore[valid-type, empty-body]
+    def number_where_positive(x: per_pixel, a: int, b: integers) -> integers:  # type: ignore[valid-type, empty-body]
         """``a`` where x > 0, else ``b``."""
         ...
 
     @wp.func_native(f"""
-    wp::vec_t<{LANES}, wp::{name}> out;
-    for (int i = 0; i < {LANES}; ++i) {{
+    wp::vec_t<{PIXELS}, wp::{name}> out;
+    for (int i = 0; i < {PIXELS}; ++i) {{
         const wp::{name} x = a[i], y = b[i];
         out[i] = x < y ? x : y;
     }}
     return out;
     """)
-    def lower(a: lanes, b: lanes) -> lanes:  # type: ignore[valid-type, empty-body]
+    def lower(a: per_pixel, b: per_pixel) -> per_pixel:  # type: ignore[valid-type, empty-body]
         """The smaller of each two, ``b`` beside a NaN."""
         ...
 
     @wp.func_native(f"""
-    wp::vec_t<{LANES}, wp::{name}> out;
-    for (int i = 0; i < {LANES}; ++i) {{
+    wp::vec_t<{PIXELS}, wp::{name}> out;
+    for (int i = 0; i < {PIXELS}; ++i) {{
         const wp::{name} x = a[i], y = b[i];
         out[i] = x > y ? x : y;
     }}
     return out;
     """)
-    def higher(a: lanes, b: lanes) -> lanes:  # type: ignore[valid-type, empty-body]
+    def higher(a: per_pixel, b: per_pixel) -> per_pixel:  # type: ignore[valid-type, empty-body]
         """The larger of each two, ``b`` beside a NaN."""
         ...
 
     @wp.func_native(f"""
     #pragma clang fp reassociate(on)
     wp::{name} sum(0);
-    for (int i = 0; i < {LANES}; ++i) sum += x[i];
+    for (int i = 0; i < {PIXELS}; ++i) sum += x[i];
     return sum;
     """)
-    def total(x: lanes) -> real:  # type: ignore[valid-type, empty-body]
+    def total(x: per_pixel) -> real:  # type: ignore[valid-type, empty-body]
         """Sum of the numbers, in whatever order is quickest."""
         ...
 
@@ -145,11 +145,11 @@ def lane_functions(real: Any) -> SimpleNamespace:
 
 
 @cache
-def block_functions(real: Any) -> SimpleNamespace:
+def block_functions(real: type) -> SimpleNamespace:
     """The steps of blending that the kernels share, for one scalar type; :mod:`.reference` has them for one pixel."""
-    lanes = wp.types.vector(LANES, real)
+    per_pixel = wp.types.vector(PIXELS, real)
     Splat = splat_of(real)
-    of = lane_functions(real)
+    of = vector_functions(real)
     sums_of_one = wp.types.vector(SUMS, real)
     response, higher, total = of.response, of.higher, of.total
     least = 1.0e-30 if real is wp.float32 else 1.0e-250
@@ -158,10 +158,10 @@ def block_functions(real: Any) -> SimpleNamespace:
     def rays(view: View, x0: int, y0: int):
         """Rays of the block whose first pixel is (x0, y0), as their three axes, and 1 for pixels in the image, 0 for
         those beyond."""
-        a = lanes()
-        b = lanes()
-        c = lanes()
-        inside = lanes()
+        a = per_pixel()
+        b = per_pixel()
+        c = per_pixel()
+        inside = per_pixel()
         for i in range(view.tile):  # axes a and b are those of a column, c of a row
             ray = pixel_ray(view, x0 + i, y0 + i)
             for j in range(view.tile):
@@ -173,17 +173,17 @@ def block_functions(real: Any) -> SimpleNamespace:
         return a, b, c, inside
 
     @wp.func
-    def meet(splat: Splat, a: lanes, b: lanes, c: lanes):
+    def meet(splat: Splat, a: per_pixel, b: per_pixel, c: per_pixel):
         """Forms g0, g1, g2 on the rays, the reciprocal of |g|^2, and by how much q is below the cutoff, times |g|^2."""
         g0 = splat.g0[0] * a + splat.g0[1] * b + splat.g0[2] * c
         g1 = splat.g1[0] * a + splat.g1[1] * b + splat.g1[2] * c
         g2 = splat.g2[0] * a + splat.g2[1] * b + splat.g2[2] * c
         n = wp.cw_mul(g1, g1) + wp.cw_mul(g2, g2)
-        square = higher(wp.cw_mul(g0, g0) + splat.flat * n, lanes(real(wp.static(least))))
+        square = higher(wp.cw_mul(g0, g0) + splat.flat * n, per_pixel(real(wp.static(least))))
         return g0, g1, g2, n, square
 
     @wp.func
-    def behind(transmittance: lanes, alpha: lanes, rule: int):
+    def behind(transmittance: per_pixel, alpha: per_pixel, rule: int):
         """The transmittance behind a layer."""
         if rule == wp.static(PRODUCT):
             return transmittance - wp.cw_mul(transmittance, alpha)
@@ -191,7 +191,14 @@ def block_functions(real: Any) -> SimpleNamespace:
 
     @wp.func
     def pair_sums(
-        slope: lanes, q: lanes, y1: lanes, y2: lanes, h0: lanes, h1: lanes, h2: lanes, weight: lanes
+        slope: per_pixel,
+        q: per_pixel,
+        y1: per_pixel,
+        y2: per_pixel,
+        h0: per_pixel,
+        h1: per_pixel,
+        h2: per_pixel,
+        weight: per_pixel,
     ):
         """What a Gaussian's pairs add to its sums, those of features excepted."""
         bent = wp.cw_mul(slope, q)
@@ -215,14 +222,14 @@ def block_functions(real: Any) -> SimpleNamespace:
 
 
 @cache
-def build_blend(real: Any, width: int) -> Any:
+def build_blend(real: type, width: int) -> Any:
     """As :func:`.reference.build_blend`."""
-    lanes = wp.types.vector(LANES, real)
-    integers = wp.types.vector(LANES, int)
+    per_pixel = wp.types.vector(PIXELS, real)
+    integers = wp.types.vector(PIXELS, int)
     values = wp.types.vector(width, real)
-    many = wp.types.matrix((width, LANES), real)
+    many = wp.types.matrix((width, PIXELS), real)
     Splat = splat_of(real)
-    of, block = lane_functions(real), block_functions(real)
+    of, block = vector_functions(real), block_functions(real)
     any_positive, where_positive, number_where_positive = (
         of.any_positive,
         of.where_positive,
@@ -254,14 +261,14 @@ def build_blend(real: Any, width: int) -> Any:
         x0 = (tile % view.tiles_x) * wp.static(BLOCK)
         y0 = (tile / view.tiles_x) * wp.static(BLOCK)
         a, b, c, transmittance = rays(view, x0, y0)
-        amax = lanes(real(rules.alpha_max))
-        tmin = lanes(real(rules.transmittance_min))
+        amax = per_pixel(real(rules.alpha_max))
+        tmin = per_pixel(real(rules.transmittance_min))
         color = many()
         feature = values()
-        total = lanes()
-        depth = lanes()
-        best = lanes()
-        peak = lanes()
+        total = per_pixel()
+        depth = per_pixel()
+        best = per_pixel()
+        peak = per_pixel()
         owner = integers(-1)
         for j in range(starts[tile], starts[tile + 1]):
             k = ids[j]
@@ -272,9 +279,9 @@ def build_blend(real: Any, width: int) -> Any:
                 if not any_positive(transmittance - tmin):
                     break
                 continue
-            inverse = wp.cw_div(lanes(real(1.0)), square)
+            inverse = wp.cw_div(per_pixel(real(1.0)), square)
             faded = splat.opacity * response(wp.cw_mul(n, inverse))
-            alpha = where_positive(counts, lower(faded, amax), lanes())
+            alpha = where_positive(counts, lower(faded, amax), per_pixel())
             weight = wp.cw_mul(alpha, transmittance)
             transmittance = behind(transmittance, alpha, rules.rule)
             t = splat.reach * wp.cw_mul(g0, inverse)
@@ -306,14 +313,14 @@ def build_blend(real: Any, width: int) -> Any:
 
 
 @cache
-def build_adjoint(real: Any, width: int) -> Any:
+def build_adjoint(real: type, width: int) -> Any:
     """As :func:`.reference.build_adjoint`."""
-    lanes = wp.types.vector(LANES, real)
+    per_pixel = wp.types.vector(PIXELS, real)
     values = wp.types.vector(width, real)
-    many = wp.types.matrix((width, LANES), real)
+    many = wp.types.matrix((width, PIXELS), real)
     sums_of_one = wp.types.vector(SUMS, real)
     Splat = splat_of(real)
-    of, block = lane_functions(real), block_functions(real)
+    of, block = vector_functions(real), block_functions(real)
     any_positive, where_positive, response, total = of.any_positive, of.where_positive, of.response, of.total
     rays, meet, behind, pair_sums = block.rays, block.meet, block.behind, block.pair_sums
     lower, higher = of.lower, of.higher
@@ -343,14 +350,14 @@ def build_adjoint(real: Any, width: int) -> Any:
         x0 = (tile % view.tiles_x) * wp.static(BLOCK)
         y0 = (tile / view.tiles_x) * wp.static(BLOCK)
         a, b, c, transmittance = rays(view, x0, y0)
-        amax = lanes(real(rules.alpha_max))
-        tmin = lanes(real(rules.transmittance_min))
-        one = lanes(real(1.0))
+        amax = per_pixel(real(rules.alpha_max))
+        tmin = per_pixel(real(rules.transmittance_min))
+        one = per_pixel(real(1.0))
         of_features = many()
         feature = values()
-        of_weight = lanes()
-        of_range = lanes()
-        rest = lanes()
+        of_weight = per_pixel()
+        of_range = per_pixel()
+        rest = per_pixel()
         for i in range(view.tile * view.tile):
             x = x0 + i % wp.static(BLOCK)
             y = y0 + i / wp.static(BLOCK)
@@ -374,7 +381,7 @@ def build_adjoint(real: Any, width: int) -> Any:
                 continue
             inverse = wp.cw_div(one, square)
             q = wp.cw_mul(n, inverse)
-            kept = where_positive(counts, response(q), lanes())
+            kept = where_positive(counts, response(q), per_pixel())
             raw = splat.opacity * kept
             alpha = lower(raw, amax)
             weight = wp.cw_mul(alpha, transmittance)
@@ -385,8 +392,8 @@ def build_adjoint(real: Any, width: int) -> Any:
             rest -= wp.cw_mul(weight, value)
             hidden = rest
             if rules.rule == wp.static(PRODUCT):
-                hidden = wp.cw_div(rest, higher(one - alpha, lanes(real(wp.static(least)))))
-            unclamped = where_positive(raw - amax, lanes(), kept)
+                hidden = wp.cw_div(rest, higher(one - alpha, per_pixel(real(wp.static(least)))))
+            unclamped = where_positive(raw - amax, per_pixel(), kept)
             slope = wp.cw_mul(wp.cw_mul(transmittance, value) - hidden, unclamped)
             transmittance = behind(transmittance, alpha, rules.rule)
             y1 = wp.cw_mul(lever, g1)
@@ -404,12 +411,12 @@ def build_adjoint(real: Any, width: int) -> Any:
 
 
 @cache
-def build_strongest(real: Any) -> Any:
+def build_strongest(real: type) -> Any:
     """As :func:`.reference.build_strongest`."""
-    lanes = wp.types.vector(LANES, real)
-    integers = wp.types.vector(LANES, int)
+    per_pixel = wp.types.vector(PIXELS, real)
+    integers = wp.types.vector(PIXELS, int)
     Splat = splat_of(real)
-    of, block = lane_functions(real), block_functions(real)
+    of, block = vector_functions(real), block_functions(real)
     any_positive, where_positive, response = of.any_positive, of.where_positive, of.response
     rays, meet, behind = block.rays, block.meet, block.behind
     lower = of.lower
@@ -431,9 +438,9 @@ def build_strongest(real: Any) -> Any:
         x0 = (tile % view.tiles_x) * wp.static(BLOCK)
         y0 = (tile / view.tiles_x) * wp.static(BLOCK)
         a, b, c, transmittance = rays(view, x0, y0)
-        amax = lanes(real(rules.alpha_max))
-        tmin = lanes(real(rules.transmittance_min))
-        total = lanes()
+        amax = per_pixel(real(rules.alpha_max))
+        tmin = per_pixel(real(rules.transmittance_min))
+        total = per_pixel()
         kept = integers()
         for j in range(starts[tile], starts[tile + 1]):
             k = ids[j]
@@ -444,9 +451,9 @@ def build_strongest(real: Any) -> Any:
                 if not any_positive(transmittance - tmin):
                     break
                 continue
-            inverse = wp.cw_div(lanes(real(1.0)), square)
+            inverse = wp.cw_div(per_pixel(real(1.0)), square)
             faded = splat.opacity * response(wp.cw_mul(n, inverse))
-            alpha = where_positive(counts, lower(faded, amax), lanes())
+            alpha = where_positive(counts, lower(faded, amax), per_pixel())
             weight = wp.cw_mul(alpha, transmittance)
             transmittance = behind(transmittance, alpha, rules.rule)
             total += weight

@@ -38,7 +38,7 @@ STEEPEST = 1.0e15
 
 
 @cache
-def splat_of(real: Any) -> Any:
+def splat_of(real: type) -> Any:
     """The struct of a Gaussian seen from the ray origin. Forms are those of :func:`.view.pixel_ray`'s axes."""
     vec3 = wp.types.vector(3, real)
 
@@ -78,7 +78,7 @@ def whitened_frame(a: wp.vec3d):
 
 
 @cache
-def build_project(real: Any) -> Any:
+def build_project(real: type) -> Any:
     """The kernel for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
@@ -180,7 +180,7 @@ def quaternion_gradient(q: wp.vec4d, y2: wp.mat33d, s: wp.vec3d):
 
 
 @cache
-def build_chain(real: Any) -> Any:
+def build_chain(real: type) -> Any:
     """The kernel for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)

@@ -52,7 +52,7 @@ def pair_sums(s: Any, slope: Any, q: Any, y1: Any, y2: Any, h0: Any, h1: Any, h2
 
 
 @cache
-def build_blend(real: Any, width: int) -> Any:
+def build_blend(real: type, width: int) -> Any:
     """The kernel that blends ``width`` channels (1 to 4) at once, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
     values = wp.types.vector(width, real)
@@ -123,7 +123,7 @@ def build_blend(real: Any, width: int) -> Any:
 
 
 @cache
-def build_adjoint(real: Any, width: int) -> Any:
+def build_adjoint(real: type, width: int) -> Any:
     """The adjoint of ``blend``, as :func:`build_blend` makes it."""
     vec3 = wp.types.vector(3, real)
     values = wp.types.vector(width, real)
@@ -211,7 +211,7 @@ def build_adjoint(real: Any, width: int) -> Any:
 
 
 @cache
-def build_background(real: Any) -> Any:
+def build_background(real: type) -> Any:
     """The adjoint of ``blend`` with respect to the background, for ``wp.float32`` or ``wp.float64``."""
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -233,7 +233,7 @@ def build_background(real: Any) -> Any:
 
 
 @cache
-def build_strongest(real: Any) -> Any:
+def build_strongest(real: type) -> Any:
     """The kernel that finds each pixel's largest blending weights, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
     Splat = splat_of(real)

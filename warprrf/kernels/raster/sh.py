@@ -6,7 +6,6 @@ Constants: the orthonormal real harmonics, e.g. Sloan, "Stupid Spherical Harmoni
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
@@ -14,7 +13,7 @@ COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> number of basis functions
 
 
 @cache
-def build(real: Any) -> SimpleNamespace:
+def build(real: type) -> SimpleNamespace:
     """Functions and kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(16, real)

@@ -16,7 +16,6 @@ and quaternion.
 
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import warp as wp
 
@@ -333,7 +332,7 @@ def collect_adjoint(
 
 
 @cache
-def build(real: Any) -> SimpleNamespace:
+def build(real: type) -> SimpleNamespace:
     """The kernels that read and write the parameters, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)

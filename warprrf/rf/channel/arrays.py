@@ -19,13 +19,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.spectra.antenna import sample_pattern
+from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
 
 PATTERNS = ("isotropic", "dipole", "half_wave_dipole", "tr38901")
@@ -57,16 +57,14 @@ class PlanarArray:
 
     rows: int
     cols: int
-    spacing: Any = 0.5
-    orientation: Any = (0.0, 0.0, 0.0)
-    pattern: Any = "isotropic"
+    spacing: ArrayLike = 0.5
+    orientation: ArrayLike = (0.0, 0.0, 0.0)
+    pattern: str | Pattern = "isotropic"
     polarisation: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("rows", "cols"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least 1")
+            _device.check_count(name, getattr(self, name))
         spacing = _device.check_array("spacing", self.spacing)
         if spacing.shape not in ((), (2,)) or (spacing <= 0).any():
             raise ValueError(f"spacing: got {self.spacing!r}, expected one or two positive numbers")
@@ -116,12 +114,12 @@ class PlanarArray:
         p = self.positions(wavelength_m)
         return float(np.linalg.norm(p[-1] - p[0])) if len(p) > 1 else 0.0
 
-    def gain(self, directions: Any) -> np.ndarray:
+    def gain(self, directions: ArrayLike) -> np.ndarray:
         """Power gain of an element [linear] towards world ``directions`` (..., 3), shape ``(...)``."""
         local = np.asarray(directions, dtype=np.float64) @ self.rotation
         return _pattern_gain(self.pattern, local)
 
-    def field(self, directions: Any) -> np.ndarray:
+    def field(self, directions: ArrayLike) -> np.ndarray:
         """Polarised amplitude of each port of an element along world zenith and azimuth unit vectors.
 
         Returns:
@@ -143,7 +141,9 @@ class PlanarArray:
             [size[..., None] * (turn @ np.array([np.cos(zeta), np.sin(zeta)])) for zeta in slants]
         )
 
-    def response(self, directions: Any, wavelength_m: float, frequency_hz: float | None = None) -> np.ndarray:
+    def response(
+        self, directions: ArrayLike, wavelength_m: float, frequency_hz: float | None = None
+    ) -> np.ndarray:
         """Plane-wave response exp(j 2 pi f / c d . u) of elements at d to world ``directions`` u (..., 3).
 
         Args:
@@ -158,7 +158,7 @@ class PlanarArray:
         return np.exp(2j * np.pi * number * reach)
 
     def spherical_response(
-        self, points: Any, wavelength_m: float, frequency_hz: float | None = None
+        self, points: ArrayLike, wavelength_m: float, frequency_hz: float | None = None
     ) -> np.ndarray:
         """Response to a source at ``points`` (..., 3) [m] from the array's centre, relative to that at the centre.
 
@@ -175,7 +175,7 @@ class PlanarArray:
         return far / each * np.exp(-2j * np.pi * number * longer)
 
 
-def rotation_matrix(orientation: Any) -> np.ndarray:
+def rotation_matrix(orientation: ArrayLike) -> np.ndarray:
     """Rotation from local to world axes of yaw, pitch and roll [rad]; 3GPP TR 38.901, eq. (7.1-4)."""
     (ca, cb, cg), (sa, sb, sg) = np.cos(orientation), np.sin(orientation)
     return np.array(
@@ -187,7 +187,7 @@ def rotation_matrix(orientation: Any) -> np.ndarray:
     )
 
 
-def orientation_towards(direction: Any) -> tuple[float, float, float]:
+def orientation_towards(direction: ArrayLike) -> tuple[float, float, float]:
     """Yaw, pitch and roll [rad] that point an array's boresight along ``direction`` (3,), columns level.
 
     Raises:
@@ -216,7 +216,7 @@ class PlaneWaveError:
 
 
 def plane_wave_error(
-    array: PlanarArray, distance_m: float, wavelength_m: float, direction: Any = (1.0, 0.0, 0.0)
+    array: PlanarArray, distance_m: float, wavelength_m: float, direction: ArrayLike = (1.0, 0.0, 0.0)
 ) -> PlaneWaveError:
     """Error of the plane wave from a source ``distance_m`` away in world ``direction``.
 
@@ -227,8 +227,7 @@ def plane_wave_error(
         ValueError: for a distance or wavelength that is not positive.
     """
     for name, value in (("distance_m", distance_m), ("wavelength_m", wavelength_m)):
-        if not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: got {value!r}, expected a positive number of metres")
+        _device.check_positive(name, value, "number of metres")
     d = _device.check_array("direction", direction, (3,))
     unit = d / np.linalg.norm(d)
     plane = array.response(unit, wavelength_m)
@@ -251,7 +250,7 @@ def _largest_phase(array: PlanarArray, distance_m: float, wavelength_m: float, u
     return float(2.0 * np.pi / wavelength_m * extra.max())
 
 
-def _pattern_gain(pattern: Any, local: np.ndarray) -> np.ndarray:
+def _pattern_gain(pattern: str | Pattern, local: np.ndarray) -> np.ndarray:
     """Power gain [linear] of ``pattern`` towards ``local`` unit directions (..., 3)."""
     if not isinstance(pattern, str):
         angle = np.arctan2(np.hypot(local[..., 1], local[..., 2]), local[..., 0])

@@ -10,9 +10,10 @@ IEEE IMS 2019), 49 to 51 and 66 below it (S. Lee et al., IEEE JSSC 54(12), 2019)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+
+from warprrf.device import check_count
 
 LOW_HZ, HIGH_HZ = 252.72e9, 321.84e9
 """Edges of the band [Hz]."""
@@ -51,9 +52,8 @@ class ThzChannel:
         Raises:
             ValueError: if ``count`` is not a whole number of at least 1.
         """
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
-        return self.low_hz + (np.arange(count) + 0.5) * (self.bandwidth_hz / count)
+        parts = check_count("count", count)
+        return self.low_hz + (np.arange(parts) + 0.5) * (self.bandwidth_hz / parts)
 
 
 def _plan() -> dict[int, ThzChannel]:
@@ -71,7 +71,7 @@ THZ_CHANNELS: dict[int, ThzChannel] = _plan()
 """All channels by number."""
 
 
-def thz_channel(number: Any) -> ThzChannel:
+def thz_channel(number: int) -> ThzChannel:
     """The channel of CHNL_ID ``number``.
 
     Raises:

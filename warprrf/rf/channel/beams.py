@@ -20,9 +20,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
@@ -62,7 +62,7 @@ class Codebook:
         across, down = np.divmod(index, len(self.factors[1]))
         return np.kron(self.factors[0][across], self.factors[1][down])
 
-    def received(self, channel: Any) -> np.ndarray:
+    def received(self, channel: ArrayLike) -> np.ndarray:
         """w^T h of every beam for channels ``(..., N)``, shape ``(..., B)``."""
         h = np.asarray(channel)
         if h.shape[-1:] != (self.array.elements,):
@@ -73,7 +73,7 @@ class Codebook:
         grid = h.reshape(*h.shape[:-1], self.array.cols, self.array.rows)
         return (across @ grid @ down.T).reshape(*h.shape[:-1], len(self))
 
-    def amplitude(self, directions: Any) -> np.ndarray:
+    def amplitude(self, directions: ArrayLike) -> np.ndarray:
         """w^T a of every beam for plane waves along world ``directions`` (L, 3), shape ``(B, L)``, complex.
 
         Elements' patterns count: |amplitude|^2 is the beam's power gain.
@@ -85,7 +85,7 @@ class Codebook:
             return parts[0] * size
         return (parts[0][:, None] * (parts[1] * size)[None]).reshape(len(self), len(d))
 
-    def superposed(self, directions: Any, gains: Any) -> np.ndarray:
+    def superposed(self, directions: ArrayLike, gains: ArrayLike) -> np.ndarray:
         """w^T h of every beam for plane waves of complex ``gains`` (..., L) along ``directions`` (L, 3).
 
         Returns:
@@ -96,7 +96,7 @@ class Codebook:
         size = np.sqrt(self.array.gain(d))
         return self._summed(d, values * size, lambda waves: waves)
 
-    def power(self, directions: Any, powers: Any) -> np.ndarray:
+    def power(self, directions: ArrayLike, powers: ArrayLike) -> np.ndarray:
         """Mean |w^T h|^2 of every beam for waves of ``powers`` (..., L) and independent phases, shape ``(..., B)``."""
         values = np.asarray(powers, dtype=np.float64)
         d = np.asarray(directions, dtype=np.float64)
@@ -139,13 +139,16 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
         ValueError: for a polarised array, or oversampling below 1.
     """
     _unpolarised("array", array)
-    if isinstance(oversampling, bool) or int(oversampling) != oversampling or oversampling < 1:
-        raise ValueError(f"oversampling: got {oversampling!r}, expected a whole number of at least 1")
-    return Codebook(array, (_dft(array.cols, int(oversampling)), _dft(array.rows, int(oversampling))))
+    times = _device.check_count("oversampling", oversampling)
+    return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
 
 
 def steering_codebook(
-    array: PlanarArray, directions: Any = None, *, points: Any = None, wavelength_m: float | None = None
+    array: PlanarArray,
+    directions: ArrayLike | None = None,
+    *,
+    points: ArrayLike | None = None,
+    wavelength_m: float | None = None,
 ) -> Codebook:
     """Beams conj(a) / |a| matched to plane waves along ``directions``, or to sources at ``points``.
 
@@ -167,12 +170,9 @@ def steering_codebook(
         raise ValueError(f"{name}: got a vector of length zero, expected ones with a length")
     if points is None:
         response = array.response(v / length, 1.0)
-    elif wavelength_m is None or not (np.isfinite(wavelength_m) and wavelength_m > 0):
-        raise ValueError(
-            f"wavelength_m: got {wavelength_m!r}, expected a positive number of metres with points"
-        )
     else:
-        response = array.spherical_response(v, wavelength_m)
+        wavelength = _device.check_positive("wavelength_m", wavelength_m, "number of metres with points")
+        response = array.spherical_response(v, wavelength)
     return Codebook(array, (response.conj() / np.linalg.norm(response, axis=1, keepdims=True),))
 
 
@@ -229,13 +229,12 @@ def select_beams(
         ValueError: for a polarised array, a count below 1, or a spectrum without departure angles for a transmitting
             array.
     """
-    if isinstance(count, bool) or int(count) != count or count < 1:
-        raise ValueError(f"count: got {count!r}, expected a whole number of at least 1")
+    most = _device.check_count("count", count)
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     rows = []
     for rays in rays_of(source, tx):
         gains = _pair_gains(rays, tx, rx)
-        best = np.argsort(-gains, axis=None, kind="stable")[: int(count)]
+        best = np.argsort(-gains, axis=None, kind="stable")[:most]
         rows.append((best % len(tx), best // len(tx), gains.ravel()[best]))
     if not (isinstance(source, PathArrays) and source.batched):
         return BeamChoice(*rows[0])
@@ -279,8 +278,7 @@ def select_beams_multiuser(
     Raises:
         TypeError, ValueError: as for :func:`select_beams`; without users, or for noise that is not positive.
     """
-    if not (np.isfinite(noise) and noise > 0):
-        raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")
+    _device.check_positive("noise", noise, "share of the transmitted power")
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
     gains = [_pair_gains(rays, tx, rx) for source in given for rays in rays_of(source, tx)]
@@ -291,7 +289,9 @@ def select_beams_multiuser(
     return MultiUserChoice(sent, received, signal_over_interference(gains, sent, received, noise))
 
 
-def signal_over_interference(gains: Sequence[Any], tx: Any, rx: Any, noise: float) -> np.ndarray:
+def signal_over_interference(
+    gains: Sequence[ArrayLike], tx: ArrayLike, rx: ArrayLike, noise: float
+) -> np.ndarray:
     """SINR of users [linear], shape ``(U,)``, power shared equally.
 
     Args:
@@ -299,7 +299,7 @@ def signal_over_interference(gains: Sequence[Any], tx: Any, rx: Any, noise: floa
         tx, rx: Beams of the users, shape ``(U,)``.
         noise: Noise power over the total transmitted power.
     """
-    heard = np.array([np.asarray(g)[r, np.asarray(tx)] for g, r in zip(gains, rx, strict=True)])
+    heard = np.array([np.asarray(g)[r, np.asarray(tx)] for g, r in zip(gains, np.asarray(rx), strict=True)])
     signal = np.diag(heard)
     return signal / (heard.sum(axis=1) - signal + noise * len(heard))
 
@@ -356,16 +356,16 @@ def rays_of(source: Source, tx: Codebook) -> Iterator[Rays]:
             yield departure if directed else None, kept.arrival, kept.power
     elif isinstance(source, Spectrum):
         power = np.asarray(source.path_gain, np.float64)
-        lit = power > 0
+        positive = power > 0
         departure = None
         if directed:
             if source.aod is None:
                 raise ValueError(
                     "source: got a spectrum without aod, expected departure angles with a tx_array"
                 )
-            lit &= np.isfinite(source.aod).all(axis=-1)
-            departure = directions_from_angles(source.aod[lit][:, 0], source.aod[lit][:, 1])
-        yield departure, pixel_directions(source.shape)[lit], power[lit]
+            positive &= np.isfinite(source.aod).all(axis=-1)
+            departure = directions_from_angles(source.aod[positive][:, 0], source.aod[positive][:, 1])
+        yield departure, pixel_directions(source.shape)[positive], power[positive]
     else:
         raise TypeError(f"source: got {type(source).__name__}, expected a Spectrum or Paths")
 

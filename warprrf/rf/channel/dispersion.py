@@ -9,9 +9,9 @@ angular spread, and its section 7.5 for the K-factor: power of the line of sight
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from warprrf import device as _device
@@ -76,7 +76,7 @@ def dispersion(paths: PathArrays) -> Dispersion:
     )
 
 
-def delay_spread(power: Any, tau: Any) -> tuple[np.ndarray, np.ndarray]:
+def delay_spread(power: ArrayLike, tau: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Mean delay and rms delay spread [s] of powers at delays ``tau`` (..., L) [s], each ``(...)``.
 
     Delays without power may be NaN; both are NaN where there is no power.
@@ -86,7 +86,7 @@ def delay_spread(power: Any, tau: Any) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.sqrt((weight * (delay - mean[..., None]) ** 2).sum(axis=-1))
 
 
-def angular_spread(power: Any, angle: Any) -> np.ndarray:
+def angular_spread(power: ArrayLike, angle: ArrayLike) -> np.ndarray:
     """sqrt(-2 ln |sum P exp(j angle)| / sum P) [rad] over the last axis; 3GPP TR 38.901, eq. (A-1)."""
     weight, angle = _weights(power, angle)
     resultant = np.abs((weight * np.exp(1j * angle)).sum(axis=-1))
@@ -94,7 +94,7 @@ def angular_spread(power: Any, angle: Any) -> np.ndarray:
         return np.sqrt(np.maximum(-2.0 * np.log(np.minimum(resultant, 1.0)), 0.0))
 
 
-def coherence_bandwidth(power: Any, tau: Any, level: float = COHERENCE) -> np.ndarray:
+def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = COHERENCE) -> np.ndarray:
     """Least frequency shift at which |sum P exp(-j 2 pi shift tau)| falls to ``level`` of sum P [Hz], shape ``(...)``.
 
     inf where it does not within 4096 periods of the longest difference of delays; NaN where there is no power.
@@ -123,7 +123,7 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
     if longest == 0.0 or 2.0 * weight.max() - 1.0 > level:
         return float("inf")
 
-    def over(shift: Any) -> np.ndarray:
+    def over(shift: ArrayLike) -> np.ndarray:
         waves = np.exp(-2j * np.pi * np.mod(np.multiply.outer(shift, tau), 1.0))
         return np.abs(waves @ weight) - level
 
@@ -136,7 +136,7 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
     return float("inf")
 
 
-def _weights(power: Any, values: Any) -> tuple[np.ndarray, np.ndarray]:
+def _weights(power: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Shares of power that sum to one over the last axis (NaN without power), and values with 0 where there is none."""
     p = _device.check_array("power", power)
     v = _device.check_array("values", values, finite=False)
@@ -144,9 +144,9 @@ def _weights(power: Any, values: Any) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"power: got shape {p.shape} for values of shape {v.shape}, expected the same")
     if (p < 0).any():
         raise ValueError("power: got negative values, expected linear power")
-    lit = p > 0
-    if not np.isfinite(v[lit]).all():
+    positive = p > 0
+    if not np.isfinite(v[positive]).all():
         raise ValueError("values: got NaN or infinite ones where there is power")
     total = p.sum(axis=-1, keepdims=True)
     share = np.divide(p, total, out=np.full(p.shape, np.nan), where=total > 0)
-    return share, np.where(lit, v, 0.0)
+    return share, np.where(positive, v, 0.0)

@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from warprrf.rf.em.absorption import Air, air_of
+from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
 
@@ -112,7 +112,7 @@ class PathArrays:
         point = None if self.receiver is None else self.receiver[receiver]
         return replace(self._taken(receiver), receiver=point)
 
-    def _taken(self, index: Any) -> Self:
+    def _taken(self, index: int | slice | np.ndarray) -> Self:
         """Every array at ``index``."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _PADDING}
         taken: dict[str, Any] = {name: None if v is None else v[index] for name, v in arrays.items()}
@@ -129,7 +129,7 @@ class PathArrays:
         else:
             yield self.select(np.flatnonzero(self.valid))
 
-    def select(self, chosen: Any) -> Self:
+    def select(self, chosen: slice | np.ndarray) -> Self:
         """Paths ``chosen`` of one receiver: indices in any order, or a mask ``(L,)``.
 
         Raises:
@@ -141,7 +141,7 @@ class PathArrays:
             )
         return self._taken(chosen)
 
-    def with_gas(self, gas: Any = True) -> Self:
+    def with_gas(self, gas: Gas = True) -> Self:
         """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
 
         Args:
@@ -267,7 +267,7 @@ def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
     return columns
 
 
-def _padded(array: np.ndarray, axis: int, length: int, fill: Any) -> np.ndarray:
+def _padded(array: np.ndarray, axis: int, length: int, fill: float) -> np.ndarray:
     widths = [(0, length - n if k == axis else 0) for k, n in enumerate(array.shape)]
     return np.pad(array, widths, constant_values=fill)
 

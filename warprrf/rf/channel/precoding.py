@@ -23,11 +23,12 @@ known channel is the covariance of rank one:
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
+from warprrf.device import check_positive
 from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -39,7 +40,7 @@ ROUNDING = 1e-13
 
 
 def transmit_covariance(
-    sources: Source | Iterable[Source], tx_array: Ends, rx_array: Ends = None, *, rx: Any = None
+    sources: Source | Iterable[Source], tx_array: Ends, rx_array: Ends = None, *, rx: ArrayLike | None = None
 ) -> np.ndarray:
     """Mean of h* h^T of every user over independent phases of its paths, shape ``(U, N, N)``, complex.
 
@@ -80,7 +81,7 @@ def transmit_covariance(
     return found
 
 
-def precoders(channels: Any, method: str = "slnr", *, noise: float) -> np.ndarray:
+def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.ndarray:
     """Weights that serve all users at once, unit norm each, shape ``(U, N)``, complex: user u is sent ``weights[u]``.
 
     Args:
@@ -94,7 +95,7 @@ def precoders(channels: Any, method: str = "slnr", *, noise: float) -> np.ndarra
     """
     if method not in METHODS:
         raise ValueError(f"method: got {method!r}, expected one of {', '.join(METHODS)}")
-    _check_noise(noise)
+    check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels)
     if h.ndim == 2:
         if method == "slnr":
@@ -109,7 +110,7 @@ def precoders(channels: Any, method: str = "slnr", *, noise: float) -> np.ndarra
     return _apart(best) if method == "zf" else best
 
 
-def precoded_sinr(channels: Any, weights: Any, *, noise: float) -> np.ndarray:
+def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> np.ndarray:
     """SINR of every user [linear], shape ``(U,)``, the power shared equally.
 
     Args:
@@ -120,7 +121,7 @@ def precoded_sinr(channels: Any, weights: Any, *, noise: float) -> np.ndarray:
     Raises:
         ValueError: naming the argument.
     """
-    _check_noise(noise)
+    check_positive("noise", noise, "share of the transmitted power")
     h = _checked(channels, allow_dark=True)
     w = np.asarray(weights, dtype=complex)
     if w.shape != h.shape[:2] or not (np.isfinite(w).all() and w.any(axis=1).all()):
@@ -166,7 +167,7 @@ def _unit(rows: np.ndarray) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def _checked(channels: Any, allow_dark: bool = False) -> np.ndarray:
+def _checked(channels: ArrayLike, allow_dark: bool = False) -> np.ndarray:
     h = np.asarray(channels, dtype=complex)
     if h.ndim not in (2, 3) or 0 in h.shape or (h.ndim == 3 and h.shape[1] != h.shape[2]):
         raise ValueError(f"channels: got shape {h.shape}, expected channels (U, N) or covariances (U, N, N)")
@@ -182,8 +183,3 @@ def _checked(channels: Any, allow_dark: bool = False) -> np.ndarray:
             f"channels: users {dark.tolist()} get no power; expected some for all, leave them out"
         )
     return h
-
-
-def _check_noise(noise: float) -> None:
-    if not (np.isfinite(noise) and noise > 0):
-        raise ValueError(f"noise: got {noise!r}, expected a positive share of the transmitted power")

@@ -28,9 +28,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import factorial
-from typing import Any, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
@@ -71,7 +72,7 @@ class LinkOptions(TypedDict, total=False):
 
 def frequency_response(
     paths: PathArrays,
-    frequencies_hz: Any,
+    frequencies_hz: ArrayLike,
     *,
     amplitude: str = "carrier",
     method: str = "auto",
@@ -145,8 +146,7 @@ def channel_taps(
     Raises:
         ValueError: naming the argument.
     """
-    if not (np.isfinite(bandwidth_hz) and bandwidth_hz > 0):
-        raise ValueError(f"bandwidth_hz: got {bandwidth_hz!r}, expected a positive number")
+    _device.check_positive("bandwidth_hz", bandwidth_hz)
     if l_max < l_min:
         raise ValueError(f"l_max: got {l_max}, expected at least l_min, {l_min}")
     lags = np.arange(l_min, l_max + 1)
@@ -368,7 +368,7 @@ def _amplitudes(paths: PathArrays, tx: PlanarArray, rx: PlanarArray) -> np.ndarr
     return np.einsum("apx,pxy,bpy->abp", received, paths.jones, sent)
 
 
-def _choice(name: str, value: Any, allowed: tuple[str, ...]) -> None:
+def _choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
     if value not in allowed:
         raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(allowed)}")
 

@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 LOW_HZ, HIGH_HZ = 1e9, 1000e9
 """Where the recommendation's sum holds."""
@@ -36,11 +37,11 @@ class Air:
     pressure_hpa: float = PRESSURE_HPA
     water_vapour_g_m3: float = WATER_VAPOUR_G_M3
 
-    def attenuation_db_per_m(self, frequency_hz: Any) -> Any:
+    def attenuation_db_per_m(self, frequency_hz: ArrayLike) -> Any:
         """Specific attenuation [dB/m], shape as ``frequency_hz``; see :func:`gas_attenuation_db_per_m`."""
         return gas_attenuation_db_per_m(frequency_hz, **vars(self))
 
-    def transmittance(self, frequency_hz: float, length_m: Any) -> np.ndarray:
+    def transmittance(self, frequency_hz: float, length_m: ArrayLike) -> np.ndarray:
         """Share of power that ``length_m`` [m] of it lets through, 10^(-gamma d / 10), shape as ``length_m``."""
         return np.asarray(10.0 ** (-0.1 * self.attenuation_db_per_m(frequency_hz) * np.asarray(length_m)))
 
@@ -60,7 +61,19 @@ class Air:
         return cls(**found) if found else None
 
 
-def air_of(gas: Any, frequency_hz: float | None = None) -> Air | None:
+class KeptEffects(Protocol):
+    """What a :class:`~warprrf.rf.relevance.search.Relevance` says of the air: "gas" is among the effects kept or not."""
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Names of the effects that matter."""
+
+
+Gas: TypeAlias = bool | Air | KeptEffects | None
+"""Whether the air absorbs: False or None for no, True for the standard atmosphere, one's own, or a relevance report."""
+
+
+def air_of(gas: Gas, frequency_hz: float | None = None) -> Air | None:
     """The air to reckon with: None for False, the standard atmosphere for True, :class:`Air` as it is.
 
     A :class:`~warprrf.rf.relevance.search.Relevance` decides by whether it kept the effect "gas".
@@ -84,7 +97,7 @@ def air_of(gas: Any, frequency_hz: float | None = None) -> Air | None:
 
 
 def gas_attenuation_db_per_m(
-    frequency_hz: Any,
+    frequency_hz: ArrayLike,
     *,
     temperature_k: float = TEMPERATURE_K,
     pressure_hpa: float = PRESSURE_HPA,

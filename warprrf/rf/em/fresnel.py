@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.rf.em.materials import Material
 
@@ -52,7 +52,7 @@ def surface_table(materials: Sequence[Material], frequency_hz: float) -> Surface
 
 
 def slab_reflection(
-    cos_incidence: Any, permittivity: Any, thickness_m: Any, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reflection of a slab (``inf`` thick: a half-space): field across (TE) and in (TM) the plane of incidence.
 
@@ -64,7 +64,7 @@ def slab_reflection(
 
 
 def slab_transmission(
-    cos_incidence: Any, permittivity: Any, thickness_m: Any, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmission of a slab: field across (TE) and in (TM) the plane of incidence; nothing leaves a half-space.
 
@@ -75,7 +75,7 @@ def slab_transmission(
 
 
 def _slab(
-    cos_incidence: Any, permittivity: Any, thickness_m: Any, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Reflection of the first face, TE and TM, and what is left of a wave that goes once through; eqs. (37), (44)."""
     cos = np.asarray(cos_incidence, dtype=np.float64)
@@ -88,7 +88,9 @@ def _slab(
     return (cos - root) / (cos + root), (eta * cos - root) / (eta * cos + root), once
 
 
-def lobe(alpha_r: int, cos_incidence: Any, cos_scatter: Any, cos_to_mirror: Any) -> np.ndarray:
+def lobe(
+    alpha_r: int, cos_incidence: ArrayLike, cos_scatter: ArrayLike, cos_to_mirror: ArrayLike
+) -> np.ndarray:
     """Scattering lobe f_s [1/sr]: Lambertian for ``alpha_r`` 0, else ((1 + cos psi) / 2)^alpha_r, normalised.
 
     Args:
@@ -101,7 +103,7 @@ def lobe(alpha_r: int, cos_incidence: Any, cos_scatter: Any, cos_to_mirror: Any)
     return (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r / lobe_norm(alpha_r, cos_incidence)
 
 
-def lobe_norm(alpha_r: int, cos_incidence: Any) -> np.ndarray:
+def lobe_norm(alpha_r: int, cos_incidence: ArrayLike) -> np.ndarray:
     """Integral of ((1 + cos psi) / 2)^alpha_r over the hemisphere [sr]. Degli-Esposti et al. (2007), eqs. (11)-(14)."""
     cos = np.asarray(cos_incidence, dtype=np.float64)
     sin_sq = 1.0 - cos**2

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.kernels.radio.bounce import MOMENTS
 from warprrf.rf.em.fresnel import slab_reflection
@@ -35,13 +35,13 @@ class FresnelCurves:
     moments: np.ndarray
     coordinates: np.ndarray
 
-    def at(self, table: np.ndarray, log_excess: Any) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, table: np.ndarray, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Rows of ``table`` (97, K) at ``log_excess`` (G,), clipped to the family, and derivatives, ``(G, K)``."""
         i, s, step = self._place(log_excess)
         s = s[:, None]
         return (1 - s) * table[i] + s * table[i + 1], (table[i + 1] - table[i]) / step
 
-    def value(self, log_excess: Any, cosine: Any) -> tuple[np.ndarray, np.ndarray]:
+    def value(self, log_excess: ArrayLike, cosine: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Reflection (N,) at ``log_excess`` (N,) and ``cosine`` (N,), and its derivative to ``log_excess``."""
         i, s, step = self._place(log_excess)
         x = np.clip(np.asarray(cosine, float), 0.0, 1.0) * (COSINES - 1)
@@ -51,12 +51,12 @@ class FresnelCurves:
         high = (1 - r) * self.curves[i + 1, j] + r * self.curves[i + 1, j + 1]
         return (1 - s) * low + s * high, (high - low) / step
 
-    def even(self, log_excess: Any) -> tuple[np.ndarray, np.ndarray]:
+    def even(self, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Reflection under even light, 2 int F cos dcos, at ``log_excess`` (G,), and its derivative."""
         cosine = np.linspace(0.0, 1.0, COSINES)
         return tuple(rows @ cosine / cosine.sum() for rows in self.at(self.curves, log_excess))  # type: ignore[return-value]
 
-    def _place(self, log_excess: Any) -> tuple[np.ndarray, np.ndarray, float]:
+    def _place(self, log_excess: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
         """Row below each ``log_excess``, the share of the next, and the distance of rows."""
         step = self.log_excess[1] - self.log_excess[0]
         x = np.clip(

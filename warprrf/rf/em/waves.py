@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.device import check_array
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
 
 
-def check_frequency(frequency_hz: Any) -> float:
+def check_frequency(frequency_hz: ArrayLike | None) -> float:
     """``frequency_hz`` as a positive float.
 
     Raises:
@@ -23,6 +22,6 @@ def check_frequency(frequency_hz: Any) -> float:
     return value
 
 
-def carrier_phase(frequency_hz: Any, tau: Any) -> np.ndarray:
+def carrier_phase(frequency_hz: ArrayLike, tau: ArrayLike) -> np.ndarray:
     """exp(-j 2 pi f tau); whole turns are dropped before the exponential, since f tau reaches 1e4 and more."""
     return np.exp(-2j * np.pi * np.mod(np.asarray(frequency_hz) * np.asarray(tau), 1.0))

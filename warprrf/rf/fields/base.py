@@ -11,11 +11,12 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from warprrf.device import Progress, check_array
-from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.absorption import Air
-from warprrf.rf.fields import files as field_files
+from warprrf import tensor_files
+from warprrf.device import DeviceLike, Progress, check_array
+from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
@@ -43,7 +44,7 @@ class RadioField(ABC):
     shape: tuple[int, int]
     mesh: Mesh | None
     air: Air | None
-    device: Any
+    device: DeviceLike
     report: dict[str, Any]
     models: ClassVar[dict[str, type[RadioField]]] = {}
 
@@ -53,7 +54,9 @@ class RadioField(ABC):
         """Name of the model."""
 
     @classmethod
-    def fit(cls, geometry: Any, ds: SpectrumDataset, model: str = "bistatic", **options: Any) -> RadioField:
+    def fit(
+        cls, geometry: GeometryLike, ds: SpectrumDataset, model: str = "bistatic", **options: Any
+    ) -> RadioField:
         """Fit a radio field to the spectra of ``ds``.
 
         Args:
@@ -71,19 +74,19 @@ class RadioField(ABC):
         return cls.models[model].fit(geometry, ds, model, **options)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> RadioField:
+    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> RadioField:
         """Read a field that :meth:`save` wrote.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if it is corrupt, or no radio field.
         """
-        model = field_files.read(path)[1].get("model")
+        model = tensor_files.read(path)[1].get("model")
         found = cls.models["bistatic" if model == "bistatic" else "rf3dgs+"]  # which reads rf3dgs too
         return found.load(path, device=device)
 
     @abstractmethod
-    def with_gas(self, gas: Any = True) -> Self:
+    def with_gas(self, gas: Gas = True) -> Self:
         """The same field with the absorption of ``gas`` over every path's length, in place of what it had.
 
         Args:
@@ -95,17 +98,19 @@ class RadioField(ABC):
         """
 
     @abstractmethod
-    def spectrum(self, rx: Any, transmitter: Any = None) -> Spectrum:
+    def spectrum(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> Spectrum:
         """The spatial spectrum at ``rx`` (3,) [m]."""
 
     @abstractmethod
-    def paths(self, rx: Any, transmitter: Any = None, max_paths: int | None = None) -> Paths:
+    def paths(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
+    ) -> Paths:
         """Propagation paths at ``rx`` (3,) or (R, 3) [m]."""
 
     def links(
         self,
-        rx: Any,
-        transmitter: Any = None,
+        rx: ArrayLike,
+        transmitter: ArrayLike | None = None,
         *,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         shape: tuple[int, int] | None = None,
@@ -133,9 +138,9 @@ class RadioField(ABC):
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         if (np.linalg.norm(receivers - source, axis=1) == 0).any():
             raise ValueError("rx: got the transmitter's own position; expected them apart")
-        return self._links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
+        return self.trace_links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
 
-    def _links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked: from paths, one receiver at a time."""
         if options.mirror_order is not None:
             raise ValueError(
@@ -149,7 +154,7 @@ class RadioField(ABC):
         )
 
     def radio_map(
-        self, height: float, cell: float = 0.25, transmitter: Any = None, **options: Any
+        self, height: float, cell: float = 0.25, transmitter: ArrayLike | None = None, **options: Any
     ) -> RadioMap:
         """Links over a floor plan, at ``height`` [m] in cells of ``cell`` [m].
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.device import check_count
 from warprrf.files import write_arrays, write_text
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene
@@ -119,9 +120,7 @@ def write_deepmimo(
 def _matrices(paths: Paths, coefficient: np.ndarray, max_paths: int | None) -> dict[str, np.ndarray]:
     count = int(paths.valid.sum(axis=1).max(initial=0))
     if max_paths is not None:
-        if isinstance(max_paths, bool) or max_paths < 1:
-            raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
-        count = min(count, int(max_paths))
+        count = min(count, check_count("max_paths", max_paths))
     count = max(count, 1)  # an empty matrix does not load
     if paths.gain.shape[1] == 0:
         raise ValueError("paths: got none for any receiver, expected at least one path")

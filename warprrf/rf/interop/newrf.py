@@ -11,9 +11,9 @@ import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from warprrf import device as _device
 from warprrf.geometry.mesh import Mesh
@@ -158,7 +158,7 @@ def _shape(data: dict[str, np.ndarray], path: Path) -> tuple[int, int]:
     return shape[0], shape[1]
 
 
-def _array(data: dict[str, np.ndarray], name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+def _array(data: dict[str, np.ndarray], name: str, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     return _device.check_array(name, data[name], shape, dtype=dtype, finite=False)
 
 

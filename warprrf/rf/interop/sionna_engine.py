@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.rf.em.absorption import air_of
+from warprrf.device import DeviceLike
+from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import ReceivedPaths
@@ -155,13 +157,13 @@ class SionnaEngine:
         self,
         scene: Scene,
         *,
-        transmitter: Any,
+        transmitter: ArrayLike,
         frequency_hz: float,
         shape: tuple[int, int],
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         sampling: Sampling | None = None,
-        gas: Any = False,
-        device: Any = None,
+        gas: Gas = False,
+        device: DeviceLike = None,
     ) -> None:
         self.shape = check_shape(shape)
         self.beam_sigma_rad = beam_sigma_rad
@@ -184,7 +186,7 @@ class SionnaEngine:
         """Sionna RT's version."""
         return str(self._rt.__version__)
 
-    def solve(self, receiver: Any, *, specular: bool = True) -> dict[str, np.ndarray]:
+    def solve(self, receiver: ArrayLike, *, specular: bool = True) -> dict[str, np.ndarray]:
         """Paths of one receiver (3,): ``power``, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.
 
         They come by rising delay: one seed gives the same paths to the bit, in the same order, in every run.
@@ -254,7 +256,7 @@ class SionnaEngine:
         drjit.flush_malloc_cache()
         drjit.flush_kernel_cache()
 
-    def receive(self, receiver: Any) -> ReceivedPaths:
+    def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         found = self.solve(receiver)
         spread = spread_paths(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress
+from warprrf.device import Progress, check_positive
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import BeamOperator
@@ -49,7 +49,8 @@ class LinkOptions:
     """How links are found.
 
     Attributes:
-        beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
+        beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
+            array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
         shape: rows and columns of the grid that rays fill; None for the model's default.
         mirror_order: most reflections on a mirror path, 0 to 3; None for the field's own.
         progress: called as ``progress("links", done, total)``.
@@ -62,8 +63,7 @@ class LinkOptions:
 
     def __post_init__(self) -> None:
         sigma = self.beam_sigma_rad
-        if not (np.isfinite(sigma) and sigma > 0):
-            raise ValueError(f"beam_sigma_rad: got {sigma!r}, expected a positive beam width in radians")
+        check_positive("beam_sigma_rad", sigma, "beam width in radians")
         if self.mirror_order not in (None, 0, 1, 2, 3):
             raise ValueError(
                 f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None for the field's own"

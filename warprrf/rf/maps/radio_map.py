@@ -16,12 +16,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.device import Progress
 from warprrf.files import write_atomically
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.maps.links import Links
+from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.receivers import ON_A_WALL_M
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
 ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
@@ -209,41 +207,37 @@ _ARRAYS = ("x", "y", "transmitter", "outline")
 
 
 @dataclass(frozen=True)
-class MapOptions:
-    """How a radio map is made.
+class MapOptions(LinkOptions):
+    """How a radio map is made: how links are found, and
 
     Attributes:
         bounds: lowest x and y, highest x and y [m]; the mesh's by default. The grid starts at the lowest.
-        beam_sigma_rad: width of the receiver's beam, kappa = 1 / sigma^2: array gain 2 / sigma^2, that of a planar
-            array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
         transmit_power_dbm: of the isotropic transmitter.
         bandwidth_hz: of the noise, k T B at 290 K; one channel of IEEE 802.15.3d by default.
         noise_figure_db: of the receiver.
-        shape: rows and columns of the grid of rays; see :meth:`RadioField.links`.
-        mirror_order: most reflections on a mirror path; see there.
-        progress: called as ``progress("links", done, total)``, cells in the air.
     """
 
     bounds: Any = None
-    beam_sigma_rad: float = BEAM_SIGMA_RAD
     transmit_power_dbm: float = 20.0
     bandwidth_hz: float = 2.16e9
     noise_figure_db: float = 10.0
-    shape: tuple[int, int] | None = None
-    mirror_order: int | None = None
-    progress: Progress | None = None
 
     def __post_init__(self) -> None:
-        for name in ("bandwidth_hz", "beam_sigma_rad"):
-            _check_number(name, getattr(self, name), positive=True)
+        super().__post_init__()
+        _device.check_positive("bandwidth_hz", self.bandwidth_hz)
         for name in ("transmit_power_dbm", "noise_figure_db"):
-            _check_number(name, getattr(self, name))
+            _check_finite(name, getattr(self, name))
 
     @property
     def noise_power_dbm(self) -> float:
         """Of the receiver, k T B F [dBm]."""
         noise_w = BOLTZMANN * ROOM_TEMPERATURE_K * self.bandwidth_hz
         return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
+
+
+def _check_finite(name: str, value: float) -> None:
+    if not np.isfinite(value):
+        raise ValueError(f"{name}: got {value!r}, expected a finite number")
 
 
 class LinkField(Protocol):
@@ -257,22 +251,8 @@ class LinkField(Protocol):
     def mesh(self) -> Mesh | None:
         """What blocks."""
 
-    def links(
-        self,
-        rx: Any,
-        transmitter: Any = None,
-        *,
-        beam_sigma_rad: float = BEAM_SIGMA_RAD,
-        shape: tuple[int, int] | None = None,
-        mirror_order: int | None = None,
-        progress: Progress | None = None,
-    ) -> Links:
-        """Links at ``rx`` (R, 3) [m]."""
-
-
-def _check_number(name: str, value: float, *, positive: bool = False) -> None:
-    if not np.isfinite(value) or (positive and value <= 0):
-        raise ValueError(f"{name}: got {value!r}, expected a {'positive' if positive else 'finite'} number")
+    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+        """Links at ``receivers`` (R, 3) [m], off the mesh."""
 
 
 def radio_map(
@@ -303,8 +283,8 @@ def radio_map(
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
     source = _device.check_array("transmitter", source, (3,))
-    _check_number("height", height)
-    _check_number("cell", cell, positive=True)
+    _check_finite("height", height)
+    _device.check_positive("cell", cell)
     low, high = mesh.bounds
     if not low[2] < height < high[2]:
         raise ValueError(
@@ -317,14 +297,7 @@ def radio_map(
     free &= (places != source).any(axis=-1)
     if not free.any():
         raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")
-    links = field.links(
-        places[free],
-        transmitter,
-        beam_sigma_rad=o.beam_sigma_rad,
-        shape=o.shape,
-        mirror_order=o.mirror_order,
-        progress=o.progress,
-    )
+    links = field.trace_links(places[free], source, o)
     layers = {}
     for name in _LAYERS:
         layers[name] = np.full(free.shape, np.nan)

@@ -8,10 +8,11 @@ What goes over two edges is left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import slab_transmission
 from warprrf.rf.spectra.spectrum import pixel_of
@@ -40,7 +41,7 @@ class SidePaths:
     length_m: np.ndarray
 
 
-def knife_edge_loss_db(v: Any) -> np.ndarray:
+def knife_edge_loss_db(v: ArrayLike) -> np.ndarray:
     """Loss J(v) of a knife edge over free space [dB]; v is positive in the shadow. Source: ITU-R P.526-15, eq. (31),
     which holds for v > -0.78; nothing is lost below."""
     v = np.asarray(v, dtype=np.float64)
@@ -55,7 +56,7 @@ def diffracted(
     wavelength_m: float,
     *,
     lift_m: float = LIFT_M,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> SidePaths:
     """Paths of ``receivers`` (R, 3), all without line of sight, over one edge of the mesh each.
 
@@ -101,7 +102,7 @@ def transmitted(
     thickness_m: np.ndarray,
     *,
     skin_m: float = 1e-4,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> SidePaths:
     """The straight path of each of ``receivers`` (R, 3) through all that stands in its way.
 

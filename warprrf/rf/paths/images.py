@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.kernels.radio import mirrors as kernels
 
@@ -58,7 +60,12 @@ class MirrorImages:
     """
 
     def __init__(
-        self, patches: PlanarPatches, transmitter: Any, *, slack_m: float | None = None, device: Any = None
+        self,
+        patches: PlanarPatches,
+        transmitter: ArrayLike,
+        *,
+        slack_m: float | None = None,
+        device: DeviceLike = None,
     ) -> None:
         self.patches = patches
         self.transmitter = np.asarray(transmitter, float)
@@ -170,23 +177,23 @@ class MirrorImages:
         octets = words_[chain, leaf].astype("<u4", copy=False).view(np.uint8).reshape(-1, 4)
         some, bit = np.nonzero(np.unpackbits(octets, axis=1, bitorder="little"))
         chain, row = chain[some], ends.order[32 * leaf[some] + bit]
-        met = chains.patch[chain]
-        point = wp.zeros(met.shape, dtype=wp.vec3d, device=where)
+        patches = chains.patch[chain]
+        point = wp.zeros(patches.shape, dtype=wp.vec3d, device=where)
         inputs = [
             self._on_device,
-            wp.array(met, dtype=wp.int32, device=where),
+            wp.array(patches, dtype=wp.int32, device=where),
             wp.array(chains.image[chain], dtype=wp.vec3d, device=where),
             wp.array(ends.positions[row], dtype=wp.vec3d, device=where),
             point,
         ]
         _device.launch(kernels.unfold_chains, len(row), inputs, device=where)
-        return row, met, point.numpy().reshape(*met.shape, 3)
+        return row, patches, point.numpy().reshape(*patches.shape, 3)
 
 
 class _Ends:
     """Points where chains end, in leaves of 32 neighbours with a ball around each, and one around all."""
 
-    def __init__(self, points: np.ndarray, where: Any) -> None:
+    def __init__(self, points: np.ndarray, where: wp.Device) -> None:
         self.positions, self.order = points, _along_curve(points)
         first = np.arange(0, len(points), 32)
         low, high = (f.reduceat(points[self.order], first) for f in (np.minimum, np.maximum))
@@ -199,7 +206,7 @@ class _Ends:
         self.middle, self.radius = 0.5 * (low + high), 1e-6 + 0.5 * float(np.linalg.norm(high - low))
 
 
-def _cones(chains: Chains, where: Any) -> Any:
+def _cones(chains: Chains, where: wp.Device) -> Any:
     cones = kernels.Cones()
     cones.apex = wp.array(chains.image, dtype=wp.vec3d, device=where)
     cones.axis = wp.array(chains.axis, dtype=wp.vec3d, device=where)
@@ -207,7 +214,7 @@ def _cones(chains: Chains, where: Any) -> Any:
     return cones
 
 
-def _patches_on_device(patches: PlanarPatches, slack_m: float, where: Any) -> Any:
+def _patches_on_device(patches: PlanarPatches, slack_m: float, where: wp.Device) -> Any:
     """The kernels' view of patches: boxes and balls ``slack_m`` too large, and a binary tree of the boxes."""
     low, high = patches.boxes[:, 0] - slack_m, patches.boxes[:, 1] + slack_m
     order = _along_curve(0.5 * (low + high))
@@ -219,7 +226,7 @@ def _patches_on_device(patches: PlanarPatches, slack_m: float, where: Any) -> An
     tree_low, tree_high = (np.concatenate(a) for a in zip(*levels, strict=True))
     result = kernels.Patches()
 
-    def put(array: np.ndarray, dtype: Any) -> wp.array:
+    def put(array: np.ndarray, dtype: type) -> wp.array:
         return wp.array(array, dtype=dtype, device=where)
 
     result.normal = put(patches.normal, wp.vec3d)

@@ -10,10 +10,11 @@ approximation of a partly covered zone), so that power falls with its square.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
@@ -132,7 +133,12 @@ class ZoneRays:
     """Rays that fill Fresnel zones on a surface with a skin; see :func:`zone_paths`."""
 
     def __init__(
-        self, patches: PlanarPatches, source: np.ndarray, wavelength_m: float, skin_m: float, device: Any
+        self,
+        patches: PlanarPatches,
+        source: np.ndarray,
+        wavelength_m: float,
+        skin_m: float,
+        device: DeviceLike,
     ) -> None:
         self.patches, self.source, self.wavelength_m = patches, source, wavelength_m
         self.skin_m, self.device = skin_m, device
@@ -154,7 +160,7 @@ class ZoneRays:
         way = self.source - receivers
         length = np.linalg.norm(way, axis=1)
         radius = self.radius(0.5 * length, 0.5 * length)
-        u, v = _across(way / np.maximum(length, 1e-12)[:, None])
+        u, v = vectors_across(way / np.maximum(length, 1e-12)[:, None])
         offset = self.samples[:, 0, None] * u[:, None] + self.samples[:, 1, None] * v[:, None]
         middle = (0.5 * (receivers + self.source))[:, None] + radius[:, None, None] * offset
         start = np.broadcast_to(receivers[:, None], middle.shape).reshape(-1, 3)
@@ -168,7 +174,7 @@ class ZoneRays:
     def mirror_share(self, ends: np.ndarray, patch: np.ndarray, point: np.ndarray) -> np.ndarray:
         """Share of each path's rays that arrive; a zone cuts a patch's plane in an ellipse, longer by 1 / cos."""
         count, order = patch.shape
-        legs = np.diff(_stops(self.source, point, ends), axis=1)
+        legs = np.diff(stops_of(self.source, point, ends), axis=1)
         lengths = np.linalg.norm(legs, axis=2)
         along = legs / np.maximum(lengths, 1e-12)[..., None]
         before = np.cumsum(lengths, axis=1)[:, :-1]
@@ -179,7 +185,7 @@ class ZoneRays:
             cosine = np.abs((along[:, k] * normal).sum(axis=1))
             across = np.cross(along[:, k], normal)
             size = np.linalg.norm(across, axis=1, keepdims=True)
-            across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), _across(normal)[0])
+            across = np.where(size > 1e-6, across / np.maximum(size, 1e-12), vectors_across(normal)[0])
             further = np.cross(normal, across) / np.maximum(cosine, 0.05)[:, None]
             offset = self.samples[:, 0, None] * across[:, None] + self.samples[:, 1, None] * further[:, None]
             around[:, :, k] += radius[:, k, None, None] * offset
@@ -233,10 +239,10 @@ def _unobstructed(
     ends: np.ndarray,
     patch: np.ndarray,
     point: np.ndarray,
-    device: Any,
+    device: DeviceLike,
 ) -> np.ndarray:
     """Whether every leg of each path is free, shape ``(L,)``; the mirrors' own faces, true to a tolerance, are not met."""
-    stops = _stops(source, point, ends)
+    stops = stops_of(source, point, ends)
     free = np.ones(len(patch), bool)
     for k in range(patch.shape[1] + 1):
         own = np.flatnonzero(free)
@@ -276,7 +282,7 @@ def _described(
 ) -> MirrorPaths:
     """Rows of paths of one order (receiver, patch, point, share), what they lack of ``columns`` filled up."""
     row, patch, point, share = (a[found[3] >= LEAST_SHARE] for a in found)
-    stops = _stops(source, point, receivers[row])
+    stops = stops_of(source, point, receivers[row])
     legs = np.diff(stops, axis=1)
     lengths = np.linalg.norm(legs, axis=2)
     along = legs / np.maximum(lengths, 1e-12)[..., None]
@@ -296,7 +302,7 @@ def _described(
     )
 
 
-def _stops(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
+def stops_of(source: np.ndarray, point: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Transmitter, mirror points and receiver of each path, shape ``(L, k + 2, 3)``."""
     return np.concatenate([np.broadcast_to(source, (len(ends), 1, 3)), point, ends[:, None]], axis=1)
 
@@ -305,10 +311,3 @@ def _joined(parts: list[MirrorPaths]) -> MirrorPaths:
     return MirrorPaths(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(MirrorPaths)}
     )
-
-
-def _across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across each unit direction ``(N, 3)``."""
-    u = np.cross(direction, np.eye(3)[np.abs(direction).argmin(axis=1)])
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return u, np.cross(direction, u)

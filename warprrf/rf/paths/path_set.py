@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.dispersion import Dispersion, dispersion
@@ -39,7 +40,7 @@ class Paths(PathArrays):
 
     def cfr(
         self,
-        frequencies_hz: Any,
+        frequencies_hz: ArrayLike,
         *,
         amplitude: str = "carrier",
         method: str = "auto",

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.spectrum import transverse_basis
 
 _PARALLEL = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
@@ -77,8 +78,7 @@ def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarr
         if k:
             other = across[:, k - 1]
         else:
-            other = np.cross(along[:, 0], np.eye(3)[np.abs(along[:, 0]).argmin(axis=1)])
-            other = other / np.linalg.norm(other, axis=1, keepdims=True)
+            other = vectors_across(along[:, 0])[0]
         own = across[:, k] / np.maximum(sine[:, k], _PARALLEL)
         across[:, k] = np.where(sine[:, k] > _PARALLEL, own, other)
     return along, across
@@ -90,7 +90,7 @@ def _rotations(turn: np.ndarray) -> np.ndarray:
 
 
 def chain_reflection(
-    log_excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray, met: np.ndarray
+    log_excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray, reflects: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Share of unpolarised power that chains of half-spaces of real permittivity reflect.
 
@@ -100,15 +100,15 @@ def chain_reflection(
         log_excess: ln(epsilon_r - 1) of each mirror of each chain, shape ``(L, k)``.
         cosine: of incidence, shape ``(L, k)``.
         turn: as :func:`turns` gives them, shape ``(L, k)``.
-        met: which mirrors there are, shape ``(L, k)``; the others let everything pass.
+        reflects: which mirrors there are, shape ``(L, k)``; the others let everything pass.
 
     Returns:
         The share, shape ``(L,)``, and its logarithmic derivatives to ``log_excess``, shape ``(L, k)``.
     """
     amplitude, rise = _half_space(log_excess, cosine)
-    amplitude = np.where(met[..., None], amplitude, 1.0)
-    rise = np.where(met[..., None], rise, 0.0)
-    rotation = _rotations(np.where(met, turn, 0.0))
+    amplitude = np.where(reflects[..., None], amplitude, 1.0)
+    rise = np.where(reflects[..., None], rise, 0.0)
+    rotation = _rotations(np.where(reflects, turn, 0.0))
     count, mirrors = cosine.shape
     whole = np.broadcast_to(np.eye(2), (count, 2, 2))
     slopes = np.zeros((mirrors, count, 2, 2))

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.geometry.mesh import Mesh, as_mesh
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
+from warprrf.geometry.mesh_topology import components
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import MirrorPaths
@@ -54,7 +54,7 @@ class Reflections:
     solve_s: float
     _tracer: MirrorTracer
 
-    def predict(self, receivers: Any) -> np.ndarray:
+    def predict(self, receivers: ArrayLike) -> np.ndarray:
         """Complex channel between isotropic antennas at ``receivers`` (R, 3) or (3,) [m], shape ``(R,)``.
 
         Raises:
@@ -69,18 +69,18 @@ class Reflections:
 
 
 def fit_reflections(
-    mesh: Any,
-    transmitter: Any,
-    receivers: Any,
-    csi: Any,
+    mesh: GeometryLike,
+    transmitter: ArrayLike,
+    receivers: ArrayLike,
+    csi: ArrayLike,
     frequency_hz: float,
     order: int = 2,
     *,
-    groups: Any = "patch",
+    groups: str | ArrayLike = "patch",
     prior: complex = 1.0,
     regularisation: float = REGULARISATION,
     chains: MirrorPaths | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> Reflections:
     """Fit one complex reflection coefficient a surface to complex channels.
 
@@ -208,7 +208,7 @@ def _gauss_newton(
     return best
 
 
-def _patch_groups(mesh: Mesh, patches: PlanarPatches, groups: Any) -> tuple[np.ndarray, int]:
+def _patch_groups(mesh: Mesh, patches: PlanarPatches, groups: str | ArrayLike) -> tuple[np.ndarray, int]:
     """Group of each patch, and how many groups there are."""
     if isinstance(groups, str):
         if groups == "patch":
@@ -236,6 +236,5 @@ def mesh_parts(mesh: Mesh) -> np.ndarray:
     corner = mesh.welded_faces
     ends = corner[:, [0, 1, 1, 2]].reshape(-1, 2)
     count = int(corner.max(initial=-1)) + 1
-    link = coo_array((np.ones(len(ends), bool), ends.T), shape=(count, count))
-    label = connected_components(link, directed=False)[1][corner[:, 0]]
+    label = components(count, ends)[corner[:, 0]]
     return np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1))

@@ -6,30 +6,31 @@ Angles: arrival points from the receiver to the last interaction, departure from
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.geometry.mesh import as_mesh
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
+from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.paths.images import MirrorImages
-from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths
+from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
 
 
 def trace_paths(
-    mesh_or_scene: Any,
+    mesh_or_scene: GeometryLike,
     *,
-    transmitter: Any,
-    receivers: Any,
+    transmitter: ArrayLike,
+    receivers: ArrayLike,
     frequency_hz: float,
     mirror_order: int = 1,
-    gas: Any = False,
-    device: Any = None,
+    gas: Gas = False,
+    device: DeviceLike = None,
 ) -> Paths:
     """Line of sight and mirror reflections by the image method, in float64.
 
@@ -40,7 +41,7 @@ def trace_paths(
     ``jones`` carries them. A bare mesh says nothing of polarisation: its paths have no ``jones``.
 
     Args:
-        mesh_or_scene: A :class:`Mesh`, or a scene with ``mesh``, ``face_material`` and ``materials``.
+        mesh_or_scene: A :class:`Mesh` or anything with a ``mesh``; a scene has ``face_material`` and ``materials`` too.
         transmitter: Position [m], shape ``(3,)``.
         receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
         frequency_hz: Carrier frequency [Hz].
@@ -77,16 +78,22 @@ class MirrorTracer:
     """
 
     def __init__(
-        self, mesh_or_scene: Any, *, transmitter: Any, frequency_hz: float, device: Any = None
+        self,
+        mesh_or_scene: GeometryLike,
+        *,
+        transmitter: ArrayLike,
+        frequency_hz: float,
+        device: DeviceLike = None,
     ) -> None:
         self.mesh = as_mesh(mesh_or_scene)
         self.transmitter = _device.check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
         self.table: SurfaceTable | None = None
         groups = None
-        if mesh_or_scene is not self.mesh:
-            self.table = surface_table(mesh_or_scene.materials, frequency_hz)
-            groups = mesh_or_scene.face_material
+        materials = getattr(mesh_or_scene, "materials", None)
+        if materials is not None:
+            self.table = surface_table(materials, frequency_hz)
+            groups = getattr(mesh_or_scene, "face_material", None)
         self.patches = planar_patches(self.mesh, groups)
         self.images = MirrorImages(self.patches, self.transmitter, device=device)
 
@@ -95,11 +102,11 @@ class MirrorTracer:
         """Wavelength [m]."""
         return SPEED_OF_LIGHT / self.frequency_hz
 
-    def trace(self, receiver: Any, mirror_order: int = 1) -> Paths:
+    def trace(self, receiver: ArrayLike, mirror_order: int = 1) -> Paths:
         """Paths of one receiver (3,); see :func:`trace_paths`."""
         return self.trace_each(_device.check_array("receiver", receiver, (3,))[None], mirror_order)[0]
 
-    def trace_each(self, receivers: Any, mirror_order: int = 1) -> list[Paths]:
+    def trace_each(self, receivers: ArrayLike, mirror_order: int = 1) -> list[Paths]:
         """Paths of each of ``receivers`` (R, 3), one after the other."""
         found = self.find(receivers, mirror_order)
         points = np.asarray(receivers, float)
@@ -118,18 +125,17 @@ class MirrorTracer:
             )  # fmt: skip
         return result
 
-    def find(self, receivers: Any, mirror_order: int = 1) -> MirrorPaths:
+    def find(self, receivers: ArrayLike, mirror_order: int = 1) -> MirrorPaths:
         """Geometry of all paths to ``receivers`` (R, 3), sorted by receiver.
 
         Raises:
             ValueError: on another order or shape, NaN, or a receiver at the transmitter's place.
         """
-        if isinstance(mirror_order, bool) or mirror_order != int(mirror_order) or mirror_order < 0:
-            raise ValueError(f"mirror_order: got {mirror_order!r}, expected a whole number of at least 0")
+        order = _device.check_count("mirror_order", mirror_order, 0)
         points = _device.check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():
             raise ValueError("receivers: got a receiver at the transmitter's place, expected them apart")
-        return exact_paths(self.images, points, int(mirror_order))
+        return exact_paths(self.images, points, order)
 
     def _reflected(self, found: MirrorPaths, receivers: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
         """Jones matrices ``(L, 2, 2)``, None for a bare mesh, and amplitudes ``(L,)``, both without the delay's phase."""
@@ -146,14 +152,7 @@ class MirrorTracer:
                 cos, self.table.permittivity[material], self.table.thickness_m[material], self.wavelength_m
             )
             smooth = np.sqrt(1.0 - self.table.scattering[material] ** 2)
-            stops = np.concatenate(
-                [
-                    np.broadcast_to(self.transmitter, (len(own), 1, 3)),
-                    found.point[own, :order],
-                    receivers[found.receiver[own], None],
-                ],
-                axis=1,
-            )
+            stops = stops_of(self.transmitter, found.point[own, :order], receivers[found.receiver[own]])
             normal, turn = self.patches.normal[patch], found.turn[own, :order]
             jones[own] = jones_matrices(stops, normal, turn, smooth * te, smooth * tm)
             phase[own] = np.where(te == 0, 1.0, te / np.where(te == 0, 1.0, np.abs(te))).prod(axis=1)

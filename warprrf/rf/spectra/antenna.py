@@ -10,12 +10,15 @@ does not turn and directions were told apart by other means; its pattern over ab
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import NamedTuple, TypeAlias, TypedDict, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import (
     check_shape,
     pixel_angles,
@@ -39,13 +42,17 @@ _TOGETHER = 32  # receivers whose estimates are refined at once
 _FLAT_DB = 0.1  # a pattern that varies less cannot tell directions apart
 
 
+Pattern: TypeAlias = Callable[[np.ndarray], ArrayLike] | ArrayLike
+"""Power gain [linear]: a function of the angle off boresight [rad], or samples of it from 0 to pi."""
+
+
 class DeembedOptions(TypedDict, total=False):
     """Options by the kind of antenna: ``limit_db`` for a fixed one, the others (:class:`Scan`) for a scanned one."""
 
     snapshots: int
     iterations: int
     tolerance: float
-    device: Any
+    device: DeviceLike
     limit_db: float
 
 
@@ -68,17 +75,14 @@ class Scan:
     snapshots: int = 1
     iterations: int = 2000
     tolerance: float = 1e-3
-    device: Any = None
+    device: DeviceLike = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.noise) and self.noise >= 0):
             raise ValueError(f"noise: got {self.noise!r}, expected a linear power of at least 0")
         for name in ("iterations", "snapshots"):
-            value = getattr(self, name)
-            if value != int(value) or value < 1:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least 1")
-        if not (np.isfinite(self.tolerance) and self.tolerance > 0):
-            raise ValueError(f"tolerance: got {self.tolerance!r}, expected a positive number")
+            _device.check_count(name, getattr(self, name))
+        _device.check_positive("tolerance", self.tolerance)
 
 
 class Deembedded(NamedTuple):
@@ -103,8 +107,8 @@ class Deembedded(NamedTuple):
 
 
 def deembed(
-    path_gain: Any,
-    pattern: Any,
+    path_gain: ArrayLike,
+    pattern: Pattern,
     beam_sigma_rad: float,
     *,
     boresight_gain_dbi: float | None = None,
@@ -133,7 +137,7 @@ def deembed(
 
 
 def scanned_kernel(
-    pattern: Any, shape: tuple[int, int], boresight_gain_dbi: float | None = None
+    pattern: Pattern, shape: tuple[int, int], boresight_gain_dbi: float | None = None
 ) -> np.ndarray:
     """Azimuth spectrum of the response between rows, shape ``(W // 2 + 1, H, H)``; real, since patterns are even.
 
@@ -169,7 +173,7 @@ def _angles_between(shape: tuple[int, int]) -> np.ndarray:
     return 2.0 * np.arcsin(np.sqrt(np.clip(half, 0.0, 1.0)))
 
 
-def respond(path_gain: Any, kernel: np.ndarray) -> np.ndarray:
+def respond(path_gain: ArrayLike, kernel: np.ndarray) -> np.ndarray:
     """What the scanned antenna measures of ``path_gain`` (..., H, W): power at each pixel it is steered to, same shape.
 
     ``kernel`` is what :func:`scanned_kernel` returned. Exact on the grid: rows are convolved in azimuth by FFT.
@@ -251,8 +255,7 @@ def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) 
     Directions in which the antenna is more than ``limit_db`` below its peak come out empty: dividing there would only
     blow up noise and leakage. The total path gain is then that of the directions that are left.
     """
-    if not (np.isfinite(limit_db) and limit_db > 0):
-        raise ValueError(f"limit_db: got {limit_db!r}, expected a positive number of decibels")
+    _device.check_positive("limit_db", limit_db, "number of decibels")
     told = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
     path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=told)
     source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)
@@ -262,7 +265,7 @@ def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) 
     return Deembedded(path_gain, source, none.astype(int), none, covered, FIXED)
 
 
-def sample_pattern(pattern: Any, angle: np.ndarray) -> np.ndarray:
+def sample_pattern(pattern: Pattern, angle: np.ndarray) -> np.ndarray:
     """The pattern at ``angle`` [rad], shape as ``angle``."""
     if callable(pattern):
         gain = _device.check_array("pattern", pattern(angle), finite=False)

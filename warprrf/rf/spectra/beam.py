@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
 from warprrf.cache import Cache
+from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions
 
 EVEN_SUB_PIXELS = 4  # square root of the directions that stand for a whole pixel's even power
@@ -22,7 +23,7 @@ class BeamOperator:
     the rows for each frequency. Sums are kept.
     """
 
-    def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
+    def __init__(self, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None) -> None:
         rows, columns = self.shape = shape
         directions = sub_pixel_directions(shape, EVEN_SUB_PIXELS)[0].reshape(rows, columns, -1, 3)[:, 0]
         even = np.full(directions.shape[1], 1.0 / directions.shape[1])
@@ -59,9 +60,9 @@ class BeamOperator:
         """The transposed map of ``images`` (H, W, ...)."""
         return self._apply(self._backward, images, np.float32 if quick else np.float64)
 
-    def _apply(self, matrices: np.ndarray, images: np.ndarray, real: Any) -> np.ndarray:
+    def _apply(self, matrices: np.ndarray, images: np.ndarray, real: DTypeLike) -> np.ndarray:
         rows, columns = self.shape
-        flat = np.asarray(images, real).reshape(rows, columns, -1)
+        flat: np.ndarray = np.asarray(images, real).reshape(rows, columns, -1)
         count = flat.shape[2]
         x = np.moveaxis(rfft(flat, axis=1), 1, 0)
         product = matrices.astype(real, copy=False) @ np.concatenate([x.real, x.imag], axis=2)
@@ -81,7 +82,7 @@ class BeamOperator:
 _OPERATORS = Cache(8)
 
 
-def beam_operator(shape: tuple[int, int], sigma: float, device: Any = None) -> BeamOperator:
+def beam_operator(shape: tuple[int, int], sigma: float, device: DeviceLike = None) -> BeamOperator:
     """The beam of width ``sigma`` [rad] on a grid of ``shape``; the last few are kept."""
     key = shape, sigma, str(device)
     return _OPERATORS.get(key, lambda: BeamOperator(shape, sigma, device=device))

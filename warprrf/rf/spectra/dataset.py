@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
-from warprrf.rf.spectra.antenna import DeembedOptions, deembed
+from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
 from warprrf.rf.spectra.spectrum import Spectrum, check_shape, default_floor, to_db
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
@@ -96,17 +97,17 @@ class SpectrumDataset:
     def from_spectra(
         cls,
         *,
-        receivers: Any,
-        transmitter: Any,
+        receivers: np.ndarray,
+        transmitter: np.ndarray,
         frequency_hz: float,
-        path_gain: Any,
-        delay_s: Any,
-        aod: Any,
-        line_of_sight: Any,
+        path_gain: np.ndarray,
+        delay_s: np.ndarray,
+        aod: np.ndarray,
+        line_of_sight: np.ndarray,
         beam_sigma_rad: float,
         engine: str,
         seed: int = 0,
-        role: Any = None,
+        role: Sequence[str] | np.ndarray | None = None,
         floor: float | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> SpectrumDataset:
@@ -126,7 +127,7 @@ class SpectrumDataset:
             engine=engine,
             polarisation=POLARISATION,
             seed=seed,
-            role=assign_roles(len(gain), seed=seed) if role is None else role,
+            role=assign_roles(len(gain), seed=seed) if role is None else np.asarray(role),
             line_of_sight=line_of_sight,
             attributes=dict(attributes or {}),
         )
@@ -169,7 +170,7 @@ class SpectrumDataset:
         """10 log10(P + N0) [dB], shape ``(R, H, W)``, float64."""
         return to_db(self.path_gain, self.floor)
 
-    def subset(self, indices: Any) -> SpectrumDataset:
+    def subset(self, indices: ArrayLike) -> SpectrumDataset:
         """The receivers named by ``indices`` (whole numbers or a mask); floor and range stay those of the whole set."""
         chosen = np.asarray(indices)
         if chosen.dtype == bool:
@@ -207,7 +208,7 @@ class SpectrumDataset:
 
     def deembed(
         self,
-        pattern: Any,
+        pattern: Pattern,
         *,
         boresight_gain_dbi: float | None = None,
         noise: float = 0.0,
@@ -259,8 +260,8 @@ class SpectrumDataset:
         delay = np.where(there >= 0, self.delay_s.reshape(count, -1)[each, chosen], np.nan)
         aod = np.where(there[..., None] >= 0, self.aod.reshape(count, -1, 2)[each, chosen], np.nan)
         gain = done.path_gain.astype(np.float32)
-        lit = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
-        floor = default_floor(gain) if lit else self.floor
+        received = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
+        floor = default_floor(gain) if received else self.floor
         return replace(
             self,
             path_gain=gain,

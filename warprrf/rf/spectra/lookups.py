@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from warprrf.device import check_array
+from warprrf.device import check_array, check_positive
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, to_db
@@ -34,7 +34,7 @@ class Lookup:
     note: str
     _predict: Callable[[np.ndarray], Spectrum] = field(repr=False)
 
-    def __call__(self, receiver: Any) -> Spectrum:
+    def __call__(self, receiver: ArrayLike) -> Spectrum:
         """The predicted spectrum at ``receiver`` (3,) [m].
 
         Raises:
@@ -74,8 +74,7 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
     Raises:
         ValueError: for a power that is not positive, or an unknown domain.
     """
-    if not (np.isfinite(power) and power > 0):
-        raise ValueError(f"power: got {power!r}, expected a positive number")
+    check_positive("power", power)
     receivers = _receivers(train)
     floor, range_db = float(train.floor), train.range_db
     images = np.asarray(train.path_gain, dtype=np.float64)

@@ -17,6 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
 from warprrf.device import Progress
@@ -34,7 +35,7 @@ SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with 
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
-def unit_image(path_gain: np.ndarray, floor: float, range_db: Any) -> np.ndarray:
+def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float]) -> np.ndarray:
     """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
     low, high = (float(v) for v in range_db)
     if not high > low:
@@ -227,11 +228,11 @@ def evaluate(
     return report
 
 
-def _predicts(values: Any) -> bool:
+def _predicts(values: np.ndarray | None) -> bool:
     return values is not None and bool(np.isfinite(values).any())
 
 
-def _checked_gain(prediction: Any, shape: tuple[int, ...], index: int) -> np.ndarray:
+def _checked_gain(prediction: Spectrum | ArrayLike, shape: tuple[int, ...], index: int) -> np.ndarray:
     value = getattr(prediction, "path_gain", prediction)
     gain = np.asarray(value.numpy() if hasattr(value, "numpy") else value, dtype=np.float64)
     if gain.shape != shape:
@@ -241,7 +242,7 @@ def _checked_gain(prediction: Any, shape: tuple[int, ...], index: int) -> np.nda
     return gain
 
 
-def _unit(angles: Any) -> np.ndarray:
+def _unit(angles: np.ndarray | None) -> np.ndarray:
     return directions_from_angles(np.asarray(angles)[..., 0], np.asarray(angles)[..., 1])
 
 

@@ -9,14 +9,17 @@ total path gain, and an isotropic field stays one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
 BEAM_SIGMA_RAD = float(np.deg2rad(2.0))
@@ -34,7 +37,7 @@ FLOOR_BELOW_MEDIAN_DB = 60.0
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
-def check_shape(shape: Any) -> tuple[int, int]:
+def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     """``shape`` as (rows, columns), each at least 2.
 
     Raises:
@@ -96,7 +99,7 @@ def sub_pixel_directions(shape: tuple[int, int], sub_pixels: int) -> tuple[np.nd
     return directions, np.repeat(pixel_solid_angles(shape) / count, columns * count)
 
 
-def directions_from_angles(zenith: Any, azimuth: Any) -> np.ndarray:
+def directions_from_angles(zenith: ArrayLike, azimuth: ArrayLike) -> np.ndarray:
     """Unit vectors, shape ``(..., 3)``, of zenith in [0, pi] and azimuth in (-pi, pi] [rad]."""
     zenith, azimuth = np.broadcast_arrays(np.asarray(zenith, float), np.asarray(azimuth, float))
     return np.stack(
@@ -104,14 +107,14 @@ def directions_from_angles(zenith: Any, azimuth: Any) -> np.ndarray:
     )
 
 
-def angles_from_directions(directions: Any) -> tuple[np.ndarray, np.ndarray]:
+def angles_from_directions(directions: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Zenith in [0, pi] and azimuth in (-pi, pi] [rad] of vectors ``(..., 3)`` of any length."""
     d = np.asarray(directions, dtype=np.float64)
     azimuth = np.arctan2(d[..., 1], d[..., 0])
     return np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]), np.where(azimuth == -np.pi, np.pi, azimuth)
 
 
-def transverse_basis(directions: Any) -> np.ndarray:
+def transverse_basis(directions: ArrayLike) -> np.ndarray:
     """Zenith and azimuth unit vectors at unit directions ``(..., 3)``, shape ``(..., 2, 3)``."""
     zenith, azimuth = angles_from_directions(directions)
     up = np.stack(
@@ -121,7 +124,7 @@ def transverse_basis(directions: Any) -> np.ndarray:
     return np.stack([up, around], axis=-2)
 
 
-def pixel_of(directions: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def pixel_of(directions: ArrayLike, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the pixel that each direction ``(..., 3)`` falls in."""
     rows, columns = check_shape(shape)
     zenith, azimuth = angles_from_directions(directions)
@@ -129,7 +132,7 @@ def pixel_of(directions: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.nd
     return row, np.floor((azimuth + np.pi) * columns / (2.0 * np.pi)).astype(np.int64) % columns
 
 
-def to_db(path_gain: Any, floor: float) -> np.ndarray:
+def to_db(path_gain: ArrayLike, floor: float) -> np.ndarray:
     """10 log10(P + N0) [dB], of linear path gain and the noise floor N0."""
     return 10.0 * np.log10(np.asarray(path_gain, dtype=np.float64) + floor)
 
@@ -161,14 +164,24 @@ class SpreadPaths(NamedTuple):
 
 
 def spread(
-    directions: Any, powers: Any, shape: tuple[int, int], sigma: float = BEAM_SIGMA_RAD, *, device: Any = None
+    directions: ArrayLike,
+    powers: ArrayLike,
+    shape: tuple[int, int],
+    sigma: float = BEAM_SIGMA_RAD,
+    *,
+    device: DeviceLike = None,
 ) -> np.ndarray:
     """Path gains spread by the receiver beam, shape ``(H, W)``, float64; sums to ``powers.sum()``. See spread_paths."""
     return spread_paths(directions, powers, shape, sigma, device=device).path_gain
 
 
 def spread_paths(
-    directions: Any, powers: Any, shape: tuple[int, int], sigma: float = BEAM_SIGMA_RAD, *, device: Any = None
+    directions: ArrayLike,
+    powers: ArrayLike,
+    shape: tuple[int, int],
+    sigma: float = BEAM_SIGMA_RAD,
+    *,
+    device: DeviceLike = None,
 ) -> SpreadPaths:
     """Path gains spread by the receiver beam, and each pixel's strongest path.
 
@@ -184,14 +197,13 @@ def spread_paths(
     rows, columns = check_shape(shape)
     d = _device.check_array("directions", directions, (None, 3))
     power = _device.check_array("powers", powers, (len(d),))
-    if not (np.isfinite(sigma) and sigma > 0):
-        raise ValueError(f"sigma: got {sigma!r}, expected a positive beam width in radians")
+    _device.check_positive("sigma", sigma, "beam width in radians")
     if (power < 0).any():
         raise ValueError(f"powers: got {int((power < 0).sum())} negative path gains, expected linear power")
-    lit = np.flatnonzero(power > 0)
-    if len(lit) == 0:
+    positive = np.flatnonzero(power > 0)
+    if len(positive) == 0:
         return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
-    d, power = d[lit], power[lit]
+    d, power = d[positive], power[positive]
     length = np.linalg.norm(d, axis=1, keepdims=True)
     if (length == 0).any():
         raise ValueError("directions: got a vector of length zero, expected directions of arrival")
@@ -204,7 +216,7 @@ def spread_paths(
 
     where = _device.resolve(device)
     grid = _beam_grid((rows, columns), float(sigma), str(where))
-    count = len(lit)
+    count = len(positive)
     toward = wp.array(d[order], dtype=wp.vec3d, device=where)
     nearest = wp.zeros(count, dtype=wp.float64, device=where)
     total = wp.zeros(count, dtype=wp.float64, device=where)
@@ -218,11 +230,16 @@ def spread_paths(
     inputs = [toward, scaled, nearest, first, *beam, image, best]
     _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
     index = best.numpy()
-    return SpreadPaths(image.numpy(), np.where(index >= 0, lit[order][index], -1).astype(np.int32))
+    return SpreadPaths(image.numpy(), np.where(index >= 0, positive[order][index], -1).astype(np.int32))
 
 
 def strongest_rays(
-    directions: wp.array, power: np.ndarray, shape: tuple[int, int], sigma: float, *, device: Any = None
+    directions: wp.array,
+    power: np.ndarray,
+    shape: tuple[int, int],
+    sigma: float,
+    *,
+    device: DeviceLike = None,
 ) -> np.ndarray:
     """The ray that gives each pixel the most through the receiver beam, shape ``(H, W)`` int32; -1 where none does.
 

@@ -8,7 +8,7 @@ import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra
 from scipy import sparse
 
-from warprrf.rf.fields import files
+from warprrf import tensor_files as files
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import NEPER

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.fields.bistatic.rays import RayGrid
 from warprrf.rf.fields.bistatic.surface import Surface
 
@@ -20,7 +21,6 @@ class ElementLinks:
     Args:
         grid: casts the rays.
         transmitter: position (3,) [m].
-        seed: of the rays' directions.
 
     Attributes:
         hits: what 128 rays from each element hit, density proportional to the cosine.
@@ -29,10 +29,10 @@ class ElementLinks:
         air: share of power that the air between lets through, shape ``(E, 128)``; 0 where a ray hits nothing.
     """
 
-    def __init__(self, grid: RayGrid, transmitter: np.ndarray, *, seed: int = 0) -> None:
+    def __init__(self, grid: RayGrid, transmitter: np.ndarray) -> None:
         surface = grid.surface
         point, normal = _sample_points(surface)
-        directions = _hemispheres(normal, seed)
+        directions = _hemispheres(normal)
         self.hits = grid.hit_along(point, directions, np.ones(len(directions)))
         self.light = grid.light(self.hits, transmitter)
         face = self.hits.face.numpy()
@@ -48,26 +48,19 @@ def _sample_points(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
     gap = np.linalg.norm(centre - surface.element_centre[surface.element], axis=1)
     order = np.lexsort((gap, surface.element))
     first = order[np.searchsorted(surface.element[order], np.arange(len(surface.element_area)))]
-    normal = np.where(
-        ((surface.normal[first] * surface.mesh.face_normals[first]).sum(axis=1) < 0)[:, None],
-        -surface.normal[first],
-        surface.normal[first],
-    )
+    normal = surface.front_normal[first]
     return centre[first] + LIFT_M * normal, normal
 
 
-def _hemispheres(normal: np.ndarray, seed: int) -> np.ndarray:
+def _hemispheres(normal: np.ndarray) -> np.ndarray:
     """``RAYS`` directions for each normal, density proportional to the cosine, shape ``(E * RAYS, 3)``."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     count = len(normal)
     k = np.arange(RAYS)
     u = np.mod(k * 0.7548776662466927 + rng.random((count, 1)), 1.0)  # R2 sequence (Roberts 2018), shifted
     v = np.mod(k * 0.5698402909980532 + rng.random((count, 1)), 1.0)
     radius, turn = np.sqrt(u), 2.0 * np.pi * v
-    least = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    a = np.cross(normal, least)
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    b = np.cross(normal, a)
+    a, b = vectors_across(normal)
     x, y, z = radius * np.cos(turn), radius * np.sin(turn), np.sqrt(np.maximum(1.0 - u, 0.0))
     d = x[..., None] * a[:, None] + y[..., None] * b[:, None] + z[..., None] * normal[:, None]
     return d.reshape(-1, 3)

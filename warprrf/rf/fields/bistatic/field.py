@@ -20,11 +20,12 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.device import Progress, check_array
-from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.absorption import Air, air_of
+from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
@@ -79,7 +80,7 @@ class BistaticField(RadioField):
     errors: uncertainty.ErrorModel | None = field(default=None, repr=False)
     air: Air | None = None
     report: dict[str, Any] = field(default_factory=dict, repr=False)
-    device: Any = field(default=None, repr=False)
+    device: DeviceLike = field(default=None, repr=False)
     _sent: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def __post_init__(self) -> None:
@@ -117,13 +118,13 @@ class BistaticField(RadioField):
     @classmethod
     def fit(  # type: ignore[override]
         cls,
-        geometry: Any,
+        geometry: GeometryLike,
         ds: SpectrumDataset,
         model: str = "bistatic",
         *,
         options: FitOptions | None = None,
         transport: TrainingViews | None = None,
-        device: Any = None,
+        device: DeviceLike = None,
         progress: Progress | None = None,
         **settings: Any,
     ) -> BistaticField:
@@ -155,7 +156,12 @@ class BistaticField(RadioField):
 
     @classmethod
     def prior(
-        cls, geometry: Any, ds: SpectrumDataset, *, terms: Terms | None = None, device: Any = None
+        cls,
+        geometry: GeometryLike,
+        ds: SpectrumDataset,
+        *,
+        terms: Terms | None = None,
+        device: DeviceLike = None,
     ) -> BistaticField:
         """The field before any measurement: every surface is taken for :meth:`Parameters.prior`.
 
@@ -187,7 +193,7 @@ class BistaticField(RadioField):
             device=device,
         )
 
-    def with_gas(self, gas: Any = True) -> BistaticField:
+    def with_gas(self, gas: Gas = True) -> BistaticField:
         """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
         return replace(self, air=air_of(gas, self.frequency_hz))
 
@@ -195,8 +201,8 @@ class BistaticField(RadioField):
 
     def spectrum(
         self,
-        rx: Any,
-        transmitter: Any = None,
+        rx: ArrayLike,
+        transmitter: ArrayLike | None = None,
         *,
         uncertainty: bool = False,
         view: ReceiverView | None = None,
@@ -226,7 +232,9 @@ class BistaticField(RadioField):
         )
         return replace(spectrum, std_db=self._std_db(seen, found)) if uncertainty else spectrum
 
-    def paths(self, rx: Any, transmitter: Any = None, max_paths: int | None = None) -> Paths:
+    def paths(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
+    ) -> Paths:
         """Propagation paths at ``rx``: line of sight, mirrors, and one diffuse path per pixel above the floor.
 
         The sum of ``|gain|^2`` equals the spectrum's sum: what pixels below the floor hold is shared among the diffuse
@@ -241,8 +249,8 @@ class BistaticField(RadioField):
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
         """
-        if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
-            raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
+        if max_paths is not None:
+            check_count("max_paths", max_paths)
         positions = check_receiver("rx", rx, self.surface.mesh)
         found = []
         for position in np.atleast_2d(positions):
@@ -250,7 +258,7 @@ class BistaticField(RadioField):
             found.append(paths_of(view, self.render(view), self.floor, self.air, max_paths))
         return found[0] if positions.ndim == 1 else Paths.stack(found)
 
-    def view(self, rx: Any, transmitter: Any = None) -> ReceiverView:
+    def view(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> ReceiverView:
         """What the receiver at ``rx`` (3,) sees of the geometry, whatever the materials: the costly part of a spectrum.
 
         Raises:
@@ -267,7 +275,7 @@ class BistaticField(RadioField):
         view = view.transport.complete(view, self.terms)
         return render(view, self.materials, self._beam, self.sent_radiance(view.transport))
 
-    def transport(self, transmitter: Any = None) -> Transport:
+    def transport(self, transmitter: ArrayLike | None = None) -> Transport:
         """The geometry under ``transmitter`` (3,) [m], by default the fitted one; that of the last few is kept."""
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         return Transport.of(
@@ -282,7 +290,8 @@ class BistaticField(RadioField):
         key = transport.transmitter.tobytes()
         return self._sent.get(key, lambda: sent_radiance(transport, self.materials))
 
-    def _links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+    def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
+        """:meth:`links` at positions that were checked, several at a time."""
         transport = self.transport(transmitter)
         tracer = LinkTracer(transport, self.materials, self.sent_radiance(transport), options, self.shape)
         return options.in_batches(receivers, tracer.batch, tracer)
@@ -309,7 +318,7 @@ class BistaticField(RadioField):
         files.write({f.name: getattr(self, f.name) for f in fields(self)}, path)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> BistaticField:
+    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> BistaticField:
         """Read a field that :meth:`save` wrote; errors as for :meth:`RadioField.load`."""
         parts = files.read(path)
         try:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from warprrf import tensor_files
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.fields import files as field_files
 from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -44,13 +44,13 @@ def write(parts: dict[str, Any], path: str | os.PathLike[str]) -> None:
         "two_sided": s.two_sided,
     }
     header |= {} if parts["air"] is None else parts["air"].attributes
-    field_files.write(path, tensors, header)
+    tensor_files.write(path, tensors, header)
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     """What makes the field that :func:`write` wrote, by the names of its attributes; errors as for
     :meth:`RadioField.load`."""
-    tensors, header = field_files.read(path)
+    tensors, header = tensor_files.read(path)
     try:
         surface = Surface(
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.linalg.blas import ssyrk
 
-from warprrf.device import Progress
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict
 
@@ -95,15 +94,13 @@ class Fitted:
 
     Attributes:
         parameters: the fitted parameters.
-        covariance: of the free ones (Laplace), shape ``(F, F)``; see ``layout``.
-        layout: which ones are free.
+        covariance: of the free ones (Laplace), shape ``(F, F)``; see :class:`Layout`.
         losses: objective after each step, per reading [dB^2].
         steps: steps taken.
     """
 
     parameters: Parameters
     covariance: np.ndarray
-    layout: Layout
     losses: list[float]
     steps: int
 
@@ -163,7 +160,6 @@ def fit_groups(
     start: Parameters,
     area: np.ndarray,
     options: GroupFit | None = None,
-    progress: Progress | None = None,
 ) -> Fitted:
     """Levenberg-Marquardt on the groups' parameters.
 
@@ -172,7 +168,6 @@ def fit_groups(
         start: where the fit starts and the priors centre; ``log_indirect`` is set here if it is -inf.
         area: area of each group [m^2], shape ``(G,)``.
         options: what is free, and how far the fit goes.
-        progress: called as ``progress("fit", step, steps)``.
     """
     o = options or GroupFit()
     start, layout = start_of(readings, start, o)
@@ -202,8 +197,6 @@ def fit_groups(
                 break
             damping *= 5.0
         taken = step + 1
-        if progress is not None:
-            progress("fit", taken, o.steps)
         if not improved:
             break
         # Steps that were cut short, or do worse than the quadratic model says, are no sign of having arrived.
@@ -215,7 +208,7 @@ def fit_groups(
         losses.append(current / weight / count)
         if fall < o.tolerance and honest and (np.abs(move) < o.longest).all():
             break
-    return Fitted(layout.unpack(vector), np.linalg.inv(hessian), layout, losses, taken)
+    return Fitted(layout.unpack(vector), np.linalg.inv(hessian), losses, taken)
 
 
 def _normal_equations(
@@ -234,11 +227,11 @@ def _normal_equations(
 
 
 def _dark_level(readings: Sequence[Reading]) -> float:
-    """ln of a radiance that explains what the darkest lit pixels hold [1/m^2]."""
+    """ln of a radiance that explains what the darkest illuminated pixels hold [1/m^2]."""
     found = []
     for reading in readings:
         base, power = reading.response.indirect.sum(axis=0), np.expm1(reading.target_db / NEPER)
-        lit = (base > 0) & (power > 0)
-        if lit.any():
-            found.append(np.percentile(np.log(power[lit] / base[lit]), 20))
+        illuminated = (base > 0) & (power > 0)
+        if illuminated.any():
+            found.append(np.percentile(np.log(power[illuminated] / base[illuminated]), 20))
     return float(np.median(found)) if found else 0.0

@@ -114,9 +114,9 @@ def _costs(readings: Sequence[Reading], p: Parameters, owner: np.ndarray) -> np.
         r, target = reading.response, reading.target_db
         power = predict(r.tied(owner), p)
         loss = huber(NEPER * np.log1p(power) - target, fit.huber_db)[0].sum()
-        met = r.path_group >= 0
-        now = np.where(met, owner[np.where(met, r.path_group, 0)], -1)
-        for unit in np.unique(np.concatenate([r.group, r.sender, r.path_group[met]])):
+        reflects = r.path_group >= 0
+        now = np.where(reflects, owner[np.where(reflects, r.path_group, 0)], -1)
+        for unit in np.unique(np.concatenate([r.group, r.sender, r.path_group[reflects]])):
             change = _mirror_change(r, now, unit, p)
             for a in np.flatnonzero(r.group == unit):
                 change += (mix - mix[owner[unit]]) @ r.bounce[a].reshape(-1, len(power))

@@ -165,8 +165,8 @@ def mirror_power(
         Power, shape ``(K,)``, and its logarithmic derivatives to ``log_excess`` of each group met, shape ``(K, 3)``,
         0 for none; those to ``log_mirror`` are 1.
     """
-    met = path_group >= 0
+    reflects = path_group >= 0
     own = np.maximum(path_group, 0)
-    share, slope = chain_reflection(p.log_excess[own], cosine, turn, met)
-    strength = np.where(met, p.log_mirror[own], 0.0).sum(axis=1)
+    share, slope = chain_reflection(p.log_excess[own], cosine, turn, reflects)
+    strength = np.where(reflects, p.log_mirror[own], 0.0).sum(axis=1)
     return np.asarray(power, float) * np.exp(strength) * share, slope

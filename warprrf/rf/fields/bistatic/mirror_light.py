@@ -1,4 +1,4 @@
-"""Surfaces lit by mirrors: which faces a mirror throws light on, and what a receiver sees of it.
+"""Surfaces illuminated by mirrors: which faces a mirror throws light on, and what a receiver sees of it.
 
 The image of the transmitter in a patch is a source that shines through the patch as through a window, so what a ray
 meets scatters its light with the same lobes as direct light. Which images light which faces is found once for a
@@ -23,8 +23,8 @@ MIRROR_SLACK_M = 0.1
 
 
 @dataclass(frozen=True)
-class MirrorLit:
-    """Light that mirrors throw on what rays hit, one row for each pair of a ray and an image that lights its hit.
+class MirrorIllumination:
+    """Light that mirrors throw on what rays hit, one row for each pair of a ray and an image that illuminates its hit.
 
     Attributes:
         ray: of the view's grid, shape ``(L,)``.
@@ -56,9 +56,7 @@ class MirrorLight:
         images = MirrorImages(s.patches, transmitter, slack_m=MIRROR_SLACK_M, device=grid.device)
         face, patch, point = images.candidates(centre, 1)
         # Light must come from in front of the face, of either side if it has two, and not from its own patch.
-        normal = np.where(((s.normal * s.mesh.face_normals).sum(axis=1) < 0)[:, None], -s.normal, s.normal)[
-            face
-        ]
+        normal = s.front_normal[face]
         side = ((point[:, 0] - centre[face]) * normal).sum(axis=1)
         normal = np.where(s.two_sided & (side < 0)[:, None], -normal, normal)
         own = np.flatnonzero((s.two_sided | (side > 0)) & (s.patch[face] != patch[:, 0]))
@@ -75,7 +73,7 @@ class MirrorLight:
         share = s.mesh.areas[face] / s.element_area[s.element[face]]
         self._irradiance = share * cos_in / np.maximum(length, NEAREST_M) ** 2 * grid.transmittance(length)
         order = np.lexsort((patch, face))
-        self._lit_by = patch[order]
+        self._mirror = patch[order]
         self._first = np.searchsorted(face[order], np.arange(len(s.mesh.faces) + 1))
 
     def irradiance(self, p: Parameters) -> np.ndarray:
@@ -86,51 +84,51 @@ class MirrorLight:
         share = mirror_share(p, self.surface.patch_group[self._patch], self._cosine)
         return np.bincount(self.surface.element[self._face], share * self._irradiance, minlength=elements)
 
-    def view(self, tracer: RayGrid, receivers: np.ndarray, met: Hits) -> MirrorLit:
-        """Mirrored light that the rays of ``tracer`` from ``receivers``, (3,) or (O, 3), see where they ``met`` faces."""
+    def view(self, grid: RayGrid, receivers: np.ndarray, hits: Hits) -> MirrorIllumination:
+        """Mirrored light that the rays of ``grid`` from ``receivers``, (3,) or (O, 3), see where they hit faces."""
         s = self.surface
         # About two rays of a pixel look for mirrored light; the stride takes all of their places in turn.
-        every = tracer.sub_pixels**2 // 2 + 1
-        grid = len(tracer.directions)
-        rays = np.add.outer(np.arange(0, len(met.face), grid), np.arange(0, grid, every)).ravel()
-        face = met.face.numpy()[rays]
+        every = grid.sub_pixels**2 // 2 + 1
+        size = len(grid.directions)
+        rays = np.add.outer(np.arange(0, len(hits.face), size), np.arange(0, size, every)).ravel()
+        face = hits.face.numpy()[rays]
         rays, face = rays[face >= 0], face[face >= 0]
         count = self._first[face + 1] - self._first[face]
         row = np.repeat(np.arange(len(rays)), count)
         within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
         pair = self._first[face[row]] + within
-        own = rays % len(tracer.directions)
-        direction = tracer.directions[own]
-        start = np.asarray(receivers, float).reshape(-1, 3)[rays // len(tracer.directions)]
-        points = start + met.range_m.numpy()[rays, None] * direction
+        own = rays % len(grid.directions)
+        direction = grid.directions[own]
+        start = np.asarray(receivers, float).reshape(-1, 3)[rays // len(grid.directions)]
+        points = start + hits.range_m.numpy()[rays, None] * direction
         if len(row) == 0:
             none = np.zeros(0, int)
-            return _packed(tracer, none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
-        patch = self._lit_by[pair]
+            return _packed(grid, none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
+        patch = self._mirror[pair]
         normal = s.normal[face]
         turned = (s.mesh.face_normals[face] * direction).sum(axis=1) > 0
         normal = np.where(turned[:, None], -normal, normal)[row]
-        look = -direction[row]
+        to_receiver = -direction[row]
         way = self._image[patch] - points[row]
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-9)[:, None]
         cos_in = (normal * toward).sum(axis=1)
         k = np.flatnonzero(cos_in > 0)
-        cos_s = np.maximum((normal[k] * look[k]).sum(axis=1), 0.0)
-        high = cos_s + tracer.half_width
-        low = np.maximum(cos_s - tracer.half_width, 0.01 * tracer.half_width)
-        strength = every * tracer.solid_angle[own[row[k]]] * cos_in[k]
+        cos_s = np.maximum((normal[k] * to_receiver[k]).sum(axis=1), 0.0)
+        high = cos_s + grid.half_width
+        low = np.maximum(cos_s - grid.half_width, 0.01 * grid.half_width)
+        strength = every * grid.solid_angle[own[row[k]]] * cos_in[k]
         strength /= (4.0 * np.pi * np.maximum(length[k], NEAREST_M)) ** 2
-        strength *= tracer.transmittance(length[k] + met.range_m.numpy()[rays[row[k]]])
+        strength *= grid.transmittance(length[k] + hits.range_m.numpy()[rays[row[k]]])
         return _packed(
-            tracer,
+            grid,
             rays[row[k]],
             patch[k],
             np.abs((toward[k] * s.plane_normal[patch[k]]).sum(axis=1)),
             face[row[k]],
             strength,
             np.minimum(cos_in[k], 1.0),
-            np.clip(2.0 * cos_in[k] * cos_s - (toward[k] * look[k]).sum(axis=1), -1.0, 1.0),
+            np.clip(2.0 * cos_in[k] * cos_s - (toward[k] * to_receiver[k]).sum(axis=1), -1.0, 1.0),
             np.log(high / low) / (high - low),
         )
 
@@ -142,8 +140,8 @@ def _packed(
     cosine: np.ndarray,
     face: np.ndarray,
     *light: np.ndarray,
-) -> MirrorLit:
-    return MirrorLit(
+) -> MirrorIllumination:
+    return MirrorIllumination(
         ray, patch, cosine, wp.array(face, dtype=wp.int32, device=grid.device),
         Illumination(*(wp.array(value, dtype=wp.float32, device=grid.device) for value in light)),
     )  # fmt: skip

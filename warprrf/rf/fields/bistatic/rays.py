@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.geometry import o3d
 from warprrf.geometry import rays as mesh_rays
 from warprrf.kernels.radio import bounce
@@ -95,7 +97,7 @@ class RayGrid:
         sub_pixels: int,
         *,
         loss_per_m: float = 0.0,
-        device: Any = None,
+        device: DeviceLike = None,
     ) -> None:
         self.surface, self.shape, self.sub_pixels = surface, shape, sub_pixels
         self.loss_per_m = float(loss_per_m)
@@ -105,7 +107,7 @@ class RayGrid:
         self._solid_angle = wp.array(self.solid_angle, dtype=wp.float32, device=self.device)
         self.half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
 
-    def transmittance(self, length_m: Any) -> np.ndarray | float:
+    def transmittance(self, length_m: ArrayLike) -> np.ndarray | float:
         """Share of power that ``length_m`` [m] of air lets through; 1.0 without absorption."""
         return np.exp(-self.loss_per_m * np.asarray(length_m)) if self.loss_per_m else 1.0
 

@@ -40,7 +40,7 @@ class Further:
     Attributes:
         rays: how many the view has.
         sent: light that surfaces send on.
-        shown: what mirrors show of the lit scene: rays and their path gain, shape ``(M,)`` each.
+        shown: what mirrors show of the illuminated scene: rays and their path gain, shape ``(M,)`` each.
     """
 
     rays: int
@@ -133,9 +133,9 @@ def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -
     if sent is not None:
         ray, face, unit = view.seen()
         power = unit * sent[t.surface.element[face]]
-        lit = power > 0
-        rows.append((ray[lit], face[lit], power[lit]))
-    m = view.mirror_lit if materials.terms.diffuse and materials.terms.mirror_scatter else None
+        some = power > 0
+        rows.append((ray[some], face[some], power[some]))
+    m = view.mirror_illumination if materials.terms.diffuse and materials.terms.mirror_scatter else None
     if m is not None and len(m.ray):
         power = scatter(
             t.surface, m.face, m.light, materials.terms.lobes, p.weight, p.log_excess, t.wavelength_m

@@ -103,8 +103,8 @@ class Response:
         group, bounce = _summed(material[self.group], self.bounce)
         seen, indirect = _summed(material[self.seen], self.indirect)
         sender, sent = _summed(material[self.sender], self.sent)
-        met = self.path_group >= 0
-        owner = np.where(met, material[np.where(met, self.path_group, 0)], -1)
+        reflects = self.path_group >= 0
+        owner = np.where(reflects, material[np.where(reflects, self.path_group, 0)], -1)
         return replace(
             self, group=group, bounce=bounce, seen=seen, indirect=indirect, sender=sender, sent=sent, path_group=owner
         )  # fmt: skip
@@ -113,9 +113,9 @@ class Response:
         """The response without the single bounces and paths that ``terms`` leave out."""
         order = (self.path_group >= 0).sum(axis=1)
         keep = (order <= terms.mirror_order) & ((order > 0) | terms.line_of_sight)
-        lit = slice(None) if terms.diffuse else slice(0)
+        scattered = slice(None) if terms.diffuse else slice(0)
         return replace(
-            self, group=self.group[lit], bounce=self.bounce[lit], path_group=self.path_group[keep],
+            self, group=self.group[scattered], bounce=self.bounce[scattered], path_group=self.path_group[keep],
             cosine=self.cosine[keep], turn=self.turn[keep], path_power=self.path_power[keep], path=self.path[keep],
         )  # fmt: skip
 
@@ -273,7 +273,7 @@ def _blocks(r: Response, p: Parameters, layout: Layout) -> Iterator[_Block]:
     power, slope = mirror_power(r.path_power, r.path_group, r.cosine, r.turn, p)
     slopes = []
     for b in range(r.path_group.shape[1]):
-        own, met = r.path_group[:, b], r.path_group[:, b] >= 0
-        slopes.append((np.where(met, layout.mirror(own), -1), power))
-        slopes.append((np.where(met, layout.excess(own), -1), power * slope[:, b]))
+        own, reflects = r.path_group[:, b], r.path_group[:, b] >= 0
+        slopes.append((np.where(reflects, layout.mirror(own), -1), power))
+        slopes.append((np.where(reflects, layout.excess(own), -1), power * slope[:, b]))
     yield r.path, power, slopes

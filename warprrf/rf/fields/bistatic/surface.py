@@ -17,7 +17,8 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.geometry.mesh import Mesh
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -77,6 +78,12 @@ class Surface:
     transports: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
+    @cached_property
+    def front_normal(self) -> np.ndarray:
+        """``normal`` on the side that each face is wound for, shape ``(F, 3)``."""
+        behind = (self.normal * self.mesh.face_normals).sum(axis=1, keepdims=True) < 0
+        return np.where(behind, -self.normal, self.normal)
+
     @property
     def groups(self) -> int:
         """Number of groups."""
@@ -88,7 +95,7 @@ class Surface:
         return len(self.cell_element)
 
     @classmethod
-    def of(cls, geometry: Any, *, element_m: float = ELEMENT_M) -> Surface:
+    def of(cls, geometry: GeometryLike) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene (its materials become groups) or a bare Mesh; a
         Surface is returned as it is.
 
@@ -97,18 +104,14 @@ class Surface:
         """
         if isinstance(geometry, Surface):
             return geometry
-        mesh = geometry if isinstance(geometry, Mesh) else getattr(geometry, "mesh", None)
-        if not isinstance(mesh, Mesh):
-            raise TypeError(
-                f"geometry: got {type(geometry).__name__}, expected a Reconstruction, a Scene or a Mesh"
-            )
-        material = getattr(geometry, "face_material", None)
+        mesh = as_mesh(geometry, "geometry")
+        material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
         if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
             patches = found
             patch, planes = found.face_patch, (found.normal, found.offset)
-            normal = _normals(found)
+            normal = _on_patches(found, smoothed_normals(found.mesh, 3))
             group, sort, colour = colour_groups(mesh, patch, gaussians)
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
@@ -119,15 +122,12 @@ class Surface:
             patch = order[patches.face_patch].astype(np.int32)
             planes = patches.normal[large], patches.offset[large]
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
-            normal, skin = mesh.face_normals.copy(), max(TRUE_SKIN_M, patches.tolerance_m)
-            flat = patches.face_patch >= 0
-            whole = patches.normal[patches.face_patch[flat]]
-            normal[flat] = np.where((whole * normal[flat]).sum(axis=1, keepdims=True) < 0, -whole, whole)
+            normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
             if material is None:
                 group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
             else:
                 group = np.asarray(material, np.int32)
-                names = tuple(m.name for m in geometry.materials)
+                names = tuple(m.name for m in materials)
             sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         sides = patches.two_sided
         mesh, parent = _split_long(mesh)
@@ -135,10 +135,10 @@ class Surface:
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=sort, colour=colour, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group, element_m),
+            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group),
         )  # fmt: skip
 
-    def on_device(self, device: Any) -> Any:
+    def on_device(self, device: DeviceLike) -> Any:
         """The kernels' view of this surface."""
         where = _device.resolve(device)
 
@@ -164,10 +164,10 @@ class Surface:
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
 
 
-def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, element_m: float) -> dict[str, np.ndarray]:
+def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray) -> dict[str, np.ndarray]:
     """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice."""
     centre, area = mesh.triangles.mean(axis=1), mesh.areas
-    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / element_m).astype(np.int64)
+    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / ELEMENT_M).astype(np.int64)
     key = np.column_stack([group, patch, cells // CELLS])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     pieces, cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
@@ -221,11 +221,11 @@ def _split_long(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
     return Mesh(vertices, np.concatenate(done_faces)), np.concatenate(done_parent)
 
 
-def _normals(patches: PlanarPatches) -> np.ndarray:
-    """Normal of each face: of its patch, on the side that it is wound for, else smoothed, shape ``(F, 3)``."""
-    mesh, own = patches.mesh, patches.face_patch >= 0
-    normal = smoothed_normals(mesh, 3)
+def _on_patches(patches: PlanarPatches, normal: np.ndarray) -> np.ndarray:
+    """``normal`` (F, 3), but of its patch where a face has one, on the side that the face is wound for."""
+    own = patches.face_patch >= 0
     flat = patches.normal[patches.face_patch[own]]
-    turned = (flat * mesh.face_normals[own]).sum(axis=1) < 0
-    normal[own] = np.where(turned[:, None], -flat, flat)
-    return normal
+    turned = (flat * patches.mesh.face_normals[own]).sum(axis=1, keepdims=True) < 0
+    result = normal.copy()
+    result[own] = np.where(turned, -flat, flat)
+    return result

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.device import Progress, check_array
+from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.geometry.mesh import GeometryLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import Regrouping, regroup
-from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters
+from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.render import render, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
@@ -139,10 +140,7 @@ class FitOptions:
     residuals: ResidualFit | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.iterations, int | np.integer) or self.iterations < 0:
-            raise ValueError(
-                f"iterations: got {self.iterations!r}, expected a whole number of steps, 0 or more"
-            )
+        check_count("iterations", self.iterations, 0)
         self.decided().terms()
 
     @classmethod
@@ -172,7 +170,7 @@ class FitOptions:
             found = replace(found, quick=False, **found._given(QUICK, QUICK))
         return found
 
-    def _given(self, values: dict[str, Any], names: Any) -> dict[str, Any]:
+    def _given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         """Of ``values`` those of ``names`` that are None here."""
         return {name: values[name] for name in names if getattr(self, name) is None}
 
@@ -233,12 +231,12 @@ class TrainingViews:
 
 
 def trace(
-    geometry: Any,
+    geometry: GeometryLike,
     ds: SpectrumDataset,
     *,
     mirror_order: int | None = None,
     sub_pixels: int | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> TrainingViews:
     """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
@@ -287,12 +285,12 @@ class Trained:
 
 
 def train(
-    geometry: Any,
+    geometry: GeometryLike,
     ds: SpectrumDataset,
     options: FitOptions,
     *,
     transport: TrainingViews | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Trained:
     """Fit materials to the spectra of ``ds``; arguments and errors as for :meth:`BistaticField.fit`."""
@@ -528,8 +526,7 @@ class _Training:
         rounds = self.choose.rounds if rounds is None else rounds
         if not terms.after_first_bounce:
             rounds = 1
-        layout = Layout(*start.log_weight.shape, indirect=False, gain=False)
-        fit = Fitted(start, np.zeros((0, 0)), layout, [], 0)
+        fit = Fitted(start, np.zeros((0, 0)), [], 0)
         for _ in range(rounds):
             follow = bool(self.material.max() < self.choose.few_materials)
             readings = self._readings(terms, fit, chosen, follow=follow)

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from warprrf.cache import Cache
+from warprrf.device import DeviceLike
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.elements import LIFT_M, ElementLinks
-from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M, MirrorLight, MirrorLit
+from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M, MirrorIllumination, MirrorLight
 from warprrf.rf.fields.bistatic.rays import Hits, Illumination, RayGrid
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -31,7 +31,7 @@ MIRROR_SUB_PIXELS = 2
 
 @dataclass(frozen=True)
 class MirrorShown:
-    """What mirrors show a receiver of the lit scene: rays turned at a planar patch.
+    """What mirrors show a receiver of the illuminated scene: rays turned at a planar patch.
 
     Attributes:
         ray: the first ray of the same pixel in the view's grid, shape ``(M,)``.
@@ -61,7 +61,7 @@ class ReceiverView:
         light: how the transmitter illuminates that.
         paths: line of sight and mirror paths, L in all, without their reflection.
         beams: unit beam of each path over the pixels, shape ``(L, H, W)`` float32; None where none was asked for.
-        mirror_lit: light that mirrors throw on what the rays hit; None where no term wants it.
+        mirror_illumination: light that mirrors throw on what the rays hit; None where no term wants it.
         mirror_shown: what mirrors show; None where no term wants it.
     """
 
@@ -71,7 +71,7 @@ class ReceiverView:
     light: Illumination
     paths: MirrorPaths
     beams: np.ndarray | None = field(default=None, repr=False)
-    mirror_lit: MirrorLit | None = None
+    mirror_illumination: MirrorIllumination | None = None
     mirror_shown: MirrorShown | None = None
 
     @property
@@ -139,7 +139,7 @@ class Transport:
         *,
         beam_sigma_rad: float | None = None,
         loss_per_m: float = 0.0,
-        device: Any = None,
+        device: DeviceLike = None,
     ) -> Transport:
         """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few of a surface are kept."""
         place = np.asarray(transmitter, np.float64).tobytes()
@@ -205,9 +205,9 @@ class Transport:
         """``view`` with what ``terms`` want and it lacks."""
         if not terms.diffuse:
             return view
-        if terms.mirror_scatter and view.mirror_lit is None:
-            lit = self.mirror_light.view(self.grid, view.receivers, view.hits)
-            view = replace(view, mirror_lit=lit)
+        if terms.mirror_scatter and view.mirror_illumination is None:
+            found = self.mirror_light.view(self.grid, view.receivers, view.hits)
+            view = replace(view, mirror_illumination=found)
         if terms.scatter_mirror and view.mirror_shown is None:
             view = replace(view, mirror_shown=self._mirror_shown(view.receivers))
         return view
@@ -222,8 +222,8 @@ class Transport:
         """Turn rays of ``receivers`` (R, 3) at the patches that they hit, and see how the transmitter lights the rest."""
         s, per_pixel = self.surface, self.grid.sub_pixels**2
         grid = self._made.get(("mirror grid", self.grid.shape, self.mirror_sub_pixels), self._mirror_grid)
-        met = grid.hit(receivers)
-        face = met.face.numpy()
+        first_hits = grid.hit(receivers)
+        face = first_hits.face.numpy()
         ray = np.flatnonzero(face >= 0)
         ray = ray[s.patch[face[ray]] >= 0]
         face, direction = face[ray], grid.directions[ray % len(grid.directions)]
@@ -232,8 +232,8 @@ class Transport:
         cosine = -(direction * normal).sum(axis=1)
         turned = direction + 2.0 * cosine[:, None] * normal
         hits = grid.hit_along(
-            met.points(ray) + LIFT_M * normal, turned, grid.solid_angle[ray % len(grid.directions)]
+            first_hits.points(ray) + LIFT_M * normal, turned, grid.solid_angle[ray % len(grid.directions)]
         )
-        air = np.broadcast_to(grid.transmittance(met.range_m.numpy()[ray]), len(ray))
+        air = np.broadcast_to(grid.transmittance(first_hits.range_m.numpy()[ray]), len(ray))
         light = grid.light(hits, self.transmitter)
         return MirrorShown(ray // grid.sub_pixels**2 * per_pixel, s.group[face], cosine, air, hits, light)

@@ -23,16 +23,17 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.device import Progress, check_array
-from warprrf.geometry.mesh import Mesh
+from warprrf import tensor_files
+from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import harmonics as _kernels
-from warprrf.rf.em.absorption import Air, air_of
+from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields import files as field_files
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
@@ -87,7 +88,7 @@ class HarmonicField(RadioField):
     delay_unit: float
     air: Air | None = None
     report: dict[str, Any] = field(default_factory=dict, repr=False)
-    device: Any = field(default=None, repr=False)
+    device: DeviceLike = field(default=None, repr=False)
     _uploaded: dict[str, wp.array] = field(default_factory=dict, init=False, repr=False)
 
     @property
@@ -98,13 +99,13 @@ class HarmonicField(RadioField):
     @classmethod
     def fit(  # type: ignore[override]
         cls,
-        geometry: Any,
+        geometry: GeometryLike | Gaussians,
         ds: SpectrumDataset,
         model: str = "rf3dgs+",
         *,
         options: FieldOptions | None = None,
         transport: Transport | None = None,
-        device: Any = None,
+        device: DeviceLike = None,
         progress: Progress | None = None,
         **settings: Any,
     ) -> HarmonicField:
@@ -164,7 +165,7 @@ class HarmonicField(RadioField):
         }
         return replace(trained, report=report)
 
-    def with_gas(self, gas: Any = True) -> HarmonicField:
+    def with_gas(self, gas: Gas = True) -> HarmonicField:
         """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
         air = air_of(gas, self.frequency_hz)
         if air != self.air and self.options.model == "rf3dgs":
@@ -174,7 +175,9 @@ class HarmonicField(RadioField):
             )
         return replace(self, air=air)
 
-    def spectrum(self, rx: Any, transmitter: Any = None, *, transport: Transport | None = None) -> Spectrum:
+    def spectrum(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, transport: Transport | None = None
+    ) -> Spectrum:
         """The spatial spectrum at ``rx`` (3,) [m].
 
         Args:
@@ -188,7 +191,9 @@ class HarmonicField(RadioField):
         """
         return self._look(rx, transmitter, transport).spectrum
 
-    def paths(self, rx: Any, transmitter: Any = None, max_paths: int | None = None) -> Paths:
+    def paths(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
+    ) -> Paths:
         """Propagation paths at ``rx``: line of sight where the mesh lets the transmitter be seen, and one diffuse path
         per pixel above the floor.
 
@@ -205,8 +210,8 @@ class HarmonicField(RadioField):
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
         """
-        if max_paths is not None and (not isinstance(max_paths, int | np.integer) or max_paths < 1):
-            raise ValueError(f"max_paths: got {max_paths!r}, expected a whole number of at least 1, or None")
+        if max_paths is not None:
+            check_count("max_paths", max_paths)
         positions = check_receiver("rx", rx, self.mesh)
         found = [
             replace(
@@ -232,17 +237,17 @@ class HarmonicField(RadioField):
         tensors["transmitter"] = self.transmitter
         header = {name: getattr(self, name) for name in _PLAIN}
         header |= {} if self.air is None else self.air.attributes
-        field_files.write(path, tensors, {**header, "options": asdict(self.options), "report": self.report})
+        tensor_files.write(path, tensors, {**header, "options": asdict(self.options), "report": self.report})
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: Any = None) -> HarmonicField:
+    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> HarmonicField:
         """Read a field that :meth:`save` wrote.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if it is corrupt, or no radio field.
         """
-        tensors, header = field_files.read(path)
+        tensors, header = tensor_files.read(path)
         try:
             parts = {
                 n: tensors[f"gaussians/{n}"] for n in ("means", "quaternions", "scales", "opacities", "sh")
@@ -321,7 +326,7 @@ class HarmonicField(RadioField):
         _device.launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
-    def _look(self, rx: Any, transmitter: Any, seen: Transport | None) -> View:
+    def _look(self, rx: ArrayLike, transmitter: ArrayLike | None, seen: Transport | None) -> View:
         """Spectrum at one receiver and what it was made of."""
         receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
         source = self._transmitter(transmitter)
@@ -362,7 +367,7 @@ class HarmonicField(RadioField):
         departure = np.stack([self._blend(f"aod_{axis}", seen) for axis in "xyz"], axis=-1)
         return np.where(empty, np.nan, delay), np.where(empty[..., None], np.nan, departure)
 
-    def _transmitter(self, transmitter: Any) -> np.ndarray:
+    def _transmitter(self, transmitter: ArrayLike | None) -> np.ndarray:
         if transmitter is None:
             return self.transmitter
         position = check_array("transmitter", transmitter, (3,))
@@ -377,7 +382,7 @@ class HarmonicField(RadioField):
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad", "gain_unit", "delay_unit")
 
 
-def _geometry(geometry: Any) -> tuple[Gaussians, Mesh | None]:
+def _geometry(geometry: GeometryLike | Gaussians) -> tuple[Gaussians, Mesh | None]:
     if isinstance(geometry, Gaussians):
         return geometry, None
     gaussians = getattr(geometry, "gaussians", None)

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from warprrf import tensor_files
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf.fields import files as field_files
 from warprrf.rf.fields.harmonic.opacity import RATE as OPACITY_RATE
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining
 from warprrf.rf.fields.harmonic.options import Rates
@@ -94,7 +94,7 @@ class Checkpoint:
         self.states: dict[str, State] = {}
         if self.path is None or not self.path.exists():
             return
-        tensors, header = field_files.read(self.path, CHECKPOINT)
+        tensors, header = tensor_files.read(self.path, CHECKPOINT)
         if header.get("identity") != identity:
             raise ValueError(
                 f"checkpoint: {self.path} belongs to a fit with other data or options; delete it or name another file"
@@ -115,7 +115,7 @@ class Checkpoint:
             if isinstance(value, np.ndarray)
         }
         losses = {layer: one.losses for layer, one in self.states.items()}
-        field_files.write(self.path, tensors, {"identity": self.identity, "losses": losses}, CHECKPOINT)
+        tensor_files.write(self.path, tensors, {"identity": self.identity, "losses": losses}, CHECKPOINT)
 
     def remove(self) -> None:
         """Delete the file."""

@@ -8,10 +8,10 @@ An interaction point stands for the whole ray, as in the paper: the centre of th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -47,7 +47,7 @@ def interaction_points(
     kind: str,
     *,
     mesh: Mesh | None = None,
-    device: Any = None,
+    device: DeviceLike = None,
 ) -> np.ndarray:
     """Where each pixel's ray is taken to interact [m], shape ``(R, H, W, 3)`` float64; NaN where it meets nothing.
 

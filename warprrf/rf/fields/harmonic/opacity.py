@@ -9,12 +9,11 @@ is 1e-4.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warprrf.device import Progress
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
@@ -57,10 +56,10 @@ class Listed:
 def list_responses(
     gaussians: Gaussians,
     seen: Transport,
-    range_db: Any,
+    range_db: tuple[float, float],
     *,
     top_k: int = LISTED,
-    device: Any = None,
+    device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Listed:
     """Responses and order along the rays of the receivers of ``seen``.

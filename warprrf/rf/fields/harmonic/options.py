@@ -6,8 +6,7 @@ import os
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import numpy as np
-
+from warprrf.device import check_count
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.interaction import INTERACTION_POINTS
 from warprrf.rf.fields.harmonic.transport import TOP_K, TRANSMITTANCE
@@ -88,9 +87,7 @@ class FieldOptions:
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {known}")
         for name, least in (("top_k", 1), ("iterations", 0), ("batch", 1)):
-            value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or value < least:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+            check_count(name, getattr(self, name), least)
         if self.train_opacity and self.transmittance != "product":
             raise ValueError(f"train_opacity: got transmittance {self.transmittance!r}, expected 'product'")
 

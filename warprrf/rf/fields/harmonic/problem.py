@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import DTypeLike
 
 from warprrf import device as _device
+from warprrf.device import DeviceLike
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.fields.harmonic.transport import Transport
@@ -50,8 +52,8 @@ class Problem:
         *,
         batch: int = 10,
         seed: int = 0,
-        device: Any = None,
-        precision: Any = np.float32,
+        device: DeviceLike = None,
+        precision: DTypeLike = np.float32,
     ) -> None:
         self.transport = transport
         self.seed = int(seed)
@@ -68,13 +70,13 @@ class Problem:
         self.batches = [self._sorted(np.sort(part)) for part in parts]
         self.basis = harmonics(transport.shape, self.real, self.device)
 
-    def upload(self, values: np.ndarray, dtype: Any = None) -> wp.array:
+    def upload(self, values: np.ndarray, dtype: type | None = None) -> wp.array:
         """``values`` on the device, in the problem's precision unless ``dtype`` says otherwise."""
         return wp.array(
             np.ascontiguousarray(values, dtype=self.precision), dtype=dtype or self.real, device=self.device
         )
 
-    def launch(self, kernel: Any, dim: int, *inputs: Any) -> None:
+    def launch(self, kernel: wp.Kernel, dim: int, *inputs: Any) -> None:
         """Launch one of the problem's kernels on its device."""
         _device.launch(kernel, dim, inputs, device=self.device)
 
@@ -105,7 +107,7 @@ class Problem:
         return Batch(receivers, len(first), pair_weight=self.upload(part.weight[order]), **on_device)
 
 
-def harmonics(shape: tuple[int, int], real: Any, device: Any) -> wp.array:
+def harmonics(shape: tuple[int, int], real: type, device: DeviceLike) -> wp.array:
     """The 16 real harmonics at every pixel's direction, shape ``(H * W,)`` of 16-vectors, on the device."""
     kernels = _kernels.build(real)
     kind = np.float64 if real is wp.float64 else np.float32

@@ -8,10 +8,10 @@ the path's length; ``rf3dgs``, which has none, learns it with the gain.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.absorption import Air
@@ -43,7 +43,7 @@ class SingleBounce:
     frequency_hz: float
     beam_sigma_rad: float
     air: Air | None = None
-    device: Any = None
+    device: DeviceLike = None
 
     def lengths(self, seen: Transport, transmitter: np.ndarray) -> Lengths:
         """Path lengths of every pixel of ``seen`` by the interaction point that the options name."""
@@ -80,7 +80,7 @@ class SingleBounce:
         toward = (transmitter - receiver)[None]
         return spread(toward, np.array([gain]), self.shape, self.beam_sigma_rad, device=self.device)
 
-    def _free_space(self, length_m: Any) -> Any:
+    def _free_space(self, length_m: float | np.ndarray) -> float | np.ndarray:
         """Gain of a path of ``length_m`` [m] between isotropic antennas, less what the air absorbs."""
         with np.errstate(divide="ignore"):
             gain = (SPEED_OF_LIGHT / self.frequency_hz / (4 * np.pi * length_m)) ** 2

@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from warprrf.device import Progress, check_array
+from warprrf.device import DeviceLike, Progress, check_array, check_count
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
@@ -73,7 +73,7 @@ class Transport:
             dropped=self.dropped,
         )
 
-    def at(self, receiver: Any) -> Transport:
+    def at(self, receiver: ArrayLike) -> Transport:
         """The part of one receiver (3,) [m].
 
         Raises:
@@ -109,7 +109,7 @@ class Transport:
         return np.diff(cumulated[self.start]).reshape(len(self.receivers), *self.shape)
 
 
-def cutoffs(range_db: Any, rule: str = "product") -> Blending:
+def cutoffs(range_db: tuple[float, float], rule: str = "product") -> Blending:
     """How to blend for images that span ``range_db`` (lowest, highest) [dB].
 
     A wall may leak no more than the floor of the range, and blending stops when no more than that is left. An alpha
@@ -122,13 +122,13 @@ def cutoffs(range_db: Any, rule: str = "product") -> Blending:
 
 def transport(
     gaussians: Gaussians,
-    receivers: Any,
+    receivers: ArrayLike,
     shape: tuple[int, int],
     *,
-    range_db: Any = (-60.0, 0.0),
+    range_db: tuple[float, float] = (-60.0, 0.0),
     rule: str = "product",
     top_k: int = TOP_K,
-    device: Any = None,
+    device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Transport:
     """Blending weights of ``gaussians`` for every pixel of every receiver.
@@ -151,8 +151,7 @@ def transport(
         raise ValueError("receivers: got none, expected at least one position")
     if rule not in TRANSMITTANCE:
         raise ValueError(f"rule: got {rule!r}, expected one of {', '.join(TRANSMITTANCE)}")
-    if not isinstance(top_k, int | np.integer) or top_k < 1:
-        raise ValueError(f"top_k: got {top_k!r}, expected a whole number of at least 1")
+    check_count("top_k", top_k)
     rows, columns = check_shape(shape)
     blending = cutoffs(range_db, rule)
     views = []

@@ -1,9 +1,10 @@
-"""Radio fields on disk: safetensors (no pickle), options as JSON in the header."""
+"""Arrays by name on disk: safetensors (no pickle), plain values as JSON in the header, replaced at once."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,26 @@ import numpy as np
 from warprrf.files import write_atomically
 
 FORMAT = "warprrf field 1"
+"""Of radio fields."""
 
 
 def write(
-    path: str | os.PathLike[str], tensors: dict[str, np.ndarray], header: dict[str, Any], kind: str = FORMAT
+    path: str | os.PathLike[str],
+    tensors: Mapping[str, np.ndarray],
+    header: Mapping[str, Any],
+    kind: str | None = FORMAT,
 ) -> None:
-    """Write ``tensors`` and ``header`` (plain values) to ``path``."""
+    """Write ``tensors`` and ``header`` (plain values) to ``path``, as a file of a ``kind``."""
     from safetensors.numpy import save_file
 
     whole = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-    about = {"format": kind, "header": json.dumps(header)}
+    about = {"header": json.dumps(dict(header))} | ({} if kind is None else {"format": kind})
     write_atomically(path, lambda file: save_file(whole, file, metadata=about))
 
 
-def read(path: str | os.PathLike[str], kind: str = FORMAT) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read(
+    path: str | os.PathLike[str], kind: str | None = FORMAT
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Tensors and header of a file that :func:`write` wrote.
 
     Raises:
@@ -43,7 +50,7 @@ def read(path: str | os.PathLike[str], kind: str = FORMAT) -> tuple[dict[str, np
             tensors = {key: file.get_tensor(key) for key in file.keys()}
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{name}: corrupt or no safetensors file: {error}") from error
-    if metadata.get("format") != kind:
+    if kind is not None and metadata.get("format") != kind:
         raise ValueError(f"{name}: got format {metadata.get('format')!r}, expected {kind!r}")
     try:
         return tensors, json.loads(metadata["header"])
