@@ -62,10 +62,10 @@ def _render(args: argparse.Namespace, bars: Bars) -> None:
     print(f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians")
 
 
-def _write_spectrum(spectrum: Any, path: Path) -> None:
+def _write_spectrum(spectrum: wr.Spectrum, path: Path) -> None:
     if path.suffix == ".npz":
         arrays = {"path_gain": spectrum.path_gain, "delay_s": spectrum.delay_s, "aod": spectrum.aod}
-        write_arrays(path, arrays)
+        write_arrays(path, {name: array for name, array in arrays.items() if array is not None})
     elif path.suffix == ".png":
         figure = require("matplotlib.figure", extra="plots").Figure(figsize=(8.0, 4.2), layout="constrained")
         spectrum.plot(ax=figure.add_subplot())

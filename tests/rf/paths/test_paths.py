@@ -3,6 +3,7 @@
 import itertools
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -50,6 +51,12 @@ def test_friis():
     np.testing.assert_allclose(
         np.angle(p.gain), np.angle(np.exp(-2j * np.pi * F * d / SPEED_OF_LIGHT)), atol=1e-9
     )
+
+
+def test_anything_with_a_mesh_is_traced_as_that_mesh():
+    settings = {"transmitter": TX, "receivers": [1.0, -2, 1.5], "frequency_hz": F, "mirror_order": 1}
+    bare, carried = trace_paths(room(), **settings), trace_paths(SimpleNamespace(mesh=room()), **settings)
+    np.testing.assert_array_equal(carried.gain, bare.gain)
 
 
 @pytest.mark.parametrize("order", [1, 2, 4])

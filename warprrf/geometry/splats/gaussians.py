@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from warprrf.device import check_array
 from warprrf.files import write_atomically
@@ -170,39 +171,12 @@ class Gaussians:
 
 def rotations_of(quaternions: np.ndarray) -> np.ndarray:
     """Rotation matrices ``(N, 3, 3)`` of quaternions wxyz ``(N, 4)``, normalised here."""
-    q = np.asarray(quaternions, dtype=np.float64)
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=1,
-    )
+    return Rotation.from_quat(np.asarray(quaternions, np.float64)[:, [1, 2, 3, 0]]).as_matrix()
 
 
 def quaternions_of(rotations: np.ndarray) -> np.ndarray:
-    """Quaternions wxyz ``(N, 4)`` of rotation matrices ``(N, 3, 3)``, by the largest component."""
-    r = np.asarray(rotations, dtype=np.float64)
-    d = np.stack([r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]], axis=1)
-    four = 1 + np.stack(
-        [d.sum(1), d[:, 0] - d[:, 1] - d[:, 2], d[:, 1] - d[:, 0] - d[:, 2], d[:, 2] - d[:, 0] - d[:, 1]],
-        axis=1,
-    )
-    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
-    e, f, g = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
-    candidates = np.stack(
-        [
-            np.stack([four[:, 0], a, b, c], axis=1),
-            np.stack([a, four[:, 1], e, f], axis=1),
-            np.stack([b, e, four[:, 2], g], axis=1),
-            np.stack([c, f, g, four[:, 3]], axis=1),
-        ],
-        axis=1,
-    )
-    best = candidates[np.arange(len(r)), np.argmax(four, axis=1)]
-    return best / np.linalg.norm(best, axis=1, keepdims=True)
+    """Quaternions wxyz ``(N, 4)`` of rotation matrices ``(N, 3, 3)``."""
+    return Rotation.from_matrix(np.asarray(rotations, np.float64)).as_quat()[:, [3, 0, 1, 2]]
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:

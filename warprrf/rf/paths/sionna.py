@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.rf.channel.arrays import PlanarArray
@@ -69,7 +70,7 @@ class SionnaPaths:
 
     def cfr(
         self,
-        frequencies: Any,
+        frequencies: ArrayLike,
         *,
         num_time_steps: int = 1,
         normalize_delays: bool = True,

@@ -41,7 +41,7 @@ def trace_paths(
     ``jones`` carries them. A bare mesh says nothing of polarisation: its paths have no ``jones``.
 
     Args:
-        mesh_or_scene: A :class:`Mesh`, or a scene with ``mesh``, ``face_material`` and ``materials``.
+        mesh_or_scene: A :class:`Mesh` or anything with a ``mesh``; a scene has ``face_material`` and ``materials`` too.
         transmitter: Position [m], shape ``(3,)``.
         receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
         frequency_hz: Carrier frequency [Hz].

@@ -260,8 +260,8 @@ class SpectrumDataset:
         delay = np.where(there >= 0, self.delay_s.reshape(count, -1)[each, chosen], np.nan)
         aod = np.where(there[..., None] >= 0, self.aod.reshape(count, -1, 2)[each, chosen], np.nan)
         gain = done.path_gain.astype(np.float32)
-        lit = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
-        floor = default_floor(gain) if lit else self.floor
+        received = count > 0 and np.median(gain.max(axis=(1, 2))) > 0
+        floor = default_floor(gain) if received else self.floor
         return replace(
             self,
             path_gain=gain,

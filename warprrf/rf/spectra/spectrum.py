@@ -9,6 +9,7 @@ total path gain, and an isotropic field stays one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -36,7 +37,7 @@ FLOOR_BELOW_MEDIAN_DB = 60.0
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
-def check_shape(shape: Any) -> tuple[int, int]:
+def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     """``shape`` as (rows, columns), each at least 2.
 
     Raises:
@@ -199,10 +200,10 @@ def spread_paths(
     _device.check_positive("sigma", sigma, "beam width in radians")
     if (power < 0).any():
         raise ValueError(f"powers: got {int((power < 0).sum())} negative path gains, expected linear power")
-    lit = np.flatnonzero(power > 0)
-    if len(lit) == 0:
+    positive = np.flatnonzero(power > 0)
+    if len(positive) == 0:
         return SpreadPaths(np.zeros((rows, columns)), np.full((rows, columns), -1, dtype=np.int32))
-    d, power = d[lit], power[lit]
+    d, power = d[positive], power[positive]
     length = np.linalg.norm(d, axis=1, keepdims=True)
     if (length == 0).any():
         raise ValueError("directions: got a vector of length zero, expected directions of arrival")
@@ -215,7 +216,7 @@ def spread_paths(
 
     where = _device.resolve(device)
     grid = _beam_grid((rows, columns), float(sigma), str(where))
-    count = len(lit)
+    count = len(positive)
     toward = wp.array(d[order], dtype=wp.vec3d, device=where)
     nearest = wp.zeros(count, dtype=wp.float64, device=where)
     total = wp.zeros(count, dtype=wp.float64, device=where)
@@ -229,7 +230,7 @@ def spread_paths(
     inputs = [toward, scaled, nearest, first, *beam, image, best]
     _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
     index = best.numpy()
-    return SpreadPaths(image.numpy(), np.where(index >= 0, lit[order][index], -1).astype(np.int32))
+    return SpreadPaths(image.numpy(), np.where(index >= 0, positive[order][index], -1).astype(np.int32))
 
 
 def strongest_rays(

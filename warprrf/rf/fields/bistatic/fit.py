@@ -227,11 +227,11 @@ def _normal_equations(
 
 
 def _dark_level(readings: Sequence[Reading]) -> float:
-    """ln of a radiance that explains what the darkest lit pixels hold [1/m^2]."""
+    """ln of a radiance that explains what the darkest illuminated pixels hold [1/m^2]."""
     found = []
     for reading in readings:
         base, power = reading.response.indirect.sum(axis=0), np.expm1(reading.target_db / NEPER)
-        lit = (base > 0) & (power > 0)
-        if lit.any():
-            found.append(np.percentile(np.log(power[lit] / base[lit]), 20))
+        illuminated = (base > 0) & (power > 0)
+        if illuminated.any():
+            found.append(np.percentile(np.log(power[illuminated] / base[illuminated]), 20))
     return float(np.median(found)) if found else 0.0

@@ -113,9 +113,9 @@ class Response:
         """The response without the single bounces and paths that ``terms`` leave out."""
         order = (self.path_group >= 0).sum(axis=1)
         keep = (order <= terms.mirror_order) & ((order > 0) | terms.line_of_sight)
-        lit = slice(None) if terms.diffuse else slice(0)
+        scattered = slice(None) if terms.diffuse else slice(0)
         return replace(
-            self, group=self.group[lit], bounce=self.bounce[lit], path_group=self.path_group[keep],
+            self, group=self.group[scattered], bounce=self.bounce[scattered], path_group=self.path_group[keep],
             cosine=self.cosine[keep], turn=self.turn[keep], path_power=self.path_power[keep], path=self.path[keep],
         )  # fmt: skip
 
