@@ -311,7 +311,7 @@ class FullModel:
         )  # fmt: skip
 
     def _rendered(self, kept: frozenset[str]) -> np.ndarray:
-        """Spectra (R, H, W) of the bistatic field with the effects ``kept``; the last asked for are remembered."""
+        """Spectra (R, H, W) of the bistatic field with the effects ``kept``; each is computed once."""
         if kept not in self._images:
             base, gas = self.field if "unseen" in kept else self._seen_only, "gas" in kept
             materials = reduced_field(base, reduced_terms(base.terms, kept)).materials
