@@ -671,7 +671,10 @@ def readme() -> str:
     )
     groups = {"methods": TRUTHS["exact"], "methods_sionna": TRUTHS["sionna"]}
     lines = [
-        [NAMES[method], *(cell(method, group, figure, form) for group in groups for _, figure, form in columns)]
+        [
+            NAMES[method],
+            *(cell(method, group, figure, form) for group in groups for _, figure, form in columns),
+        ]
         for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "mean")
     ]
     head = ["50 spectra", *(f"{truth}: {name}" for truth in groups.values() for name, *_ in columns)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,12 +18,6 @@ ALL_LAYERS = 128  # Gaussians that may share a pixel and count as seen: more hav
 ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
 NEEDS = {"mirror_1": ("mirror_2",), "diffuse_1": (*FURTHER, "residual")}
 """What goes with an effect, because it rests on it."""
-OPEN = {
-    "lobes": "only known materials or a fit tell which lobes matter",
-    "residual": "only a fit tells",
-    "indirect": "only a fit tells",
-}
-"""Effects that only a fit can tell about, and why."""
 COSTLY = (
     "scatter_mirror", "diffuse_2", "mirror_scatter", "mirror_2", "diffuse_1", "mirror_1", "diffraction", "transmission",
     "line_of_sight",
@@ -38,6 +33,7 @@ class Effect:
         name: key of the effect.
         image_db, total_db: changes of the dB image and of the total path gain without it [dB], rms over receivers.
         image_blocked_db, total_blocked_db: those of the receivers without line of sight; None if there are none.
+        seconds: what it takes by itself, per spectrum; None if it takes no time of its own.
         kept: whether the smallest model has it; None if only a fit can tell.
         reason: why, in a few words.
     """
@@ -47,6 +43,7 @@ class Effect:
     total_db: float | None
     image_blocked_db: float | None
     total_blocked_db: float | None
+    seconds: float | None
     kept: bool | None
     reason: str
 
@@ -109,47 +106,94 @@ def effect_row(model: FullModel, name: str, kept: frozenset[str]) -> Effect:
     image, total = (rms(x) for x in loss)
     dark = [rms(x[model.blocked]) if model.blocked.any() else None for x in loss]
     stays = name in kept and not (lobe and "diffuse_1" not in kept)
-    return Effect(name, image, total, dark[0], dark[1], stays, _reason(model, name, lost))
+    seconds, reason = model.seconds.get(name), _reason(model, name, lost)
+    return Effect(name, image, total, dark[0], dark[1], seconds, stays, reason)
 
 
-def open_rows(known: set[str]) -> list[Effect]:
-    """Rows of the effects that are not ``known`` here."""
-    rows = {k: v for k, v in OPEN.items() if k not in known}
-    return [Effect(name, None, None, None, None, None, reason) for name, reason in rows.items()]
+def open_row(name: str, reason: str) -> Effect:
+    """The row of an effect that only a fit can tell about."""
+    return Effect(name, None, None, None, None, None, None, reason)
 
 
 def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
     if name == "gas":
-        return f"{1e3 * model.gas_db_per_m:.2g} dB/km"
+        return _gas(model)
     if name == "unseen":
-        return f"{model.unseen.sum()} of {len(model.unseen)}; they matter to further bounces alone"
+        return _elements(model)
+    if name in model.side:
+        return _beside(model, name)
     if name.startswith("lobe_"):
-        return "the only lobe" if len(model.field.terms.lobes) == 1 else "its neighbours stand in for it"
+        return _lobe(model, int(name.removeprefix("lobe_")))
     share = f"{_percent(model.power(lost))} of the received power"
-    assumed = name == "transmission" and model.walls.assumed
-    return f"{share}; walls of 12.5 mm and permittivity 4 assumed" if assumed else share
+    if name == "line_of_sight":
+        return f"{int((~model.blocked).sum())} of {len(model.blocked)} receivers see the transmitter; {share}"
+    return share
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share >= 1e-4 or share == 0 else f"{100 * share:.0e} %"
 
 
-def change_of_unseen(
-    gaussians: Gaussians, receivers: np.ndarray, shape: tuple[int, int], device: Any
-) -> tuple[float, str]:
-    """What Gaussians with no blending weight at any of ``receivers`` (R, 3) could change [dB], and a few words on them.
+def _gas(model: FullModel) -> str:
+    longest = max(
+        [float(np.max(x, initial=0.0)) for x in model.bounce_length_m]
+        + [float(np.max(v.paths.length_m, initial=0.0)) for v in model.views]
+    )
+    rate = model.gas_db_per_m
+    return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"
 
-    It is rendered, not assumed.
-    """
+
+def _beside(model: FullModel, name: str) -> str:
+    found, blocked = model.side[name], model.blocked
+    if not blocked.any():
+        return "no receiver is blocked"
+    power = np.bincount(found.receiver, found.power, minlength=len(blocked))[blocked]
+    rest = model.image(model.all - set(model.side)).sum(axis=(1, 2))[blocked]
+    reached = power > 0
+    assumed = (
+        "; walls of 12.5 mm and permittivity 4 assumed"
+        if name == "transmission" and model.walls.assumed
+        else ""
+    )
+    if not reached.any():
+        return f"no such path to any blocked receiver{assumed}"
+    nearest = float(np.min(10.0 * np.log10(np.maximum(rest[reached], 1e-300) / power[reached])))
+    where = f"{nearest:.0f} dB below" if nearest >= 0 else f"{-nearest:.0f} dB above"
+    return f"at its strongest {where} the rest of a blocked receiver's power{assumed}"
+
+
+def _lobe(model: FullModel, n: int) -> str:
+    others = [k for k in model.field.terms.lobes if k != n]
+    if not others:
+        return "the only lobe"
+    surface, weight = model.field.surface, model.field.parameters.weight
+    area = np.bincount(surface.element_group, surface.element_area, minlength=surface.groups)
+    share = area @ weight[:, model.field.terms.lobes.index(n)] / max(float(area @ weight.sum(axis=1)), 1e-300)
+    return f"{_percent(float(share))} of the lobes' weight; its neighbours stand in for it"
+
+
+def _elements(model: FullModel) -> str:
+    unseen, area = model.unseen, model.field.surface.element_area
+    share = _percent(float(area[unseen].sum() / area.sum()))
+    return f"{int(unseen.sum())} of {len(unseen)}, {share} of the area; they matter to further bounces alone"
+
+
+def gaussians_row(
+    gaussians: Gaussians, receivers: np.ndarray, shape: tuple[int, int], tolerance_db: float, device: Any
+) -> Effect:
+    """Gaussians with no blending weight at any receiver; what they could change is rendered, not assumed."""
+    start = time.perf_counter()
     weights = transport(gaussians, receivers, shape, top_k=ALL_LAYERS, device=device)
-    unseen = np.ones(len(gaussians.means), bool)
-    unseen[weights.gaussian] = False
-    marked, share = unseen.astype(np.float32)[:, None], 0.0
+    seen = np.zeros(len(gaussians.means), bool)
+    seen[weights.gaussian] = True
+    seconds = (time.perf_counter() - start) / len(receivers)
+    marked = (~seen).astype(np.float32)[:, None]
+    share = 0.0
     for receiver in receivers:
         camera = Camera.spherical(shape[1], shape[0], position=receiver)
         share = max(share, float(render(gaussians, camera, marked, device=device).features.max()))
     change = float(-10.0 * np.log10(max(1.0 - share, 1e-12)))
-    return (
-        change,
-        f"{unseen.sum()} of {len(unseen)}; blending gives them at most {_percent(share)} of a pixel",
-    )
+    return Effect(
+        "gaussians", change, change, None, None, seconds, change > tolerance_db,
+        f"{int((~seen).sum())} of {len(seen)}; blending gives them at most {_percent(share)} of a pixel",
+    )  # fmt: skip

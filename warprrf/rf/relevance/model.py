@@ -1,14 +1,16 @@
-"""The full model of a scene at a few receivers, and what of it is left without some of its effects.
+"""The full model of a scene at a few receivers, by parts that can be left out one by one.
 
-All that a bistatic field can model is switched on; edges and walls are added as estimates. A reduced model is the field
-with fewer terms, rendered from the same views. Mirror paths and all that is scattered are rendered apart and kept, since
-most reduced models differ in one of them only.
+All that a bistatic field can model is switched on; air, edges and walls are added as estimates. Path gains add up, so
+each part is computed once and every reduced model is a sum of parts. Only light after a first bounce is no sum: its
+parts are computed for each combination that is asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,10 +23,10 @@ from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Parameters
-from warprrf.rf.fields.bistatic.render import render, sent_radiance
+from warprrf.rf.fields.bistatic.render import further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import LOBES, Terms
-from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.paths.blockage import LIFT_M, SidePaths, diffracted, transmitted
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, spread, to_db
@@ -32,10 +34,15 @@ from warprrf.rf.spectra.spectrum import default_floor, pixel_solid_angles, sprea
 ASSUMED_PERMITTIVITY = 4.0 * (1.0 - 0.06j)
 """Of walls whose material is not known; loss as of plasterboard and wood at 300 GHz in ITU-R P.2040-4, table 3."""
 ASSUMED_THICKNESS_M = 0.0125  # a plasterboard: thin walls let more through
+ONE_BOUNCE: dict[str, Any] = {
+    "mirror_scatter": False,
+    "scatter_mirror": False,
+    "diffuse_order": 1,
+    "indirect": False,
+}
+"""Terms without anything after a first bounce."""
 MIRRORS = ("line_of_sight", "mirror_1", "mirror_2")
 FURTHER = ("mirror_scatter", "scatter_mirror", "diffuse_2")
-OUTSIDE = ("diffraction", "transmission")
-"""Effects that a bistatic field has no term for: they are estimated beside it."""
 
 
 @dataclass(frozen=True)
@@ -194,33 +201,11 @@ def without_elements(field: BistaticField, dropped: np.ndarray) -> BistaticField
     return replace(field, surface=surface, parameters=parameters, material=material)
 
 
-def reduced_terms(full: Terms, kept: frozenset[str]) -> Terms:
-    """``full`` without the terms whose effects are not ``kept``."""
-    diffuse = "diffuse_1" in kept
-    switches = ("line_of_sight", "mirror_scatter", "scatter_mirror", "indirect", "residual")
-    return replace(
-        full,
-        diffuse=diffuse,
-        mirror_order=2 if "mirror_2" in kept else int("mirror_1" in kept),
-        lobes=tuple(n for n in full.lobes if f"lobe_{n}" in kept) if diffuse else full.lobes[:1],
-        diffuse_order=full.diffuse_order if "diffuse_2" in kept else 1,
-        **{name: name in kept for name in switches},
-    )
-
-
-def reduced_field(full: BistaticField, terms: Terms) -> BistaticField:
-    """``full`` with ``terms``, whose lobes are some of its own; see :func:`with_lobes`."""
-    lobes = full.terms.lobes
-    p = with_lobes(full.parameters, lobes, terms.lobes)
-    p = replace(p, log_weight=p.log_weight[:, [lobes.index(n) for n in terms.lobes]])
-    return replace(full, terms=terms, parameters=p, errors=None)
-
-
 class FullModel:
-    """The full model at receivers, and every model with some of its effects.
+    """The full model at receivers.
 
     Args:
-        field: with every term on, in a vacuum.
+        field: with every term on.
         walls: what transmission goes through.
         receivers: positions [m], shape ``(R, 3)``.
         floor: N0; None for the default of the full model's spectra.
@@ -228,10 +213,10 @@ class FullModel:
         progress: called with the stage ``"relevance"``.
 
     Attributes:
-        effects: names of all effects, in the order of the table.
-        all: the same as a set.
+        effects: names of all parts, in the order of the table.
         blocked: whether each receiver has no line of sight, shape ``(R,)``.
-        unseen: elements that no ray of any receiver meets, shape ``(E,)``, bool.
+        seconds: what an effect takes by itself [s] per spectrum, for those that take a time of their own.
+        spectrum_s: what a spectrum with every term takes [s].
 
     Raises:
         ValueError: if most receivers get no power at all.
@@ -248,26 +233,29 @@ class FullModel:
         progress: Progress,
     ) -> None:
         self.field, self.walls, self.receivers = field, walls, receivers
-        own = gas_attenuation_db_per_m(field.frequency_hz)
-        self.gas_db_per_m = float(own if gas_db_per_m is None else gas_db_per_m)
-        self._images: dict[frozenset[str], np.ndarray] = {}
-        self._views: dict[bool, list[ReceiverView]] = {False: [], True: []}  # by whether there is air
+        self.gas_db_per_m = (
+            gas_attenuation_db_per_m(field.frequency_hz) if gas_db_per_m is None else gas_db_per_m
+        )
+        self.beam = beam_operator(field.shape, field.beam_sigma_rad, field.device)
+        self._parts: dict[tuple[Any, ...], np.ndarray] = {}
+        self.seconds: dict[str, float] = {}
+        field.render(
+            replace(field, terms=replace(field.terms, **ONE_BOUNCE)).view(receivers[0])
+        )  # compile first
+        setup_s = clock(lambda: field.sent_radiance(field.transport())) / len(receivers)
+        self.views: list[ReceiverView] = []
+        self._mirror_power, seconds = [], []
         for r, receiver in enumerate(receivers):
-            dry = field.view(receiver)
-            self._views[False].append(dry)
-            self._views[True].append(
-                self._transport(field, True).view(receiver, field.terms, paths=dry.paths)
-            )
+            start = time.perf_counter()
+            self.views.append(field.view(receiver))
+            self._mirror_power.append(field.render(self.views[-1]).powers.mirror)
+            seconds.append(time.perf_counter() - start)
             progress("relevance", r, len(receivers) + 1)
-        self.blocked = np.array([not (v.paths.order == 0).any() for v in self._views[False]])
-        self.unseen = np.ones(len(field.surface.element_area), bool)
-        for view in self._views[False]:
-            self.unseen[field.surface.element[view.seen()[1]]] = False
-        self._seen_only = without_elements(field, self.unseen)
-        self._side = self._past_obstacles()
-        learned = (name for name in ("indirect", "residual") if getattr(field.terms, name))
-        lobes = (f"lobe_{n}" for n in field.terms.lobes)
-        self.effects = (*MIRRORS, "diffuse_1", *FURTHER, *learned, *lobes, "unseen", "gas", *OUTSIDE)
+        self.spectrum_s = float(np.median(seconds))
+        self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
+        self._time(setup_s)
+        self.side = {"diffraction": self._diffracted(), "transmission": self._transmitted()}
+        self.effects = self._names()
         self.all = frozenset(self.effects)
         solid_angle = pixel_solid_angles(field.shape)
         self._weight = solid_angle[:, None] / solid_angle.sum() / field.shape[1]
@@ -279,14 +267,44 @@ class FullModel:
         self.floor = default_floor(full) if floor is None else float(floor)
         self._reference = self._db(full)
 
+    def _names(self) -> tuple[str, ...]:
+        t = self.field.terms
+        learned = [name for name in ("indirect", "residual") if getattr(t, name)]
+        lobes = [f"lobe_{n}" for n in t.lobes]
+        return (
+            *MIRRORS,
+            "diffuse_1",
+            *FURTHER,
+            *learned,
+            *lobes,
+            "unseen",
+            "gas",
+            "diffraction",
+            "transmission",
+        )
+
+    # -------------------------------------------------------------------------------------- images and losses
+
     def image(self, kept: frozenset[str]) -> np.ndarray:
         """Spectra (R, H, W) of the model with the effects ``kept``, path gain."""
-        gas = kept & {"gas"}
-        total = self._rendered((kept & {*MIRRORS}) | gas | {"unseen"})
-        total = total + self._rendered(kept - {*MIRRORS, *OUTSIDE})
-        for name in OUTSIDE:
+        gas = "gas" in kept
+        total = np.zeros((len(self.receivers), *self.field.shape))
+        for order, name in enumerate(MIRRORS):
             if name in kept:
-                total += self._beside(name, bool(gas))
+                total += self._part("specular", order, gas)
+        for name in self.side:
+            if name in kept:
+                total += self._part("side", name, gas)
+        diffuse = "diffuse_1" in kept
+        if diffuse:
+            lobes = tuple(n for n in self.field.terms.lobes if f"lobe_{n}" in kept)
+            total += self._part("diffuse", lobes, "residual" in kept, gas)
+        more = tuple(diffuse and name in kept for name in FURTHER)
+        if any(more) or "indirect" in kept:
+            further = self._part("further", diffuse, *more, "indirect" in kept, "unseen" in kept)
+            # No length of its own is known of this light: it counts as the longest single bounce.
+            longest = np.array([x.max(initial=0.0) for x in self.bounce_length_m])
+            total += further * np.broadcast_to(self._air(longest, gas), len(longest))[:, None, None]
         return total
 
     def power(self, lost: frozenset[str]) -> float:
@@ -296,49 +314,164 @@ class FullModel:
     def loss(self, kept: frozenset[str]) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the dB image (rms over the sphere) and of the total path gain [dB] of each receiver, ``(R,)``,
         when of the full model only ``kept`` stays."""
-        now, then = self._db(self.image(kept)), self._reference
-        image = np.sqrt((self._weight * (now[0] - then[0]) ** 2).sum(axis=(1, 2)))
-        return image, np.abs(now[1] - then[1])
+        return self.difference(self.image(kept))
+
+    def difference(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same for given spectra (R, H, W)."""
+        now, then = self._db(image), self._reference
+        return (
+            np.sqrt((self._weight * (now[0] - then[0]) ** 2).sum(axis=(1, 2))),
+            np.abs(now[1] - then[1]),
+        )
 
     def _db(self, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return to_db(image, self.floor), to_db(image.sum(axis=(1, 2)), self.floor)
 
-    def _transport(self, field: BistaticField, gas: bool) -> Transport:
-        loss = 0.1 * np.log(10.0) * self.gas_db_per_m if gas else 0.0
-        return Transport.of(
-            field.surface, field.transmitter, field.frequency_hz, field.shape, field.terms.sub_pixels,
-            beam_sigma_rad=field.beam_sigma_rad, loss_per_m=loss, device=field.device,
-        )  # fmt: skip
+    # -------------------------------------------------------------------------------------- parts
 
-    def _rendered(self, kept: frozenset[str]) -> np.ndarray:
-        """Spectra (R, H, W) of the bistatic field with the effects ``kept``; each is computed once."""
-        if kept not in self._images:
-            base, gas = self.field if "unseen" in kept else self._seen_only, "gas" in kept
-            materials = reduced_field(base, reduced_terms(base.terms, kept)).materials
-            beam = beam_operator(base.shape, base.beam_sigma_rad, base.device)
-            transport = self._transport(base, gas)
-            sent = sent_radiance(transport, materials)
-            views = (replace(view, transport=transport) for view in self._views[gas])
-            self._images[kept] = np.stack([render(view, materials, beam, sent).image for view in views])
-        return self._images[kept]
+    def _part(self, kind: str, *key: Any) -> np.ndarray:
+        if (kind, *key) not in self._parts:
+            self._parts[kind, *key] = getattr(self, f"_{kind}")(*key)
+        return self._parts[kind, *key]
 
-    def _beside(self, name: str, gas: bool) -> np.ndarray:
-        """Spectra (R, H, W) of estimated paths."""
-        found, f = self._side[name], self.field
-        power = found.power * 10.0 ** (-0.1 * self.gas_db_per_m * found.length_m * gas)
+    def _air(self, length_m: np.ndarray, gas: bool) -> np.ndarray | float:
+        return 10.0 ** (-0.1 * self.gas_db_per_m * length_m) if gas else 1.0
+
+    def _specular(self, order: int, gas: bool) -> np.ndarray:
+        images = []
+        for view, power in zip(self.views, self._mirror_power, strict=True):
+            beams = np.zeros(0) if view.beams is None else view.beams
+            own, air = view.paths.order == order, self._air(view.paths.length_m, gas)
+            images.append(np.tensordot(np.where(own, power * air, 0.0), beams, axes=1))
+        return np.stack(images)
+
+    def _side(self, name: str, gas: bool) -> np.ndarray:
+        found, f = self.side[name], self.field
+        power = found.power * self._air(found.length_m, gas)
         images = np.zeros((len(self.receivers), *f.shape))
         for r in np.unique(found.receiver):
             own = found.receiver == r
             images[r] = spread(found.arrival[own], power[own], f.shape, f.beam_sigma_rad, device=f.device)
         return images
 
-    def _past_obstacles(self) -> dict[str, SidePaths]:
-        """Estimated paths to receivers without line of sight."""
-        which, f, w = np.flatnonzero(self.blocked), self.field, self.walls
-        place = w.mesh, f.transmitter, self.receivers[which], f.wavelength_m
-        skin = f.surface.skin_m
-        found = {
-            "diffraction": diffracted(*place, lift_m=max(LIFT_M, skin), device=f.device),
-            "transmission": transmitted(*place, w.permittivity, w.thickness_m, skin_m=skin, device=f.device),
-        }
-        return {name: replace(paths, receiver=which[paths.receiver]) for name, paths in found.items()}
+    def _diffuse(self, lobes: tuple[int, ...], residual: bool, gas: bool) -> np.ndarray:
+        f = self.field
+        reduced = replace(
+            f,
+            terms=replace(f.terms, **ONE_BOUNCE, residual=residual and f.terms.residual),
+            parameters=with_lobes(f.parameters, f.terms.lobes, lobes),
+        )
+        images = []
+        for view, length in zip(self.views, self.bounce_length_m, strict=True):
+            rays = reduced.render(view).powers.single * self._air(length, gas)
+            images.append(np.maximum(self.beam(rays.reshape(*f.shape, -1).sum(axis=-1)), 0.0))
+        return np.stack(images)
+
+    def _further(
+        self,
+        diffuse: bool,
+        mirror_scatter: bool,
+        scatter_mirror: bool,
+        diffuse_2: bool,
+        indirect: bool,
+        unseen: bool,
+    ) -> np.ndarray:
+        base = self.field if unseen else self.seen_only
+        terms = replace(
+            base.terms, diffuse=diffuse, mirror_scatter=mirror_scatter, scatter_mirror=scatter_mirror,
+            diffuse_order=3 if diffuse_2 else 1, indirect=indirect,
+        )  # fmt: skip
+        field = replace(base, terms=terms)
+        return np.stack([np.maximum(self.beam(_further_image(field, view)), 0.0) for view in self.views])
+
+    @cached_property
+    def bounce_length_m(self) -> list[np.ndarray]:
+        """Length transmitter-surface-receiver of each ray of each receiver [m]; 0 where it hits nothing or is dark."""
+        lengths = []
+        for view in self.views:
+            length = np.zeros(len(view.hits.face))
+            lit = np.flatnonzero((view.light.strength.numpy() > 0) & (view.hits.face.numpy() >= 0))
+            way = view.hits.points(lit) - view.transport.transmitter
+            length[lit] = view.hits.range_m.numpy()[lit] + np.linalg.norm(way, axis=1)
+            lengths.append(length)
+        return lengths
+
+    @cached_property
+    def unseen(self) -> np.ndarray:
+        """Elements that no ray of any receiver meets, shape ``(E,)``, bool."""
+        s = self.field.surface
+        seen = np.zeros(len(s.element_area), bool)
+        for view in self.views:
+            face = view.hits.face.numpy()
+            seen[s.element[face[face >= 0]]] = True
+        return ~seen
+
+    @cached_property
+    def seen_only(self) -> BistaticField:
+        """The field with every term on but for what elements that no receiver sees scatter."""
+        return without_elements(self.field, self.unseen)
+
+    # -------------------------------------------------------------------------------------- estimates and times
+
+    def _diffracted(self) -> SidePaths:
+        start = time.perf_counter()
+        which = np.flatnonzero(self.blocked)
+        f = self.field
+        found = diffracted(
+            self.walls.mesh, f.transmitter, self.receivers[which], f.wavelength_m,
+            lift_m=max(LIFT_M, f.surface.skin_m), device=f.device,
+        )  # fmt: skip
+        self.seconds["diffraction"] = (time.perf_counter() - start) / len(self.receivers)
+        return replace(found, receiver=which[found.receiver])
+
+    def _transmitted(self) -> SidePaths:
+        start = time.perf_counter()
+        which = np.flatnonzero(self.blocked)
+        f, w = self.field, self.walls
+        found = transmitted(
+            w.mesh, f.transmitter, self.receivers[which], f.wavelength_m, w.permittivity, w.thickness_m,
+            skin_m=f.surface.skin_m, device=f.device,
+        )  # fmt: skip
+        self.seconds["transmission"] = (time.perf_counter() - start) / len(self.receivers)
+        return replace(found, receiver=which[found.receiver])
+
+    def _time(self, setup_s: float) -> None:
+        """Seconds per spectrum of the terms, each by itself; ``setup_s`` is a receiver's share of lighting elements."""
+        f, transport, view = self.field, self.field.transport(), self.views[0]
+        orders = [
+            clock(partial(transport.paths, self.receivers, order)) / len(self.receivers)
+            for order in (0, 1, 2)
+        ]
+        differences = np.maximum(np.diff(orders, prepend=0.0), 0.0)
+        self.seconds |= dict(zip(MIRRORS, map(float, differences), strict=True))
+        single = replace(f, terms=replace(f.terms, **ONE_BOUNCE))
+
+        def bounce() -> None:
+            transport.grid.light(transport.grid.hit(view.receivers), transport.transmitter)
+            single.render(view)
+
+        self.seconds["diffuse_1"] = clock(bounce)
+        for name, share, terms in (
+            ("mirror_scatter", setup_s, {"mirror_scatter": True}),
+            ("scatter_mirror", 0.0, {"scatter_mirror": True}),
+            ("diffuse_2", setup_s, {"diffuse_order": 3}),
+        ):
+            alone = replace(f, terms=replace(f.terms, **{**ONE_BOUNCE, **terms}))
+            bare = replace(view, mirror_illumination=None, mirror_shown=None)
+            self.seconds[name] = share + clock(partial(_further_image, alone, bare))
+
+
+def _further_image(field: BistaticField, view: ReceiverView) -> np.ndarray:
+    """Path gain per pixel (H, W) of what comes after a first bounce, before the beam; ``view`` may be of another
+    division of the same mesh into groups."""
+    transport = field.transport()
+    own = transport.complete(replace(view, transport=transport), field.terms)
+    found = further_bounces(own, field.materials, field.sent_radiance(transport))
+    return found.by_ray().reshape(*field.shape, -1).sum(axis=-1)
+
+
+def clock(work: Callable[[], Any]) -> float:
+    """Seconds that ``work`` takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start

@@ -4,8 +4,9 @@ The full model (:mod:`warprrf.rf.relevance.model`) is evaluated at a handful of 
 What an effect is worth is the larger of two changes that leaving it out makes, both root mean squares over receivers:
 that of the dB image 10 log10(P + N0), over the sphere, and that of the total path gain. The smallest model is found by
 leaving out effects one after another, each time the one whose loss hurts least together with all that went before (the
-costliest of those that hurt alike, to a hundredth of a dB), while the model stays within the tolerance of the full one.
-There the mean squares count with one standard error more, because few receivers stand for many.
+costliest of those that hurt alike, to a hundredth of a dB), while the model stays within the tolerance of the full one;
+what is left is then evaluated as a field of its own, to be sure. There the mean squares count with one standard error
+more, because few receivers stand for many.
 The order does not depend on the tolerance, so a larger one never keeps more.
 """
 
@@ -13,14 +14,15 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_array, check_positive
+from warprrf.device import Progress, check_array
 from warprrf.files import write_text
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.waves import check_frequency
@@ -28,8 +30,8 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.receivers import check_receiver
-from warprrf.rf.relevance.choice import Effect, change_of_unseen, effect_row, leave_out, open_rows, rms
-from warprrf.rf.relevance.model import OUTSIDE, FullModel, full_field, reduced_field, reduced_terms
+from warprrf.rf.relevance.choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
+from warprrf.rf.relevance.model import FullModel, full_field, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 
 SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds
@@ -50,6 +52,10 @@ TITLES = {
     "unseen": "surface elements that no receiver sees",
     "gaussians": "Gaussians that no receiver sees",
 }
+OUTSIDE = ("diffraction", "transmission")
+"""Effects that a bistatic field has no term for."""
+ESTIMATED = ("gas", *OUTSIDE)
+"""Effects that are estimated beside the model."""
 MATERIALS = {
     "scene": "materials of the scene",
     "fit": "fitted parameters",
@@ -70,6 +76,8 @@ class Relevance:
         effects: rows of the table.
         terms: the smallest bistatic model.
         image_db, total_db: its changes against the full model [dB], rms over receivers, all effects left out at once.
+        full_s, reduced_s: time of a spectrum by the full and by the smallest model [s].
+        unseen: surface elements that no receiver sees, shape ``(E,)``, bool; not written to files.
     """
 
     materials: str
@@ -82,6 +90,9 @@ class Relevance:
     terms: Terms
     image_db: float
     total_db: float
+    full_s: float
+    reduced_s: float
+    unseen: np.ndarray | None = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Effect:
         """The effect ``name``; KeyError if there is none."""
@@ -126,7 +137,10 @@ class Relevance:
 
     def reduce(self, full: BistaticField) -> BistaticField:
         """``full``, a field with the terms that this was made of, cut down to the smallest model."""
-        return reduced_field(full, self.terms)
+        lobes = self.terms.lobes
+        p = with_lobes(full.parameters, full.terms.lobes, lobes)
+        p = replace(p, log_weight=p.log_weight[:, [full.terms.lobes.index(n) for n in lobes]])
+        return replace(full, terms=self.terms, parameters=p, errors=None)
 
     def table(self) -> str:
         """The effects as a Markdown table, with what was chosen below it."""
@@ -138,32 +152,35 @@ class Relevance:
             f"{self.frequency_hz / 1e9:g} GHz, tolerance {self.tolerance_db:g} dB, {self.receivers} receivers, "
             f"{self.blocked} of them blocked; {MATERIALS[self.materials]}.",
             "",
-            "| effect | image [dB] | total [dB] | blocked: image [dB] | total [dB] | in the model | why |",
-            "|---|---|---|---|---|---|---|",
+            "| effect | image [dB] | total [dB] | blocked: image [dB] | total [dB] | time [ms] | in the model | why |",
+            "|---|---|---|---|---|---|---|---|",
         ]
         for e in self.effects:
             chosen = "left to the fit" if e.kept is None else "yes" if e.kept else "no"
             if e.name in self.missing:
                 chosen = "needed, no term for it"
             numbers = [cell(v) for v in (e.image_db, e.total_db, e.image_blocked_db, e.total_blocked_db)]
-            lines.append(f"| {title(e.name)} | {' | '.join(numbers)} | {chosen} | {e.reason} |")
+            time_ms = "" if e.seconds is None else f"{1e3 * e.seconds:.1f}"
+            lines.append(f"| {title(e.name)} | {' | '.join(numbers)} | {time_ms} | {chosen} | {e.reason} |")
         lines += [
             "",
             f"All that is left out, together: {self.image_db:.3f} dB of the image, {self.total_db:.3f} dB of the "
-            "total.",
+            f"total. A spectrum takes {1e3 * self.reduced_s:.0f} ms instead of {1e3 * self.full_s:.0f} ms.",
         ]
         if self.missing:
             lines.append(f"Needed, but no term of the bistatic model: {', '.join(map(title, self.missing))}.")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it, in terms of JSON."""
-        rows = [{**asdict(e), "worth_db": e.worth_db} for e in self.effects]
-        return {**asdict(self), "effects": rows, "missing": list(self.missing)}
+        """All but ``unseen``, in terms of JSON."""
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "unseen"}
+        values["effects"] = [{**asdict(e), "worth_db": e.worth_db} for e in self.effects]
+        return {**values, "terms": asdict(self.terms), "missing": list(self.missing)}
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON, in one go."""
-        write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+        text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
+        write_text(path, text)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Relevance:
@@ -231,8 +248,8 @@ class Setting:
             )  # fmt: skip
         elif isinstance(geometry, RadioField):
             raise TypeError(f"geometry: got a field of model {geometry.model!r}, expected a bistatic one")
-        if found.floor is not None:
-            check_positive("floor", found.floor, "path gain")
+        if found.floor is not None and not (np.isfinite(found.floor) and found.floor > 0):
+            raise ValueError(f"floor: got {found.floor!r}, expected a path gain of more than 0")
         for name in ("transmitter", "frequency_hz"):
             if getattr(found, name) is None:
                 raise ValueError(f"{name}: got None, expected it for anything but a fitted field")
@@ -282,7 +299,8 @@ def relevances(
 ) -> list[Relevance]:
     """:func:`relevance` at several tolerances, for little more than the time of one; arguments and errors as there."""
     for tolerance in tolerances_db:
-        check_positive("tolerance_db", tolerance)
+        if not (np.isfinite(tolerance) and tolerance > 0):
+            raise ValueError(f"tolerance_db: got {tolerance!r}, expected more than 0")
     asked = Setting(**setting).of(geometry)
     full, walls, source = full_field(
         geometry,
@@ -295,26 +313,68 @@ def relevances(
     places = np.atleast_2d(check_receiver("receivers", receivers, full.surface.mesh))
     tick: Progress = progress or (lambda stage, done, total: None)
     model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
-    found = [_choose(model, source, float(tolerance)) for tolerance in tolerances_db]
     gaussians = getattr(geometry, "gaussians", None)
-    if isinstance(gaussians, Gaussians):
-        change, reason = change_of_unseen(gaussians, places, full.shape, device)
-        rows = [
-            Effect("gaussians", change, change, None, None, change > f.tolerance_db, reason) for f in found
-        ]
-        found = [replace(f, effects=(*f.effects, row)) for f, row in zip(found, rows, strict=True)]
+    found = []
+    for tolerance in tolerances_db:
+        one = _choose(model, source, float(tolerance))
+        if isinstance(gaussians, Gaussians):
+            row = gaussians_row(gaussians, places, full.shape, tolerance, device)
+            one = replace(one, effects=(*one.effects, row))
+        found.append(one)
     tick("relevance", len(places) + 1, len(places) + 1)
     return found
 
 
 def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
-    full = model.field
-    guessed = {f"lobe_{n}" for n in full.terms.lobes} if source == "assumed" else set()
-    kept = model.all - frozenset(leave_out(model, model.all - guessed, tolerance_db))
-    effects = [effect_row(model, name, kept) for name in model.effects if name not in guessed]
-    effects += open_rows({*model.all} if guessed else {*model.all, "lobes"})
-    image_db, total_db = (rms(x) for x in model.loss(kept))
-    return Relevance(
-        source, full.frequency_hz, tolerance_db, model.floor, len(model.receivers), int(model.blocked.sum()),
-        tuple(effects), reduced_terms(full.terms, kept), image_db, total_db,
-    )  # fmt: skip
+    full, places = model.field, model.receivers
+    known = model.all if source != "assumed" else model.all - {f"lobe_{n}" for n in full.terms.lobes}
+    order = leave_out(model, known, tolerance_db)
+    # Measured on the reduced field itself, where fewer lobes light other surfaces too: step back if that errs more.
+    while True:
+        kept = model.all - frozenset(order)
+        chosen = Relevance(
+            source, full.frequency_hz, tolerance_db, model.floor, len(places), int(model.blocked.sum()), (),
+            _terms(full.terms, kept), 0.0, 0.0, model.spectrum_s, 0.0, model.unseen,
+        )  # fmt: skip
+        image, seconds = _spectra(chosen.reduce(full if "unseen" in kept else model.seen_only), places)
+        image += model.image(kept) - model.image(kept - set(ESTIMATED))
+        loss = model.difference(np.maximum(image, 0.0))
+        if decisive(loss) <= tolerance_db or not order:
+            break
+        order.pop()
+    effects = [effect_row(model, name, kept) for name in model.effects if name in known]
+    if source == "assumed":
+        effects.append(open_row("lobes", "only known materials or a fit tell which lobes matter"))
+    for name in ("residual", "indirect"):
+        if name not in model.all:
+            effects.append(open_row(name, "only a fit tells"))
+    return replace(
+        chosen, effects=tuple(effects), image_db=rms(loss[0]), total_db=rms(loss[1]), reduced_s=seconds
+    )
+
+
+def _terms(full: Terms, kept: frozenset[str]) -> Terms:
+    diffuse = "diffuse_1" in kept
+    return Terms(
+        line_of_sight="line_of_sight" in kept,
+        diffuse=diffuse,
+        mirror_order=2 if "mirror_2" in kept else int("mirror_1" in kept),
+        lobes=tuple(n for n in full.lobes if f"lobe_{n}" in kept) if diffuse else full.lobes[:1],
+        mirror_scatter="mirror_scatter" in kept,
+        scatter_mirror="scatter_mirror" in kept,
+        diffuse_order=full.diffuse_order if "diffuse_2" in kept else 1,
+        indirect="indirect" in kept,
+        residual="residual" in kept,
+        sub_pixels=full.sub_pixels,
+    )
+
+
+def _spectra(field: BistaticField, receivers: np.ndarray) -> tuple[np.ndarray, float]:
+    """Spectra (R, H, W), and the median time of one [s], set-up apart."""
+    field.render(field.view(receivers[0]))  # tables and, where needed, the light on elements
+    images, seconds = [], []
+    for receiver in receivers:
+        start = time.perf_counter()
+        images.append(field.render(field.view(receiver)).image)
+        seconds.append(time.perf_counter() - start)
+    return np.stack(images), float(np.median(seconds))
