@@ -82,15 +82,6 @@ def tone_map(radiance: np.ndarray, exposure: float = 1.5) -> np.ndarray:
     return np.where(y <= 0.0031308, 12.92 * y, 1.055 * np.maximum(y, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def render_radiance(
-    xml: str | os.PathLike[str], camera: Camera, *, spp: int = 4, seed: int = 0, max_depth: int = 4
-) -> np.ndarray:
-    """Linear RGB radiance of one view, shape ``(height, width, 3)``; see :func:`render_photos`."""
-    with _mitsuba(VARIANT) as mi:
-        scene = mi.load_file(str(xml))
-        return _radiance(mi, scene, camera, spp, seed, max_depth)
-
-
 def render_positions(xml: str | os.PathLike[str], camera: Camera, *, spp: int = 4) -> np.ndarray:
     """Mean surface point that each pixel sees in Mitsuba [m], shape ``(height, width, 3)``; proves a pose."""
     with _mitsuba(VARIANT) as mi:
