@@ -179,6 +179,7 @@ def _lobby_seeds() -> str:
         [r["figure"], *(show(r[k], "{:.4g}") for k in ("mean", "spread", "least", "most"))]
         for r in found["rows"]
         if not r["key"].startswith("methods")
+        and not r["key"].endswith("time_s")  # what a machine decides, not a seed
         or ("bistatic" in r["key"] or "rf3dgs+" in r["key"])
         and "psnr" in r["key"]
     ]
@@ -665,7 +666,7 @@ def readme() -> str:
         return shown + form.replace("%", "").format(scale * row["spread"]) + (" %" if "%" in form else "")
 
     columns = (
-        ("PSNR", "psnr_db", "{:.1f}"),
+        ("PSNR [dB]", "psnr_db", "{:.1f}"),
         ("within 3°", "direction_within_3deg", "{:.0f}%"),
         ("within 3°, blocked", "direction_within_3deg_blocked", "{:.0f}%"),
     )
