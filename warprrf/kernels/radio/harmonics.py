@@ -27,8 +27,6 @@ from warprrf.kernels.raster import sh as _sh
 EXPONENTIAL, CLAMPED, SIGNED = 0, 1, 2  # what a gain is of its harmonics' sum
 COEFFICIENTS = 16
 EXPONENT_LIMIT = 60.0  # nepers: keeps a runaway gain finite in float32; 260 dB off the median gain
-
-
 PER_NEPER = 10.0 / np.log(10.0)  # dB per unit of natural logarithm of power
 
 
@@ -37,7 +35,22 @@ def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}
     forward, adjoint = _forward(real), _adjoints(real)
-    return SimpleNamespace(**types, **forward, **adjoint, adam=_adam(real))
+    return SimpleNamespace(**types, **forward, **adjoint, evaluate_basis=_basis(real), adam=_adam(real))
+
+
+def _basis(real: type) -> wp.Kernel:
+    """The kernel of the harmonics."""
+    vec3 = wp.types.vector(3, real)
+    vec16 = wp.types.vector(COEFFICIENTS, real)
+    harmonics = _sh.build(real).basis
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def evaluate_basis(offset: int, directions: wp.array(dtype=vec3), out: wp.array(dtype=vec16)):
+        """The 16 harmonics of each direction."""
+        i = offset + wp.tid()
+        out[i] = harmonics(directions[i])
+
+    return evaluate_basis
 
 
 def _forward(real: type) -> dict[str, Any]:
@@ -46,13 +59,6 @@ def _forward(real: type) -> dict[str, Any]:
     vec16 = wp.types.vector(COEFFICIENTS, real)
     limit = wp.constant(real(EXPONENT_LIMIT))
     per_neper = wp.constant(real(PER_NEPER))
-    harmonics = _sh.build(real).basis
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def evaluate_basis(offset: int, directions: wp.array(dtype=vec3), out: wp.array(dtype=vec16)):
-        """The 16 harmonics of each direction."""
-        i = offset + wp.tid()
-        out[i] = harmonics(directions[i])
 
     @wp.func
     def gain(x: real, kind: int):
@@ -136,7 +142,6 @@ def _forward(real: type) -> dict[str, Any]:
         out[p] = total
 
     return {
-        "evaluate_basis": evaluate_basis,
         "contributions": contributions,
         "pixel_sums": pixel_sums,
         "to_image": to_image,
