@@ -10,9 +10,9 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Layout
+from warprrf.rf.fields.bistatic.materials import Layout, Parameters
 from warprrf.rf.fields.bistatic.render import path_powers
-from warprrf.rf.fields.bistatic.response import jacobian, predict, respond
+from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 
@@ -78,6 +78,29 @@ def test_its_jacobian_is_that_of_differences(field: BistaticField) -> None:
         ) / 0.04
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.02  # that of permittivity is a table's
         assert np.abs(row - slope).max() <= allowed * np.abs(slope).max() + 1e-5 * values.max()
+
+
+def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() -> None:
+    """One reading a path, so that what one mirror of a chain changes is not hidden by others."""
+    rng = np.random.default_rng(3)
+    groups = np.array([[0, 1, 2], [2, 0, -1], [1, -1, -1], [-1, -1, -1]])
+    none, count = np.zeros(0, int), len(groups)
+    response = Response(
+        group=none, bounce=np.zeros((0, 2, 3, count), np.float32), seen=none, indirect=np.zeros((0, count), np.float32),
+        sender=none, sent=np.zeros((0, count), np.float32), path_group=groups,
+        cosine=rng.uniform(0.2, 0.9, groups.shape), turn=rng.uniform(-1.0, 1.0, groups.shape),
+        path_power=np.ones(count), path=np.eye(count, dtype=np.float32), offset=np.zeros(count, np.float32),
+    )  # fmt: skip
+    layout = Layout(3, 2, indirect=False, gain=False)
+    x = layout.pack(Parameters.prior(3, 2)) + rng.normal(0.0, 0.3, layout.size)
+    values, table, index = jacobian(response, layout.unpack(x), layout)
+    whole = np.zeros((layout.size, count))
+    whole[index] = table
+    for place in range(layout.size):
+        step = 1e-2 * (np.arange(layout.size) == place)
+        high, low = (predict(response, layout.unpack(x + s * step)) for s in (1.0, -1.0))
+        slope = (high - low) / 2e-2
+        assert (np.abs(whole[place] - slope) <= 1e-3 * np.abs(slope) + 1e-4 * values).all()
 
 
 def test_a_used_field_is_copied_and_pickled_without_what_it_traced(field: BistaticField) -> None:
