@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.interop.sionna_engine import load_sionna_scene, select_variant, sionna_rt
 
@@ -42,7 +42,7 @@ class SionnaMap:
         height_m: float,
         depth: int = 3,
     ) -> None:
-        columns, rows = _device.check_array("x", x, (None,)), _device.check_array("y", y, (None,))
+        columns, rows = check_array("x", x, (None,)), check_array("y", y, (None,))
         steps = np.concatenate([np.diff(columns), np.diff(rows)])
         if len(columns) < 2 or not (steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-6)):
             raise ValueError(
@@ -55,7 +55,7 @@ class SionnaMap:
         self._scene = load_sionna_scene(scene, frequency_hz=check_frequency(frequency_hz))
         self._solver = self._rt.RadioMapSolver()
         self._scene.rx_array = self._array("V")
-        place = _device.check_array("transmitter", transmitter, (3,))
+        place = check_array("transmitter", transmitter, (3,))
         self._scene.add(self._rt.Transmitter("tx", position=place.tolist()))
 
     def _array(self, polarisation: str) -> Any:

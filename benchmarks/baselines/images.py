@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 from warprrf.rf.spectra.metrics import unit_image
 from warprrf.rf.spectra.spectrum import pixel_directions
 

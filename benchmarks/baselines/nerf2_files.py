@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.baselines.images import SpectrumImages
-from warprrf.device import check_array, require
+from warprrf.checks import check_array
+from warprrf.device import require
 
 
 def load_nerf2_spectra(folder: str | os.PathLike[str], part: str | None = None) -> SpectrumImages:

@@ -20,7 +20,8 @@ import numpy as np
 
 from benchmarks.baselines.images import SpectrumImages, path_gain_of
 from warprrf import tensor_files
-from warprrf.device import Progress, check_array, require
+from warprrf.checks import check_array
+from warprrf.device import Progress, require
 from warprrf.rf.spectra.spectrum import Spectrum
 from warprrf.steps import digest
 

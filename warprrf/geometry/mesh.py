@@ -17,6 +17,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces
@@ -53,8 +54,8 @@ class Mesh:
     """
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
-        self.vertices: np.ndarray = _device.check_array("vertices", vertices, (None, 3)).copy()
-        raw = _device.check_array("faces", faces, (None, 3), dtype=np.float64)
+        self.vertices: np.ndarray = check_array("vertices", vertices, (None, 3)).copy()
+        raw = check_array("faces", faces, (None, 3), dtype=np.float64)
         self.faces: np.ndarray = raw.astype(np.int32)
         if len(raw) == 0:
             raise ValueError("faces: got none, expected at least one triangle")
@@ -199,7 +200,7 @@ class Mesh:
 
     def closest(self, points: ArrayLike, *, device: DeviceLike = None) -> Closest:
         """The nearest point of the surface to each of ``points`` (N, 3) [m], in float64 once the face is known."""
-        p = _device.check_array("points", points, (None, 3))
+        p = check_array("points", points, (None, 3))
         where = _device.resolve(device)
         face = wp.zeros(len(p), dtype=wp.int32, device=where)
         reach = float(
@@ -239,7 +240,7 @@ class Mesh:
         Of a closed mesh it is whole: how many of its parts, wound outward, a point lies in. Source: van Oosterom and
         Strackee, "The solid angle of a plane triangle", IEEE Trans. Biomed. Eng. 30 (1983).
         """
-        p = _device.check_array("points", points, (None, 3))
+        p = check_array("points", points, (None, 3))
         number = np.zeros(len(p))
         for k, point in enumerate(p):
             a, b, c = np.moveaxis(self.triangles - point, 1, 0)

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import check_array, require
+from warprrf.checks import check_array
+from warprrf.device import require
 from warprrf.files import write_atomically
 
 

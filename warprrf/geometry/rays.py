@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.geometry import o3d
 from warprrf.kernels.rays.mesh import (
     AGAIN,
@@ -328,7 +329,7 @@ def check_rows(first: tuple[str, Any], second: tuple[str, Any]) -> tuple[np.ndar
     """
     arrays = []
     for name, value in (first, second):
-        array = np.atleast_2d(_device.check_array(name, value, finite=False))
+        array = np.atleast_2d(check_array(name, value, finite=False))
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
         arrays.append(array)
@@ -346,7 +347,7 @@ def _given(array: np.ndarray, dtype: type, device: wp.Device) -> wp.array:
 def _refuse(*ends: tuple[str, np.ndarray]) -> None:
     """Say what is wrong with rays or segments of which some are bad."""
     for name, array in ends:
-        _device.check_array(name, array)
+        check_array(name, array)
         if name == "directions" and (np.linalg.norm(array, axis=1) == 0).any():
             raise ValueError("directions: got a vector of length zero, expected directions")
     raise ValueError(

@@ -20,6 +20,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE
 from warprrf.kernels.radio.scatter import scatter_to_receiver
@@ -170,7 +171,7 @@ class ExactEngine:
 
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
-        point = _device.check_array("receiver", receiver, (3,))
+        point = check_array("receiver", receiver, (3,))
         specular = self.tracer.trace(point, 1).with_gas(self.air)
         scattered = self.diffuse(point)
         directions = np.concatenate([specular.arrival, scattered.direction])

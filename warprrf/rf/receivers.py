@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 from warprrf.geometry.mesh import Mesh
 
 ON_A_WALL_M = 1e-4  # a receiver nearer to the mesh than this sits in the wall

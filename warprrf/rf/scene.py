@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import DeviceLike, check_array
+from warprrf.checks import check_array
+from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.materials import Material, load_materials

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.em.absorption import Gas, air_of
@@ -85,8 +85,8 @@ def simulate(
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
-    points = _device.check_array("receivers", receivers, (None, 3))
-    source = _device.check_array("transmitter", transmitter, (3,))
+    points = check_array("receivers", receivers, (None, 3))
+    source = check_array("transmitter", transmitter, (3,))
     frequency = check_frequency(frequency_hz)
     table = surface_table(scene.materials, frequency)
     air = air_of(gas, frequency)

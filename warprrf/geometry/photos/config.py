@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warprrf.device import check_positive
+from warprrf.checks import check_positive
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 

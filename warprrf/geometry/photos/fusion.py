@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import DeviceLike, Progress, check_array
+from warprrf.checks import check_array
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import o3d as o3d_package
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 from warprrf.geometry.photos.cells import plane_mesh, visible_from
 from warprrf.geometry.photos.config import SweepConfig
 from warprrf.geometry.photos.planes import Plane, plane_axes

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 from warprrf.geometry.photos.config import PlaneConfig
 
 REFITS = 8  # of a hypothesis, from its neighbourhood outwards

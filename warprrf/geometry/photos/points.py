@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 from warprrf.geometry.photos.config import PlaneConfig
 from warprrf.geometry.photos.planes import Plane, detect_planes
 

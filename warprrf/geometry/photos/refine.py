@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warprrf.device import DeviceLike, Progress, check_array, launch, resolve
+from warprrf.checks import check_array
+from warprrf.device import DeviceLike, Progress, launch, resolve
 from warprrf.files import write_atomically
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import PARAMETERS, STATISTICS, Arrays, densified, opacity_and_scales

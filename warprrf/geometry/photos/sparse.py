@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 from warprrf.geometry.photos.photo_files import match_names, some
 from warprrf.geometry.splats.camera import Camera
 

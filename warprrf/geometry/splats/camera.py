@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import check_array, check_count, check_positive
+from warprrf.checks import check_array, check_count, check_positive
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from warprrf.device import check_count
+from warprrf.checks import check_count
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 

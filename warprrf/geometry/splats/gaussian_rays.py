@@ -20,7 +20,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.device import DeviceLike, check_array, check_count, launch, resolve
+from warprrf.checks import check_array, check_count
+from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.gaussians import Gaussians

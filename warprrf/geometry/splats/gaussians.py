@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 from warprrf.files import write_atomically
 from warprrf.kernels.raster.sh import COEFFICIENTS
 

@@ -8,7 +8,8 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.device import DeviceLike, check_array, check_count, resolve
+from warprrf.checks import check_array, check_count
+from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussians import Gaussians

@@ -23,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
+from warprrf.checks import check_array, check_count, check_positive
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
@@ -64,8 +64,8 @@ class PlanarArray:
 
     def __post_init__(self) -> None:
         for name in ("rows", "cols"):
-            _device.check_count(name, getattr(self, name))
-        spacing = _device.check_array("spacing", self.spacing)
+            check_count(name, getattr(self, name))
+        spacing = check_array("spacing", self.spacing)
         if spacing.shape not in ((), (2,)) or (spacing <= 0).any():
             raise ValueError(f"spacing: got {self.spacing!r}, expected one or two positive numbers")
         if isinstance(self.pattern, str) and self.pattern not in PATTERNS:
@@ -91,7 +91,7 @@ class PlanarArray:
     @cached_property
     def rotation(self) -> np.ndarray:
         """Rotation from local to world axes, shape ``(3, 3)``."""
-        value = _device.check_array("orientation", self.orientation)
+        value = check_array("orientation", self.orientation)
         if value.shape == (3,):
             return rotation_matrix(value)
         if value.shape != (3, 3) or not np.allclose(value @ value.T, np.eye(3), atol=1e-9):
@@ -193,7 +193,7 @@ def orientation_towards(direction: ArrayLike) -> tuple[float, float, float]:
     Raises:
         ValueError: for a vector without length.
     """
-    d = _device.check_array("direction", direction, (3,))
+    d = check_array("direction", direction, (3,))
     if not np.linalg.norm(d) > 0:
         raise ValueError("direction: got a zero vector, expected one with a length")
     return float(np.arctan2(d[1], d[0])), float(-np.arctan2(d[2], np.hypot(d[0], d[1]))), 0.0
@@ -227,8 +227,8 @@ def plane_wave_error(
         ValueError: for a distance or wavelength that is not positive.
     """
     for name, value in (("distance_m", distance_m), ("wavelength_m", wavelength_m)):
-        _device.check_positive(name, value, "number of metres")
-    d = _device.check_array("direction", direction, (3,))
+        check_positive(name, value, "number of metres")
+    d = check_array("direction", direction, (3,))
     unit = d / np.linalg.norm(d)
     plane = array.response(unit, wavelength_m)
     true = array.spherical_response(distance_m * unit, wavelength_m)

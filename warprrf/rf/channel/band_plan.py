@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.device import check_count
+from warprrf.checks import check_count
 
 LOW_HZ, HIGH_HZ = 252.72e9, 321.84e9
 """Edges of the band [Hz]."""

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
+from warprrf.checks import check_array, check_count, check_positive
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
@@ -139,7 +139,7 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
         ValueError: for a polarised array, or oversampling below 1.
     """
     _unpolarised("array", array)
-    times = _device.check_count("oversampling", oversampling)
+    times = check_count("oversampling", oversampling)
     return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
 
 
@@ -164,14 +164,14 @@ def steering_codebook(
     if (directions is None) == (points is None):
         raise ValueError("directions: expected either directions or points, and got both or neither")
     name, given = ("directions", directions) if points is None else ("points", points)
-    v = _device.check_array(name, given, (None, 3))
+    v = check_array(name, given, (None, 3))
     length = np.linalg.norm(v, axis=1, keepdims=True)
     if not (length > 0).all():
         raise ValueError(f"{name}: got a vector of length zero, expected ones with a length")
     if points is None:
         response = array.response(v / length, 1.0)
     else:
-        wavelength = _device.check_positive("wavelength_m", wavelength_m, "number of metres with points")
+        wavelength = check_positive("wavelength_m", wavelength_m, "number of metres with points")
         response = array.spherical_response(v, wavelength)
     return Codebook(array, (response.conj() / np.linalg.norm(response, axis=1, keepdims=True),))
 
@@ -229,7 +229,7 @@ def select_beams(
         ValueError: for a polarised array, a count below 1, or a spectrum without departure angles for a transmitting
             array.
     """
-    most = _device.check_count("count", count)
+    most = check_count("count", count)
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     rows = []
     for rays in rays_of(source, tx):
@@ -278,7 +278,7 @@ def select_beams_multiuser(
     Raises:
         TypeError, ValueError: as for :func:`select_beams`; without users, or for noise that is not positive.
     """
-    _device.check_positive("noise", noise, "share of the transmitted power")
+    check_positive("noise", noise, "share of the transmitted power")
     tx, rx = codebook_of("tx_array", tx_array), codebook_of("rx_array", rx_array)
     given: Iterable[Source] = [sources] if isinstance(sources, Spectrum | PathArrays) else sources
     gains = [_pair_gains(rays, tx, rx) for source in given for rays in rays_of(source, tx)]

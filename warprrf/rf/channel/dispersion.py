@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.rf.channel.path_arrays import PathArrays
 
 COHERENCE = 0.5
@@ -138,8 +138,8 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
 
 def _weights(power: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Shares of power that sum to one over the last axis (NaN without power), and values with 0 where there is none."""
-    p = _device.check_array("power", power)
-    v = _device.check_array("values", values, finite=False)
+    p = check_array("power", power)
+    v = check_array("values", values, finite=False)
     if p.shape != v.shape or p.ndim == 0:
         raise ValueError(f"power: got shape {p.shape} for values of shape {v.shape}, expected the same")
     if (p < 0).any():

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
-from warprrf.device import check_positive
+from warprrf.checks import check_positive
 from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum

@@ -33,7 +33,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
+from warprrf.checks import check_array, check_positive
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
 from warprrf.rf.channel.lengths import PairLengths, plane_lengths, scattered_lengths, spherical_lengths
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -93,7 +93,7 @@ def frequency_response(
     Raises:
         ValueError: naming the argument; where ``diffuse`` or polarised amplitudes are needed and missing.
     """
-    f = _device.check_array("frequencies_hz", frequencies_hz, (None,))
+    f = check_array("frequencies_hz", frequencies_hz, (None,))
     if not (len(f) and (f > 0).all()):
         raise ValueError(
             "frequencies_hz: expected at least one, all positive (absolute, not about the carrier)"
@@ -146,7 +146,7 @@ def channel_taps(
     Raises:
         ValueError: naming the argument.
     """
-    _device.check_positive("bandwidth_hz", bandwidth_hz)
+    check_positive("bandwidth_hz", bandwidth_hz)
     if l_max < l_min:
         raise ValueError(f"l_max: got {l_max}, expected at least l_min, {l_min}")
     lags = np.arange(l_min, l_max + 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import check_array
+from warprrf.checks import check_array
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.device import DeviceLike, Progress, check_array
+from warprrf.checks import check_array
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import check_count
+from warprrf.checks import check_count
 from warprrf.files import write_arrays, write_text
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
@@ -126,14 +126,14 @@ def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
     if (gain[valid] == 0).any():
         raise ValueError("gain: got rays with a gain of zero, expected them left out")
     return NewrfRays(
-        transmitter=_device.check_array("transmitter", data["transmitter"], (3,)),
-        receivers=_device.check_array("receivers", data["receivers"], (count, 3)),
+        transmitter=check_array("transmitter", data["transmitter"], (3,)),
+        receivers=check_array("receivers", data["receivers"], (count, 3)),
         frequency_hz=check_frequency(data["frequency_hz"]),
         last_point=np.where(valid[..., None], last, np.nan),
         gain=np.where(valid, gain, 0.0),
         valid=valid,
         line_of_sight=_array(data, "line_of_sight", (count,), bool),
-        csi=_device.check_array("csi", _array(data, "csi", (count,), complex), (count,), dtype=complex),
+        csi=check_array("csi", _array(data, "csi", (count,), complex), (count,), dtype=complex),
         mesh=read_stl(base / MESH_FILE),
     )
 
@@ -159,7 +159,7 @@ def _shape(data: dict[str, np.ndarray], path: Path) -> tuple[int, int]:
 
 
 def _array(data: dict[str, np.ndarray], name: str, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
-    return _device.check_array(name, data[name], shape, dtype=dtype, finite=False)
+    return check_array(name, data[name], shape, dtype=dtype, finite=False)
 
 
 def read_stl(path: str | os.PathLike[str]) -> Mesh:

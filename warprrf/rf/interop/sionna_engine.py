@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
@@ -167,7 +168,7 @@ class SionnaEngine:
     ) -> None:
         self.shape = check_shape(shape)
         self.beam_sigma_rad = beam_sigma_rad
-        self.transmitter = _device.check_array("transmitter", transmitter, (3,))
+        self.transmitter = check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
         self.sampling = Sampling() if sampling is None else sampling
         self.air = air_of(gas)
@@ -192,7 +193,7 @@ class SionnaEngine:
         They come by rising delay: one seed gives the same paths to the bit, in the same order, in every run.
         Without ``specular`` reflections every ray scatters, and at depth 1 Sionna's result hardly depends on chance.
         """
-        point = _device.check_array("receiver", receiver, (3,))
+        point = check_array("receiver", receiver, (3,))
         select_variant()
         self._scene.add(self._rt.Receiver("rx", position=point.tolist()))
         try:

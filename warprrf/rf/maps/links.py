@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_positive
+from warprrf.checks import check_positive
+from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import BeamOperator

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from warprrf import device as _device
+from warprrf.checks import check_array, check_positive
 from warprrf.files import write_atomically
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.maps.links import LinkOptions, Links
@@ -224,7 +225,7 @@ class MapOptions(LinkOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _device.check_positive("bandwidth_hz", self.bandwidth_hz)
+        check_positive("bandwidth_hz", self.bandwidth_hz)
         for name in ("transmit_power_dbm", "noise_figure_db"):
             _check_finite(name, getattr(self, name))
 
@@ -282,9 +283,9 @@ def radio_map(
     if not isinstance(mesh, Mesh):
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
-    source = _device.check_array("transmitter", source, (3,))
+    source = check_array("transmitter", source, (3,))
     _check_finite("height", height)
-    _device.check_positive("cell", cell)
+    check_positive("cell", cell)
     low, high = mesh.bounds
     if not low[2] < height < high[2]:
         raise ValueError(
@@ -346,7 +347,7 @@ def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarr
     if bounds is None:
         low, high = mesh.bounds[0][:2], mesh.bounds[1][:2]
     else:
-        low, high = _device.check_array("bounds", bounds, (4,)).reshape(2, 2)
+        low, high = check_array("bounds", bounds, (4,)).reshape(2, 2)
     if not (low < high).all():
         raise ValueError(f"bounds: got {bounds!r}, expected lowest x and y, then higher x and y")
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1.0)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components
@@ -60,7 +60,7 @@ class Reflections:
         Raises:
             ValueError: on another shape, NaN, or a receiver at the transmitter's place.
         """
-        points = np.atleast_2d(_device.check_array("receivers", receivers))
+        points = np.atleast_2d(check_array("receivers", receivers))
         return self.channel(self._tracer.find(points, self.order), len(points))
 
     def channel(self, paths: MirrorPaths, count: int) -> np.ndarray:
@@ -106,8 +106,8 @@ def fit_reflections(
         ValueError: on a wrong shape, NaN, channels that are all zero, another order, or groups of another form.
     """
     surface = as_mesh(mesh)
-    points = _device.check_array("receivers", receivers, (None, 3))
-    channel = _device.check_array("csi", csi, (len(points),), dtype=np.complex128, finite=False)
+    points = check_array("receivers", receivers, (None, 3))
+    channel = check_array("csi", csi, (len(points),), dtype=np.complex128, finite=False)
     if not np.isfinite(channel).all():
         raise ValueError("csi: got NaN or infinite values, expected finite complex channels")
     if len(channel) and not channel.any():
@@ -217,7 +217,7 @@ def _patch_groups(mesh: Mesh, patches: PlanarPatches, groups: str | ArrayLike) -
             raise ValueError(f"groups: got {groups!r}, expected 'patch', 'part' or an index for each face")
         face = mesh_parts(mesh)
     else:
-        face = _device.check_array("groups", groups, (len(mesh.faces),), dtype=np.int64)
+        face = check_array("groups", groups, (len(mesh.faces),), dtype=np.int64)
     if (face < 0).any():
         raise ValueError("groups: got negative indices, expected whole numbers from 0")
     own = np.flatnonzero((patches.face_patch >= 0) & patches.once)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
@@ -83,7 +84,7 @@ class SionnaPaths:
         ``normalize`` scales each link to unit mean energy; ``method`` is that of
         :func:`~warprrf.rf.channel.response.frequency_response`.
         """
-        f = self._paths.carrier_hz + _device.check_array("frequencies", frequencies, (None,))
+        f = self._paths.carrier_hz + check_array("frequencies", frequencies, (None,))
         h = frequency_response(
             self._paths,
             f,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import device as _device
+from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
@@ -55,7 +55,7 @@ def trace_paths(
         ValueError: on bad positions, a frequency that is not positive or outside a material's band, another order.
     """
     tracer = MirrorTracer(mesh_or_scene, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
-    points = _device.check_array("receivers", receivers)
+    points = check_array("receivers", receivers)
     if points.ndim not in (1, 2) or points.shape[-1] != 3:
         raise ValueError(f"receivers: got shape {points.shape}, expected (3,) or (R, 3)")
     if points.ndim == 1:
@@ -86,7 +86,7 @@ class MirrorTracer:
         device: DeviceLike = None,
     ) -> None:
         self.mesh = as_mesh(mesh_or_scene)
-        self.transmitter = _device.check_array("transmitter", transmitter, (3,))
+        self.transmitter = check_array("transmitter", transmitter, (3,))
         self.frequency_hz = check_frequency(frequency_hz)
         self.table: SurfaceTable | None = None
         groups = None
@@ -104,7 +104,7 @@ class MirrorTracer:
 
     def trace(self, receiver: ArrayLike, mirror_order: int = 1) -> Paths:
         """Paths of one receiver (3,); see :func:`trace_paths`."""
-        return self.trace_each(_device.check_array("receiver", receiver, (3,))[None], mirror_order)[0]
+        return self.trace_each(check_array("receiver", receiver, (3,))[None], mirror_order)[0]
 
     def trace_each(self, receivers: ArrayLike, mirror_order: int = 1) -> list[Paths]:
         """Paths of each of ``receivers`` (R, 3), one after the other."""
@@ -131,8 +131,8 @@ class MirrorTracer:
         Raises:
             ValueError: on another order or shape, NaN, or a receiver at the transmitter's place.
         """
-        order = _device.check_count("mirror_order", mirror_order, 0)
-        points = _device.check_array("receivers", receivers, (None, 3))
+        order = check_count("mirror_order", mirror_order, 0)
+        points = check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():
             raise ValueError("receivers: got a receiver at the transmitter's place, expected them apart")
         return exact_paths(self.images, points, order)

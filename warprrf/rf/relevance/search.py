@@ -22,7 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.device import Progress, check_array
+from warprrf.checks import check_array
+from warprrf.device import Progress
 from warprrf.files import write_text
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.waves import check_frequency

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.checks import check_array, check_count, check_positive
 from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import (
     check_shape,
@@ -81,8 +82,8 @@ class Scan:
         if not (np.isfinite(self.noise) and self.noise >= 0):
             raise ValueError(f"noise: got {self.noise!r}, expected a linear power of at least 0")
         for name in ("iterations", "snapshots"):
-            _device.check_count(name, getattr(self, name))
-        _device.check_positive("tolerance", self.tolerance)
+            check_count(name, getattr(self, name))
+        check_positive("tolerance", self.tolerance)
 
 
 class Deembedded(NamedTuple):
@@ -124,7 +125,7 @@ def deembed(
         TypeError: for an option of the other kind of antenna.
         ValueError: for noise with a fixed antenna, or naming another argument.
     """
-    power = _device.check_array("path_gain", path_gain, (None, None, None))
+    power = check_array("path_gain", path_gain, (None, None, None))
     if (power < 0).any():
         raise ValueError(f"path_gain: got {int((power < 0).sum())} negative values, expected linear power")
     if callable(pattern) or np.ndim(pattern) != 2:
@@ -132,7 +133,7 @@ def deembed(
         return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)  # type: ignore[misc]
     if noise != 0.0:
         raise ValueError("noise: a fixed antenna's spectra are divided as they are; take the noise off first")
-    gain = _gains(_device.check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
+    gain = _gains(check_array("pattern", pattern, power.shape[1:]), boresight_gain_dbi)
     return _deembed_fixed(power, gain, **options)  # type: ignore[misc]
 
 
@@ -255,7 +256,7 @@ def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) 
     Directions in which the antenna is more than ``limit_db`` below its peak come out empty: dividing there would only
     blow up noise and leakage. The total path gain is then that of the directions that are left.
     """
-    _device.check_positive("limit_db", limit_db, "number of decibels")
+    check_positive("limit_db", limit_db, "number of decibels")
     told = gain >= gain.max() * 10.0 ** (-limit_db / 10.0)
     path_gain = np.divide(power, gain, out=np.zeros(power.shape), where=told)
     source = np.where(path_gain > 0, np.arange(gain.size).reshape(gain.shape), -1)
@@ -268,13 +269,13 @@ def _deembed_fixed(power: np.ndarray, gain: np.ndarray, limit_db: float = 20.0) 
 def sample_pattern(pattern: Pattern, angle: np.ndarray) -> np.ndarray:
     """The pattern at ``angle`` [rad], shape as ``angle``."""
     if callable(pattern):
-        gain = _device.check_array("pattern", pattern(angle), finite=False)
+        gain = check_array("pattern", pattern(angle), finite=False)
         if gain.shape not in ((), angle.shape):
             raise ValueError(
                 f"pattern: got shape {gain.shape} for angles {angle.shape}, expected one gain for each angle"
             )
         return np.broadcast_to(gain, angle.shape)
-    samples = _device.check_array("pattern", pattern, finite=False)
+    samples = check_array("pattern", pattern, finite=False)
     if samples.ndim != 1 or len(samples) < 2:
         raise ValueError(
             f"pattern: got shape {samples.shape}, expected a function of the angle, samples (N,) from 0 to pi, or a "

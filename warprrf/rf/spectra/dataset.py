@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.checks import check_array
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
@@ -62,7 +63,7 @@ class SpectrumDataset:
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        check = _device.check_array
+        check = check_array
         receivers = check("receivers", self.receivers, (None, 3))
         count = len(receivers)
         gain = check("path_gain", self.path_gain, (count, None, None), dtype=np.float32)

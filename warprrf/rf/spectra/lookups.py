@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import check_array, check_positive
+from warprrf.checks import check_array, check_positive
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, to_db

@@ -19,6 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.checks import check_array, check_positive
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -195,9 +196,9 @@ def spread_paths(
         ValueError: on a wrong shape, NaN, a negative gain, a direction of length zero, or a sigma that is not positive.
     """
     rows, columns = check_shape(shape)
-    d = _device.check_array("directions", directions, (None, 3))
-    power = _device.check_array("powers", powers, (len(d),))
-    _device.check_positive("sigma", sigma, "beam width in radians")
+    d = check_array("directions", directions, (None, 3))
+    power = check_array("powers", powers, (len(d),))
+    check_positive("sigma", sigma, "beam width in radians")
     if (power < 0).any():
         raise ValueError(f"powers: got {int((power < 0).sum())} negative path gains, expected linear power")
     positive = np.flatnonzero(power > 0)

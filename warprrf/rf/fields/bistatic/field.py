@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.checks import check_array, check_count
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT

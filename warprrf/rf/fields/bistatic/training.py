@@ -10,7 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.checks import check_array, check_count
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups

@@ -27,7 +27,8 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf import tensor_files
-from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.checks import check_array, check_count
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
 from warprrf.geometry.splats.gaussians import Gaussians

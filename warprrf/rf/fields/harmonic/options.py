@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from warprrf.device import check_count
+from warprrf.checks import check_count
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.interaction import INTERACTION_POINTS
 from warprrf.rf.fields.harmonic.transport import TOP_K, TRANSMITTANCE

@@ -15,7 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.device import DeviceLike, Progress, check_array, check_count
+from warprrf.checks import check_array, check_count
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
