@@ -131,7 +131,7 @@ def _main(path: Path, read: str, flips: int, cuts: int, seed: int) -> None:
                 result.refused += 1
             else:
                 result.wrong.append((damage, f"does not name the file: {type(error).__name__}: {error}"))
-        except Exception as error:  # whatever it is, it is reported
+        except Exception as error:  # noqa: BLE001 (whatever it is, it is reported)
             result.wrong.append((damage, f"{type(error).__name__}: {error}"))
         else:
             differ = differences(found, expected)
