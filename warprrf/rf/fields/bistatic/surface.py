@@ -9,14 +9,13 @@ told apart at both scales.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.cache import Cache
+from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
