@@ -241,23 +241,6 @@ def _finite(word: str) -> float:
     return number
 
 
-def read_json(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The mapping in a JSON file.
-
-    Raises:
-        OSError: naming ``path``, if it cannot be read.
-        ValueError: if it does not read as a mapping.
-    """
-    name = os.fspath(path)
-    try:
-        held = json.loads(Path(path).read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{name}: damaged, or no JSON: {error}") from error
-    if not isinstance(held, dict):
-        raise ValueError(f"{name}: got JSON of type {type(held).__name__}, expected a mapping {{...}}")
-    return held
-
-
 def plain(value: Any) -> Any:
     """`value` in terms of what strict JSON holds; numbers keep their value, NaN and infinities become None."""
     if isinstance(value, dict):
