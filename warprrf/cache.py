@@ -37,8 +37,8 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_wait, after_in_parent=_go_on, after_in_child=_go_on)
 
 
-def built_once(build: Callable[P, T]) -> Callable[P, T]:
-    """As ``functools.cache``, for what makes kernels: by one thread, and while none loads the module that they enter."""
+def once(build: Callable[P, T]) -> Callable[P, T]:
+    """As ``functools.cache``, for what starts Warp or makes kernels: by one thread, while none loads kernels."""
     kept = functools.cache(build)
 
     @functools.wraps(build)

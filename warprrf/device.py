@@ -20,6 +20,7 @@ from typing import Any, TypeAlias
 
 import warp as wp
 
+from warprrf import runtime
 from warprrf.cache import loading
 
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default: it would announce devices and every compiled module
@@ -44,8 +45,8 @@ def resolve(device: DeviceLike = None) -> wp.Device:
         ValueError: if Warp has no such device.
     """
     try:
-        with loading:  # the first call starts Warp
-            return wp.get_device(device)
+        runtime.start()
+        return wp.get_device(device)
     except (ValueError, RuntimeError, TypeError) as error:
         known = ", ".join(str(d) for d in wp.get_devices())
         raise ValueError(f"device: got {device!r}, expected one of {known}") from error
@@ -105,7 +106,7 @@ def launch(
         bounds = [dim * k // count for k in range(count + 1)]
     arguments = [bounds[0], *inputs]
     with loading:
-        kernel.module.load(where, block_dim=256 if where.is_cuda else 1)
+        runtime.load(kernel.module, where, block_dim=256 if where.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
     if len(bounds) == 2:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.cache import built_once
+from warprrf.cache import once
 
 RADIUS = 5  # pixels: 11 taps
 WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
@@ -20,7 +20,7 @@ WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2  # the paper's constants for a range of one
 
 
-@built_once
+@once
 def _filters(real: type) -> tuple[Any, Any]:
     """The kernels that average over the window, along rows and along columns."""
     vec3 = wp.types.vector(3, real)
@@ -71,7 +71,7 @@ def _filters(real: type) -> tuple[Any, Any]:
     return filter_rows, filter_columns
 
 
-@built_once
+@once
 def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)

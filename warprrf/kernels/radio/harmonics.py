@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warprrf.cache import built_once
+from warprrf.cache import once
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.raster import sh as _sh
 
@@ -30,7 +30,7 @@ EXPONENT_LIMIT = 60.0  # nepers: keeps a runaway gain finite in float32; 260 dB 
 PER_NEPER = 10.0 / np.log(10.0)  # dB per unit of natural logarithm of power
 
 
-@built_once
+@once
 def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}

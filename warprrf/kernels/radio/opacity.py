@@ -13,10 +13,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warprrf.cache import built_once
+from warprrf.cache import once
 
 
-@built_once
+@once
 def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
 

@@ -8,12 +8,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warprrf.cache import built_once
+from warprrf.cache import once
 
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> number of basis functions
 
 
-@built_once
+@once
 def build(real: type) -> SimpleNamespace:
     """Functions and kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)

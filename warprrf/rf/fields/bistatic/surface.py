@@ -53,7 +53,6 @@ class Surface:
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
         two_sided: whether mirrors have two sides; False: only that of ``plane_normal``, of a surface that photos saw.
-        transports: what was traced on it last, by transmitter and grid.
     """
 
     mesh: Mesh = field(repr=False)
@@ -74,7 +73,6 @@ class Surface:
     group_names: tuple[str, ...]
     skin_m: float
     two_sided: bool = False
-    transports: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     @cached_property
