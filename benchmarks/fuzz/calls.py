@@ -109,7 +109,8 @@ def _warp(p: Place) -> dict[str, Any]:
     features = raster.colors(means, sh, p.camera)
     return {
         "raster": raster, "means": means, "quaternions": quaternions, "scales": scales, "opacities": opacities,
-        "sh": sh, "features": features, "out": wp.zeros_like(features, requires_grad=True), "origin": wp.array([p.camera.position], dtype=wp.vec3, device="cpu"),
+        "sh": sh, "features": features, "out": wp.zeros_like(features, requires_grad=True),
+        "origin": wp.array([p.camera.position], dtype=wp.vec3, device="cpu"),
         "prepared": raster.prepare(means, quaternions, scales, opacities, p.camera),
     }  # fmt: skip
 
@@ -327,6 +328,8 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "channel.transmit_covariance": _sources(rx=np.zeros(3, int)),
     # waves
     "em.Band": lambda p: {"low_hz": 1e9, "high_hz": 1e12, "a": 5.0, "b": 0.0, "c": 0.01, "d": 0.9},
+    "em.Band.conductivity": _on(lambda p: BANDS[0], frequency_hz=CARRIER),
+    "em.Band.relative_permittivity": _on(lambda p: BANDS[0], frequency_hz=CARRIER),
     "em.carrier_phase": lambda p: {"frequency_hz": CARRIER, "tau": 1e-8 * ANGLES},
     "em.gas_attenuation_db_per_m": lambda p: {"frequency_hz": CARRIER},
     "em.load_materials": lambda p: {"path": p.folder / "materials.json"},
