@@ -32,12 +32,14 @@ class Variable:
         unit: by its symbol; None for text and flags.
         about: more attributes of it.
         packed: compress it, and do so in chunks of whole rows.
+        optional: files may lack it.
     """
 
     dimensions: tuple[str, ...]
     unit: str | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
     packed: bool = False
+    optional: bool = False
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,8 @@ def read(
             attributes = {n: _plain(value) for n, value in file.attrs.items()}
     except Exception as error:  # of a damaged file h5netcdf and h5py raise anything
         raise ValueError(f"{name}: damaged, or no NetCDF-4 file: {error}") from error
+    if lacking := sorted(n for n, it in variables.items() if n not in found and not it.optional):
+        raise ValueError(f"{name}: lacks {', '.join(lacking)}, expected a file saved by warprrf")
     try:
         arrays = {n: found[n].values(it) for n, it in variables.items() if n in found}
         for dimension, axis in axes.items():

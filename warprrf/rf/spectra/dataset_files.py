@@ -101,10 +101,8 @@ def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     file = os.fspath(path)
     arrays, attributes = netcdf_files.read(path, _VARIABLES, _AXES)
-    known = {*_FIELDS, "range_low_db", "range_high_db"}
-    missing = sorted((known - set(attributes)) | (set(_VARIABLES) - set(arrays)))
-    if missing:
-        raise ValueError(f"{file} lacks {', '.join(missing)}, expected a data set saved by warprrf")
+    if lacking := sorted({*_FIELDS, "range_low_db", "range_high_db"} - set(attributes)):
+        raise ValueError(f"{file}: lacks {', '.join(lacking)}, expected a data set saved by warprrf")
     for name in ("role", "line_of_sight"):
         if not np.isin(arrays[name], (0, 1)).all():
             raise ValueError(f"{file}: {name}: got {sorted(set(arrays[name].tolist()))}, expected 0 and 1")
