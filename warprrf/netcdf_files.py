@@ -99,7 +99,7 @@ def write(
                 packing = {"compression": "gzip", "compression_opts": level, "shuffle": True}
                 packing["chunks"] = (rows, *array.shape[1:])
             made = file.create_variable(name, it.dimensions, array.dtype, data=array, **packing)
-            for key, value in ({} if it.unit is None else {"units": it.unit} | it.about).items():
+            for key, value in {**({} if it.unit is None else {"units": it.unit}), **it.about}.items():
                 made.attrs[key] = value
         for key, value in attributes.items():
             file.attrs[key] = int(value) if isinstance(value, bool | np.bool_) else value

@@ -216,7 +216,8 @@ class RadioMap:
                 order = np.argsort(arrays[name])  # as another tool may have turned it
                 for held in (name, *_LAYERS):
                     arrays[held] = arrays[held].take(order, axis=min(axis, arrays[held].ndim - 1))
-            return cls(**arrays, **{name: attributes[name] for name in _PLAIN})
+            fields: dict[str, Any] = {**arrays, **{name: attributes[name] for name in _PLAIN}}
+            return cls(**fields)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise ValueError(f"{os.fspath(path)}: damaged, or no radio map: {error}") from error
 
