@@ -188,9 +188,7 @@ def _write_netcdf(path: Path, tree: Any) -> None:
     import xarray
 
     variables = {k: (tuple(d), np.asarray(v), a) for k, (d, v, a) in tree["variables"].items()}
-    xarray.Dataset(variables, attrs=tree["attributes"]).to_netcdf(
-        path, engine="h5netcdf", invalid_netcdf=True
-    )
+    xarray.Dataset(variables, attrs=tree["attributes"]).to_netcdf(path, engine="h5netcdf")
 
 
 def _read_zip(path: Path) -> Any:
