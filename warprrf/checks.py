@@ -2,6 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+import numbers
+import types
+import typing
+from collections.abc import Callable
+from dataclasses import is_dataclass
+from typing import Any, TypeVar
+
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, DTypeLike
@@ -106,3 +115,104 @@ def _number(value: object) -> float:
         return float(value) if array.ndim == 0 and array.dtype.kind in "iufO" else np.nan  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return np.nan
+
+
+Public = TypeVar("Public", bound=Callable[..., Any])
+
+
+def checked(public: Public) -> Public:
+    """A function, or a class with its public methods, whose arguments must be what their annotations say.
+
+    Numbers may be NumPy's, arrays Warp's, torch's or nested lists; what stands in a sequence or a mapping is not looked
+    at. Values are checked by the function itself.
+
+    Raises:
+        TypeError: when called, naming the argument.
+    """
+    if isinstance(public, type):
+        for name, member in list(vars(public).items()):
+            inner = member.__func__ if isinstance(member, classmethod) else member
+            if inspect.isfunction(inner) and (name == "__init__" or not name.startswith("_")):
+                by_field = name == "__init__" and is_dataclass(
+                    public
+                )  # inherited ones have names of other modules
+                wrapped = _checked_call(inner, public if by_field else inner)
+                setattr(public, name, classmethod(wrapped) if isinstance(member, classmethod) else wrapped)
+        return public
+    return _checked_call(public, public)  # type: ignore[return-value]
+
+
+def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[..., Any]:
+    signature = inspect.signature(function)
+
+    @functools.cache
+    def kinds() -> dict[str, Any]:
+        """By argument, when first asked for: annotations name what modules import last."""
+        found = typing.get_type_hints(annotated)
+        for one in signature.parameters.values():
+            if one.kind is one.VAR_KEYWORD:
+                options = found.pop(one.name, Any)
+                if typing.get_origin(options) is typing.Unpack:
+                    found |= typing.get_type_hints(typing.get_args(options)[0])
+        return found
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        wanted, names = kinds(), signature.parameters
+        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+            kind = wanted.get(name, Any)
+            if not _is(value, kind) and value is not (names[name].default if name in names else None):
+                what = inspect.formatannotation(kind).replace("typing.", "").replace("collections.abc.", "")
+                raise TypeError(f"{name}: got {_shown(value)}, expected {what}")
+        return function(*args, **kwargs)
+
+    return call
+
+
+def _shown(value: object) -> str:
+    """A value by its type, and as it is written where that is short."""
+    written = f" {value!r}" if isinstance(value, (str, bytes, numbers.Number)) else ""
+    return type(value).__name__ + (written if len(written) < 60 else "")
+
+
+def _is(value: object, kind: Any) -> bool:
+    """Whether a value may stand where an annotation says ``kind``."""
+    origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return any(_is(value, one) for one in inside if one is not bytes)  # which NumPy reads as text
+    if kind in (bool, int, float, complex):
+        return _is_number(value, kind)
+    if getattr(origin, "__module__", "").startswith("numpy"):
+        return _is_array(value)
+    if origin is tuple:
+        free = Ellipsis in inside
+        return isinstance(value, (tuple, list, np.ndarray)) and (
+            free or np.shape(value)[:1] == (len(inside),)
+        )
+    if origin is Callable:
+        return callable(value)
+    if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+        return True
+    if isinstance(value, str) and origin is not object:
+        return origin is str and "\0" not in value
+    return isinstance(value, origin) and not (isinstance(value, bytes) and origin is not bytes)
+
+
+def _is_number(value: object, kind: type) -> bool:
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if kind is bool or isinstance(value, (bool, np.bool_)):
+        return kind is bool and (isinstance(value, np.bool_) or value in (0, 1))
+    wanted = {int: numbers.Integral, float: numbers.Real, complex: numbers.Complex}[kind]
+    return isinstance(value, wanted) and not (isinstance(value, int) and abs(value) >= 2**63)
+
+
+def _is_array(value: object) -> bool:
+    if isinstance(value, wp.array) or hasattr(value, "detach"):
+        return True
+    try:
+        array = np.asarray(value)
+        array = array.astype(complex) if array.dtype.kind == "O" else array
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return array.dtype.kind in "biufcU"

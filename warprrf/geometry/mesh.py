@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.cache import cached_property
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces
@@ -41,6 +41,7 @@ class Closest:
     face: np.ndarray
 
 
+@checked
 class Mesh:
     """A triangle mesh in metres.
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.em.absorption import Gas, air_of
@@ -33,6 +33,7 @@ _BATCH = 1000
 _TRIES = 200
 
 
+@checked
 def simulate(
     scene: Scene,
     *,
@@ -168,6 +169,7 @@ def check_positions(
             )
 
 
+@checked
 def sample_receivers(
     scene: Scene,
     n: int,

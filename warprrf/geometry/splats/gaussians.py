@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.files import write_atomically
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
@@ -25,6 +25,7 @@ _PLY_TYPES = {
 }  # fmt: skip
 
 
+@checked
 @dataclass(frozen=True)
 class Gaussians:
     """N anisotropic Gaussians.

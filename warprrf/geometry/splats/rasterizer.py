@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from warprrf.checks import checked
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.splats.blending import RADIO as RADIO
 from warprrf.geometry.splats.blending import Blending as Blending
@@ -80,6 +81,7 @@ class Image:
         return self.features, self.alpha, self.depth
 
 
+@checked
 class Rasterizer:
     """Projects, bins and blends on one device in one precision.
 

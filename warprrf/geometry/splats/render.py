@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.camera import Camera, check_camera
@@ -35,6 +35,7 @@ class Rendering:
     peak: np.ndarray = field(repr=False)
 
 
+@checked
 @dataclass(frozen=True)
 class BlendWeights:
     """The ``K`` largest blending weights of every pixel, front to back.
@@ -56,6 +57,7 @@ class BlendWeights:
     dropped: np.ndarray = field(repr=False)
 
 
+@checked
 def render(
     g: Gaussians,
     cam: Camera,
@@ -99,6 +101,7 @@ def render(
     return Rendering(image.features.numpy(), alpha, depth, dominant, peak)
 
 
+@checked
 def blend_weights(
     g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: DeviceLike = None
 ) -> BlendWeights:

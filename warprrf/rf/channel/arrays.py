@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_count, check_positive
+from warprrf.checks import check_array, check_count, check_positive, checked
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
@@ -38,6 +38,7 @@ SLANTS_RAD = {
 """Slant angle of each port of an element, by the name of its polarisation."""
 
 
+@checked
 @dataclass(frozen=True)
 class PlanarArray:
     """A planar array of equal elements.
@@ -187,6 +188,7 @@ def rotation_matrix(orientation: ArrayLike) -> np.ndarray:
     )
 
 
+@checked
 def orientation_towards(direction: ArrayLike) -> tuple[float, float, float]:
     """Yaw, pitch and roll [rad] that point an array's boresight along ``direction`` (3,), columns level.
 
@@ -199,6 +201,7 @@ def orientation_towards(direction: ArrayLike) -> tuple[float, float, float]:
     return float(np.arctan2(d[1], d[0])), float(-np.arctan2(d[2], np.hypot(d[0], d[1]))), 0.0
 
 
+@checked
 @dataclass(frozen=True)
 class PlaneWaveError:
     """What taking a spherical wave for a plane one costs an array.
@@ -215,6 +218,7 @@ class PlaneWaveError:
     entry_error: float
 
 
+@checked
 def plane_wave_error(
     array: PlanarArray, distance_m: float, wavelength_m: float, direction: ArrayLike = (1.0, 0.0, 0.0)
 ) -> PlaneWaveError:

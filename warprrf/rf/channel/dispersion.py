@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.rf.channel.path_arrays import PathArrays
 
 COHERENCE = 0.5
@@ -24,6 +24,7 @@ _STEPS = 16  # trials of the correlation over the shortest period that it can ha
 _MOST_PERIODS = 4096  # searched for the first crossing
 
 
+@checked
 @dataclass(frozen=True)
 class Dispersion:
     """Spreads of the paths of one receiver, arrays ``()``, or of several, ``(R,)``; NaN where there is no path.
@@ -76,6 +77,7 @@ def dispersion(paths: PathArrays) -> Dispersion:
     )
 
 
+@checked
 def delay_spread(power: ArrayLike, tau: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Mean delay and rms delay spread [s] of powers at delays ``tau`` (..., L) [s], each ``(...)``.
 
@@ -86,6 +88,7 @@ def delay_spread(power: ArrayLike, tau: ArrayLike) -> tuple[np.ndarray, np.ndarr
     return mean, np.sqrt((weight * (delay - mean[..., None]) ** 2).sum(axis=-1))
 
 
+@checked
 def angular_spread(power: ArrayLike, angle: ArrayLike) -> np.ndarray:
     """sqrt(-2 ln |sum P exp(j angle)| / sum P) [rad] over the last axis; 3GPP TR 38.901, eq. (A-1)."""
     weight, angle = _weights(power, angle)
@@ -94,6 +97,7 @@ def angular_spread(power: ArrayLike, angle: ArrayLike) -> np.ndarray:
         return np.sqrt(np.maximum(-2.0 * np.log(np.minimum(resultant, 1.0)), 0.0))
 
 
+@checked
 def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = COHERENCE) -> np.ndarray:
     """Least frequency shift at which |sum P exp(-j 2 pi shift tau)| falls to ``level`` of sum P [Hz], shape ``(...)``.
 

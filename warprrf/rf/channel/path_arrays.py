@@ -18,6 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from warprrf.checks import checked
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -29,6 +30,7 @@ _PADDING: dict[str, Any] = {
 """Arrays with an entry for each path, and what they hold where there is none."""
 
 
+@checked
 @dataclass(frozen=True)
 class PathArrays:
     """Paths of one receiver, arrays ``(L,)``, or of several, arrays ``(R, L)`` padded where ``valid`` is False.

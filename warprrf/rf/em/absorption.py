@@ -15,6 +15,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.checks import checked
+
 LOW_HZ, HIGH_HZ = 1e9, 1000e9
 """Where the recommendation's sum holds."""
 TEMPERATURE_K = 288.15  # ITU-R P.835, mean annual global reference atmosphere at sea level
@@ -23,6 +25,7 @@ WATER_VAPOUR_G_M3 = 7.5
 _PREFIX = "air_"
 
 
+@checked
 @dataclass(frozen=True)
 class Air:
     """A state of the air; the defaults are the standard atmosphere at sea level (ITU-R P.835).
@@ -96,6 +99,7 @@ def air_of(gas: Gas, frequency_hz: float | None = None) -> Air | None:
     return air
 
 
+@checked
 def gas_attenuation_db_per_m(
     frequency_hz: ArrayLike,
     *,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.checks import checked
 from warprrf.rf.em.materials import Material
 
 LAMBERTIAN = 0
@@ -51,6 +52,7 @@ def surface_table(materials: Sequence[Material], frequency_hz: float) -> Surface
     )
 
 
+@checked
 def slab_reflection(
     cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -63,6 +65,7 @@ def slab_reflection(
     return te * (1.0 - echo) / (1.0 - te**2 * echo), tm * (1.0 - echo) / (1.0 - tm**2 * echo)  # eq. (43a)
 
 
+@checked
 def slab_transmission(
     cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -88,6 +91,7 @@ def _slab(
     return (cos - root) / (cos + root), (eta * cos - root) / (eta * cos + root), once
 
 
+@checked
 def lobe(
     alpha_r: int, cos_incidence: ArrayLike, cos_scatter: ArrayLike, cos_to_mirror: ArrayLike
 ) -> np.ndarray:

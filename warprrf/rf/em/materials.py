@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_count, check_number, check_positive, check_type
+from warprrf.checks import check_count, check_number, check_positive, check_type, checked
 from warprrf.files import read_json
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
@@ -31,6 +31,7 @@ the sums of binomials that normalise it leave double precision; what is narrower
 ROUGHEST_M = 1.0  # rms height; from a few wavelengths on nothing is reflected as by a mirror
 
 
+@checked
 @dataclass(frozen=True)
 class Band:
     """One row of permittivity coefficients and where it holds.
@@ -77,6 +78,7 @@ class Band:
             return float(self.c * np.float64(frequency_hz / 1e9) ** self.d)
 
 
+@checked
 @dataclass(frozen=True)
 class Material:
     """What a surface does to a radio wave.
@@ -197,6 +199,7 @@ class Material:
         return roughness_scattering(self.roughness_m, frequency_hz)
 
 
+@checked
 def roughness_scattering(roughness_m: float, frequency_hz: float) -> float:
     """Scattering coefficient of a surface of rms height ``roughness_m`` [m] at normal incidence, in [0, 1]."""
     height = check_number("roughness_m", roughness_m, 0.0, ROUGHEST_M)
@@ -282,6 +285,7 @@ def _material(entry: object, where: str) -> Material:
         raise ValueError(f"{where}: {error}") from error
 
 
+@checked
 def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     """Read a table of materials (see ``data/lobby/materials.json``), by name.
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
@@ -26,6 +26,7 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
 
+@checked
 class RadioField(ABC):
     """A fitted radio field; build it with :meth:`fit` or :meth:`load`.
 

@@ -7,6 +7,8 @@ import os
 import re
 from pathlib import Path
 
+from warprrf.checks import checked
+
 MIN_LLVM = 17
 """Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)."""
 
@@ -32,6 +34,7 @@ def installed_llvm() -> dict[int, Path]:
     return found
 
 
+@checked
 def select_llvm() -> Path | None:
     """Point Dr.Jit at the newest LLVM of at least 17 before it is first imported; returns it.
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
@@ -97,6 +97,7 @@ class NewrfRays:
         return np.arange(chosen), np.arange(count - int(count * 0.2), count)
 
 
+@checked
 def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
     """Read ``newrf_conference.npz`` and ``conferenceroom.stl`` from ``folder``.
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
@@ -34,6 +34,7 @@ NARROWEST_SIONNA_LOBE = 127
 _RECEIVERS_PER_FLUSH = 20
 
 
+@checked
 def load_sionna_scene(scene: Scene | str | os.PathLike[str], *, frequency_hz: float) -> Any:
     """Open a scene in Sionna RT with its table of materials, scattering patterns included.
 

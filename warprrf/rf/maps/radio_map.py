@@ -17,7 +17,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf import netcdf_files
-from warprrf.checks import check_array, check_number, check_positive
+from warprrf.checks import check_array, check_number, check_positive, checked
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
@@ -48,6 +48,7 @@ QUANTITIES = {
 """What :meth:`RadioMap.plot` draws, and how the picture calls it."""
 
 
+@checked
 @dataclass(frozen=True)
 class RadioMap:
     """What receivers at the centres of cells get; rows go along y, columns along x, NaN outside the air.

@@ -12,6 +12,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.checks import checked
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.dispersion import Dispersion, dispersion
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -25,6 +26,7 @@ from warprrf.rf.channel.response import (
 from warprrf.rf.paths import files, sionna
 
 
+@checked
 @dataclass(frozen=True)
 class Paths(PathArrays):
     """Paths of one receiver, arrays ``(L,)``, or of several, arrays ``(R, L)`` padded where ``valid`` is False.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components
@@ -68,6 +68,7 @@ class Reflections:
         return _Model(paths, self.patch_group, count, self._tracer.wavelength_m).channel(self.coefficient)
 
 
+@checked
 def fit_reflections(
     mesh: GeometryLike,
     transmitter: ArrayLike,

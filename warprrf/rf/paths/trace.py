@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
@@ -22,6 +22,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
 
 
+@checked
 def trace_paths(
     mesh_or_scene: GeometryLike,
     *,

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.device import Progress
 from warprrf.files import write_text
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -64,6 +64,7 @@ MATERIALS = {
 }
 
 
+@checked
 @dataclass(frozen=True)
 class Relevance:
     """What a scene needs; made by :func:`relevance`.
@@ -257,6 +258,7 @@ class Setting:
         return found
 
 
+@checked
 def relevance(
     geometry: Any,
     *,

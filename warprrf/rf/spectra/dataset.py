@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
@@ -23,6 +23,7 @@ POLARISATION = "mean over vertical and horizontal transmit, sum over both receiv
 _ROLES = ("train", "test")
 
 
+@checked
 @dataclass(frozen=True)
 class SpectrumDataset:
     """Spectra at R receivers.

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
+from warprrf.checks import checked
 from warprrf.device import Progress
 from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -35,6 +36,7 @@ SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with 
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
+@checked
 def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float]) -> np.ndarray:
     """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
     low, high = (float(v) for v in range_db)
@@ -45,12 +47,14 @@ def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float
     return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
 
 
+@checked
 def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Peak signal-to-noise ratio [dB] of two images in [0, 1]; equal images score :data:`PSNR_CEILING_DB`."""
     error = float(np.mean((np.asarray(prediction, np.float64) - truth) ** 2))
     return PSNR_CEILING_DB if error <= 10 ** (-PSNR_CEILING_DB / 10) else -10.0 * np.log10(error)
 
 
+@checked
 def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Structural similarity of two images in [0, 1], shape ``(height, width)`` of at least 7 x 7 pixels.
 
@@ -79,6 +83,7 @@ def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
     return float(np.mean(score / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
 
 
+@checked
 def rmse_db(prediction_db: np.ndarray, truth_db: np.ndarray) -> float:
     """Root mean square difference [dB] of two dB images ``(height, width)``, weighted by solid angle."""
     weight = pixel_solid_angles(truth_db.shape)[:, None]
@@ -86,6 +91,7 @@ def rmse_db(prediction_db: np.ndarray, truth_db: np.ndarray) -> float:
     return float(np.sqrt(np.sum(weight * error) / (np.sum(weight) * truth_db.shape[1])))
 
 
+@checked
 def strongest_direction(path_gain: np.ndarray) -> np.ndarray:
     """Unit direction ``(3,)`` of the pixel with the most path gain per solid angle.
 
@@ -96,11 +102,13 @@ def strongest_direction(path_gain: np.ndarray) -> np.ndarray:
     return pixel_directions(path_gain.shape)[row, column]
 
 
+@checked
 def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle [degrees] between unit vectors ``(..., 3)``; accurate for small angles too."""
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
+@checked
 def beam_kappa(width_rad: float) -> float:
     """Concentration of the von Mises-Fisher beam whose power falls to half at ``width_rad / 2`` off its axis."""
     if not 0 < width_rad < 2 * np.pi:
@@ -108,6 +116,7 @@ def beam_kappa(width_rad: float) -> float:
     return float(np.log(2.0) / (1.0 - np.cos(width_rad / 2)))
 
 
+@checked
 def beam_response(path_gain: np.ndarray, width_rad: float) -> np.ndarray:
     """Power a beam collects when steered to each pixel centre, shape ``(height, width)``.
 
@@ -122,6 +131,7 @@ def _beam_kernel(shape: tuple[int, int], kappa: float) -> np.ndarray:
     return scanned_kernel(lambda angle: np.exp(-2.0 * kappa * np.sin(0.5 * angle) ** 2), shape)
 
 
+@checked
 def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: float) -> float:
     """Loss [dB] of a beam steered to ``direction`` (3,) on the spectrum ``path_gain`` against its best steering.
 
@@ -136,6 +146,7 @@ def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: f
     return float(10.0 * np.log10(best / max(got, best * 1e-30)))
 
 
+@checked
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     """Smallest value at which the cumulated weight reaches one half; NaN when no weight is positive."""
     values, weights = np.ravel(values), np.ravel(weights)
@@ -146,6 +157,7 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
 
 
+@checked
 def evaluate(
     test: SpectrumDataset,
     predict: Callable[[np.ndarray], Any],

@@ -19,7 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, checked
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -352,6 +352,7 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     )
 
 
+@checked
 @dataclass(frozen=True)
 class Spectrum:
     """The spatial spectrum of one receiver.

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf import tensor_files
 from warprrf.cache import Cache
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
@@ -55,6 +55,7 @@ CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that a
 CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class HarmonicField(RadioField):
     """A radio field of spherical harmonics per Gaussian; build it with :meth:`fit` or :meth:`load`.
