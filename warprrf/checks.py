@@ -121,13 +121,13 @@ Public = TypeVar("Public", bound=Callable[..., Any])
 
 
 def checked(public: Public) -> Public:
-    """A function, or a class with its public methods, whose arguments must be what their annotations say.
+    """A function, or a class with its public methods, whose arguments come as their annotations say.
 
-    Numbers may be NumPy's, arrays Warp's, torch's or nested lists; what stands in a sequence or a mapping is not looked
-    at. Values are checked by the function itself.
+    Numbers of other kinds become Python's, arrays of other kinds (torch's, lists, Python objects) NumPy's; Warp's stay
+    where they are. What a sequence or a mapping holds is not looked at, and values are checked by the function itself.
 
     Raises:
-        TypeError: when called, naming the argument.
+        TypeError: when called with something else, naming the argument.
     """
     if isinstance(public, type):
         for name, member in list(vars(public).items()):
@@ -143,30 +143,41 @@ def checked(public: Public) -> Public:
 
 
 def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[..., Any]:
-    signature = inspect.signature(function)
+    parameters = inspect.signature(function).parameters
+    names = list(parameters)
 
     @functools.cache
     def kinds() -> dict[str, Any]:
         """By argument, when first asked for: annotations name what modules import last."""
         found = typing.get_type_hints(annotated)
-        for one in signature.parameters.values():
+        for one in parameters.values():
             if one.kind is one.VAR_KEYWORD:
                 options = found.pop(one.name, Any)
                 if typing.get_origin(options) is typing.Unpack:
                     found |= typing.get_type_hints(typing.get_args(options)[0])
         return found
 
+    def taken(name: str, value: object) -> object:
+        kind = kinds().get(name, Any)
+        if name in parameters and value is parameters[name].default:
+            return value
+        found = _as(value, kind)
+        if found is _OTHER:
+            what = inspect.formatannotation(kind).replace("typing.", "").replace("collections.abc.", "")
+            raise TypeError(f"{name}: got {_shown(value)}, expected {what}")
+        return found
+
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        wanted, names = kinds(), signature.parameters
-        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
-            kind = wanted.get(name, Any)
-            if not _is(value, kind) and value is not (names[name].default if name in names else None):
-                what = inspect.formatannotation(kind).replace("typing.", "").replace("collections.abc.", "")
-                raise TypeError(f"{name}: got {_shown(value)}, expected {what}")
-        return function(*args, **kwargs)
+        given = [taken(name, value) for name, value in zip(names, args, strict=False)]
+        return function(
+            *given, *args[len(given) :], **{name: taken(name, value) for name, value in kwargs.items()}
+        )
 
     return call
+
+
+_OTHER = object()  # what does not fit its annotation
 
 
 def _shown(value: object) -> str:
@@ -175,44 +186,56 @@ def _shown(value: object) -> str:
     return type(value).__name__ + (written if len(written) < 60 else "")
 
 
-def _is(value: object, kind: Any) -> bool:
-    """Whether a value may stand where an annotation says ``kind``."""
+def _as(value: object, kind: Any) -> object:
+    """A value as the annotation ``kind`` says, or :data:`_OTHER`."""
     origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        return any(_is(value, one) for one in inside if one is not bytes)  # which NumPy reads as text
-    if kind in (bool, int, float, complex):
-        return _is_number(value, kind)
-    if getattr(origin, "__module__", "").startswith("numpy"):
-        return _is_array(value)
-    if origin is tuple:
-        free = Ellipsis in inside
-        return isinstance(value, (tuple, list, np.ndarray)) and (
-            free or np.shape(value)[:1] == (len(inside),)
+        inside = (
+            tuple(one for one in inside if one not in (bytes, str, complex)) if bytes in inside else inside
         )
+        return next((found for one in inside if (found := _as(value, one)) is not _OTHER), _OTHER)
+    if kind in (bool, int, float, complex):
+        return _as_number(value, kind)
+    if getattr(origin, "__module__", "").startswith("numpy"):  # an array, or one of what ArrayLike stands for
+        return _as_array(value, "biufcU" if origin is np.ndarray else "biufc")
+    if origin is tuple:
+        row = isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim)
+        return value if row and (Ellipsis in inside or len(value) == len(inside)) else _OTHER  # type: ignore[arg-type]
     if origin is Callable:
-        return callable(value)
+        return value if callable(value) else _OTHER
     if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
-        return True
-    if isinstance(value, str) and origin is not object:
-        return origin is str and "\0" not in value
-    return isinstance(value, origin) and not (isinstance(value, bytes) and origin is not bytes)
+        return value
+    if isinstance(value, str):
+        return value if origin is object or (origin is str and "\0" not in value) else _OTHER
+    return value if isinstance(value, origin) and not isinstance(value, bytes) else _OTHER
 
 
-def _is_number(value: object, kind: type) -> bool:
+def _as_number(value: object, kind: type) -> object:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
-    if kind is bool or isinstance(value, (bool, np.bool_)):
-        return kind is bool and (isinstance(value, np.bool_) or value in (0, 1))
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value) if kind is bool else _OTHER
+    if kind is bool:
+        return bool(value) if isinstance(value, (int, np.integer)) and value in (0, 1) else _OTHER
     wanted = {int: numbers.Integral, float: numbers.Real, complex: numbers.Complex}[kind]
-    return isinstance(value, wanted) and not (isinstance(value, int) and abs(value) >= 2**63)
+    if not isinstance(value, wanted):
+        return _OTHER
+    number = int(value) if isinstance(value, numbers.Integral) else kind(value)
+    return number if not isinstance(number, int) or abs(number) < 2**63 else _OTHER
 
 
-def _is_array(value: object) -> bool:
-    if isinstance(value, wp.array) or hasattr(value, "detach"):
-        return True
+def _as_array(value: Any, letters: str) -> object:
+    if isinstance(value, (wp.array, float, complex)):
+        return value
     try:
-        array = np.asarray(value)
-        array = array.astype(complex) if array.dtype.kind == "O" else array
-    except (TypeError, ValueError, OverflowError):
-        return False
-    return array.dtype.kind in "biufcU"
+        array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+        if array.dtype.kind == "O":
+            array = array.astype(complex)
+            array = array if array.imag.any() else array.real
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return _OTHER
+    if array.dtype.kind not in letters:
+        return _OTHER
+    if isinstance(value, (numbers.Number, np.generic)):
+        return array[()].item()
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))

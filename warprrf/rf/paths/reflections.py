@@ -8,6 +8,7 @@ complex Gauss-Newton steps (the channel is a polynomial in them); a prior holds 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +78,7 @@ def fit_reflections(
     frequency_hz: float,
     order: int = 2,
     *,
-    groups: str | ArrayLike = "patch",
+    groups: str | Sequence[int] | np.ndarray = "patch",
     prior: complex = 1.0,
     regularisation: float = REGULARISATION,
     chains: MirrorPaths | None = None,
@@ -209,7 +210,9 @@ def _gauss_newton(
     return best
 
 
-def _patch_groups(mesh: Mesh, patches: PlanarPatches, groups: str | ArrayLike) -> tuple[np.ndarray, int]:
+def _patch_groups(
+    mesh: Mesh, patches: PlanarPatches, groups: str | Sequence[int] | np.ndarray
+) -> tuple[np.ndarray, int]:
     """Group of each patch, and how many groups there are."""
     if isinstance(groups, str):
         if groups == "patch":
