@@ -75,6 +75,15 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
     return int(value)  # type: ignore[call-overload]
 
 
+def check_seed(seed: object) -> int:
+    """``seed`` as a whole number of at least 0.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    return check_count("seed", seed, 0, 2**63 - 1)
+
+
 def check_number(name: str, value: object, least: float = -np.inf, most: float = np.inf) -> float:
     """``value`` as a finite number from ``least`` to ``most``.
 
@@ -207,7 +216,10 @@ def _as(value: object, kind: Any) -> object:
         return value
     if isinstance(value, str):
         return value if origin is object or (origin is str and "\0" not in value) else _OTHER
-    return value if isinstance(value, origin) and not isinstance(value, bytes) else _OTHER
+    # One's own class may stand for one of ours, as long as it is an object with attributes.
+    own = origin.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
+    fits = isinstance(value, origin) or (own and not isinstance(value, wp.array))
+    return value if fits and not isinstance(value, bytes) else _OTHER
 
 
 def _as_number(value: object, kind: type) -> object:

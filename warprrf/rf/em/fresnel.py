@@ -54,7 +54,7 @@ def surface_table(materials: Sequence[Material], frequency_hz: float) -> Surface
 
 @checked
 def slab_reflection(
-    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reflection of a slab (``inf`` thick: a half-space): field across (TE) and in (TM) the plane of incidence.
 
@@ -67,7 +67,7 @@ def slab_reflection(
 
 @checked
 def slab_transmission(
-    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmission of a slab: field across (TE) and in (TM) the plane of incidence; nothing leaves a half-space.
 
@@ -78,7 +78,7 @@ def slab_transmission(
 
 
 def _slab(
-    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Reflection of the first face, TE and TM, and what is left of a wave that goes once through; eqs. (37), (44)."""
     cos = np.asarray(cos_incidence, dtype=np.float64)
