@@ -9,6 +9,7 @@ import types
 import typing
 from collections.abc import Callable
 from dataclasses import is_dataclass
+from types import EllipsisType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,14 +20,15 @@ from numpy.typing import ArrayLike, DTypeLike
 def check_array(
     name: str,
     value: ArrayLike | wp.array,
-    shape: tuple[int | None, ...] | None = None,
+    shape: tuple[int | EllipsisType | None, ...] | None = None,
     dtype: DTypeLike = np.float64,
     finite: bool = True,
 ) -> np.ndarray:
     """``value`` (NumPy, Warp, torch or nested lists) as a contiguous NumPy array of ``shape`` and ``dtype``.
 
     Args:
-        shape: expected shape, ``None`` for a free length; ``None`` altogether skips the check.
+        shape: expected shape, ``None`` for a free length, ``...`` at its beginning for any number of these; ``None``
+            altogether skips the check.
         dtype: of whole numbers: what is not whole, or too large for it, is refused.
         finite: refuse NaN and infinities.
 
@@ -48,11 +50,14 @@ def check_array(
         raise TypeError(f"{name}: got {what} of {given.dtype}, expected an array of {wanted}")
     with np.errstate(over="ignore", invalid="ignore"):  # both are found below
         array = np.asarray(given, dtype=wanted, order="C")
+    sizes = shape or ()
+    if sizes and sizes[0] is Ellipsis:
+        sizes = (*(None,) * (array.ndim + 1 - len(sizes)), *sizes[1:])
     if shape is not None and (
-        array.ndim != len(shape)
-        or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True))
+        array.ndim != len(sizes)
+        or any(s is not None and s != n for s, n in zip(sizes, array.shape, strict=True))
     ):
-        wished = ", ".join("any" if s is None else str(s) for s in shape)
+        wished = ", ".join("any" if s is None else "..." if s is Ellipsis else str(s) for s in shape)
         raise ValueError(f"{name}: got shape {array.shape}, expected ({wished})")
     if wanted.kind in "iu" and given.dtype != wanted and not np.array_equal(array, given):
         raise TypeError(f"{name}: got numbers that are not whole or too large, expected {wanted}")
@@ -60,6 +65,17 @@ def check_array(
         bad = int(np.count_nonzero(~np.isfinite(array)))
         raise ValueError(f"{name}: got {bad} values that are NaN or infinite, expected finite numbers")
     return array
+
+
+def check_alike(**arrays: ArrayLike) -> None:
+    """Raise ValueError, naming the arguments, unless their shapes can be broadcast to one."""
+    shapes = [np.shape(array) for array in arrays.values()]
+    try:
+        np.broadcast_shapes(*shapes)
+    except ValueError as error:
+        raise ValueError(
+            f"{', '.join(arrays)}: got shapes {', '.join(map(str, shapes))}, expected ones that go together"
+        ) from error
 
 
 def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1) -> int:
@@ -132,8 +148,8 @@ Public = TypeVar("Public", bound=Callable[..., Any])
 def checked(public: Public) -> Public:
     """A function, or a class with its public methods, whose arguments come as their annotations say.
 
-    Numbers of other kinds become Python's, arrays of other kinds (torch's, lists, Python objects) NumPy's; Warp's stay
-    where they are. What a sequence or a mapping holds is not looked at, and values are checked by the function itself.
+    Numbers of other kinds become Python's, arrays of other kinds (Warp's, torch's, lists, Python objects) NumPy's, unless
+    an annotation names them. What a sequence or a mapping holds is not looked at, and values are checked by the function itself.
 
     Raises:
         TypeError: when called with something else, naming the argument.
@@ -199,14 +215,16 @@ def _as(value: object, kind: Any) -> object:
     """A value as the annotation ``kind`` says, or :data:`_OTHER`."""
     origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        inside = (
-            tuple(one for one in inside if one not in (bytes, str, complex)) if bytes in inside else inside
-        )
+        if bytes in inside:  # those of ArrayLike
+            inside = tuple(one for one in inside if one not in (bytes, str, complex))
+        inside = tuple(sorted(inside, key=_is_of_numpy))  # what need not be turned into an array comes first
         return next((found for one in inside if (found := _as(value, one)) is not _OTHER), _OTHER)
     if kind in (bool, int, float, complex):
         return _as_number(value, kind)
-    if getattr(origin, "__module__", "").startswith("numpy"):  # an array, or one of what ArrayLike stands for
-        return _as_array(value, "biufcU" if origin is np.ndarray else "biufc")
+    if _is_of_numpy(kind):  # an array, or one of what ArrayLike stands for
+        found = _as_array(value, "U" if "str_" in repr(inside) else "biufc")
+        plain = origin is np.ndarray and isinstance(found, (bool, int, float, complex))
+        return np.asarray(found) if plain else found
     if origin is tuple:
         row = isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim)
         return value if row and (Ellipsis in inside or len(value) == len(inside)) else _OTHER  # type: ignore[arg-type]
@@ -220,6 +238,10 @@ def _as(value: object, kind: Any) -> object:
     own = origin.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
     fits = isinstance(value, origin) or (own and not isinstance(value, wp.array))
     return value if fits and not isinstance(value, bytes) else _OTHER
+
+
+def _is_of_numpy(kind: Any) -> bool:
+    return str(getattr(typing.get_origin(kind) or kind, "__module__", "")).startswith("numpy")
 
 
 def _as_number(value: object, kind: type) -> object:
@@ -237,11 +259,13 @@ def _as_number(value: object, kind: type) -> object:
 
 
 def _as_array(value: Any, letters: str) -> object:
-    if isinstance(value, (wp.array, float, complex)):
-        return value
+    if isinstance(value, wp.array):
+        value = value.numpy()
     try:
         array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
         if array.dtype.kind == "O":
+            if not all(isinstance(one, numbers.Number) for one in array.flat):
+                return _OTHER
             array = array.astype(complex)
             array = array if array.imag.any() else array.real
     except (TypeError, ValueError, OverflowError, RuntimeError):

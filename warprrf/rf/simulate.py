@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from warprrf.checks import check_array, check_count, check_number, check_seed, checked
 from warprrf.device import DeviceLike, Progress
@@ -48,7 +48,7 @@ def simulate(
     refraction: bool = False,
     seed: int = 0,
     gas: Gas = False,
-    roles: Sequence[str] | np.ndarray | None = None,
+    roles: Sequence[str] | NDArray[np.str_] | None = None,
     floor: float | None = None,
     workspace: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,

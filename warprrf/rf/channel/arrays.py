@@ -117,7 +117,7 @@ class PlanarArray:
 
     def gain(self, directions: ArrayLike) -> np.ndarray:
         """Power gain of an element [linear] towards world ``directions`` (..., 3), shape ``(...)``."""
-        local = np.asarray(directions, dtype=np.float64) @ self.rotation
+        local = check_array("directions", directions, (..., 3), finite=False) @ self.rotation
         return _pattern_gain(self.pattern, local)
 
     def field(self, directions: ArrayLike) -> np.ndarray:
@@ -131,7 +131,7 @@ class PlanarArray:
         """
         if self.polarisation is None:
             raise ValueError("polarisation: got None, expected 'V', 'H', 'VH' or 'cross'")
-        world = np.asarray(directions, dtype=np.float64)
+        world = check_array("directions", directions, (..., 3), finite=False)
         local = world @ self.rotation
         size = np.sqrt(_pattern_gain(self.pattern, local))
         turn = np.einsum(
@@ -154,7 +154,7 @@ class PlanarArray:
         Returns:
             Shape ``(..., N)``, complex, of unit modulus, phase zero at the array's centre.
         """
-        reach = np.asarray(directions, dtype=np.float64) @ self.positions(wavelength_m).T
+        reach = check_array("directions", directions, (..., 3), finite=False) @ self.positions(wavelength_m).T
         number = 1.0 / wavelength_m if frequency_hz is None else frequency_hz / SPEED_OF_LIGHT
         return np.exp(2j * np.pi * number * reach)
 
@@ -166,7 +166,7 @@ class PlanarArray:
         Every element's own distance counts, in phase and (as its inverse) in amplitude: r / r_n exp(-j 2 pi f (r_n -
         r) / c). Shape ``(..., N)``, complex; other arguments as in :meth:`response`.
         """
-        source = np.asarray(points, dtype=np.float64)[..., None, :]
+        source = check_array("points", points, (..., 3), finite=False)[..., None, :]
         place = self.positions(wavelength_m)
         far = np.linalg.norm(source, axis=-1)
         each = np.linalg.norm(source - place, axis=-1)

@@ -79,7 +79,7 @@ class Codebook:
 
         Elements' patterns count: |amplitude|^2 is the beam's power gain.
         """
-        d = np.asarray(directions, dtype=np.float64)
+        d = check_array("directions", directions, (None, 3), finite=False)
         size = np.sqrt(self.array.gain(d))
         parts = self._waves(d)
         if len(parts) == 1:
@@ -92,15 +92,15 @@ class Codebook:
         Returns:
             Shape ``(..., B)``.
         """
-        values = np.asarray(gains, dtype=complex)
-        d = np.asarray(directions, dtype=np.float64)
+        d = check_array("directions", directions, (None, 3), finite=False)
+        values = check_array("gains", gains, (..., len(d)), complex, finite=False)
         size = np.sqrt(self.array.gain(d))
         return self._summed(d, values * size, lambda waves: waves)
 
     def power(self, directions: ArrayLike, powers: ArrayLike) -> np.ndarray:
         """Mean |w^T h|^2 of every beam for waves of ``powers`` (..., L) and independent phases, shape ``(..., B)``."""
-        values = np.asarray(powers, dtype=np.float64)
-        d = np.asarray(directions, dtype=np.float64)
+        d = check_array("directions", directions, (None, 3), finite=False)
+        values = check_array("powers", powers, (..., len(d)), finite=False)
         return self._summed(d, values * self.array.gain(d), squared)
 
     def _summed(
@@ -308,7 +308,19 @@ def signal_over_interference(
         tx, rx: Beams of the users, shape ``(U,)``.
         noise: Noise power over the total transmitted power.
     """
-    heard = np.array([np.asarray(g)[r, np.asarray(tx)] for g, r in zip(gains, np.asarray(rx), strict=True)])
+    users = len(gains)
+    sent, received = (
+        check_array(name, value, (users,), np.int64) for name, value in (("tx", tx), ("rx", rx))
+    )
+    tables = [check_array("gains", g, (None, None)) for g in gains]
+    for name, index, axis in (("rx", received, 0), ("tx", sent, 1)):
+        fewest = min((table.shape[axis] for table in tables), default=0)
+        if users and not -fewest <= index.min() <= index.max() < fewest:
+            raise ValueError(f"{name}: got beams {index.min()} to {index.max()}, expected 0 to {fewest - 1}")
+    check_positive("noise", noise, "noise power")
+    heard = np.array([table[r, sent] for table, r in zip(tables, received, strict=True)]).reshape(
+        users, users
+    )
     signal = np.diag(heard)
     return signal / (heard.sum(axis=1) - signal + noise * len(heard))
 

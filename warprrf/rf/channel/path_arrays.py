@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from warprrf.checks import checked
+from warprrf.checks import check_array, checked
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -61,7 +62,7 @@ class PathArrays:
     theta_t: np.ndarray
     phi_t: np.ndarray
     vertices: np.ndarray
-    kind: np.ndarray
+    kind: NDArray[np.str_]
     valid: np.ndarray
     jones: np.ndarray | None = None
     frequency_hz: float | None = None
@@ -141,6 +142,15 @@ class PathArrays:
             raise TypeError(
                 "paths of several receivers cannot be selected from at once; index a receiver first"
             )
+        index = chosen if isinstance(chosen, slice) else np.asarray(chosen)
+        try:
+            found = np.arange(len(self.gain))[index]
+        except IndexError as error:
+            raise ValueError(
+                f"chosen: {error}; expected indices of {len(self.gain)} paths, or a mask"
+            ) from error
+        if found.ndim != 1:
+            raise ValueError(f"chosen: got shape {found.shape}, expected a list of paths")
         return self._taken(chosen)
 
     def with_gas(self, gas: Gas = True) -> Self:
@@ -191,7 +201,7 @@ class PathArrays:
         receiver: np.ndarray,
         vertices: np.ndarray,
         amplitude: np.ndarray,
-        kind: np.ndarray,
+        kind: NDArray[np.str_],
         frequency_hz: float,
         jones: np.ndarray | None = None,
     ) -> Self:
@@ -201,7 +211,13 @@ class PathArrays:
             amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
             jones: Polarised gain before exp(-j 2 pi f tau), complex, shape ``(L, 2, 2)``.
         """
+        transmitter = check_array("transmitter", transmitter, (3,))
+        receiver = check_array("receiver", receiver, (3,))
+        vertices = check_array("vertices", vertices, (None, None, 3), finite=False)
         count, depth = vertices.shape[:2]
+        amplitude = check_array("amplitude", amplitude, (count,), complex)
+        if jones is not None:
+            jones = check_array("jones", jones, (count, 2, 2), complex)
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
         each = np.arange(count)

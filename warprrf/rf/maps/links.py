@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_positive
+from warprrf.checks import check_positive, checked
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
@@ -45,6 +45,7 @@ class Links:
         return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__})
 
 
+@checked
 @dataclass(frozen=True)
 class LinkOptions:
     """How links are found.

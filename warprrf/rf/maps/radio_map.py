@@ -232,6 +232,7 @@ _VARIABLES = {
 }
 
 
+@checked
 @dataclass(frozen=True)
 class MapOptions(LinkOptions):
     """How a radio map is made: how links are found, and

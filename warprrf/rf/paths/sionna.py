@@ -173,6 +173,8 @@ def from_sionna(
 ) -> list[dict[str, Any]]:
     """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
     carrier = check_frequency(frequency_hz)
+    if not hasattr(paths, "synthetic_array"):
+        raise TypeError(f"paths: got {type(paths).__name__}, expected what Sionna RT's PathSolver returned")
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
     if not paths.synthetic_array or real.shape[1] != 2 or real.shape[3] != 2:
         raise ValueError(

@@ -206,6 +206,7 @@ def title(name: str) -> str:
     return TITLES.get(name) or f"scattering lobe of exponent {name.removeprefix('lobe_')}"
 
 
+@checked
 @dataclass(frozen=True)
 class Setting:
     """What relevance is judged for.

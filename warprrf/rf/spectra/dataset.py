@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from warprrf import device as _device
 from warprrf.checks import check_array, check_seed, checked
@@ -58,7 +58,7 @@ class SpectrumDataset:
     engine: str
     polarisation: str
     seed: int
-    role: np.ndarray
+    role: NDArray[np.str_]
     line_of_sight: np.ndarray
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -109,7 +109,7 @@ class SpectrumDataset:
         beam_sigma_rad: float,
         engine: str,
         seed: int = 0,
-        role: Sequence[str] | np.ndarray | None = None,
+        role: Sequence[str] | NDArray[np.str_] | None = None,
         floor: float | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> SpectrumDataset:

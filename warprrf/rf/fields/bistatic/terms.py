@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.rf.em.materials import NARROWEST_LOBE
 
 LOBES = (0, 2, 5, 12, 30)
 """Exponents of the lobe mix; 0 is Lambertian."""
 
 
+@checked
 @dataclass(frozen=True)
 class Terms:
     """What a bistatic field models; see :class:`warprrf.rf.fields.bistatic.training.FitOptions`.
