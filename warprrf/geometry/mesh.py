@@ -16,6 +16,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.brief import one_line
 from warprrf.cache import cached_property
 from warprrf.checks import check_array
 from warprrf.device import DeviceLike
@@ -35,6 +36,8 @@ class Closest:
         point: Nearest point on the surface [m], shape ``(N, 3)``.
         face: Its face, shape ``(N,)``, int32.
     """
+
+    __repr__ = one_line
 
     distance: np.ndarray
     point: np.ndarray
