@@ -62,6 +62,8 @@ class Material:
         alpha_r: width of the directive lobe ((1 + cos psi) / 2)^alpha_r, a whole number of at least 1.
         itu: the P.2040 name, or None for a custom material.
         sources: where thickness, roughness and pattern come from.
+        reciprocal: whether it scatters alike when transmitter and receiver change places. Degli-Esposti's lobes, the
+            default and Sionna RT's, do not; see :func:`warprrf.rf.em.fresnel.lobe`. ``engine="exact"`` takes either.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Material:
     alpha_r: int = 4
     itu: str | None = None
     sources: Mapping[str, str] | None = None
+    reciprocal: bool = False
 
     def __post_init__(self) -> None:
         if not self.bands:
@@ -105,10 +108,11 @@ class Material:
         scattering: float = 0.0,
         pattern: str = "lambertian",
         alpha_r: int = 4,
+        reciprocal: bool = False,
     ) -> Material:
         """A material with the same permittivity and conductivity [S/m] at every frequency up to 10 THz."""
         band = Band(1e6, 1e13, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
-        return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r)
+        return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, reciprocal=reciprocal)
 
     @classmethod
     def conductor(cls, *, scattering: float = 0.0, pattern: str = "lambertian", alpha_r: int = 4) -> Material:
@@ -192,6 +196,8 @@ def table_entry(material: Material) -> dict[str, Any]:
         entry[key] = {"value": values[key], "source": sources.get(key, "assumed")}
     if material.pattern == "directive":
         entry["pattern"]["alpha_r"] = int(material.alpha_r)
+    if material.reciprocal:
+        entry["pattern"]["reciprocal"] = True
     return entry
 
 
@@ -200,6 +206,13 @@ def _number(entry: Mapping[str, Any], key: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"{where}: {key!r} is {value!r}, expected a number")
     return float(value)
+
+
+def _flag(entry: Mapping[str, Any], key: str, where: str) -> bool:
+    value = entry.get(key, False)
+    if not isinstance(value, bool):
+        raise ValueError(f"{where}: {key!r} is {value!r}, expected true or false")
+    return value
 
 
 def _material(entry: Mapping[str, Any], path: Path) -> Material:
@@ -236,6 +249,7 @@ def _material(entry: Mapping[str, Any], path: Path) -> Material:
         alpha_r=int(parts["pattern"].get("alpha_r", 4)),
         itu=entry.get("itu"),
         sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
+        reciprocal=_flag(parts["pattern"], "reciprocal", where),
     )
 
 

@@ -16,6 +16,8 @@ class Terms:
         line_of_sight, diffuse: whether there are such paths.
         mirror_order: most mirror reflections on a path, 0 to 3.
         lobes: exponents of the scattering lobes, 0 for Lambertian.
+        reciprocal: whether single bounces keep their power when the ends are swapped; see
+            :mod:`warprrf.rf.fields.bistatic.scattering`.
         mirror_scatter: whether mirrors light surfaces.
         scatter_mirror: whether mirrors show the lit scene.
         diffuse_order: diffuse bounces on a path, 1 to 3.
@@ -28,6 +30,7 @@ class Terms:
     diffuse: bool = True
     mirror_order: int = 1
     lobes: tuple[int, ...] = LOBES
+    reciprocal: bool = False
     mirror_scatter: bool = False
     scatter_mirror: bool = False
     diffuse_order: int = 1
