@@ -3,9 +3,12 @@
 Line of sight and mirrors come from the image method (:mod:`warprrf.rf.paths.trace`). Diffuse scattering is evaluated along 64
 directions per pixel, each with one receiver ray and one shadow ray on the mesh, as a path of its own: path gain
 (lambda / 4 pi)^2 S^2 |Gamma|^2 f_s cos(theta_i) / (cos(theta_s) d1^2) times its share of the pixel's solid angle, with
-|Gamma|^2 the mean over transmit polarisations. That changes when transmitter and receiver change places, by some decibels
-where lobes are narrow or surfaces are seen at grazing; materials with ``reciprocal`` scatter alike both ways. All paths are spread by one receiver beam. Absorption by the air, where
-asked for, is that of each path's own length.
+|Gamma|^2 the mean over transmit polarisations. All paths are spread by one receiver beam. Absorption by the air, where asked
+for, is that of each path's own length.
+
+Diffuse power changes, by some decibels a path, when transmitter and receiver change places: lobes are normalised by the
+direction of incidence (Degli-Esposti et al. 2007). Materials with ``reciprocal`` scatter alike both ways, with |Gamma|^2 the
+mean of both angles.
 
 The directions form a rank-1 lattice of equal solid angles, shifted from row to row and column to column: a regular grid
 would meet upright edges in whole columns, and errs 3 to 5 times more.

@@ -106,9 +106,7 @@ class Lobes:
 
 
 @wp.func
-def lobe_value(
-    lobes: Lobes, which: int, cos_in: float, cos_out: float, cos_mirror: float, grazing: float
-):
+def lobe_value(lobes: Lobes, which: int, cos_in: float, cos_out: float, cos_mirror: float, grazing: float):
     """f_s / cos(theta_s) [1/sr] of lobe ``which``; exponent 0 is Lambertian, whose cosine cancels."""
     value = INV_PI
     n = lobes.exponent[which]

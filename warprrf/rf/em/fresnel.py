@@ -134,7 +134,9 @@ def reciprocal_factor(alpha_r: int, cosine: ArrayLike) -> np.ndarray:
     """
     cos = np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0)
     node, weighed = _reciprocal_nodes(int(alpha_r))
-    return np.asarray(1.0 / (_around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed).reshape(cos.shape))
+    return np.asarray(
+        1.0 / (_around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed).reshape(cos.shape)
+    )
 
 
 @lru_cache(maxsize=64)

@@ -137,9 +137,7 @@ def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -
         rows.append((ray[some], face[some], power[some]))
     m = view.mirror_illumination if materials.terms.diffuse and materials.terms.mirror_scatter else None
     if m is not None and len(m.ray):
-        power = scatter(
-            t.surface, m.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m
-        )
+        power = scatter(t.surface, m.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
         rows.append(
             (m.ray, m.face.numpy(), power * mirror_share(p, t.surface.patch_group[m.patch], m.cosine))
         )
@@ -156,9 +154,7 @@ def mirror_shown(
     if not wanted or m is None or len(m.ray) == 0:
         return np.zeros(0, int), np.zeros(0)
     wavelength, face = t.wavelength_m, m.hits.face.numpy()
-    power = scatter(
-        t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, wavelength
-    )
+    power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, wavelength)
     power = power.astype(float)
     if sent is not None:
         radiance = np.where(face >= 0, sent[t.surface.element[np.maximum(face, 0)]], 0.0)
