@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_positive, check_type
+from warprrf.checks import check_array, check_count, check_positive, check_seed, check_type
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
@@ -86,7 +86,7 @@ class SpectrumDataset:
             "floor": check_positive("floor", self.floor, "linear noise floor"),
             "range_db": check_range_db(self.range_db),
             "beam_sigma_rad": check_positive("beam_sigma_rad", self.beam_sigma_rad, "beam width in radians"),
-            "seed": check_count("seed", self.seed, least=0, most=2**63 - 1),
+            "seed": check_seed(self.seed),
             "role": _check_roles(self.role, count),
             "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
             "attributes": _check_attributes(self.attributes),
@@ -220,12 +220,11 @@ class SpectrumDataset:
         """
         train, test = np.flatnonzero(self.role == "train"), np.flatnonzero(self.role == "test")
         check_count("n_train", n_train, most=len(train))
-        check_count("seed", seed, least=0)
         if len(test) == 0:
             raise ValueError(
                 "role: there are no test receivers; give simulate(..., roles=) or assign_roles some"
             )
-        if seed != 0:
+        if check_seed(seed) != 0:
             train = np.random.default_rng(seed).permutation(train)
         return self.subset(train[:n_train]), self.subset(test)
 
@@ -348,7 +347,7 @@ def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.nd
     """ "train" or "test" for each of ``count`` receivers, ``test`` of them (an eighth by default) drawn at random."""
     check_count("count", count, least=0)
     wanted = count // 8 if test is None else check_count("test", test, least=0, most=count)
-    check_count("seed", seed, least=0)
+    check_seed(seed)
     role = np.full(count, "train", dtype="<U5")
     role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
     return role
