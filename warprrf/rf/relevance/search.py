@@ -22,7 +22,7 @@ import numpy as np
 
 from warprrf.checks import check_array
 from warprrf.device import Progress
-from warprrf.files import read_json
+from warprrf.files import read_json, write_json
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.fields.base import RadioField
