@@ -12,7 +12,6 @@ The order does not depend on the tolerance, so a larger one never keeps more.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ import numpy as np
 
 from warprrf.checks import check_array
 from warprrf.device import Progress
-from warprrf.files import read_json, write_text
+from warprrf.files import read_json, write_json
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.fields.base import RadioField
@@ -179,8 +178,7 @@ class Relevance:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as JSON, in one go."""
-        text = json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
-        write_text(path, text)
+        write_json(path, self.to_dict(), seal=True)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Relevance:
