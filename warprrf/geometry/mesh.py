@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from warprrf import device as _device
 from warprrf.brief import one_line
 from warprrf.cache import cached_property
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_number
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces
@@ -191,6 +191,7 @@ class Mesh:
             Shape ``(N,)``, bool.
         """
         start, end = check_rows(("a", a), ("b", b))
+        clearance = check_number("clearance", clearance, 0.0)
         where = _device.resolve(device)
         return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
@@ -218,7 +219,7 @@ class Mesh:
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
-        above = self.triangles[:, :, 2] > height
+        above = self.triangles[:, :, 2] > check_number("height", height)
         cut = (above.sum(axis=1) % 3) > 0
         corners, above = self.triangles[cut], above[cut]
         ends = []

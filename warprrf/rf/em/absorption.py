@@ -15,6 +15,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.checks import check_array
+
 LOW_HZ, HIGH_HZ = 1e9, 1000e9
 """Where the recommendation's sum holds."""
 TEMPERATURE_K = 288.15  # ITU-R P.835, mean annual global reference atmosphere at sea level
@@ -114,7 +116,7 @@ def gas_attenuation_db_per_m(
     Raises:
         ValueError: for a frequency outside the band, or a state of the air that cannot be.
     """
-    f_hz = np.asarray(frequency_hz, dtype=np.float64)
+    f_hz = check_array("frequency_hz", frequency_hz, finite=False)
     if not np.all((f_hz >= LOW_HZ) & (f_hz <= HIGH_HZ)):
         raise ValueError(
             f"frequency_hz: got {frequency_hz!r}, expected {LOW_HZ:g} to {HIGH_HZ:g} Hz, where ITU-R P.676 holds"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_type
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
@@ -70,7 +70,8 @@ class RadioField(ABC):
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.
         """
-        if model not in cls.models:
+        check_type("ds", ds, SpectrumDataset, " (SpectrumDataset.load reads one, simulate makes one)")
+        if not isinstance(model, str) or model not in cls.models:
             raise ValueError(f"model: got {model!r}, expected one of {', '.join(cls.models)}")
         return cls.models[model].fit(geometry, ds, model, **options)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, check_type
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, to_db
@@ -124,6 +124,7 @@ def mean(train: SpectrumDataset) -> Lookup:
 
 
 def _receivers(train: SpectrumDataset) -> np.ndarray:
+    check_type("train", train, SpectrumDataset)
     receivers = np.asarray(train.receivers, dtype=np.float64)
     if len(receivers) == 0:
         raise ValueError("train: got no receivers, expected at least one")
