@@ -20,10 +20,14 @@ from warprrf import device as _device
 from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
-from warprrf.kernels.rays.mesh import closest_faces
+from warprrf.kernels.rays.mesh import closest_faces, look_around
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
+
+
+MOST_CROSSINGS = 64
+"""Surfaces that a ray of :meth:`Mesh.look_around` crosses at most: what lies behind no longer matters."""
 
 
 @dataclass(frozen=True)
@@ -219,6 +223,28 @@ class Mesh:
     def distance(self, points: ArrayLike, *, device: DeviceLike = None) -> np.ndarray:
         """Distance from each of ``points`` (N, 3) [m] to the surface [m], shape ``(N,)``."""
         return self.closest(points, device=device).distance
+
+    def look_around(
+        self, points: ArrayLike, directions: ArrayLike, *, device: DeviceLike = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What rays in the same ``directions`` (D, 3), of unit length, cross from each of ``points`` (N, 3) [m].
+
+        Returns:
+            How many surfaces they leave less those that they enter, by the surfaces' normals; of a closed mesh the
+            winding number, whatever the direction; those within :data:`ENDPOINT_CLEARANCE` of each other count once.
+            And the side from which they meet the first: 1 where its normal points to the point, -1 where it points
+            away, 0 where there is none. Shapes ``(N, D)``, int32.
+        """
+        p, d = check_array("points", points, (None, 3)), check_array("directions", directions, (None, 3))
+        where = _device.resolve(device)
+        mesh, planes = self._rays.on_device(where)
+        winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
+        toward = wp.array(d.astype(np.float32), dtype=wp.vec3, device=where)
+        inputs = [
+            mesh.id, planes, self._local(p, where), toward, ENDPOINT_CLEARANCE, MOST_CROSSINGS, winding, side
+        ]  # fmt: skip
+        _device.launch(look_around, len(p) * len(d), inputs, device=where)
+        return winding.numpy().reshape(len(p), -1), side.numpy().reshape(len(p), -1)
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""

@@ -221,3 +221,43 @@ def closest_faces(
         face[i] = query.face
     else:
         face[i] = -1
+
+
+@wp.kernel(enable_backward=False)
+def look_around(
+    offset: int,
+    mesh: wp.uint64,
+    planes: wp.array(dtype=wp.vec4d),
+    points: wp.array(dtype=wp.vec3),
+    directions: wp.array(dtype=wp.vec3),
+    step: float,
+    most: int,
+    winding: wp.array(dtype=wp.int32),
+    side: wp.array(dtype=wp.int32),
+):
+    """Surfaces that each of ``directions`` from each point leaves less those that it enters, and the first one's side.
+
+    Surfaces within ``step`` [m] of each other along a ray are crossed once. ``side`` is 1 where the first surface's
+    normal points towards the point, -1 where it points away, 0 where nothing is met.
+    """
+    i = offset + wp.tid()
+    point = points[i // directions.shape[0]]
+    direction = directions[i % directions.shape[0]]
+    start = float(0.0)
+    sum = int(0)
+    first = int(0)
+    for _ in range(most):
+        query = wp.mesh_query_ray(mesh, point + start * direction, direction, 1.0e30)
+        if not query.result:
+            break
+        plane = planes[query.face]
+        normal = wp.vec3(wp.float32(plane[0]), wp.float32(plane[1]), wp.float32(plane[2]))
+        leaves = int(-1)
+        if wp.dot(normal, direction) > 0.0:
+            leaves = 1
+        if first == 0:
+            first = -leaves
+        sum += leaves
+        start += query.t + step
+    winding[i] = sum
+    side[i] = first
