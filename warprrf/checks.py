@@ -18,53 +18,91 @@ def check_array(
 
     Args:
         shape: expected shape, ``None`` for a free length; ``None`` altogether skips the check.
+        dtype: of whole numbers: what is not whole, or too large for it, is refused.
         finite: refuse NaN and infinities.
 
     Raises:
-        TypeError: if it cannot be read as numbers.
+        TypeError: if it cannot be read as numbers of that kind.
         ValueError: naming the argument, what came and what was expected.
     """
     if isinstance(value, wp.array):
         value = value.numpy()
     elif hasattr(value, "detach"):
         value = value.detach().cpu().numpy()
+    wanted, what = np.dtype(dtype), type(value).__name__
     try:
-        array = np.ascontiguousarray(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name}: got {type(value).__name__} that does not read as an array of {np.dtype(dtype)}"
-        ) from error
-    if np.ndim(value) == 0:
-        array = array.reshape(())
+        given = np.asarray(value)
+        given = given.astype(np.float64) if given.dtype.kind == "O" else given
+    except (TypeError, ValueError, OverflowError) as error:
+        raise TypeError(f"{name}: got {what} that does not read as an array of {wanted}") from error
+    if given.dtype.kind not in ("biufc" if wanted.kind == "c" else "biuf"):
+        raise TypeError(f"{name}: got {what} of {given.dtype}, expected an array of {wanted}")
+    with np.errstate(over="ignore", invalid="ignore"):  # both are found below
+        array = np.asarray(given, dtype=wanted, order="C")
     if shape is not None and (
         array.ndim != len(shape)
         or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True))
     ):
-        wanted = ", ".join("any" if s is None else str(s) for s in shape)
-        raise ValueError(f"{name}: got shape {array.shape}, expected ({wanted})")
-    if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
+        wished = ", ".join("any" if s is None else str(s) for s in shape)
+        raise ValueError(f"{name}: got shape {array.shape}, expected ({wished})")
+    if wanted.kind in "iu" and given.dtype != wanted and not np.array_equal(array, given):
+        raise TypeError(f"{name}: got numbers that are not whole or too large, expected {wanted}")
+    if finite and wanted.kind in "fc" and not np.isfinite(array).all():
         bad = int(np.count_nonzero(~np.isfinite(array)))
         raise ValueError(f"{name}: got {bad} values that are NaN or infinite, expected finite numbers")
     return array
 
 
-def check_count(name: str, value: object, least: int = 1) -> int:
-    """``value`` as a whole number of at least ``least``.
+def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1) -> int:
+    """``value`` as a whole number from ``least`` to ``most``.
 
     Raises:
         ValueError: otherwise, naming the argument.
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
-    return int(value)
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or not least <= value <= most:  # type: ignore[operator]
+        limit = f"{least} to {most}" if most < 2**31 - 1 else f"at least {least}"
+        raise ValueError(f"{name}: got {value!r}, expected a whole number of {limit}")
+    return int(value)  # type: ignore[call-overload]
 
 
-def check_positive(name: str, value: float | None, what: str = "number") -> float:
+def check_number(name: str, value: object, least: float = -np.inf, most: float = np.inf) -> float:
+    """``value`` as a finite number from ``least`` to ``most``.
+
+    Raises:
+        ValueError: otherwise, naming the argument.
+    """
+    number = _number(value)
+    if not (np.isfinite(number) and least <= number <= most):
+        limits = [f"at least {least:g}"] * (least > -np.inf) + [f"at most {most:g}"] * (most < np.inf)
+        raise ValueError(
+            f"{name}: got {value!r}, expected a finite number{' of ' * any(limits)}{', '.join(limits)}"
+        )
+    return number
+
+
+def check_positive(name: str, value: object, what: str = "number") -> float:
     """``value`` as a finite number above zero; ``what`` says of what kind it is.
 
     Raises:
         ValueError: otherwise, naming the argument.
     """
-    if value is None or not (np.isfinite(value) and value > 0):
+    number = _number(value)
+    if not (np.isfinite(number) and number > 0):
         raise ValueError(f"{name}: got {value!r}, expected a positive {what}")
-    return float(value)
+    return number
+
+
+def check_type(name: str, value: object, kind: type, hint: str = "") -> None:
+    """Raise TypeError, naming the argument, unless ``value`` is a ``kind``; ``hint`` says how to get one."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: got {type(value).__name__}, expected a {kind.__name__}{hint}")
+
+
+def _number(value: object) -> float:
+    """A real number as a float, NaN for what is none."""
+    try:
+        array = np.asarray(value)
+        return float(value) if array.ndim == 0 and array.dtype.kind in "iufO" else np.nan  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return np.nan

@@ -59,12 +59,9 @@ class Mesh:
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
         self.vertices: np.ndarray = check_array("vertices", vertices, (None, 3)).copy()
-        raw = check_array("faces", faces, (None, 3), dtype=np.float64)
-        self.faces: np.ndarray = raw.astype(np.int32)
-        if len(raw) == 0:
+        self.faces: np.ndarray = check_array("faces", faces, (None, 3), dtype=np.int32).copy()
+        if len(self.faces) == 0:
             raise ValueError("faces: got none, expected at least one triangle")
-        if not np.array_equal(raw, self.faces):
-            raise TypeError("faces: got numbers that are not whole, expected vertex indices")
         low, high = int(self.faces.min()), int(self.faces.max())
         if low < 0 or high >= len(self.vertices):
             raise ValueError(
