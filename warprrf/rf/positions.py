@@ -99,7 +99,11 @@ def check_positions(
     near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
     _refuse(near, "on a surface", points, labels, mesh)
     inside = in_another_solid(mesh, points, reference, device=device)
-    if known is None and inside[1:].sum() > 0.5 * (len(points) - 1) and _sees_backs(mesh, transmitter, device):
+    if (
+        known is None
+        and inside[1:].sum() > 0.5 * (len(points) - 1)
+        and _sees_backs(mesh, transmitter, device)
+    ):
         inside = np.arange(len(points)) == 0
     _refuse(inside, "inside a solid", points, labels, mesh)
 
@@ -112,7 +116,10 @@ def check_dataset(
     Raises, warns: as :func:`check_positions` and :func:`question_unit`.
     """
     receivers = check_array("ds.receivers", ds.receivers, (None, 3))
-    transmitter, wavelength_m = check_array("ds.transmitter", ds.transmitter, (3,)), SPEED_OF_LIGHT / ds.frequency_hz
+    transmitter, wavelength_m = (
+        check_array("ds.transmitter", ds.transmitter, (3,)),
+        SPEED_OF_LIGHT / ds.frequency_hz,
+    )
     if mesh is not None:
         question_unit(mesh, wavelength_m)
     check_positions(
@@ -143,7 +150,9 @@ def in_another_solid(
             middle = np.median(differs, axis=1, keepdims=True)
             parted |= (middle[:, 0] != 0) & ((differs == middle).mean(axis=1) >= _AGREED)
         else:
-            parted &= (np.sign(front_of_known) * _mean_side(side) < _BEHIND) & (abs(front_of_known) > -_BEHIND)
+            parted &= (np.sign(front_of_known) * _mean_side(side) < _BEHIND) & (
+                abs(front_of_known) > -_BEHIND
+            )
         found[some] = parted
     return found
 

@@ -1,9 +1,10 @@
 """Radio maps: what a link gets at every place of a floor plan.
 
 A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room, on a
-surface or in the transmitter's reactive near field hold NaN. Which they are is decided by the mesh alone, open and torn as a reconstructed one may be: rays from
-the centre over the whole sphere meet surfaces from their outer side in the air and from behind anywhere else, and three
-in four decide. Which side is the outer one is decided at the transmitter, which stands in the air.
+surface or in the transmitter's reactive near field hold NaN. Which are inside or outside is decided by the mesh alone,
+open and torn as a reconstructed one may be: rays from the centre over the whole sphere meet surfaces from their outer
+side in the air and from behind anywhere else, and three in four decide. Which side is the outer one is decided at the
+transmitter, which stands in the air.
 """
 
 from __future__ import annotations
@@ -285,7 +286,9 @@ def radio_map(
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
     source, wavelength_m = check_array("transmitter", source, (3,)), SPEED_OF_LIGHT / field.frequency_hz
-    check_positions(mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device)
+    check_positions(
+        mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device
+    )
     _check_finite("height", height)
     check_positive("cell", cell)
     low, high = mesh.bounds

@@ -217,7 +217,8 @@ class BistaticField(RadioField):
             view: what this receiver sees, if it was traced before (:meth:`view`).
 
         Raises:
-            ValueError: as for :meth:`check_positions`; for ``uncertainty`` of a field that was fitted to too few receivers to know it.
+            ValueError: as for :meth:`check_positions`; for ``uncertainty`` of a field that was fitted to too few
+                receivers to know it.
         """
         seen = view or self.view(rx, transmitter)
         found = self.render(seen)

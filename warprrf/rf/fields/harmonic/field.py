@@ -45,6 +45,7 @@ from warprrf.rf.fields.harmonic.single_bounce import SingleBounce
 from warprrf.rf.fields.harmonic.targets import targets
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
+from warprrf.rf.positions import check_dataset
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
 from warprrf.steps import digest
@@ -131,7 +132,7 @@ class HarmonicField(RadioField):
         chosen = FieldOptions.of(options, {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
-        receivers = np.asarray(ds.receivers, np.float64)
+        receivers, transmitter = check_dataset(mesh, ds, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError(
                 'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
@@ -140,7 +141,7 @@ class HarmonicField(RadioField):
         blank = cls(
             gaussians=gaussians,
             mesh=mesh,
-            transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
+            transmitter=transmitter,
             frequency_hz=float(ds.frequency_hz),
             shape=images.shape[1:],  # type: ignore[arg-type]
             floor=float(ds.floor),
