@@ -26,10 +26,6 @@ ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
 
 
-MOST_CROSSINGS = 64
-"""Surfaces that a ray of :meth:`Mesh.look_around` crosses at most: what lies behind no longer matters."""
-
-
 @dataclass(frozen=True)
 class Closest:
     """Nearest surface points.
@@ -71,6 +67,7 @@ class Mesh:
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
         self._search: RaySearch | None = None
+        self._boxed: dict[str, tuple[wp.Bvh, wp.array]] = {}
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -128,6 +125,12 @@ class Mesh:
         faces = np.unique(np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1), axis=0)
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         return len(edges) > 0 and bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+
+    @cached_property
+    def distinct_faces(self) -> np.ndarray:
+        """Faces of which no earlier one has the same three corners, however wound, shape ``(K,)``."""
+        corner = np.sort(self.welded_faces, axis=1)
+        return np.sort(np.unique(corner, axis=0, return_index=True)[1])
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -224,24 +227,34 @@ class Mesh:
     def look_around(
         self, points: ArrayLike, directions: ArrayLike, *, device: DeviceLike = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What rays in the same ``directions`` (D, 3), of unit length, cross from each of ``points`` (N, 3) [m].
+        """What rays in the same ``directions`` (D, 3) cross from each of ``points`` (N, 3) [m].
 
         Returns:
-            How many surfaces they leave less those that they enter, by the surfaces' normals; of a closed mesh the
-            winding number, whatever the direction; those within :data:`ENDPOINT_CLEARANCE` of each other count once.
-            And the side from which they meet the first: 1 where its normal points to the point, -1 where it points
-            away, 0 where there is none. Shapes ``(N, D)``, int32.
+            How many surfaces they leave less those that they enter, by the surfaces' normals, repeated faces once; of a
+            closed mesh that is the winding number, whatever the direction. And the side from which they meet the first:
+            1 where its normal points to the point, -1 where it points away, 0 where there is none. Shapes ``(N, D)``,
+            int32.
         """
         p, d = check_array("points", points, (None, 3)), check_array("directions", directions, (None, 3))
         where = _device.resolve(device)
-        mesh, planes = self._rays.on_device(where)
+        bvh, corners = self._boxes(where)
         winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
-        toward = wp.array(d.astype(np.float32), dtype=wp.vec3, device=where)
-        inputs = [
-            mesh.id, planes, self._local(p, where), toward, ENDPOINT_CLEARANCE, MOST_CROSSINGS, winding, side
-        ]  # fmt: skip
+        start, toward = (wp.array(x, dtype=wp.vec3d, device=where) for x in (p - self.center, d))
+        inputs = [bvh.id, corners, start, toward, winding, side]
         _device.launch(look_around, len(p) * len(d), inputs, device=where)
         return winding.numpy().reshape(len(p), -1), side.numpy().reshape(len(p), -1)
+
+    def _boxes(self, where: wp.Device) -> tuple[wp.Bvh, wp.array]:
+        """Boxes of the distinct faces, which a ray can be asked for all of, and their corners about the centre."""
+        with _device.building:
+            if str(where) not in self._boxed:
+                corners = self.triangles[self.distinct_faces] - self.center
+                margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
+                bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
+                low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
+                kept = wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
+                self._boxed[str(where)] = wp.Bvh(low, high), kept
+            return self._boxed[str(where)]
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""

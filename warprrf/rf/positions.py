@@ -62,6 +62,7 @@ def check_positions(
     *,
     names: tuple[str, str] = ("transmitter", "receivers"),
     known: np.ndarray | None = None,
+    on_surfaces: bool = False,
     device: DeviceLike = None,
 ) -> None:
     """Refuse places where no answer would be right.
@@ -73,6 +74,7 @@ def check_positions(
         wavelength_m: Wavelength [m].
         names: Of the two arguments.
         known: A place that is in the air for certain [m], shape ``(3,)``; the transmitter by default.
+        on_surfaces: Whether antennas may be mounted flush with a surface.
         device: Where rays are cast.
 
     Raises:
@@ -96,8 +98,9 @@ def check_positions(
         within = within[((within >= low) & (within <= high)).all(axis=1)]
         outside &= len(within) > 0 and _is_enclosed(mesh, within[0], device)
     _refuse(outside, "outside the scene", points, labels, mesh)
-    near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
-    _refuse(near, "on a surface", points, labels, mesh)
+    if not on_surfaces:
+        near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
+        _refuse(near, "on a surface", points, labels, mesh)
     inside = in_another_solid(mesh, points, reference, device=device)
     if (
         known is None
@@ -184,10 +187,8 @@ def _check_apart(points: np.ndarray, wavelength_m: float, labels: list[str]) -> 
     if len(apart) == 0 or apart.min() >= FAR_FIELD:
         return
     k = int(apart.argmin())
-    what = (
-        f"{labels[1 + k]}: {points[1 + k].tolist()} is {apart[k]:.3g} wavelengths ({apart[k] * wavelength_m:.3g} m) "
-        f"from the transmitter"
-    )
+    where = f"{apart[k]:.3g} wavelengths ({apart[k] * wavelength_m:.3g} m) from the transmitter"
+    what = f"{labels[1 + k]}: {points[1 + k].tolist()} is {where if apart[k] else "the transmitter's own position"}"
     if apart[k] < NEAR_FIELD:
         raise ValueError(
             f"{what}, within its reactive near field, where path gain has no meaning (it would exceed one); expected "

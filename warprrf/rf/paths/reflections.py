@@ -62,7 +62,9 @@ class Reflections:
             ValueError: on another shape, NaN, or a place where :func:`trace_paths` refuses to answer.
         """
         points, t = np.atleast_2d(check_receivers("receivers", receivers)), self._tracer
-        check_positions(t.mesh, t.transmitter, points, t.wavelength_m, device=t.images.device)
+        check_positions(
+            t.mesh, t.transmitter, points, t.wavelength_m, on_surfaces=True, device=t.images.device
+        )
         return self.channel(self._tracer.find(points, self.order), len(points))
 
     def channel(self, paths: MirrorPaths, count: int) -> np.ndarray:
@@ -121,7 +123,7 @@ def fit_reflections(
     begin = time.perf_counter()
     tracer = MirrorTracer(surface, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
     question_unit(surface, tracer.wavelength_m)
-    check_positions(surface, tracer.transmitter, points, tracer.wavelength_m, device=device)
+    check_positions(surface, tracer.transmitter, points, tracer.wavelength_m, on_surfaces=True, device=device)
     patch_group, count = _patch_groups(surface, tracer.patches, groups)
     if chains is None:
         chains = tracer.find(points, order)

@@ -53,15 +53,15 @@ def trace_paths(
         Arrays ``(L,)`` for one receiver, ``(R, L)`` for several; line of sight first, then by order, then by delay.
 
     Raises:
-        ValueError: on a position that is NaN, outside a closed room, inside a solid, on a surface, or within the
-            reactive near field of the transmitter; on a frequency that is not positive or outside a material's band, or
+        ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near
+            field of the transmitter; on a frequency that is not positive or outside a material's band, or
             another order.
     """
     points = check_receivers("receivers", receivers)
     source, frequency = check_array("transmitter", transmitter, (3,)), check_frequency(frequency_hz)
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
-    check_positions(mesh, source, points, wavelength_m, device=device)
+    check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
     tracer = MirrorTracer(mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device)
     if points.ndim == 1:
         return tracer.trace(points, mirror_order).with_gas(gas)
