@@ -188,7 +188,9 @@ def _check_apart(points: np.ndarray, wavelength_m: float, labels: list[str]) -> 
         return
     k = int(apart.argmin())
     where = f"{apart[k]:.3g} wavelengths ({apart[k] * wavelength_m:.3g} m) from the transmitter"
-    what = f"{labels[1 + k]}: {points[1 + k].tolist()} is {where if apart[k] else "the transmitter's own position"}"
+    if apart[k] == 0:
+        where = "the transmitter's own position"
+    what = f"{labels[1 + k]}: {points[1 + k].tolist()} is {where}"
     if apart[k] < NEAR_FIELD:
         raise ValueError(
             f"{what}, within its reactive near field, where path gain has no meaning (it would exceed one); expected "
