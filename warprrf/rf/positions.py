@@ -37,7 +37,7 @@ MOST_WAVELENGTHS = 5e6
 SMALLEST_M = 0.05
 
 _DIRECTIONS = 24
-_AGREED = 0.85  # share of rays that must say the same
+_AGREED = 0.75  # share of rays that must say the same
 _BEHIND = -0.3  # mean of the sides (1 front, -1 back) from which rays meet surfaces: 65 % from behind
 _AT_ONCE = 20_000  # places whose rays are cast in one launch
 
@@ -96,7 +96,7 @@ def check_positions(
     if outside.any() and not mesh.is_closed:
         within = np.concatenate([reference[None], points])
         within = within[((within >= low) & (within <= high)).all(axis=1)]
-        outside &= len(within) > 0 and _is_enclosed(mesh, within[0], device)
+        outside &= len(within) > 0 and _are_enclosed(mesh, within[:_DIRECTIONS], device)
     _refuse(outside, "outside the scene", points, labels, mesh)
     if not on_surfaces:
         near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
@@ -213,10 +213,10 @@ def _refuse(bad: np.ndarray, what: str, points: np.ndarray, labels: list[str], m
         )
 
 
-def _is_enclosed(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
-    """Whether nearly all ways from a point end on a surface: no sky, no open side."""
-    side = mesh.look_around(point[None], _fan(), device=device)[1]
-    return bool((side != 0).mean() >= 0.95)
+def _are_enclosed(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> bool:
+    """Whether nearly all ways from each of ``points`` (N, 3) end on a surface: no sky, no open side."""
+    side = mesh.look_around(points, _fan(), device=device)[1]
+    return bool(((side != 0).mean(axis=1) >= 0.95).all())
 
 
 def _sees_backs(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
