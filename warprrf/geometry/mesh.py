@@ -9,7 +9,6 @@ query, which may come from several threads at once.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -17,6 +16,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
@@ -66,8 +66,6 @@ class Mesh:
             )
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
-        self._search: RaySearch | None = None
-        self._boxed: dict[str, tuple[wp.Bvh, wp.array]] = {}
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -137,12 +135,9 @@ class Mesh:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
         return self.bounds.mean(axis=0)
 
-    @property
+    @cached_property
     def _rays(self) -> RaySearch:
-        with _device.building:
-            if self._search is None:
-                self._search = RaySearch(self.vertices, self.faces, self.face_normals, self.bounds)
-            return self._search
+        return RaySearch(self.vertices, self.faces, self.face_normals, self.bounds)
 
     def on_device(self, device: DeviceLike = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""
@@ -244,17 +239,21 @@ class Mesh:
         _device.launch(look_around, len(p) * len(d), inputs, device=where)
         return winding.numpy().reshape(len(p), -1), side.numpy().reshape(len(p), -1)
 
+    @cached_property
+    def _boxed(self) -> Cache:
+        return Cache(8)
+
     def _boxes(self, where: wp.Device) -> tuple[wp.Bvh, wp.array]:
         """Boxes of the distinct faces, which a ray can be asked for all of, and their corners about the centre."""
-        with _device.building:
-            if str(where) not in self._boxed:
-                corners = self.triangles[self.distinct_faces] - self.center
-                margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
-                bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
-                low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
-                kept = wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
-                self._boxed[str(where)] = wp.Bvh(low, high), kept
-            return self._boxed[str(where)]
+
+        def build() -> tuple[wp.Bvh, wp.array]:
+            corners = self.triangles[self.distinct_faces] - self.center
+            margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
+            bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
+            low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
+            return wp.Bvh(low, high), wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
+
+        return self._boxed.get(str(where), build)
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""

@@ -9,14 +9,13 @@ told apart at both scales.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.cache import Cache
+from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
@@ -54,7 +53,6 @@ class Surface:
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
         two_sided: whether mirrors have two sides; False: only that of ``plane_normal``, of a surface that photos saw.
-        transports: what was traced on it last, by transmitter and grid.
     """
 
     mesh: Mesh = field(repr=False)
@@ -75,7 +73,6 @@ class Surface:
     group_names: tuple[str, ...]
     skin_m: float
     two_sided: bool = False
-    transports: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     @cached_property
