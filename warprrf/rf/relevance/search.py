@@ -359,6 +359,7 @@ def _terms(full: Terms, kept: frozenset[str]) -> Terms:
         diffuse=diffuse,
         mirror_order=2 if "mirror_2" in kept else int("mirror_1" in kept),
         lobes=tuple(n for n in full.lobes if f"lobe_{n}" in kept) if diffuse else full.lobes[:1],
+        reciprocal=full.reciprocal,
         mirror_scatter="mirror_scatter" in kept,
         scatter_mirror="scatter_mirror" in kept,
         diffuse_order=full.diffuse_order if "diffuse_2" in kept else 1,

@@ -4,7 +4,7 @@ A pixel holds the power of every path of a scattering surface, spread by the rec
 
 - line of sight (Friis) and mirror reflections by the image method, blocking softened;
 - diffuse scattering of surfaces that the transmitter illuminates, a non-negative mix of normalised lobes
-  (:mod:`warprrf.rf.fields.bistatic.scattering`);
+  (:mod:`warprrf.rf.fields.bistatic.scattering`), which changes when the ends are swapped unless fitted as ``reciprocal``;
 - what those illuminate in turn (:mod:`warprrf.rf.fields.bistatic.elements`), and an indirect radiance of each group.
 
 Where the data hold absorption by the air, every leg of a path has its own.

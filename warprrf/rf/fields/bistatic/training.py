@@ -104,6 +104,8 @@ class FitOptions:
         line_of_sight, diffuse: switches of those terms.
         mirror_order: mirror reflections on a path: 0 to 3.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
+        reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
+            Degli-Esposti et al. (2007), Sionna RT's, which do not.
         mirror_scatter: surfaces lit by mirrors.
         scatter_mirror: the lit scene seen in mirrors.
         diffuse_order: diffuse bounces on a path: 1, 2 or 3.
@@ -125,6 +127,7 @@ class FitOptions:
     diffuse: bool = True
     mirror_order: int | None = None
     lobes: tuple[int, ...] | None = None
+    reciprocal: bool = False
     mirror_scatter: bool | None = None
     scatter_mirror: bool | None = None
     diffuse_order: int | None = None
@@ -182,7 +185,7 @@ class FitOptions:
         Raises:
             ValueError: naming an option out of range.
         """
-        names = ("line_of_sight", "diffuse", "lobes", "sub_pixels", *TERMS)
+        names = ("line_of_sight", "diffuse", "lobes", "reciprocal", "sub_pixels", *TERMS)
         return Terms(**{name: getattr(self, name) for name in names if getattr(self, name) is not None})
 
 
@@ -348,11 +351,11 @@ class _Training:
         pixels = self.target[0].size
         most = min(pixels, max(200, self.choose.readings // self.count))
         self.measured, self.readings = [], []
-        lobes = options.terms().lobes
+        terms = options.terms()
         for r in range(self.count):
             chosen = np.sort(rng.choice(pixels, most, replace=False))
             self.measured.append(SpectrumPixels(self.beam, chosen))
-            response = respond(self.views[r], self.measured[r], lobes, self.floor)
+            response = respond(self.views[r], self.measured[r], terms, self.floor)
             self.readings.append(Reading(response, self.target[r].ravel()[chosen]))
             self.progress("fit", r, 2 * self.count)
         self.log: list[dict[str, Any]] = []
