@@ -93,6 +93,7 @@ class Steps:
     def __enter__(self) -> Steps:
         self._own.mkdir(parents=True, exist_ok=True)
         if not self._shared:
+            self._process = os.getpid()
             self._lock = (self._own / "lock").open("w")
             try:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -105,6 +106,8 @@ class Steps:
 
     def __exit__(self, *error: object) -> None:
         if self._lock is not None:
+            if os.getpid() == self._process:  # a child that was forked meanwhile holds the lock as well
+                fcntl.flock(self._lock, fcntl.LOCK_UN)
             self._lock.close()
 
     def run(
