@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive, check_type
+from warprrf.checks import check_array, check_positive
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, to_db
@@ -124,7 +124,8 @@ def mean(train: SpectrumDataset) -> Lookup:
 
 
 def _receivers(train: SpectrumDataset) -> np.ndarray:
-    check_type("train", train, SpectrumDataset)
+    if not hasattr(train, "receivers"):
+        raise TypeError(f"train: got {type(train).__name__}, expected a SpectrumDataset")
     receivers = np.asarray(train.receivers, dtype=np.float64)
     if len(receivers) == 0:
         raise ValueError("train: got no receivers, expected at least one")

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
-from warprrf.checks import check_type
 from warprrf.device import Progress
 from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -175,7 +174,8 @@ def evaluate(
     Raises:
         ValueError: if a prediction has another shape than the truth, or holds NaN, infinite or negative path gain.
     """
-    check_type("test", test, SpectrumDataset)
+    if not hasattr(test, "path_gain"):
+        raise TypeError(f"test: got {type(test).__name__}, expected a SpectrumDataset")
     if not callable(predict):
         raise TypeError(f"predict: got {type(predict).__name__}, expected a function such as field.spectrum")
     count = len(test.receivers)
