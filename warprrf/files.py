@@ -61,7 +61,7 @@ def write_atomically(
                 file.write(_SEAL + digest.encode() + b"\n")
         os.replace(partial, path)
     except OSError as error:
-        if error.filename in (None, str(partial)):
+        if error.errno is not None and error.filename in (None, str(partial)):
             error.filename, error.filename2 = os.fspath(path), None
         raise
     finally:

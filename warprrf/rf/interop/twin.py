@@ -20,7 +20,6 @@ import json
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -29,6 +28,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
+from warprrf.files import partial_path
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import LAMBERTIAN, lobe, slab_reflection
 from warprrf.rf.em.half_spaces import fresnel_curves
@@ -174,11 +174,12 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
         "about": [ABOUT, f"Fitted to spectra at {field.frequency_hz / 1e9:g} GHz. Left out:", *left_out],
         "materials": [table_entry(group.material) for group in groups],
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    earlier = part.with_name(part.name + ".earlier")
+    part = partial_path(folder)
+    earlier = part.with_name(
+        f"{part.name}.earlier.kept"
+    )  # no partial file: the only one, if this is killed just then
     try:
-        part.chmod(0o755)
+        part.mkdir()
         for m in used:
             kept, faces = np.unique(surface.mesh.faces[face_material == m], return_inverse=True)
             write_mesh(

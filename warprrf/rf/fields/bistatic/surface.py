@@ -9,7 +9,6 @@ told apart at both scales.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.cache import Cache
+from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components, smoothed_normals
@@ -56,7 +55,6 @@ class Surface:
         skin_m: depth of the surface's skin.
         two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
             that photos saw.
-        transports: what was traced on it last, by transmitter and grid.
     """
 
     mesh: Mesh = field(repr=False)
@@ -77,7 +75,6 @@ class Surface:
     group_names: tuple[str, ...]
     skin_m: float
     two_sided: bool = False
-    transports: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     @cached_property
