@@ -128,11 +128,13 @@ def _moved(room: Room, rotation: Rotation, factor: float, shift: np.ndarray) -> 
     """Everything turned, then scaled, then shifted."""
 
     def place(points: np.ndarray) -> np.ndarray:
-        return np.asarray(factor * rotation.apply(np.asarray(points, float)) + shift)
+        return np.asarray(factor * (np.asarray(points, float) @ rotation.as_matrix().T) + shift)
 
     g = room.gaussians
     if g is not None:
-        turn = (rotation * Rotation.from_quat(g.quaternions[:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
+        turn = (rotation * Rotation.from_quat(np.array(g.quaternions[:, [1, 2, 3, 0]]))).as_quat()[
+            :, [3, 0, 1, 2]
+        ]
         g = wr.Gaussians(place(g.means), turn, factor * g.scales, g.opacities, g.sh)
     return replace(
         room, vertices=place(room.vertices), transmitter=place(room.transmitter), receivers=place(room.receivers),

@@ -102,7 +102,7 @@ def test_a_harmonic_field_does_not_change(law):
     check_spectra("rf3dgs+", law, 0.1)
 
 
-@pytest.mark.parametrize("factor", [1e-2, 1e3])
+@pytest.mark.parametrize("factor", [0.1, 1e3])
 def test_gains_keep_and_delays_scale_with_the_unit(factor):
     def paths(r):
         return wr.trace_paths(
