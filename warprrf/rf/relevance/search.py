@@ -28,7 +28,7 @@ from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.receivers import check_receiver
+from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.relevance.choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
 from warprrf.rf.relevance.model import FullModel, full_field, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
@@ -307,7 +307,9 @@ def relevances(
         beam_sigma_rad=asked.beam_sigma_rad,
         device=device,
     )
-    places = np.atleast_2d(check_receiver("receivers", receivers, full.surface.mesh))
+    places = np.atleast_2d(check_receivers("receivers", receivers))
+    known = geometry.transmitter if isinstance(geometry, BistaticField) else None
+    check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
     tick: Progress = progress or (lambda stage, done, total: None)
     model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
     gaussians = getattr(geometry, "gaussians", None)

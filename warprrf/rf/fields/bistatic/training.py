@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from warprrf.checks import check_array, check_count, check_seed
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import GeometryLike
+from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import Regrouping, regroup
@@ -25,7 +25,7 @@ from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
-from warprrf.rf.receivers import check_receiver
+from warprrf.rf.positions import check_dataset
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
@@ -257,13 +257,13 @@ def trace(
         TypeError: for a geometry without a mesh.
     """
     started = time.perf_counter()
+    receivers, transmitter = check_dataset(as_mesh(geometry, "geometry"), ds, device=device)
     surface = Surface.of(geometry)
-    receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
     order = 3 if mirror_order is None else mirror_order
     terms = Terms(mirror_order=order, sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels)
     frequency_hz, air = float(ds.frequency_hz), getattr(ds, "air", None)
     transport = Transport.of(
-        surface, check_array("ds.transmitter", ds.transmitter, (3,)), frequency_hz,
+        surface, transmitter, frequency_hz,
         (int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])), terms.sub_pixels,
         beam_sigma_rad=float(ds.beam_sigma_rad), loss_per_m=0.0 if air is None else air.loss_per_m(frequency_hz),
         device=device,
