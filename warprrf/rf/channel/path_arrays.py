@@ -19,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from warprrf.brief import one_line
 from warprrf.checks import check_array, checked
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
@@ -54,6 +55,8 @@ class PathArrays:
         receiver: Position ``(3,)`` or positions ``(R, 3)`` [m]; None if not known.
         air: The air whose absorption (ITU-R P.676) is in ``gain`` and ``jones``; None for none.
     """
+
+    __repr__ = one_line
 
     gain: np.ndarray
     tau: np.ndarray
