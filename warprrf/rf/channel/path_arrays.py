@@ -145,7 +145,10 @@ class PathArrays:
             raise TypeError(
                 "paths of several receivers cannot be selected from at once; index a receiver first"
             )
-        index = chosen if isinstance(chosen, slice) else np.asarray(chosen)
+        index: Any = chosen
+        if not isinstance(chosen, slice):
+            index = np.asarray(chosen)
+            index = index if index.size else index.astype(int)
         try:
             found = np.arange(len(self.gain))[index]
         except IndexError as error:
