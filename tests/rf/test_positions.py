@@ -211,3 +211,14 @@ def test_sizes_that_are_no_metres_are_questioned(scale, unit):
         wr.trace_paths(mesh, **places)
     assert [unit in str(w.message) for w in told if unit] == ([True] if unit else [])
     assert len(told) == (unit is not None)
+
+
+def test_a_room_in_millimetres_is_refused_by_a_fit_before_it_is_cut_to_elements(field):
+    places = {"receivers": 1e3 * AIR[None], "transmitter": 1e3 * TX, "frequency_hz": F, "beam_sigma_rad": 0.1}
+    ds = wr.SpectrumDataset.from_spectra(path_gain=np.full((1, 16, 32), 1e-12), floor=1e-14, **places)
+    small = scene().mesh
+    with (
+        pytest.warns(UserWarning, match="coordinates look like millimetres"),
+        pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
+    ):
+        wr.RadioField.fit(Mesh(1e3 * small.vertices, small.faces), ds)
