@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from warprrf.brief import one_line
 from warprrf.checks import check_array
 from warprrf.files import write_atomically
 from warprrf.kernels.raster.sh import COEFFICIENTS
@@ -40,6 +41,8 @@ class Gaussians:
         ValueError: for shapes that do not fit, values that are not finite, zero quaternions, scales that are not
             positive, opacities outside [0, 1].
     """
+
+    __repr__ = one_line
 
     means: np.ndarray = field(repr=False)
     quaternions: np.ndarray = field(repr=False)
