@@ -157,7 +157,7 @@ class PathArrays:
             ) from error
         if found.ndim != 1:
             raise ValueError(f"chosen: got shape {found.shape}, expected a list of paths")
-        return self._taken(chosen)
+        return self._taken(index)
 
     def with_gas(self, gas: Gas = True) -> Self:
         """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
