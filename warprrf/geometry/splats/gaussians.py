@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import check_array
+from warprrf.checks import LARGEST_M, check_array
 from warprrf.files import write_atomically
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 # The file holds the logit; beyond this an opacity is as good as 0 or 1 and its logit stays finite in float32.
 OPACITY_MARGIN = 1e-7
+LARGEST_SH = 1e6
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
@@ -56,6 +57,15 @@ class Gaussians:
         sh = check_array("sh", self.sh, (n, None, None), np.float32)
         if sh.shape[1] not in COEFFICIENTS.values():
             raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
+        for name, array, most in (
+            ("means", means, LARGEST_M),
+            ("scales", scales, LARGEST_M),
+            ("sh", sh, LARGEST_SH),
+        ):
+            if np.abs(array).max(initial=0.0) > most:
+                raise ValueError(
+                    f"{name}: got values up to {np.abs(array).max():g}, expected at most {most:g}"
+                )
         norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
         if (norm < 1e-12).any():
             raise ValueError(

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import check_array
+from warprrf.checks import LARGEST_M, check_array, check_number, check_positive, check_type
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
@@ -22,8 +23,13 @@ from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.receivers import check_receiver
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
+
+PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
+"""Attributes of every model that are numbers, under these names in the header of a file."""
+CARRIERS_HZ = (1e3, 1e16)
+NARROWEST_BEAM_RAD = 1e-4
 
 
 class RadioField(ABC):
@@ -33,6 +39,8 @@ class RadioField(ABC):
         transmitter: position it was fitted for [m], shape ``(3,)``.
         frequency_hz: carrier [Hz].
         shape: rows and columns of its spectra.
+        floor, range_db, beam_sigma_rad: of the data set it was fitted to.
+        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where an older file does not say.
         mesh: what blocks; None if the geometry has no mesh.
         air: absorption in its path gains, that of the data set it was fitted to; None for none.
         device: where it computes.
@@ -43,6 +51,10 @@ class RadioField(ABC):
     transmitter: np.ndarray
     frequency_hz: float
     shape: tuple[int, int]
+    floor: float
+    range_db: tuple[float, float]
+    beam_sigma_rad: float
+    fitted_on: np.ndarray | None
     mesh: Mesh | None
     air: Air | None
     device: DeviceLike
@@ -170,6 +182,51 @@ class RadioField(ABC):
             TypeError: for an unknown option.
         """
         return radio_map(self, height, cell, transmitter, MapOptions(**options))
+
+    def was_fitted_on(self, ds: SpectrumDataset) -> np.ndarray:
+        """Which receivers of ``ds`` it was fitted on, under the same transmitter, shape ``(R,)`` bool."""
+        if self.fitted_on is None:
+            return np.zeros(len(ds.receivers), dtype=bool)
+        return measured_at(ds, self.fitted_on, self.transmitter)
+
+    def __post_init__(self) -> None:
+        """Check what every model has; ValueError or TypeError names the attribute."""
+        object.__setattr__(self, "transmitter", check_array("transmitter", self.transmitter, (3,)))
+        check_number("frequency_hz", self.frequency_hz, *CARRIERS_HZ)
+        check_shape(self.shape)
+        check_positive("floor", self.floor, "linear noise floor")
+        low, high = (check_number("range_db", value, -1e4, 1e4) for value in self.range_db)
+        if not low <= high:
+            raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
+        check_number("beam_sigma_rad", self.beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
+        if self.fitted_on is not None:
+            check_array("fitted_on", self.fitted_on, (None, 3))
+        if np.abs(self.transmitter).max() > LARGEST_M:
+            raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
+        if self.air is not None:
+            self.air.loss_per_m(self.frequency_hz)
+
+    @property
+    def _stored(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Tensors and header of what every model has, for its file."""
+        tensors = {"transmitter": self.transmitter}
+        tensors |= {} if self.fitted_on is None else {"fitted_on": self.fitted_on}
+        header = {name: getattr(self, name) for name in PLAIN} | {"model": self.model, "report": self.report}
+        return tensors, header | ({} if self.air is None else self.air.attributes)
+
+    @staticmethod
+    def _restored(tensors: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> dict[str, Any]:
+        """What :attr:`_stored` took apart, by the names of a field's attributes."""
+        check_type("report", header["report"], dict)
+        return {
+            **{name: header[name] for name in PLAIN},
+            "shape": tuple(header["shape"]),
+            "range_db": tuple(header["range_db"]),
+            "transmitter": tensors["transmitter"],
+            "fitted_on": tensors.get("fitted_on"),
+            "air": Air.from_attributes(header),
+            "report": header["report"],
+        }
 
     @abstractmethod
     def save(self, path: str | os.PathLike[str]) -> None:
