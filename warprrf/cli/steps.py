@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -187,7 +188,10 @@ def add_evaluate(add: Add) -> None:
     eva.add_argument("field", help="field file (.safetensors)")
     eva.add_argument("spectra", help="NetCDF file of spectra with held-out receivers")
     eva.add_argument(
-        "--train", type=int, default=50, metavar="N", help="what the lookups may see (default 50)"
+        "--train",
+        type=int,
+        metavar="N",
+        help="training receivers that the lookups see (default: as many as the field)",
     )
     eva.add_argument("--no-lookups", dest="lookups", action="store_false", help="the field alone")
     eva.add_argument("-o", "--out", help="JSON file of the figures")
@@ -198,6 +202,7 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
 
     Whole receivers are held out, the same for every method; beside the field stand lookups that know no geometry (nearest
     measurement, inverse distance, a constant, the mean image). `blocked` counts receivers without line of sight alone.
+    A field knows which receivers it was fitted on: if the file names one of them for test, nothing is scored.
 
     examples:
       warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
@@ -206,7 +211,17 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
 
     field = wr.RadioField.load(existing(args.field))
     dataset = wr.SpectrumDataset.load(existing(args.spectra))
-    train, test = dataset.split(args.train, seed=args.seed)
+    if field.fitted_on is None:
+        warnings.warn(f"{args.field}: an older file, which does not say what it was fitted on", stacklevel=1)
+    there = int(np.count_nonzero(dataset.role == "train"))
+    count = there if field.fitted_on is None else min(max(len(field.fitted_on), 1), there)
+    train, test = dataset.split(count if args.train is None else args.train, seed=args.seed)
+    learned = field.was_fitted_on(test)
+    if learned.any():
+        raise ValueError(
+            f"{args.field}: was fitted on {learned.sum()} of the {len(test)} test receivers of {args.spectra}, the first "
+            f"at {test.receivers[learned][0].tolist()}; score it on receivers that it never saw, or fit it again without"
+        )
     methods: dict[str, Any] = {field.model: field.spectrum}
     if args.lookups:
         known = (lookups.nearest, lookups.idw, lookups.constant, lookups.mean)

@@ -23,14 +23,14 @@ PATCH_ARRAYS = {
     "patch_normal": Expected("P 3", -1.001, 1.001),
     "patch_offset": lengths("P"),
     "patch_area": Expected("P", 0.0, LARGEST_M**2),
-    "patch_group": Expected("P", -1, kind=np.integer),
-    "patch_once": Expected("F", kind=np.bool_),
+    "patch_group": Expected("P", -1, kind="iu"),
+    "patch_once": Expected("F", kind="b"),
 }
 """What the arrays of patches must be: F faces, P patches."""
 PLANE_ARRAYS = {
     "planes": lengths("K 8"),
-    "plane_shapes": Expected("K 2", 0, 2**15, kind=np.integer),
-    "plane_cells": Expected("C", kind=np.bool_),
+    "plane_shapes": Expected("K 2", 0, 2**15, kind="iu"),
+    "plane_cells": Expected("C", kind="b"),
 }
 """What the arrays of planes must be: K planes, C cells of all of them."""
 Arrays = dict[str, np.ndarray]

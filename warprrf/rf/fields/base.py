@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -26,7 +25,7 @@ from warprrf.rf.receivers import check_receiver
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
-PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
+_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 """Attributes of every model that are numbers, under these names in the header of a file."""
 CARRIERS_HZ = (1e3, 1e16)
 NARROWEST_BEAM_RAD = 1e-4
@@ -87,16 +86,56 @@ class RadioField(ABC):
         return cls.models[model].fit(geometry, ds, model, **options)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> RadioField:
+    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> Self:
         """Read a field that :meth:`save` wrote.
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if it is corrupt, or no radio field.
+            ValueError: if it is corrupt, or no radio field (of this model).
         """
-        model = tensor_files.read(path)[1].get("model")
-        found = cls.models["bistatic" if model == "bistatic" else "rf3dgs+"]  # which reads rf3dgs too
-        return found.load(path, device=device)
+        tensors, header = tensor_files.read(path)
+        found = cls.models[
+            "bistatic" if header.get("model") == "bistatic" else "rf3dgs+"
+        ]  # which reads rf3dgs too
+        if not issubclass(found, cls):
+            raise ValueError(f"{os.fspath(path)}: holds a {found.__name__}, expected a {cls.__name__}")
+        with tensor_files.named(path, "corrupt, or no radio field of this version"):
+            check_type("report", header["report"], dict)
+            return found(
+                **{name: header[name] for name in _PLAIN}
+                | {"shape": tuple(header["shape"]), "range_db": tuple(header["range_db"])},
+                transmitter=tensors["transmitter"],
+                fitted_on=tensors.get("fitted_on"),
+                air=Air.from_attributes(header),
+                report=header["report"],
+                device=device,
+                **found._put_together(tensors, header),
+            )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything to one safetensors file, in one go."""
+        tensors, header = self._taken_apart()
+        tensors["transmitter"] = self.transmitter
+        if self.fitted_on is not None:
+            tensors["fitted_on"] = self.fitted_on
+        header |= {name: getattr(self, name) for name in _PLAIN} | {
+            "model": self.model,
+            "report": self.report,
+        }
+        tensor_files.write(path, tensors, header | ({} if self.air is None else self.air.attributes))
+
+    @abstractmethod
+    def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Tensors and header of what this model alone has, for its file."""
+
+    @classmethod
+    @abstractmethod
+    def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
+        """What :meth:`_taken_apart` took apart, by the names of the attributes.
+
+        Raises:
+            KeyError, TypeError, ValueError: for what is missing or does not fit.
+        """
 
     @abstractmethod
     def with_gas(self, gas: Gas = True) -> Self:
@@ -205,29 +244,3 @@ class RadioField(ABC):
             raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
         if self.air is not None:
             self.air.loss_per_m(self.frequency_hz)
-
-    @property
-    def _stored(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Tensors and header of what every model has, for its file."""
-        tensors = {"transmitter": self.transmitter}
-        tensors |= {} if self.fitted_on is None else {"fitted_on": self.fitted_on}
-        header = {name: getattr(self, name) for name in PLAIN} | {"model": self.model, "report": self.report}
-        return tensors, header | ({} if self.air is None else self.air.attributes)
-
-    @staticmethod
-    def _restored(tensors: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> dict[str, Any]:
-        """What :attr:`_stored` took apart, by the names of a field's attributes."""
-        check_type("report", header["report"], dict)
-        return {
-            **{name: header[name] for name in PLAIN},
-            "shape": tuple(header["shape"]),
-            "range_db": tuple(header["range_db"]),
-            "transmitter": tensors["transmitter"],
-            "fitted_on": tensors.get("fitted_on"),
-            "air": Air.from_attributes(header),
-            "report": header["report"],
-        }
-
-    @abstractmethod
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one safetensors file, in one go."""

@@ -15,14 +15,12 @@ function of both directions and of the path's lengths, the field holds for a tra
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf import tensor_files
 from warprrf.cache import Cache
 from warprrf.checks import Expected, check_array, check_arrays, check_count, index_to
 from warprrf.device import DeviceLike, Progress
@@ -325,18 +323,12 @@ class BistaticField(RadioField):
 
     # ------------------------------------------------------------------------------------------ files
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one safetensors file, in one go: surface, parameters, terms, report."""
-        tensors, header = files.taken_apart({f.name: getattr(self, f.name) for f in fields(self)})
-        common, plain = self._stored
-        tensor_files.write(path, tensors | common, header | plain)
+    def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return files.taken_apart({f.name: getattr(self, f.name) for f in fields(self)})
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> BistaticField:
-        """Read a field that :meth:`save` wrote; errors as for :meth:`RadioField.load`."""
-        tensors, header = tensor_files.read(path)
-        with tensor_files.named(path, "corrupt or no bistatic field of this version"):
-            return cls(**files.put_together(tensors, header), **cls._restored(tensors, header), device=device)
+    def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
+        return files.put_together(tensors, header)
 
 
 _ARRAYS = {"material": index_to("G", "G"), "residual": Expected("2 X", -MOST_NEPERS, MOST_NEPERS)}

@@ -26,7 +26,6 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf import tensor_files
 from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_positive
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -246,46 +245,30 @@ class HarmonicField(RadioField):
         ]
         return found[0] if positions.ndim == 1 else Paths.stack(found)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one safetensors file, in one go: geometry, coefficients, options, report."""
+    def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         tensors = {f"layer/{name}": table for name, table in self.layers.items()}
         tensors |= {f"gaussians/{f.name}": getattr(self.gaussians, f.name) for f in fields(Gaussians)}
         if self.mesh is not None:
             tensors["mesh/vertices"], tensors["mesh/faces"] = self.mesh.vertices, self.mesh.faces
-        common, header = self._stored
-        header |= {
-            "gain_unit": self.gain_unit,
-            "delay_unit": self.delay_unit,
-            "options": asdict(self.options),
-        }
-        tensor_files.write(path, tensors | common, header)
+        header = {"gain_unit": self.gain_unit, "delay_unit": self.delay_unit, "options": asdict(self.options)}
+        return tensors, header
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> HarmonicField:
-        """Read a field that :meth:`save` wrote.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if it is corrupt, or no radio field.
-        """
-        tensors, header = tensor_files.read(path)
-        with tensor_files.named(path, "corrupt or no radio field of this version"):
-            layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
-            options = dict(header["options"])
-            if "gain" not in layers:
-                raise ValueError("it has no layer of gain")
-            return cls(
-                gaussians=Gaussians(**{f.name: tensors[f"gaussians/{f.name}"] for f in fields(Gaussians)}),
-                mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"])
-                if "mesh/faces" in tensors
-                else None,
-                options=FieldOptions(**options | {"rates": Rates(**options.get("rates", {}))}),
-                layers=layers,
-                gain_unit=header["gain_unit"],
-                delay_unit=header["delay_unit"],
-                **cls._restored(tensors, header),
-                device=device,
-            )
+    def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
+        options = dict(header["options"])
+        layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
+        if "gain" not in layers:
+            raise ValueError("it has no layer of gain")
+        return {
+            "gaussians": Gaussians(**{f.name: tensors[f"gaussians/{f.name}"] for f in fields(Gaussians)}),
+            "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"])
+            if "mesh/faces" in tensors
+            else None,
+            "options": FieldOptions(**options | {"rates": Rates(**options.get("rates", {}))}),
+            "layers": layers,
+            "gain_unit": header["gain_unit"],
+            "delay_unit": header["delay_unit"],
+        }
 
     @property
     def law(self) -> SingleBounce:
