@@ -101,16 +101,16 @@ class RadioField(ABC):
             raise ValueError(f"{os.fspath(path)}: holds a {found.__name__}, expected a {cls.__name__}")
         with tensor_files.named(path, "corrupt, or no radio field of this version"):
             check_type("report", header["report"], dict)
-            return found(
-                **{name: header[name] for name in _PLAIN}
-                | {"shape": tuple(header["shape"]), "range_db": tuple(header["range_db"])},
-                transmitter=tensors["transmitter"],
-                fitted_on=tensors.get("fitted_on"),
-                air=Air.from_attributes(header),
-                report=header["report"],
-                device=device,
-                **found._put_together(tensors, header),
-            )
+            parts: dict[str, Any] = {name: header[name] for name in _PLAIN} | {
+                "shape": tuple(header["shape"]),
+                "range_db": tuple(header["range_db"]),
+                "transmitter": tensors["transmitter"],
+                "fitted_on": tensors.get("fitted_on"),
+                "air": Air.from_attributes(header),
+                "report": header["report"],
+                "device": device,
+            }
+            return found(**parts, **found._put_together(tensors, header))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one safetensors file, in one go."""
