@@ -20,6 +20,8 @@ from typing import Any, TypeAlias
 
 import warp as wp
 
+from warprrf import runtime
+
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default: it would announce devices and every compiled module
     wp.config.log_level = wp.LOG_ERROR
 
@@ -42,6 +44,7 @@ def resolve(device: DeviceLike = None) -> wp.Device:
         ValueError: if Warp has no such device.
     """
     try:
+        runtime.start()
         return wp.get_device(device)
     except (ValueError, RuntimeError, TypeError) as error:
         known = ", ".join(str(d) for d in wp.get_devices())
@@ -113,7 +116,7 @@ def launch(
         bounds = [dim * k // count for k in range(count + 1)]
     arguments = [bounds[0], *inputs]
     with building:
-        kernel.module.load(where, block_dim=256 if where.is_cuda else 1)
+        runtime.load(kernel.module, where, block_dim=256 if where.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
     if len(bounds) == 2:

@@ -27,6 +27,9 @@ from warprrf.rf.paths.sionna import DIFFUSE, repeated
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
 
+NARROWEST_SIONNA_LOBE = 127
+"""Largest exponent that Sionna RT can normalise: it divides by 2^alpha_r in single precision."""
+
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
 
@@ -78,6 +81,12 @@ def load_sionna_scene(scene: Scene | str | os.PathLike[str], *, frequency_hz: fl
 
 def _radio_material(loaded: Any, rt: Any, material: Material, frequency: float) -> Any:
     """The material of this name in Sionna's scene, added if it has none that can be set, with our values."""
+    directive = material.pattern == "directive"
+    if directive and material.alpha_r > NARROWEST_SIONNA_LOBE:
+        raise ValueError(
+            f"material {material.name!r}: alpha_r is {material.alpha_r}, but in Sionna's single precision a lobe of more "
+            f'than {NARROWEST_SIONNA_LOBE} scatters nothing; take engine="exact" or a wider lobe'
+        )
     if not np.isfinite(material.thickness_m):
         raise ValueError(
             f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
@@ -91,7 +100,6 @@ def _radio_material(loaded: Any, rt: Any, material: Material, frequency: float) 
     radio.thickness = float(material.thickness_m)
     radio.scattering_coefficient = float(material.scattering_coefficient(frequency))
     radio.xpd_coefficient = 0.0
-    directive = material.pattern == "directive"
     radio.scattering_pattern = (
         rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
     )
