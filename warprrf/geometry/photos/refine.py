@@ -238,7 +238,7 @@ class _Refinement:
         try:
             arrays, header = tensor_files.read(path, CHECKPOINT)
         except ValueError as error:
-            raise ValueError(f"checkpoint: {error}; delete it to start over") from error
+            raise ValueError(f"checkpoint: it cannot be read; delete it to start over ({error})") from error
         if header.get("key") != key:
             raise ValueError(
                 f"checkpoint: {path} is of other settings or inputs; delete it or give another file"
