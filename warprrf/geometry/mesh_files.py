@@ -6,6 +6,7 @@ per vertex, so a vertex on a texture seam is stored once per side.
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from warprrf.files import write_bytes
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
 
 LARGEST_BYTES = 4 << 30
+_CHECKSUM = b"# warprrf sha256 "  # the comment that ends an OBJ file of ours: a letter there may be a face
 _OBJ = {
     "v": (3, 8), "vt": (1, 3), "vn": (3, 3), "vp": (1, 3), "f": (3, 4096), "l": (2, 4096), "p": (1, 4096), "o": (0, 99),
     "g": (0, 99), "s": (1, 1), "usemtl": (1, 99), "mtllib": (1, 99),
@@ -104,9 +106,15 @@ def _fans(polygons: Lists, path: Path) -> np.ndarray:
 
 
 def _from_obj(path: Path) -> MeshFile:
-    """By trimesh, once every line is one that the format knows and has as many numbers as it should."""
+    """By trimesh, once a checksum of ours holds and every line has as many words as the format gives it."""
+    data = path.read_bytes()
+    content, tag, digest = data.rpartition(_CHECKSUM)
+    if tag and digest.decode("ascii", "replace").strip() != hashlib.sha256(content).hexdigest():
+        raise ValueError(
+            f"path: {path} is damaged: its sha256 does not fit; take that line out if the file was edited"
+        )
     try:
-        lines = path.read_bytes().decode("utf-8").replace("\\\n", " ").splitlines()
+        lines = data.decode("utf-8").replace("\\\n", " ").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(f"path: {path} is not a readable mesh: {error}") from error
     triangles = 0
@@ -150,4 +158,8 @@ def write_mesh(
         write_ply(path, columns, triangles)
         return
     data = _trimesh().Trimesh(vertices, triangles, process=False).export(file_type=path.suffix.lstrip("."))
-    write_bytes(path, data.encode() if isinstance(data, str) else data)
+    data = data.encode() if isinstance(data, str) else data
+    if path.suffix == ".obj":
+        data = data.rstrip() + b"\n"
+        data += _CHECKSUM + hashlib.sha256(data).hexdigest().encode() + b"\n"
+    write_bytes(path, data)
