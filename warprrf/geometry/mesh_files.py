@@ -22,7 +22,7 @@ from warprrf.files import write_bytes
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
 
 LARGEST_BYTES = 4 << 30
-_CHECKSUM = b"# warprrf sha256 "  # the comment that ends an OBJ file of ours: a letter there may be a face
+_CHECKSUM = b"# warprrf sha256 "  # the comment that begins an OBJ file of ours: a letter there may be a face
 _OBJ = {
     "v": (3, 8), "vt": (1, 3), "vn": (3, 3), "vp": (1, 3), "f": (3, 4096), "l": (2, 4096), "p": (1, 4096), "o": (0, 99),
     "g": (0, 99), "s": (1, 1), "usemtl": (1, 99), "mtllib": (1, 99),
@@ -84,7 +84,11 @@ def _from_ply(path: Path) -> MeshFile:
         raise ValueError(
             f"path: {path} holds no triangles: it lacks x, y, z of vertices or lists of their indices"
         )
-    uv = next((names for names in (("s", "t"), ("u", "v")) if set(names) <= set(vertex)), None)
+    uv = next((names for names in (("s", "t"), ("u", "v")) if set(names) & set(vertex)), None)
+    if uv is not None and not set(uv) <= set(vertex):
+        raise ValueError(
+            f"path: {path} holds one of the texture coordinates {' and '.join(uv)}, expected both"
+        )
     return MeshFile(
         _columns(vertex, "xyz"), _fans(corners, path), None if uv is None else _columns(vertex, uv)
     )  # fmt: skip
@@ -108,8 +112,8 @@ def _fans(polygons: Lists, path: Path) -> np.ndarray:
 def _from_obj(path: Path) -> MeshFile:
     """By trimesh, once a checksum of ours holds and every line has as many words as the format gives it."""
     data = path.read_bytes()
-    content, tag, digest = data.rpartition(_CHECKSUM)
-    if tag and digest.decode("ascii", "replace").strip() != hashlib.sha256(content).hexdigest():
+    first, _, content = data.partition(b"\n")
+    if first.startswith(_CHECKSUM) and first != _CHECKSUM + hashlib.sha256(content).hexdigest().encode():
         raise ValueError(
             f"path: {path} is damaged: its sha256 does not fit; take that line out if the file was edited"
         )
@@ -160,6 +164,5 @@ def write_mesh(
     data = _trimesh().Trimesh(vertices, triangles, process=False).export(file_type=path.suffix.lstrip("."))
     data = data.encode() if isinstance(data, str) else data
     if path.suffix == ".obj":
-        data = data.rstrip() + b"\n"
-        data += _CHECKSUM + hashlib.sha256(data).hexdigest().encode() + b"\n"
+        data = _CHECKSUM + hashlib.sha256(data).hexdigest().encode() + b"\n" + data
     write_bytes(path, data)
