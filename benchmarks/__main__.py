@@ -24,6 +24,7 @@ NAMES = {
     ),
     "beams": ("benchmarks.beams.run", "beams chosen from the field, beside pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
+    "fuzz": ("benchmarks.fuzz.command", "hostile arguments and damaged files, for as long as it is told to"),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
     "channel": ("benchmarks.channel", "channels: closed forms, Sionna RT, wide responses, the near field"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),

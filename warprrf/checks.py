@@ -69,6 +69,15 @@ def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1)
     return int(value)  # type: ignore[call-overload]
 
 
+def check_seed(seed: object) -> int:
+    """``seed`` as a whole number of at least 0.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    return check_count("seed", seed, 0, 2**63 - 1)
+
+
 def check_number(name: str, value: object, least: float = -np.inf, most: float = np.inf) -> float:
     """``value`` as a finite number from ``least`` to ``most``.
 

@@ -11,16 +11,17 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 
 import warp as wp
+
+from warprrf.cache import once
 
 _NO_CUDA = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 
 _temporary: list[tempfile.TemporaryDirectory[str]] = []  # removed when the process ends
 
 
-@cache
+@once
 def start() -> None:
     """Start Warp; a CPU is all it needs.
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
+from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add, add_point, existing, load_geometry, read_positions, read_receivers
 from warprrf.cli.tables import table
@@ -86,7 +87,7 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
     A spectrum is path gain per pixel over the full sphere, spread by the receiver beam; its sum is the total path gain.
 
     examples:
-      warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5
+      warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,5,1.5
       warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
     """
     unfinished = Path(f"{args.out}.receivers")
@@ -264,7 +265,7 @@ def _relevance(args: argparse.Namespace, bars: Bars) -> None:
 
     examples:
       warprrf relevance data/lobby/scene.xml --spectra data/lobby/spectra.nc -o relevance.json
-      warprrf relevance data/lobby/scene.xml --transmitter 2 3 3.2 --receivers 7,4,1.5 9,4,1.5 --frequency 140e9
+      warprrf relevance data/lobby/scene.xml --transmitter 2 3 3.2 --receivers 7,4,1.5 9,5,1.5 --frequency 140e9
       warprrf relevance field.safetensors --receivers receivers.csv --tolerance 0.5
       warprrf fit room spectra.nc -o field.safetensors --relevance relevance.json
     """
@@ -280,6 +281,7 @@ def _relevance(args: argparse.Namespace, bars: Bars) -> None:
         raise ValueError(
             "--receivers: none given, expected positions, or --spectra with a file that holds some"
         )
+    check_count("--most", args.most)
     if len(receivers) > args.most:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
     fitted = source.suffix == ".safetensors"

@@ -78,6 +78,8 @@ def _look_at(
     position: Sequence[float], target: Sequence[float], size: tuple[int, int], fov_deg: float
 ) -> Any:
     """A pinhole camera at `position` that looks at `target`, z up; `fov_deg` is horizontal."""
+    if not 0.0 < fov_deg < 180.0:
+        raise ValueError(f"--field-of-view: got {fov_deg}, expected degrees between 0 and 180")
     eye, goal = np.array(position, dtype=np.float64), np.array(target, dtype=np.float64)
     forward = goal - eye
     right = np.cross(forward, (0.0, 0.0, 1.0))

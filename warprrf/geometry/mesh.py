@@ -9,7 +9,6 @@ query, which may come from several threads at once.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -17,6 +16,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.cache import cached_property
 from warprrf.checks import LARGEST_M, check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
@@ -70,7 +70,6 @@ class Mesh:
             )
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
-        self._search: RaySearch | None = None
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
@@ -134,12 +133,9 @@ class Mesh:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
         return self.bounds.mean(axis=0)
 
-    @property
+    @cached_property
     def _rays(self) -> RaySearch:
-        with _device.building:
-            if self._search is None:
-                self._search = RaySearch(self.vertices, self.faces, self.face_normals, self.bounds)
-            return self._search
+        return RaySearch(self.vertices, self.faces, self.face_normals, self.bounds)
 
     def on_device(self, device: DeviceLike = None) -> wp.Mesh:
         """The Warp mesh on ``device`` with its vertices relative to :attr:`center`, built once per device."""

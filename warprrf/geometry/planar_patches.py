@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
+from warprrf.cache import cached_property
 from warprrf.geometry.mesh import Mesh, vectors_across
 from warprrf.geometry.mesh_topology import components
 

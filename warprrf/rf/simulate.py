@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_count, check_number, check_seed
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.em.absorption import Gas, air_of
@@ -82,6 +82,8 @@ def simulate(
             a material's band, or P.676's with ``gas``; on an unknown engine.
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
     """
+    if not hasattr(scene, "face_material"):
+        raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
@@ -172,7 +174,7 @@ def sample_receivers(
     scene: Scene,
     n: int,
     *,
-    z: tuple[float, float] = (0.8, 2.2),
+    z: ArrayLike = (0.8, 2.2),
     clearance: float = 0.3,
     seed: int,
     device: DeviceLike = None,
@@ -188,16 +190,19 @@ def sample_receivers(
     Raises:
         ValueError: if there is no such place, or the range is empty.
     """
-    if n < 1 or not z[0] <= z[1]:
-        raise ValueError(f"n, z: got {n!r}, {z!r}, expected at least 1 and (lowest, highest)")
+    check_count("n", n)
+    check_number("clearance", clearance, 0.0)
+    z = check_array("z", z, (2,))
+    if z[0] > z[1]:
+        raise ValueError(f"z: got {z.tolist()}, expected the lowest and the highest place")
     mesh = as_mesh(scene)
     low, high = mesh.bounds.copy()
     low[2], high[2] = max(low[2], z[0]), min(high[2], z[1])
     if low[2] > high[2]:
         raise ValueError(
-            f"z: got {z!r}, but the scene lies between {mesh.bounds[0, 2]:g} and {mesh.bounds[1, 2]:g} m"
+            f"z: got {z.tolist()}, but the scene lies between {mesh.bounds[0, 2]:g} and {mesh.bounds[1, 2]:g} m"
         )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed(seed))
     found: list[np.ndarray] = []
     count = 0
     for _ in range(_TRIES):

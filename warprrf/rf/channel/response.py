@@ -33,7 +33,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, check_seed
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
 from warprrf.rf.channel.lengths import PairLengths, plane_lengths, scattered_lengths, spherical_lengths
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -282,6 +282,7 @@ def _links(
             "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
             "(left out of the sum) or 'given' (phases as they are)"
         )
+    check_seed(seed)
     tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
     carrier = paths.carrier_hz
     places = [array.positions(SPEED_OF_LIGHT / carrier) for array in (tx, rx)]

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
@@ -138,10 +138,9 @@ class Sampling:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("depth", 0), ("samples", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or int(value) != value or value < least:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+        check_count("depth", self.depth, 0)
+        check_count("samples", self.samples)
+        check_count("seed", self.seed, 0)
 
 
 class SionnaEngine:

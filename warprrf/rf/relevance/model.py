@@ -10,11 +10,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from warprrf.cache import cached_property
 from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m

@@ -17,14 +17,13 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from warprrf.checks import check_array
 from warprrf.device import Progress
-from warprrf.files import write_text
+from warprrf.files import read_json, write_text
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.fields.base import RadioField
@@ -191,9 +190,8 @@ class Relevance:
             FileNotFoundError: if there is no such file.
             ValueError: if it is something else.
         """
-        text = Path(path).read_text(encoding="utf-8")
+        values = read_json(path)
         try:
-            values = json.loads(text)
             values.pop("missing")
             rows = [{k: v for k, v in row.items() if k != "worth_db"} for row in values.pop("effects")]
             terms = Terms(**values.pop("terms"))

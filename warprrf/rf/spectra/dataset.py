@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_seed
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
@@ -205,7 +205,7 @@ class SpectrumDataset:
             raise ValueError(
                 "role: there are no test receivers; give simulate(..., roles=) or assign_roles some"
             )
-        if seed != 0:
+        if check_seed(seed) != 0:
             train = np.random.default_rng(seed).permutation(train)
         return self.subset(train[:n_train]), self.subset(test)
 

@@ -9,14 +9,13 @@ told apart at both scales.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warprrf import device as _device
-from warprrf.cache import Cache
+from warprrf.cache import Cache, cached_property
 from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
@@ -73,7 +72,6 @@ class Surface:
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
         two_sided: whether mirrors have two sides; False: only that of ``plane_normal``, of a surface that photos saw.
-        transports: what was traced on it last, by transmitter and grid.
 
     Raises:
         TypeError, ValueError: for arrays that do not fit each other, or indices and values out of range.
@@ -97,7 +95,6 @@ class Surface:
     group_names: tuple[str, ...]
     skin_m: float
     two_sided: bool = False
-    transports: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def __post_init__(self) -> None:

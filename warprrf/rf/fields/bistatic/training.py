@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, check_seed
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike
 from warprrf.rf.em.absorption import Air
@@ -142,6 +142,7 @@ class FitOptions:
 
     def __post_init__(self) -> None:
         check_count("iterations", self.iterations, 0)
+        check_seed(self.seed)
         self.decided().terms()
 
     @classmethod

@@ -26,6 +26,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.cache import Cache
 from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_positive
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -94,7 +95,7 @@ class HarmonicField(RadioField):
     fitted_on: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
-    _uploaded: dict[str, wp.array] = field(default_factory=dict, init=False, repr=False)
+    _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(8))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -305,10 +306,6 @@ class HarmonicField(RadioField):
         """The blended layer ``name`` of one receiver, shape ``(H, W)`` float64."""
         device = _device.resolve(self.device)
         kernels = _kernels.build(wp.float32)
-        if name not in self._uploaded:
-            self._uploaded[name] = wp.array(self.layers[name], dtype=kernels.vec16, device=device)
-        if "basis" not in self._uploaded:
-            self._uploaded["basis"] = harmonics(self.shape, wp.float32, device)
         kind = KINDS[self.options.gain] if name == "gain" else KINDS["signed"]
         out = wp.zeros(self.shape[0] * self.shape[1], dtype=float, device=device)
         inputs = [
@@ -316,8 +313,8 @@ class HarmonicField(RadioField):
             wp.array(seen.start.astype(np.int32), dtype=int, device=device),
             wp.array(seen.gaussian, dtype=int, device=device),
             wp.array(seen.weight, dtype=float, device=device),
-            self._uploaded["basis"],
-            self._uploaded[name],
+            self._uploaded.get("basis", lambda: harmonics(self.shape, wp.float32, device)),
+            self._uploaded.get(name, lambda: wp.array(self.layers[name], dtype=kernels.vec16, device=device)),
             out,
         ]
         _device.launch(kernels.predict, len(out), inputs, device=device)
