@@ -4,8 +4,6 @@ The same room, written in ways in which exporters write it, must give the same m
 field. A law that does not hold yet is marked as an expected failure, strictly: whoever mends it takes the mark away.
 """
 
-import subprocess
-import sys
 from functools import cache
 
 import numpy as np
@@ -155,57 +153,3 @@ def test_a_field_does_not_change(change):
         db(now.sum(axis=(1, 2))), db(truth.sum(axis=(1, 2))), rtol=0, atol=tolerance_db(change, 0.1)
     )
     assert rms_db(now, truth) < max(0.3, tolerance_db(change, 0.1))
-
-
-FIRST_USE = """
-import sys, threading
-sys.path[:0] = {path!r}
-import numpy as np
-import warprrf as wr
-from golden import make
-
-import test_invariances
-mesh, part = make.room_mesh()
-FINE = mesh.vertices, mesh.faces, part
-for _ in range(5):
-    FINE = test_invariances.subdivided(*FINE)
-FINE = FINE[:2]
-
-def use(what):
-    {use}
-
-fresh = {fresh}
-for _ in range({rounds}):
-    thing, found = fresh(), [None] * 4
-    start = threading.Barrier(4)
-    def ask(i):
-        start.wait()
-        found[i] = use(thing)
-    threads = [threading.Thread(target=ask, args=(i,)) for i in range(4)]
-    [t.start() for t in threads]
-    [t.join() for t in threads]
-    assert all(f is not None for f in found), "a thread failed"
-    assert all(np.array_equal(f, use(fresh())) for f in found), "threads and one alone differ"
-"""
-
-
-def first_use(fresh, use, rounds=20):
-    """What a process does that asks a fresh thing from four threads at once, again and again."""
-    script = FIRST_USE.format(path=sys.path, fresh=fresh, use=use, rounds=rounds)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, f"exit status {done.returncode}\n{done.stderr[-2000:]}"
-
-
-def test_a_mesh_may_be_asked_first_from_four_threads():
-    first_use(
-        "lambda: wr.Mesh(*FINE)",
-        "return what.distance(np.random.default_rng(0).uniform(0, 3, (200, 3)))",
-    )
-
-
-def test_a_field_may_be_asked_first_from_four_threads(tmp_path):
-    make.bistatic().save(tmp_path / "field.safetensors")
-    first_use(
-        f"lambda: wr.RadioField.load({str(tmp_path / 'field.safetensors')!r})",
-        "return what.spectrum(make.places(8)[2]).path_gain",
-    )

@@ -24,6 +24,7 @@ from warprrf.rf.fields.bistatic.uncertainty import LEVEL_DB, STEEPNESS_DB, Error
 from warprrf.rf.fields.harmonic.field import HarmonicField
 from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.interop.twin import write_twin
+from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.spectra.exr import export_exr, import_exr
 from warprrf.rf.spectra.spectrum import Spectrum
 
@@ -169,6 +170,16 @@ def read_exr(path: Path) -> dict[str, Any]:
     """A spectrum."""
     found = import_exr(path)
     return {n: v for n, v in vars(found).items() if n != "attributes"}
+
+
+def read_dataset(path: Path) -> dict[str, Any]:
+    """All that a data set's file holds."""
+    return {n: v for n, v in vars(wr.SpectrumDataset.load(path)).items() if n != "attributes"}
+
+
+def read_map(path: Path) -> dict[str, Any]:
+    """All that a radio map's file holds."""
+    return vars(RadioMap.load(path))
 
 
 def read_scene(path: Path) -> dict[str, Any]:

@@ -294,7 +294,7 @@ def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: Spec
     found = further_bounces(view, humid.materials, humid.sent_radiance(view.transport))
     assert found.by_ray().sum() == pytest.approx(expected, rel=1e-9)
     measured = SpectrumPixels(BeamOperator(SHAPE, humid.beam_sigma_rad), np.arange(SHAPE[0] * SHAPE[1]))
-    response = respond(view, measured, humid.terms.lobes, humid.floor)  # what a fit of it is made on
+    response = respond(view, measured, humid.terms, humid.floor)  # what a fit of it is made on
     assert response.indirect.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
 
 

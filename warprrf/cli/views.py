@@ -58,7 +58,7 @@ def _render(args: argparse.Namespace, bars: Bars) -> None:
     from PIL import Image
 
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
-    write_atomically(Path(args.out), lambda path: Image.fromarray(pixels).save(path))
+    write_atomically(args.out, lambda path: Image.fromarray(pixels).save(path))
     print(f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians")
 
 

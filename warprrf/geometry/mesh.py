@@ -16,11 +16,11 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.cache import cached_property
+from warprrf.cache import Cache, cached_property
 from warprrf.checks import LARGEST_M, check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
-from warprrf.kernels.rays.mesh import closest_faces
+from warprrf.kernels.rays.mesh import closest_faces, look_around
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -129,6 +129,12 @@ class Mesh:
         return len(edges) > 0 and bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
 
     @cached_property
+    def distinct_faces(self) -> np.ndarray:
+        """Faces of which no earlier one has the same three corners, however wound, shape ``(K,)``."""
+        corner = np.sort(self.welded_faces, axis=1)
+        return np.sort(np.unique(corner, axis=0, return_index=True)[1])
+
+    @cached_property
     def center(self) -> np.ndarray:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
         return self.bounds.mean(axis=0)
@@ -216,6 +222,42 @@ class Mesh:
     def distance(self, points: ArrayLike, *, device: DeviceLike = None) -> np.ndarray:
         """Distance from each of ``points`` (N, 3) [m] to the surface [m], shape ``(N,)``."""
         return self.closest(points, device=device).distance
+
+    def look_around(
+        self, points: ArrayLike, directions: ArrayLike, *, device: DeviceLike = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What rays in the same ``directions`` (D, 3) cross from each of ``points`` (N, 3) [m].
+
+        Returns:
+            How many surfaces they leave less those that they enter, by the surfaces' normals, repeated faces once; of a
+            closed mesh that is the winding number, whatever the direction. And the side from which they meet the first:
+            1 where its normal points to the point, -1 where it points away, 0 where there is none. Shapes ``(N, D)``,
+            int32.
+        """
+        p, d = check_array("points", points, (None, 3)), check_array("directions", directions, (None, 3))
+        where = _device.resolve(device)
+        bvh, corners = self._boxes(where)
+        winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
+        start, toward = (wp.array(x, dtype=wp.vec3d, device=where) for x in (p - self.center, d))
+        inputs = [bvh.id, corners, start, toward, winding, side]
+        _device.launch(look_around, len(p) * len(d), inputs, device=where)
+        return winding.numpy().reshape(len(p), -1), side.numpy().reshape(len(p), -1)
+
+    @cached_property
+    def _boxed(self) -> Cache:
+        return Cache(8)
+
+    def _boxes(self, where: wp.Device) -> tuple[wp.Bvh, wp.array]:
+        """Boxes of the distinct faces, which a ray can be asked for all of, and their corners about the centre."""
+
+        def build() -> tuple[wp.Bvh, wp.array]:
+            corners = self.triangles[self.distinct_faces] - self.center
+            margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
+            bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
+            low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
+            return wp.Bvh(low, high), wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
+
+        return self._boxed.get(str(where), build)
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""

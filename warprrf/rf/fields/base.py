@@ -18,10 +18,11 @@ from warprrf.checks import LARGEST_M, check_array, check_number, check_positive,
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.receivers import check_receiver
+from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
@@ -186,11 +187,25 @@ class RadioField(ABC):
         Raises:
             ValueError: as for :meth:`spectrum`, and for a beam width that is not positive.
         """
-        receivers = check_receiver("rx", check_array("rx", rx, (None, 3)), self.mesh)
-        source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
-        if (np.linalg.norm(receivers - source, axis=1) == 0).any():
-            raise ValueError("rx: got the transmitter's own position; expected them apart")
+        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
         return self.trace_links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
+
+    def check_positions(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``rx`` (3,) or (R, 3) and ``transmitter`` (3,), by default the fitted one, if the field holds there [m].
+
+        Raises:
+            ValueError: for a place that is not finite, outside the scene, on a surface, in another solid than the air
+                of the fitted transmitter, or a receiver within the transmitter's reactive near field.
+        """
+        receivers = check_receivers("rx", rx)
+        source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
+        check_positions(
+            self.mesh, source, receivers, SPEED_OF_LIGHT / self.frequency_hz, names=("transmitter", "rx"),
+            known=self.transmitter, device=self.device,
+        )  # fmt: skip
+        return receivers, source
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked: from paths, one receiver at a time."""

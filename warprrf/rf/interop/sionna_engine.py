@@ -91,6 +91,11 @@ def _radio_material(loaded: Any, rt: Any, material: Material, frequency: float) 
         raise ValueError(
             f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
         )
+    if material.reciprocal and material.scattering_coefficient(frequency) > 0:
+        raise ValueError(
+            f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
+            'take its lobe of the same width, or use engine="exact"'
+        )
     radio = loaded.radio_materials.get(material.name)
     if type(radio) is not rt.RadioMaterial:  # an ITU material keeps its own permittivity
         radio = rt.RadioMaterial(f"warprrf-{material.name}")  # objects and materials share one set of names

@@ -21,6 +21,7 @@ from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import MirrorPaths
 from warprrf.rf.paths.trace import MirrorTracer
+from warprrf.rf.positions import check_positions, check_receivers, question_unit
 
 REGULARISATION = 1e-4
 """Default weight of the prior; see :func:`fit_reflections`."""
@@ -58,9 +59,12 @@ class Reflections:
         """Complex channel between isotropic antennas at ``receivers`` (R, 3) or (3,) [m], shape ``(R,)``.
 
         Raises:
-            ValueError: on another shape, NaN, or a receiver at the transmitter's place.
+            ValueError: on another shape, NaN, or a place where :func:`trace_paths` refuses to answer.
         """
-        points = np.atleast_2d(check_array("receivers", receivers))
+        points, t = np.atleast_2d(check_receivers("receivers", receivers)), self._tracer
+        check_positions(
+            t.mesh, t.transmitter, points, t.wavelength_m, on_surfaces=True, device=t.images.device
+        )
         return self.channel(self._tracer.find(points, self.order), len(points))
 
     def channel(self, paths: MirrorPaths, count: int) -> np.ndarray:
@@ -118,6 +122,8 @@ def fit_reflections(
         raise ValueError(f"prior: got {prior!r}, expected a finite complex number")
     begin = time.perf_counter()
     tracer = MirrorTracer(surface, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
+    question_unit(surface, tracer.wavelength_m)
+    check_positions(surface, tracer.transmitter, points, tracer.wavelength_m, on_surfaces=True, device=device)
     patch_group, count = _patch_groups(surface, tracer.patches, groups)
     if chains is None:
         chains = tracer.find(points, order)

@@ -66,8 +66,11 @@ _EXPLAINED = {
     "axes": "metres, z up; zenith 0 to pi, azimuth -pi to pi; arrival points from the receiver",
 }
 
-RESERVED = {*_FIELDS, "range_low_db", "range_high_db", *_EXPLAINED, "compact", "compact_rounding"}
-"""Names of attributes of the file that the fields need."""
+RESERVED = {
+    *_FIELDS, *_FIELD_OF.values(), "range_db", "attributes", "range_low_db", "range_high_db", *_EXPLAINED, "compact",
+    "compact_rounding", "CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST",
+}  # fmt: skip
+"""Names that the file needs itself, fields among them, and those of HDF5's dimensions."""
 
 
 def write(path: str | os.PathLike[str], values: Mapping[str, Any], *, compact: bool = False) -> None:

@@ -4,7 +4,7 @@ A pixel holds the power of every path of a scattering surface, spread by the rec
 
 - line of sight (Friis) and mirror reflections by the image method, blocking softened;
 - diffuse scattering of surfaces that the transmitter illuminates, a non-negative mix of normalised lobes
-  (:mod:`warprrf.rf.fields.bistatic.scattering`);
+  (:mod:`warprrf.rf.fields.bistatic.scattering`), which changes when the ends are swapped unless fitted as ``reciprocal``;
 - what those illuminate in turn (:mod:`warprrf.rf.fields.bistatic.elements`), and an indirect radiance of each group.
 
 Where the data hold absorption by the air, every leg of a path has its own.
@@ -40,7 +40,6 @@ from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.receivers import check_receiver
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -227,8 +226,8 @@ class BistaticField(RadioField):
             view: what this receiver sees, if it was traced before (:meth:`view`).
 
         Raises:
-            ValueError: for a position that is not finite, outside the scene or on a surface, or at the transmitter;
-                for ``uncertainty`` of a field that was fitted to too few receivers to know it.
+            ValueError: as for :meth:`check_positions`; for ``uncertainty`` of a field that was fitted to too few
+                receivers to know it.
         """
         seen = view or self.view(rx, transmitter)
         found = self.render(seen)
@@ -261,10 +260,10 @@ class BistaticField(RadioField):
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
-        positions = check_receiver("rx", rx, self.surface.mesh)
+        positions, source = self.check_positions(rx, transmitter)
         found = []
         for position in np.atleast_2d(positions):
-            view = self.view(position, transmitter)
+            view = self.transport(source).view(position, self.terms)
             found.append(paths_of(view, self.render(view), self.floor, self.air, max_paths))
         return found[0] if positions.ndim == 1 else Paths.stack(found)
 
@@ -274,11 +273,8 @@ class BistaticField(RadioField):
         Raises:
             ValueError: as for :meth:`spectrum`.
         """
-        receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.surface.mesh)
-        transport = self.transport(transmitter)
-        if np.linalg.norm(receiver - transport.transmitter) == 0:
-            raise ValueError("rx: got the transmitter's own position; expected them apart")
-        return transport.view(receiver, self.terms)
+        receiver, source = self.check_positions(check_array("rx", rx, (3,)), transmitter)
+        return self.transport(source).view(receiver, self.terms)
 
     def render(self, view: ReceiverView) -> Rendered:
         """The spectrum of what is seen, by its parts."""

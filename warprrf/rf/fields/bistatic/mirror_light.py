@@ -103,7 +103,7 @@ class MirrorLight:
         points = start + hits.range_m.numpy()[rays, None] * direction
         if len(row) == 0:
             none = np.zeros(0, int)
-            return _packed(grid, none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
+            return _packed(grid, none, none, np.zeros(0), none, *[np.zeros(0)] * 5)
         patch = self._mirror[pair]
         normal = s.normal[face]
         turned = (s.mesh.face_normals[face] * direction).sum(axis=1) > 0
@@ -128,6 +128,7 @@ class MirrorLight:
             face[row[k]],
             strength,
             np.minimum(cos_in[k], 1.0),
+            np.minimum(cos_s, 1.0),
             np.clip(2.0 * cos_in[k] * cos_s - (toward[k] * to_receiver[k]).sum(axis=1), -1.0, 1.0),
             np.log(high / low) / (high - low),
         )

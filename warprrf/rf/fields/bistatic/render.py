@@ -113,7 +113,7 @@ def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | Non
     single = np.zeros(len(view.hits.face))
     if terms.diffuse:
         face = view.hits.face
-        power = scatter(t.surface, face, view.light, terms.lobes, p.weight, p.log_excess, t.wavelength_m)
+        power = scatter(t.surface, face, view.light, terms, p.weight, p.log_excess, t.wavelength_m)
         single = p.gain * power * materials.cell_gain(t.surface.cell[np.maximum(face.numpy(), 0)])
     return PathPowers(single, mirror, further_bounces(view, materials, sent))
 
@@ -137,9 +137,7 @@ def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -
         rows.append((ray[some], face[some], power[some]))
     m = view.mirror_illumination if materials.terms.diffuse and materials.terms.mirror_scatter else None
     if m is not None and len(m.ray):
-        power = scatter(
-            t.surface, m.face, m.light, materials.terms.lobes, p.weight, p.log_excess, t.wavelength_m
-        )
+        power = scatter(t.surface, m.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
         rows.append(
             (m.ray, m.face.numpy(), power * mirror_share(p, t.surface.patch_group[m.patch], m.cosine))
         )
@@ -156,9 +154,7 @@ def mirror_shown(
     if not wanted or m is None or len(m.ray) == 0:
         return np.zeros(0, int), np.zeros(0)
     wavelength, face = t.wavelength_m, m.hits.face.numpy()
-    power = scatter(
-        t.surface, m.hits.face, m.light, materials.terms.lobes, p.weight, p.log_excess, wavelength
-    )
+    power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, wavelength)
     power = power.astype(float)
     if sent is not None:
         radiance = np.where(face >= 0, sent[t.surface.element[np.maximum(face, 0)]], 0.0)
@@ -187,7 +183,7 @@ def _element_radiance(transport: Transport, p: Parameters, materials: Materials)
     """Radiance of light that elements got from other surfaces, one or two diffuse bounces before, shape ``(E,)``."""
     terms, links, wavelength = materials.terms, transport.elements, transport.wavelength_m
     power = scatter(
-        transport.surface, links.hits.face, links.light, terms.lobes, p.weight, p.log_excess, wavelength
+        transport.surface, links.hits.face, links.light, terms, p.weight, p.log_excess, wavelength
     )
     # rays are drawn by the cosine: pi times the mean radiance that they see is the irradiance
     got = np.pi * (power.reshape(-1, RAYS) * (4.0 * np.pi / wavelength) ** 2).mean(axis=1)

@@ -109,7 +109,7 @@ def predicted_std_db(
     gain = size < len(errors.covariance)
     layout = Layout(*p.log_weight.shape, indirect=terms.indirect, gain=gain)
     measured = SpectrumPixels(beam, np.arange(rendered.image.size))
-    response = respond(view, measured, terms.lobes, floor).tied(material)
+    response = respond(view, measured, terms, floor).tied(material)
     slopes, index = jacobian(response, p, layout)[1:]
     image = rendered.image / floor
     slopes *= (NEPER / (1.0 + image.ravel())).astype(np.float32)

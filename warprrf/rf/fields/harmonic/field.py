@@ -45,7 +45,7 @@ from warprrf.rf.fields.harmonic.single_bounce import SingleBounce
 from warprrf.rf.fields.harmonic.targets import targets
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
-from warprrf.rf.receivers import check_receiver
+from warprrf.rf.positions import check_dataset
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
 from warprrf.steps import digest
@@ -149,8 +149,7 @@ class HarmonicField(RadioField):
         chosen = FieldOptions.of(options, {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
-        receivers = np.asarray(ds.receivers, np.float64)
-        check_receiver("ds.receivers", receivers, mesh)
+        receivers, transmitter = check_dataset(mesh, ds, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError(
                 'line_of_sight="explicit" and interaction_point="mesh" need a mesh; the geometry has none'
@@ -159,7 +158,7 @@ class HarmonicField(RadioField):
         blank = cls(
             gaussians=gaussians,
             mesh=mesh,
-            transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
+            transmitter=transmitter,
             frequency_hz=float(ds.frequency_hz),
             shape=images.shape[1:],  # type: ignore[arg-type]
             floor=float(ds.floor),
@@ -194,6 +193,18 @@ class HarmonicField(RadioField):
             )
         return replace(self, air=air)
 
+    def check_positions(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`RadioField.check_positions`; ValueError also for another transmitter of an ``rf3dgs`` field."""
+        receivers, source = super().check_positions(rx, transmitter)
+        if self.options.model == "rf3dgs" and not np.array_equal(source, self.transmitter):
+            raise ValueError(
+                f"transmitter: got {source.tolist()}, but an rf3dgs field holds only for the one it was fitted for, "
+                f'{self.transmitter.tolist()}; fit model="rf3dgs+", which recomputes lengths, or fit again'
+            )
+        return receivers, source
+
     def spectrum(
         self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, transport: Transport | None = None
     ) -> Spectrum:
@@ -205,10 +216,11 @@ class HarmonicField(RadioField):
             transport: blending weights of exactly this receiver, if they were computed before.
 
         Raises:
-            ValueError: for a position that is not finite, outside the scene or on a surface; or another transmitter
-                with ``rf3dgs``, whose delays and gains hold only for the one it was fitted for.
+            ValueError: as for :meth:`check_positions`; or another transmitter with ``rf3dgs``, whose delays and gains
+                hold only for the one it was fitted for.
         """
-        return self._look(rx, transmitter, transport).spectrum
+        receiver, source = self.check_positions(check_array("rx", rx, (3,)), transmitter)
+        return self._look(receiver, source, transport).spectrum
 
     def paths(
         self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
@@ -231,11 +243,11 @@ class HarmonicField(RadioField):
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
-        positions = check_receiver("rx", rx, self.mesh)
+        positions, source = self.check_positions(rx, transmitter)
         found = [
             replace(
                 paths_of(
-                    self._look(position, transmitter, None),
+                    self._look(position, source, None),
                     beam_sigma_rad=self.beam_sigma_rad,
                     frequency_hz=self.frequency_hz,
                     max_paths=max_paths,
@@ -320,10 +332,8 @@ class HarmonicField(RadioField):
         _device.launch(kernels.predict, len(out), inputs, device=device)
         return out.numpy().reshape(self.shape).astype(np.float64)
 
-    def _look(self, rx: ArrayLike, transmitter: ArrayLike | None, seen: Transport | None) -> View:
+    def _look(self, receiver: np.ndarray, source: np.ndarray, seen: Transport | None) -> View:
         """Spectrum at one receiver and what it was made of."""
-        receiver = check_receiver("rx", check_array("rx", rx, (3,)), self.mesh)
-        source = self._transmitter(transmitter)
         seen = self._seen_from(receiver[None], seen, None)
         law = self.law
         visible, friis = law.line_of_sight(receiver, source)
@@ -360,17 +370,6 @@ class HarmonicField(RadioField):
         delay = np.maximum(self._blend("delay", seen), 0.0) * self.delay_unit
         departure = np.stack([self._blend(f"aod_{axis}", seen) for axis in "xyz"], axis=-1)
         return np.where(empty, np.nan, delay), np.where(empty[..., None], np.nan, departure)
-
-    def _transmitter(self, transmitter: ArrayLike | None) -> np.ndarray:
-        if transmitter is None:
-            return self.transmitter
-        position = check_array("transmitter", transmitter, (3,))
-        if self.options.model == "rf3dgs" and not np.array_equal(position, self.transmitter):
-            raise ValueError(
-                f"transmitter: got {position.tolist()}, but an rf3dgs field holds only for the one it was fitted for, "
-                f'{self.transmitter.tolist()}; fit model="rf3dgs+", which recomputes lengths, or fit again'
-            )
-        return position
 
 
 def _geometry(geometry: GeometryLike | Gaussians) -> tuple[Gaussians, Mesh | None]:
