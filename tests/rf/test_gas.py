@@ -203,7 +203,7 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
     ratio = images[1][lit] / (images[0][lit] * passed(length[lit]))
     assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
     # elements that send on evenly: two legs from them
-    sent = np.ones(len(field.surface.element_area))
+    sent = np.ones(field.surface.element_sides)
     dark = replace(field.parameters, log_weight=np.full_like(field.parameters.log_weight, -np.inf))
     glow = []
     for view in views:
@@ -242,7 +242,7 @@ def test_irradiance_by_a_mirror_has_its_images_length(dry: SpectrumDataset) -> N
     before, after = (
         one.transport().mirror_light.irradiance(field.parameters) for one in (field, field.with_gas())
     )
-    centre = field.surface.element_centre
+    centre = np.tile(field.surface.element_centre, (2, 1))  # of both sides
     lid = (centre[:, 2] > 3.9) & (before > 0)
     assert lid.sum() > 20
     length = np.linalg.norm(centre[lid] - TX * [1, 1, -1], axis=1)

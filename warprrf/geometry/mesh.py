@@ -14,6 +14,9 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
@@ -108,11 +111,34 @@ class Mesh:
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     @cached_property
+    def rounding_m(self) -> float:
+        """What float32 may have rounded coordinates by [m]: about the mesh's own centre, or where they were rounded.
+
+        A mesh that was rounded far from its centre has coordinates that are odd multiples of float32's spacing there.
+        """
+        near = float(np.spacing(np.float32(0.5 * np.ptp(self.bounds, axis=0).max())))
+        step = np.spacing(np.abs(self.vertices).astype(np.float32)).astype(float)
+        count = self.vertices / step
+        if not (count == np.rint(count)).all():
+            return near
+        return max(near, float(step[count % 2 == 1].max(initial=0.0)))
+
+    @cached_property
     def welded_faces(self) -> np.ndarray:
-        """Faces with vertices at one place (to 1e-7 of the box) given one index, shape ``(F, 3)``."""
-        step = 1e-7 * max(float(np.ptp(self.bounds, axis=0).max()), 1e-12)
-        cells = np.round((self.vertices - self.bounds[0]) / step).astype(np.int64)
-        return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)[self.faces]
+        """Faces with vertices at one place (to 1e-6 of the box's half diagonal) given one index, shape ``(F, 3)``."""
+        point, index = np.unique(self.vertices, axis=0, return_inverse=True)
+        reach = max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
+        near = cKDTree(point - self.center).query_pairs(reach, output_type="ndarray")
+        link = sparse.coo_array((np.ones(len(near), bool), near.T), shape=(len(point), len(point)))
+        place = csgraph.connected_components(link, directed=False)[1]
+        return np.asarray(place[index.reshape(-1)][self.faces])
+
+    @cached_property
+    def first_at_place(self) -> np.ndarray:
+        """The first face with the same three corners: itself unless it repeats one, however wound, shape ``(F,)``."""
+        corner = np.sort(self.welded_faces, axis=1)
+        first, index = np.unique(corner, axis=0, return_index=True, return_inverse=True)[1:]
+        return np.asarray(first[index.reshape(-1)])
 
     @cached_property
     def is_closed(self) -> bool:

@@ -51,7 +51,7 @@ Error of the total diffuse power at 60 x 120 over 17 places in a furnished room,
 """
 FACTORS = 1025
 """Entries of a reciprocal lobe's factor over the cosine: interpolation errs by 1e-5 at most up to an exponent of 100."""
-REVISION = 2
+REVISION = 3
 """Raised whenever the engine's numbers change: finished receivers of another revision are not used."""
 
 
@@ -129,7 +129,9 @@ class ExactEngine:
                 "scene: got a bare Mesh, expected a Scene with materials, because scattering needs them"
             )
         self.device = _device.resolve(device)
-        self._surface = self._upload(self.tracer.table, np.asarray(scene.face_material, dtype=np.int32))
+        # Of faces at one place rays may meet any: each is of the first one's material.
+        material = np.asarray(scene.face_material, dtype=np.int32)[self.tracer.patches.first]
+        self._surface = self._upload(self.tracer.table, material)
 
     def _upload(self, table: SurfaceTable, face_material: np.ndarray) -> list[Any]:
         where, mesh = self.device, self.tracer.mesh

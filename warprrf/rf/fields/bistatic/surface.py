@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
-from warprrf.geometry.mesh_topology import smoothed_normals
+from warprrf.geometry.mesh_topology import components, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import bounce
@@ -71,7 +72,8 @@ class Surface:
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
-        two_sided: whether mirrors have two sides; False: only that of ``plane_normal``, of a surface that photos saw.
+        two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
+            that photos saw.
 
     Raises:
         TypeError, ValueError: for arrays that do not fit each other, or indices and values out of range.
@@ -107,6 +109,28 @@ class Surface:
         behind = (self.normal * self.mesh.face_normals).sum(axis=1, keepdims=True) < 0
         return np.where(behind, -self.normal, self.normal)
 
+    @cached_property
+    def side_normal(self) -> np.ndarray:
+        """What the first side of each face's element faces, however its faces are wound, shape ``(F, 3)``."""
+        if not self.two_sided:
+            return self.front_normal
+        own, normal = self.patch >= 0, self.front_normal.copy()
+        normal[own] = self.plane_normal[self.patch[own]]
+        return normal
+
+    @property
+    def element_sides(self) -> int:
+        """Number of elements' sides: two each, or that of a reconstructed surface which photos saw."""
+        return (1 + self.two_sided) * len(self.element_area)
+
+    def side_met(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Side of an element that a ray of ``direction`` (N, 3) meets at ``face`` (N,): second sides stand after all the
+        first ones, shape ``(N,)``."""
+        if not self.two_sided:
+            return self.element[face]
+        behind = np.einsum("ni,ni->n", self.side_normal[face], direction) > 0
+        return self.element[face] + behind * len(self.element_area)
+
     @property
     def groups(self) -> int:
         """Number of groups."""
@@ -139,11 +163,7 @@ class Surface:
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
             patches = planar_patches(mesh, material)
-            large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
-            order = np.full(len(patches) + 1, -1)
-            order[large] = np.arange(len(large))
-            patch = order[patches.face_patch].astype(np.int32)
-            planes = patches.normal[large], patches.offset[large]
+            patch, planes = _mirrors(patches)
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
             normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
             if material is None:
@@ -153,7 +173,7 @@ class Surface:
                 names = tuple(m.name for m in materials)
             sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         sides = patches.two_sided
-        mesh, parent = _split_long(mesh)
+        mesh, parent = _split_long(mesh, np.flatnonzero(patches.once))
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
@@ -216,13 +236,37 @@ def _largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: i
     return area.argmax(axis=1).astype(np.int32)
 
 
-def _split_long(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
-    """``mesh`` with faces halved across their longest edge until none is long, and each face's parent.
+def _mirrors(patches: PlanarPatches) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Patches large enough to mirror, those of one group in one plane as one: patch of each face, -1 for none, and planes.
+
+    Faces that overlap in a plane, or sheets closer than the tolerance, would mirror twice.
+    """
+    large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
+    middle = patches.mesh.center
+    height = patches.offset[large] - patches.normal[large] @ middle
+    reach = 0.5 * float(np.linalg.norm(np.ptp(patches.mesh.bounds, axis=0)))
+    plane = np.column_stack([reach * patches.normal[large], height])
+    count = len(large)
+    near = cKDTree(np.concatenate([plane, -plane])).query_pairs(patches.tolerance_m, output_type="ndarray")
+    near = near[(near[:, 0] < count) | (near[:, 1] < count)] % max(count, 1)
+    near = near[patches.group[large][near[:, 0]] == patches.group[large][near[:, 1]]]
+    piece = components(count, near)
+    first, piece = np.unique(piece, return_index=True, return_inverse=True)[
+        1:
+    ]  # the largest: they stand by area
+    order = np.full(len(patches) + 1, -1)
+    order[large] = piece.reshape(-1)
+    own = large[first]
+    return order[patches.face_patch].astype(np.int32), (patches.normal[own], patches.offset[own])
+
+
+def _split_long(mesh: Mesh, chosen: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """Faces ``chosen`` of ``mesh``, halved across their longest edge until none is long, and each face's parent.
 
     Both faces at an edge are split at its midpoint or not at all, because the edge's length alone decides: no cracks.
     """
-    vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
-    parent = np.arange(len(faces))
+    vertices, faces = mesh.vertices, mesh.faces[chosen].astype(np.int64)
+    parent = chosen
     done_faces, done_parent = [], []
     for _ in range(64):
         edge = np.linalg.norm(vertices[np.roll(faces, -1, axis=1)] - vertices[faces], axis=2)
@@ -245,10 +289,11 @@ def _split_long(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
 
 
 def _on_patches(patches: PlanarPatches, normal: np.ndarray) -> np.ndarray:
-    """``normal`` (F, 3), but of its patch where a face has one, on the side that the face is wound for."""
+    """``normal`` (F, 3), but of its patch where a face has one, on the side that the face is wound for; upward for faces
+    without area."""
     own = patches.face_patch >= 0
     flat = patches.normal[patches.face_patch[own]]
     turned = (flat * patches.mesh.face_normals[own]).sum(axis=1, keepdims=True) < 0
-    result = normal.copy()
+    result = np.where(normal.any(axis=1, keepdims=True), normal, [0.0, 0.0, 1.0])
     result[own] = np.where(turned, -flat, flat)
     return result
