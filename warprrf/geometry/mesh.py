@@ -19,8 +19,9 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
+from warprrf.brief import one_line
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import LARGEST_M, check_array
+from warprrf.checks import LARGEST_M, check_array, check_number
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, look_around
@@ -38,6 +39,8 @@ class Closest:
         point: Nearest point on the surface [m], shape ``(N, 3)``.
         face: Its face, shape ``(N,)``, int32.
     """
+
+    __repr__ = one_line
 
     distance: np.ndarray
     point: np.ndarray
@@ -224,6 +227,7 @@ class Mesh:
             Shape ``(N,)``, bool.
         """
         start, end = check_rows(("a", a), ("b", b))
+        clearance = check_number("clearance", clearance, 0.0)
         where = _device.resolve(device)
         return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
@@ -287,7 +291,7 @@ class Mesh:
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
-        above = self.triangles[:, :, 2] > height
+        above = self.triangles[:, :, 2] > check_number("height", height)
         cut = (above.sum(axis=1) % 3) > 0
         corners, above = self.triangles[cut], above[cut]
         ends = []

@@ -46,7 +46,7 @@ class MeshFile:
 
 
 def _trimesh() -> Any:
-    return require("trimesh", extra="photos")
+    return require("trimesh", extra="mesh")
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshFile:

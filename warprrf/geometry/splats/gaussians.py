@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from warprrf.brief import one_line
 from warprrf.checks import LARGEST_M, check_array
 from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster.sh import COEFFICIENTS
@@ -36,6 +37,8 @@ class Gaussians:
         ValueError: for shapes that do not fit, values that are not finite, zero quaternions, scales that are not
             positive, opacities outside [0, 1].
     """
+
+    __repr__ = one_line
 
     means: np.ndarray = field(repr=False)
     quaternions: np.ndarray = field(repr=False)

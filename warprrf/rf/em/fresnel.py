@@ -20,7 +20,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.rf.em.materials import Material
+from warprrf.checks import check_count
+from warprrf.rf.em.materials import NARROWEST_LOBE, Material
 
 LAMBERTIAN = 0
 """Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""
@@ -117,7 +118,7 @@ def lobe(
         reciprocal: The reciprocal lobe: cos(theta_s) b(theta_i) b(theta_s) ((1 + cos psi) / 2)^alpha_r, with b of
             :func:`reciprocal_factor`.
     """
-    if alpha_r == LAMBERTIAN:
+    if check_count("alpha_r", alpha_r, 0, NARROWEST_LOBE) == LAMBERTIAN:
         return np.asarray(cos_scatter) / np.pi
     shape = (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r
     if reciprocal:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_positive
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components
@@ -116,7 +116,7 @@ def fit_reflections(
         raise ValueError("csi: got NaN or infinite values, expected finite complex channels")
     if len(channel) and not channel.any():
         raise ValueError("csi: got channels that are all zero, expected some power")
-    if not (np.isfinite(regularisation) and regularisation > 0):
+    if check_positive("regularisation", regularisation) <= 0:
         raise ValueError(f"regularisation: got {regularisation!r}, expected a positive number")
     if not np.isfinite(prior):
         raise ValueError(f"prior: got {prior!r}, expected a finite complex number")

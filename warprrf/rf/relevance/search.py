@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_positive
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -296,8 +296,7 @@ def relevances(
 ) -> list[Relevance]:
     """:func:`relevance` at several tolerances, for little more than the time of one; arguments and errors as there."""
     for tolerance in tolerances_db:
-        if not (np.isfinite(tolerance) and tolerance > 0):
-            raise ValueError(f"tolerance_db: got {tolerance!r}, expected more than 0")
+        check_positive("tolerance_db", tolerance, "number of decibels")
     asked = Setting(**setting).of(geometry)
     full, walls, source = full_field(
         geometry,

@@ -130,6 +130,8 @@ def mean(train: SpectrumDataset) -> Lookup:
 
 
 def _receivers(train: SpectrumDataset) -> np.ndarray:
+    if not hasattr(train, "receivers"):
+        raise TypeError(f"train: got {type(train).__name__}, expected a SpectrumDataset")
     receivers = np.asarray(train.receivers, dtype=np.float64)
     if len(receivers) == 0:
         raise ValueError("train: got no receivers, expected at least one")

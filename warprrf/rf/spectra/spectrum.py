@@ -19,6 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.brief import one_line
 from warprrf.checks import check_array, check_number, check_positive
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
@@ -404,6 +405,8 @@ class Spectrum:
         range_db: Lowest and highest value of the data set's dB images [dB].
         std_db: Standard deviation of the dB image per pixel [dB], shape ``(H, W)``; None where it is not known.
     """
+
+    __repr__ = one_line
 
     path_gain: np.ndarray
     delay_s: np.ndarray | None = None
