@@ -16,7 +16,7 @@ from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.maps.radio_map import RadioMap
-from warprrf.rf.simulate import check_positions
+from warprrf.rf.positions import check_positions
 
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = (
@@ -49,7 +49,7 @@ def test_examples_that_need_the_repository_alone_run(
     import warprrf as wr
 
     def placed(scene: wr.Scene, *, transmitter: np.ndarray, receivers: np.ndarray, **options: object) -> None:
-        check_positions(scene, np.asarray(transmitter), receivers, 1e-3)
+        check_positions(scene.mesh, np.asarray(transmitter), receivers, 1e-3)
         raise ValueError("positions are fine")
 
     (tmp_path / "data").symlink_to(ROOT / "data")

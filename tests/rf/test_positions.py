@@ -1,6 +1,7 @@
 """Positions: every verb refuses what lies in solids, outside rooms or in the near field; what is in the air passes."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -211,3 +212,14 @@ def test_sizes_that_are_no_metres_are_questioned(scale, unit):
         wr.trace_paths(mesh, **places)
     assert [unit in str(w.message) for w in told if unit] == ([True] if unit else [])
     assert len(told) == (unit is not None)
+
+
+def test_a_room_in_millimetres_is_refused_by_a_fit_before_it_is_cut_to_elements():
+    s = scene()
+    ds = wr.simulate(s, transmitter=TX, receivers=[AIR], frequency_hz=F, shape=(16, 32))
+    ds = replace(ds, receivers=1e3 * ds.receivers, transmitter=1e3 * ds.transmitter)
+    with (
+        pytest.warns(UserWarning, match="coordinates look like millimetres"),
+        pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
+    ):
+        wr.RadioField.fit(Mesh(1e3 * s.mesh.vertices, s.mesh.faces), ds)

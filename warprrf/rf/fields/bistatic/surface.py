@@ -28,6 +28,8 @@ from warprrf.rf.fields.bistatic.colours import colour_groups
 
 ELEMENT_M = 0.5  # width of an element
 CELLS = 3  # along an element
+MOST_ELEMENTS = 500_000
+"""More elements are refused: light between them takes 5 kB each. It is 125,000 m^2 of surfaces, a large hall's."""
 LARGEST_FACE_M = 0.6  # longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
 SKIN_M = 0.02  # depth of a reconstructed surface's skin: shadow rays ignore it
@@ -148,10 +150,12 @@ class Surface:
 
         Raises:
             TypeError: if it has no mesh.
+            ValueError: if it is so large that it would take more than :data:`MOST_ELEMENTS` elements.
         """
         if isinstance(geometry, Surface):
             return geometry
         mesh = as_mesh(geometry, "geometry")
+        _check_size(mesh)
         material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
@@ -234,6 +238,18 @@ def _largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: i
     own = patch >= 0
     np.add.at(area, (patch[own], group[own]), mesh.areas[own])
     return area.argmax(axis=1).astype(np.int32)
+
+
+def _check_size(mesh: Mesh) -> None:
+    area = float(mesh.areas.sum())
+    elements = area / ELEMENT_M**2
+    if elements > MOST_ELEMENTS:
+        size = " x ".join(f"{e:.4g}" for e in np.ptp(mesh.bounds, axis=0))
+        raise ValueError(
+            f"geometry: its {area:.3g} m^2 of surfaces make about {elements:.2g} elements of {ELEMENT_M} m, which take "
+            f"{5e-6 * elements:.2g} GB and more, expected at most {MOST_ELEMENTS}; its box is {size} m: if that is not in "
+            "metres but in millimetres, give Mesh(1e-3 * vertices, faces), else the part of it that was measured"
+        )
 
 
 def _mirrors(patches: PlanarPatches) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
