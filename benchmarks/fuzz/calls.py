@@ -196,6 +196,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Mesh.closest": _on(lambda p: p.mesh, points=POINTS, device="cpu"),
     "Mesh.cross_section": _on(lambda p: p.mesh, height=1.0),
     "Mesh.distance": _on(lambda p: p.mesh, points=POINTS, device="cpu"),
+    "Mesh.look_around": _on(lambda p: p.mesh, points=POINTS, directions=TOWARDS, device="cpu"),
     "Mesh.on_device": _on(lambda p: p.mesh, device="cpu"),
     "Mesh.visible": _on(lambda p: p.mesh, a=POINTS, b=POINTS[::-1].copy(), device="cpu"),
     "Mesh.winding_number": _on(lambda p: p.mesh, points=POINTS),
@@ -242,6 +243,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "SpectrumDataset.save": _on(lambda p: p.train, path="saved.nc"),
     "SpectrumDataset.split": _on(lambda p: p.spectra, n_train=4),
     "SpectrumDataset.subset": _on(lambda p: p.spectra, indices=np.array([0, 3])),
+    "RadioField.check_positions": _on(lambda p: p.field, rx=POINTS),
     "RadioField.fit": lambda p: {
         "geometry": p.scene, "ds": p.train, "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False,
         "residual": False, "sub_pixels": 1, "device": "cpu",
