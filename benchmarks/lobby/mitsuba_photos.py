@@ -26,6 +26,7 @@ SIONNA_VARIANT = (
     "llvm_ad_mono_polarized"  # Sionna RT registers its plugins with the variant it is imported in
 )
 JPEG_QUALITY = 90
+PANE_SAMPLES = 4  # times as many paths a pixel where a pane mirrors the room: grain as of a sensor is left
 
 
 @contextmanager
@@ -104,7 +105,22 @@ def _radiance(mi: Any, scene: Any, camera: Camera, spp: int, seed: int, max_dept
     path = {"type": "path", "max_depth": max_depth}
     noisy = _layers(mi, scene, camera, guides, path, spp, seed)
     texture = _layers(mi, scene, camera, "albedo:albedo", None, 4 * spp, seed)[..., -3:]
-    return denoise(noisy[..., :3], noisy[..., -9:-6], noisy[..., -6:-3], noisy[..., -3:], texture)
+    image = denoise(noisy[..., :3], noisy[..., -9:-6], noisy[..., -6:-3], noisy[..., -3:], texture)
+    pane = _mirrors(mi, scene, camera, spp, seed)
+    if pane.any():  # what a pane mirrors would be smoothed away
+        image[pane] = _layers(mi, scene, camera, "position:position", path, PANE_SAMPLES * spp, seed)[pane, :3]
+    return image
+
+
+def _mirrors(mi: Any, scene: Any, camera: Camera, spp: int, seed: int) -> np.ndarray:
+    """Which pixels show a surface with a mirror reflection, shape ``(height, width)``, bool."""
+    smooth = [
+        k for k, shape in enumerate(scene.shapes()) if mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.DeltaReflection)
+    ]
+    if not smooth:
+        return np.zeros((camera.height, camera.width), dtype=bool)
+    index = _layers(mi, scene, camera, "index:shape_index", None, spp, seed)[..., -1]
+    return np.isin(np.round(index, 3), smooth)
 
 
 def denoise(
