@@ -106,21 +106,23 @@ def _radiance(mi: Any, scene: Any, camera: Camera, spp: int, seed: int, max_dept
     noisy = _layers(mi, scene, camera, guides, path, spp, seed)
     texture = _layers(mi, scene, camera, "albedo:albedo", None, 4 * spp, seed)[..., -3:]
     image = denoise(noisy[..., :3], noisy[..., -9:-6], noisy[..., -6:-3], noisy[..., -3:], texture)
-    pane = _mirrors(mi, scene, camera, spp, seed)
+    pane = _mirrors(mi, scene, camera)
     if pane.any():  # what a pane mirrors would be smoothed away
-        image[pane] = _layers(mi, scene, camera, "position:position", path, PANE_SAMPLES * spp, seed)[pane, :3]
+        image[pane] = _layers(mi, scene, camera, "position:position", path, PANE_SAMPLES * spp, seed)[
+            pane, :3
+        ]
     return image
 
 
-def _mirrors(mi: Any, scene: Any, camera: Camera, spp: int, seed: int) -> np.ndarray:
+def _mirrors(mi: Any, scene: Any, camera: Camera) -> np.ndarray:
     """Which pixels show a surface with a mirror reflection, shape ``(height, width)``, bool."""
-    smooth = [
-        k for k, shape in enumerate(scene.shapes()) if mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.DeltaReflection)
-    ]
-    if not smooth:
-        return np.zeros((camera.height, camera.width), dtype=bool)
-    index = _layers(mi, scene, camera, "index:shape_index", None, spp, seed)[..., -1]
-    return np.isin(np.round(index, 3), smooth)
+    directions = camera.directions().reshape(-1, 3)
+    origin = mi.Point3f(*(float(x) for x in camera.position))
+    hit = scene.ray_intersect(
+        mi.Ray3f(origin, mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)))
+    )
+    smooth = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaReflection) & hit.is_valid()
+    return np.asarray(smooth, dtype=bool).reshape(camera.height, camera.width)
 
 
 def denoise(
