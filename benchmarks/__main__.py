@@ -24,12 +24,14 @@ NAMES = {
     ),
     "beams": ("benchmarks.beams.run", "beams chosen from the field, beside pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
+    "fuzz": ("benchmarks.fuzz.command", "hostile arguments and damaged files, for as long as it is told to"),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
     "channel": ("benchmarks.channel", "channels: closed forms, Sionna RT, wide responses, the near field"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
     "relevance": ("benchmarks.relevance", "what each effect is worth, at two bands and roughnesses"),
     "newrf": ("benchmarks.newrf", "rays and channels of NeWRF's conference room"),
     "city-paths": ("benchmarks.city_paths", "mirror paths of Sionna RT's own scenes beside its solver's"),
+    "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

@@ -16,6 +16,7 @@ from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.maps.radio_map import RadioMap
+from warprrf.rf.positions import check_positions
 
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = (
@@ -39,6 +40,74 @@ def test_help_shows_an_example_that_the_parser_takes(
     assert examples
     for words in examples:
         cli._parser().parse_args(words)  # exits where an example is wrong
+
+
+@pytest.mark.parametrize("command", ["simulate", "relevance"])
+def test_examples_that_need_the_repository_alone_run(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import warprrf as wr
+
+    def placed(scene: wr.Scene, *, transmitter: np.ndarray, receivers: np.ndarray, **options: object) -> None:
+        check_positions(scene.mesh, np.asarray(transmitter), receivers, 1e-3)
+        raise ValueError("positions are fine")
+
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(wr, "relevance", placed)  # takes seconds
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    lines = re.findall(rf"warprrf ({command} .*data/lobby.*)", capsys.readouterr().out)
+    runnable = [line.split() for line in lines if not re.search(r"receivers\.csv|sionna", line)]
+    assert runnable
+    for words in runnable:
+        status = cli.main([*words, *["--shape", "8", "16"][: 3 * (command == "simulate")], "--quiet"])
+        assert status == 0 or "positions are fine" in capsys.readouterr().err
+
+
+def test_numbers_below_zero_are_no_options() -> None:
+    words = [
+        "simulate",
+        "s.xml",
+        "-o",
+        "x.nc",
+        "--transmitter",
+        "-1e-3",
+        "-2",
+        "-.5",
+        "--receivers",
+        "-1,4,-1.5",
+    ]
+    seen: list[object] = []
+    parser = cli._parser()
+    for action in parser._subparsers._group_actions[0].choices.values():  # type: ignore[union-attr]
+        action.set_defaults(command=lambda args, bars: seen.append((args.transmitter, args.receivers)))
+    assert cli.run(parser, words) == 0
+    (transmitter, receivers) = seen[0]  # type: ignore[misc]
+    assert transmitter == [-0.001, -2.0, -0.5]
+    np.testing.assert_array_equal(read_receivers(receivers), [[-1.0, 4.0, -1.5]])
+
+
+@pytest.mark.parametrize("kind", [ValueError, TypeError, OSError, ImportError, MemoryError])
+def test_what_went_wrong_is_one_line_and_a_bug_is_a_traceback(
+    kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(error: type[Exception]) -> object:
+        def load(path: object) -> None:
+            raise error("first line\nsecond")
+
+        return load
+
+    import warprrf as wr
+
+    words = ["twin", str(SCENE), "-o", "none"]
+    monkeypatch.setattr(wr.RadioField, "load", fail(kind))
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err == "warprrf: error: first line second\n"
+    for bug in (AttributeError, KeyError, RuntimeError):
+        monkeypatch.setattr(wr.RadioField, "load", fail(bug))
+        with pytest.raises(bug):
+            cli.main(words)
 
 
 def test_top_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,6 +140,43 @@ BAD = {
     "NaN receiver": ([*SIMULATE, "2,2,nan"], "receivers"),
     "receiver outside": ([*SIMULATE, "2,2,40"], "receivers"),
     "frequency outside the materials": ([*SIMULATE, "2,2,1", "--frequency", "5e12"], "frequency"),
+    "materials of a list": (["simulate", "{tmp}/scene.xml", *SIMULATE[2:], "2,2,1"], "materials.json"),
+    "seed below zero": ([*SIMULATE, "7,4,1.5", "--seed", "-1"], "seed"),
+    "receivers of complex numbers": ([*SIMULATE, "{tmp}/c.npy"], "c.npy"),
+    "too wide a view": (
+        [
+            *RENDER,
+            "{tmp}/one.ply",
+            "--position",
+            "0",
+            "0",
+            "1",
+            "--look-at",
+            "1",
+            "0",
+            "1",
+            "--field-of-view",
+            "180",
+        ],
+        "--field-of-view",
+    ),
+    "no receivers at all": (["relevance", "{scene}", "--receivers", "2,2,1", "--most", "0"], "--most"),
+    "relevance that nests too deep": (
+        [
+            "fit",
+            "{scene}",
+            str(SCENE.parent / "spectra.nc"),
+            "-o",
+            "{tmp}/f.safetensors",
+            "--relevance",
+            "{tmp}/deep.json",
+        ],
+        "deep.json",
+    ),
+    "positions that nest too deep": (
+        ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/deep.json"],
+        "deep.json",
+    ),
     "geometry of unknown kind": (
         ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
         ".ply",
@@ -112,12 +218,24 @@ BAD = {
 }
 
 
+def test_an_empty_name_of_the_result_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
+    words = [word.format(tmp="", scene=SCENE) for word in SIMULATE]
+    words[words.index("-o") + 1] = ""
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([*words, "7,4,1.5"])
+    assert "-o/--out: got ''" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("case", sorted(BAD))
 def test_bad_input_is_one_line_and_status_2(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     import warprrf as wr
 
+    (tmp_path / "scene.xml").write_text("<scene/>")
+    (tmp_path / "materials.json").write_text("[5]")
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    np.save(tmp_path / "c.npy", np.ones((2, 3), complex))
     (tmp_path / "words.txt").write_text("these are, words\n")
     (tmp_path / "bad.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0notjson!")
     (tmp_path / "bad.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))

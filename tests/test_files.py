@@ -1,11 +1,31 @@
-"""A file is whole or not there."""
+"""A file is whole or not there, and not what it was written as is an error."""
 
+import io
+import json
+import os
+import resource
+import signal
+import stat
+import subprocess
+import sys
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from warprrf.files import write_arrays, write_atomically, write_text
+from warprrf.files import (
+    check_seal,
+    partial_path,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_atomically,
+    write_bytes,
+    write_json,
+    write_text,
+)
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
@@ -33,9 +53,165 @@ def test_the_file_is_written_beside_its_place_under_its_suffix(tmp_path: Path) -
     assert seen[0].parent == path.parent and seen[0].suffix == ".nc" and not seen[0].exists()
 
 
+def test_names_as_long_as_the_system_takes_them_are_written(tmp_path: Path) -> None:
+    for name in ("ö" * 125 + ".nc", "a." + "b" * 250):
+        write_text(tmp_path / name, "text")
+        assert (tmp_path / name).read_text() == "text"
+
+
+def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "kept.bin"
+    path.write_bytes(b"old")
+    handler, limit = signal.signal(signal.SIGXFSZ, signal.SIG_IGN), resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
+        with pytest.raises(OSError, match=r"kept\.bin"):
+            write_bytes(path, bytes(5000), seal=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["kept.bin"]
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o027, 0o002])
+def test_files_have_the_rights_that_the_umask_leaves(tmp_path: Path, mask: int) -> None:
+    before = os.umask(mask)
+    try:
+        write_bytes(tmp_path / "a", b"")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o666 & ~mask
+
+
+def test_threads_may_write_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "shared"
+    contents = [bytes([k]) * 100_000 for k in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda k: write_bytes(path, contents[k % 8]), range(200)))
+    assert path.read_bytes() in contents and os.listdir(tmp_path) == ["shared"]
+
+
+def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_stay(tmp_path: Path) -> None:
+    killed = (
+        "import os, sys, time; from pathlib import Path; from warprrf.files import write_atomically;"
+        "write_atomically(sys.argv[1], lambda p: (p.write_text('half'), print(p.name, flush=True), time.sleep(60)))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", killed, tmp_path / "a.nc"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        name = process.stdout.readline().strip()
+        write_text(tmp_path / "b.txt", "")
+        assert sorted(os.listdir(tmp_path)) == sorted([name, "b.txt"])
+        process.kill()
+    other_machine = f".a.00000000-{process.pid}-00000000.partial.nc"
+    (tmp_path / other_machine).touch()
+    folder = tmp_path / name.replace(".nc", "")
+    (folder / "inside").mkdir(parents=True)
+    write_text(tmp_path / "b.txt", "")
+    assert sorted(os.listdir(tmp_path)) == sorted([other_machine, "b.txt"])
+
+
+def test_a_path_without_a_name_is_refused() -> None:
+    with pytest.raises(ValueError, match="path: got ''"):
+        partial_path("")
+
+
 def test_text_and_arrays_come_back(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "größer")
     assert (tmp_path / "a.txt").read_bytes() == "größer".encode()
-    write_arrays(tmp_path / "a.bin", {"x": np.arange(3), "y": np.eye(2)})
-    with np.load(tmp_path / "a.bin") as found:
-        assert sorted(found) == ["x", "y"] and np.array_equal(found["x"], np.arange(3))
+    held = {"x": np.arange(3), "y": np.eye(2, order="F"), "z": np.array("text"), "none": np.zeros((0, 3))}
+    for compress in (True, False):
+        write_arrays(tmp_path / "a.bin", held, compress=compress)
+        found = read_arrays(tmp_path / "a.bin")
+        assert list(found) == list(held)
+        for name, array in held.items():
+            np.testing.assert_array_equal(found[name], array)
+            assert found[name].dtype == array.dtype
+    with pytest.raises(TypeError, match="^x: got an array of Python objects"):
+        write_arrays(tmp_path / "a.bin", {"x": np.array([None])})
+
+
+def damaged(whole: bytes, seed: int = 0) -> list[bytes]:
+    """200 times one bit flipped, 60 times the end cut off."""
+    rng = np.random.default_rng(seed)
+    out = [whole[:n] for n in rng.integers(0, len(whole), 60)]
+    for place in rng.integers(0, 8 * len(whole), 200):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        out.append(bytes(flipped))
+    return out
+
+
+@pytest.mark.parametrize("compress", [True, False])
+def test_damaged_arrays_are_refused_or_as_they_were(tmp_path: Path, compress: bool) -> None:
+    path = tmp_path / "a.npz"
+    held = {"x": np.linspace(0, 1, 60), "y": np.zeros((9, 9), np.int32)}
+    write_arrays(path, held, compress=compress)
+    for content in damaged(path.read_bytes()):
+        path.write_bytes(content)
+        try:
+            found = read_arrays(path)
+        except ValueError as error:
+            assert str(path) in str(error)
+        else:  # the seal itself was hit
+            assert list(found) == list(held) and all((found[k] == held[k]).all() for k in held)
+
+
+def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    pickled = io.BytesIO()
+    np.save(pickled, np.array([{}]), allow_pickle=True)
+    for content in (header.getvalue(), pickled.getvalue(), b"", b"\x93NUMPY\x09\x00"):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("x.npy", content)
+        with pytest.raises(ValueError, match=r"a\.npz: damaged, or no NPZ file"):
+            read_arrays(path)
+
+
+def test_sealed_files_tell_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    for data in (b"", b"content", bytes(3_000_000)):
+        write_bytes(path, data, seal=True)
+        assert check_seal(path) and path.read_bytes().startswith(data)
+        write_bytes(path, data)
+        assert not check_seal(path)
+    write_bytes(path, bytes(range(250)), seal=True)
+    whole = path.read_bytes()
+    for content in damaged(whole):
+        path.write_bytes(content)
+        try:
+            assert not check_seal(path)
+        except ValueError as error:
+            assert "a: the checksum at its end does not fit" in str(error)
+        else:  # of a seal that is no seal any more, the content is the same
+            assert content[:250] == whole[:250] or len(content) < len(whole)
+    with pytest.raises(FileNotFoundError, match="missing"):
+        check_seal(tmp_path / "missing")
+
+
+def test_sealed_json_tells_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    value = {"b": [1, 2.5, 1e-30, None, "ö"], "a": {"c": True}}
+    write_json(path, value, seal=True)
+    assert read_json(path) == value
+    for content in damaged(path.read_bytes()):
+        path.write_bytes(content)
+        try:
+            found = read_json(path)
+        except ValueError as error:
+            assert str(path) in str(error)
+        else:  # the name of the checksum was hit
+            assert {name: found[name] for name in value} == value
+    path.write_text(json.dumps(value))
+    assert read_json(path) == value
+
+
+@pytest.mark.parametrize("text", ["[5]", "5", "", "{", "[" * 100_000, '{"a": NaN}', '{"a": 1e999}', "\xff"])
+def test_json_that_is_no_mapping_of_finite_numbers_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(ValueError, match=r"a\.json: "):
+        read_json(path)

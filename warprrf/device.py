@@ -10,15 +10,18 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from copy import copy
 from functools import cache
 from itertools import pairwise
-from threading import RLock
 from types import ModuleType
 from typing import Any, TypeAlias
 
 import warp as wp
+
+from warprrf import runtime
+from warprrf.cache import loading
 
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default: it would announce devices and every compiled module
     wp.config.log_level = wp.LOG_ERROR
@@ -42,6 +45,7 @@ def resolve(device: DeviceLike = None) -> wp.Device:
         ValueError: if Warp has no such device.
     """
     try:
+        runtime.start()
         return wp.get_device(device)
     except (ValueError, RuntimeError, TypeError) as error:
         known = ", ".join(str(d) for d in wp.get_devices())
@@ -64,19 +68,8 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=max(threads() - 1, 1), thread_name_prefix="warprrf")
 
 
-building = RLock()
-"""Held while something shared is built at its first use: hierarchies of a mesh, modules of kernels."""
-
-
-def _after_fork() -> None:
-    """A forked child has none of its parent's threads: its pool and its lock are new."""
-    global building
-    building = RLock()
-    _pool.cache_clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+if hasattr(os, "register_at_fork"):  # a forked child has none of its parent's threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def launch(
@@ -112,8 +105,8 @@ def launch(
             count = min(PIECES_PER_THREAD * threads(), max(1, dim // grain))
         bounds = [dim * k // count for k in range(count + 1)]
     arguments = [bounds[0], *inputs]
-    with building:
-        kernel.module.load(where, block_dim=256 if where.is_cuda else 1)
+    with loading:
+        runtime.load(kernel.module, where, block_dim=256 if where.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
     if len(bounds) == 2:
@@ -147,10 +140,18 @@ def _issue(parts: Sequence[wp.Launch]) -> None:
         for part in waiting:
             part.launch()
 
-    others = [_pool().submit(work) for _ in range(min(threads(), len(parts)) - 1)]
-    work()
-    for other in others:
-        other.result()
+    others: list[Future[None]] = []
+    try:
+        with suppress(
+            RuntimeError
+        ):  # the main thread has ended, and the pool with it: this thread works alone
+            for _ in range(min(threads(), len(parts)) - 1):
+                others.append(_pool().submit(work))
+        work()
+    finally:  # also after Ctrl-C: nothing that is still written to may be freed
+        for other in others:
+            if not other.cancel():
+                other.result()
 
 
 def require(module: str, extra: str) -> ModuleType:

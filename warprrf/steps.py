@@ -14,11 +14,9 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 import os
 import shutil
 import time
-import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -27,8 +25,9 @@ from typing import IO, Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.files import plain, write_atomically, write_json
+from warprrf.files import plain, read_arrays, read_json, write_arrays, write_json
 
+_RECORDED = {"key", "finished", "seconds", "attempts", "stages", "figures"}
 HEARTBEAT_S = 5.0  # how much time of a killed attempt may go unrecorded
 
 
@@ -94,6 +93,7 @@ class Steps:
     def __enter__(self) -> Steps:
         self._own.mkdir(parents=True, exist_ok=True)
         if not self._shared:
+            self._process = os.getpid()
             self._lock = (self._own / "lock").open("w")
             try:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -106,6 +106,8 @@ class Steps:
 
     def __exit__(self, *error: object) -> None:
         if self._lock is not None:
+            if os.getpid() == self._process:  # a child that was forked meanwhile holds the lock as well
+                fcntl.flock(self._lock, fcntl.LOCK_UN)
             self._lock.close()
 
     def run(
@@ -149,7 +151,7 @@ class Steps:
         def write(**news: Any) -> None:
             self._records[name] = record
             record.update(seconds=before + time.monotonic() - start, **news)
-            write_json(self._file(name), record)
+            write_json(self._file(name), record, seal=True)
 
         def progress(stage: str, done: int, total: int) -> None:
             nonlocal last, written
@@ -196,14 +198,13 @@ class Steps:
         key, path = digest(name, version, list(inputs)), self.folder / f"{name}.npz"
         if path.is_file() and not self._fresh:
             try:
-                with np.load(path, allow_pickle=False) as stored:
-                    found = dict(stored)
-                if str(found.pop("key", "")) == key:
-                    return found
-            except (zipfile.BadZipFile, EOFError, OSError, ValueError):
-                path.unlink()
+                found = read_arrays(path)
+            except ValueError:  # damaged: to be replaced
+                found = {}
+            if str(found.pop("key", "")) == key:
+                return found
         made = {n: np.asarray(a) for n, a in make().items()}
-        write_atomically(path, lambda file: np.savez(file, key=np.array(key), **made))  # type: ignore[arg-type]
+        write_arrays(path, {"key": np.array(key), **made}, compress=False)
         return made
 
     @property
@@ -244,9 +245,10 @@ class Steps:
         if self._fresh and name not in self._records:
             return {}
         try:
-            return dict(json.loads(self._file(name).read_text()))
-        except (FileNotFoundError, ValueError):
+            record = read_json(self._file(name))
+        except (FileNotFoundError, ValueError):  # what is damaged is done again
             return {}
+        return record if _RECORDED <= record.keys() else {}
 
 
 def _add(total: Any, part: Any) -> None:

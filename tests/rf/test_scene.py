@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -99,6 +100,85 @@ def test_a_scene_from_arrays_checks_its_indices() -> None:
         Scene(wall, [Material.conductor()], [0, 0])
     with pytest.raises(TypeError, match="mesh"):
         Scene([[0, 0, 0]], [Material.conductor()], [0])  # type: ignore[arg-type]
+
+
+WRONG = {
+    "indices between": ({"face_material": [0.4]}, "face_material"),
+    "negative index": ({"face_material": [-1]}, "face_material"),
+    "too many indices": ({"face_material": [0, 0]}, "face_material"),
+    "no indices": ({"face_material": None}, "face_material"),
+    "indices of text": ({"face_material": ["0"]}, "face_material"),
+    "an object too far": ({"face_object": [1]}, "face_object"),
+    "an object between": ({"face_object": [0.5]}, "face_object"),
+    "no materials": ({"materials": []}, "face_material"),
+    "a material's name": ({"materials": ["conductor"]}, r"materials\[0\]"),
+    "materials none": ({"materials": None}, "materials"),
+    "one name as names": ({"object_names": "object"}, "object_names"),
+    "names of numbers": ({"object_names": [1]}, r"object_names\[0\]"),
+    "a name twice": ({"object_names": ["a", "a"]}, "object_names"),
+    "no mesh": ({"mesh": None}, "mesh"),
+}
+
+
+@pytest.mark.parametrize("case", sorted(WRONG))
+def test_a_scene_of_what_does_not_match_is_refused(case: str) -> None:
+    change, name = WRONG[case]
+    wall = Mesh([[0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]])
+    with pytest.raises((ValueError, TypeError), match=f"^{name}: got"):
+        Scene(**({"mesh": wall, "materials": [Material.conductor()], "face_material": [0]} | change))
+
+
+def test_other_materials_are_materials_one_for_each(lobby: Scene) -> None:
+    for wrong in (None, ["marble"] * len(lobby.materials), lobby.materials[:-1]):
+        with pytest.raises((ValueError, TypeError), match="^materials"):
+            lobby.with_materials(wrong)
+    with pytest.raises(ValueError, match="^clearance_m"):
+        lobby.is_free([[1.0, 1.0, 1.0]], clearance_m=np.nan)
+
+
+def test_a_scene_says_what_it_is_in_a_line(lobby: Scene) -> None:
+    assert re.fullmatch(r"Scene\(\d+ faces, \d+ objects, materials [a-z_, ]*marble[a-z_, ]*\)", repr(lobby))
+
+
+@pytest.mark.parametrize("how", ["absolute", "upward", "link", "folder that is a link"])
+def test_meshes_outside_the_scenes_folder_are_read_on_request_alone(
+    how: str, copy: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    away = tmp_path_factory.mktemp("away")
+    desk = (copy / "meshes" / "desk.ply").rename(away / "desk.ply")
+    names = {"absolute": str(desk), "upward": f"../{away.name}/desk.ply", "link": "meshes/desk.ply"}
+    if how == "link":
+        (copy / "meshes" / "desk.ply").symlink_to(desk)
+    elif how == "folder that is a link":
+        (copy / "linked").symlink_to(away)
+    text = (copy / "scene.xml").read_text()
+    (copy / "scene.xml").write_text(text.replace("meshes/desk.ply", names.get(how, "linked/desk.ply")))
+    with pytest.raises(ValueError, match=r"'desk'.*outside.*allow_outside=True"):
+        Scene.load(copy / "scene.xml")
+    assert "desk" in Scene.load(copy / "scene.xml", allow_outside=True).object_names
+
+
+def test_a_scene_whose_folder_is_a_link_is_read(copy: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    link = tmp_path_factory.mktemp("links") / "room"
+    link.symlink_to(copy)
+    assert "desk" in Scene.load(link / "scene.xml").object_names
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        '<?xml version="1.0" encoding="no-such"?>',
+        '<!DOCTYPE s [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<x>&x;</x>',
+        "<!DOCTYPE s [<!ENTITY a '" + "ha" * 50 + "'>"
+        + "".join(f"<!ENTITY {b} '{f'&{a};' * 40}'>" for a, b in zip("abcdef", "bcdefg", strict=True))
+        + "]>\n<x>&g;</x>",
+    ],
+    ids=["encoding", "external entity", "entities that multiply"],
+)  # fmt: skip
+def test_hostile_xml_is_a_value_error(head: str, copy: Path) -> None:
+    (copy / "scene.xml").write_text(head)
+    with pytest.raises(ValueError, match=r"scene\.xml"):
+        Scene.load(copy / "scene.xml")
 
 
 def test_meshes_survive_a_file(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import re
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -31,6 +32,8 @@ a walk through:
 Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
 """
 
+_NEGATIVE = re.compile(r"-[.\d][-+.,\deE]*")  # numbers such as -1, -1e-3 and -1,4,1.5
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status: 0 done, 2 bad input, 130 interrupted."""
@@ -39,14 +42,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> int:
     """Run one command of ``parser`` (see :func:`make_parser`) and return its exit status."""
-    args = parser.parse_args(argv)
+    words = sys.argv[1:] if argv is None else argv
+    # A space before a number that is negative keeps argparse from taking it for an option; whoever reads it drops it.
+    args = parser.parse_args([f" {word}" if _NEGATIVE.fullmatch(word) else word for word in words])
     try:
         with Bars(quiet=args.quiet) as bars:
             args.command(args, bars)
     except KeyboardInterrupt:
         print(f"{parser.prog}: interrupted; what is finished is kept", file=sys.stderr)
         return 130
-    except (ValueError, TypeError, OSError, ImportError) as error:
+    except (ValueError, TypeError, OSError, ImportError, MemoryError) as error:
         if args.debug:
             raise
         print(f"{parser.prog}: error: {_one_line(error)}", file=sys.stderr)

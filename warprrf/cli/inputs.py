@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +12,8 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
+from warprrf.checks import check_array
+from warprrf.files import read_json
 
 Add = Callable[..., argparse.ArgumentParser]
 """Defines one command: name and what runs it, whose docstring is its help (or a line and a text of help)."""
@@ -21,6 +22,17 @@ Add = Callable[..., argparse.ArgumentParser]
 def add_point(parser: argparse.ArgumentParser, flag: str, text: str, required: bool = False) -> None:
     """Define an option of three coordinates [m]."""
     parser.add_argument(flag, nargs=3, type=float, metavar=("X", "Y", "Z"), help=text, required=required)
+
+
+def add_out(parser: argparse.ArgumentParser, text: str, required: bool = True) -> None:
+    """Define the option that says where the result goes; an empty name is refused before any work is done."""
+    parser.add_argument("-o", "--out", required=required, type=_file_name, help=text)
+
+
+def _file_name(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected the name of a file or folder")
+    return text
 
 
 def existing(path: str | os.PathLike[str]) -> Path:
@@ -36,15 +48,14 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
     path = existing(path)
     try:
         if path.suffix == ".json":
-            content = json.loads(path.read_text())
-            rows = [(name, *position) for name, position in content.items()]
+            rows = [(name, *position) for name, position in read_json(path).items()]
         else:
             with path.open(newline="") as lines:
                 rows = [tuple(row) for row in csv.reader(lines) if row and not row[0].startswith("#")]
             if rows and rows[0][0] == "file":
                 rows = rows[1:]
         return {str(name): (float(x), float(y), float(z)) for name, x, y, z in rows}
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(
             f'{path}: expected camera positions in metres, JSON {{"file.jpg": [x, y, z]}} or CSV file,x,y,z ({error})'
         ) from error
@@ -61,9 +72,7 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
                 found = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "x"))
         except ValueError as error:
             raise ValueError(f"{path}: expected rows x,y,z in metres ({error})") from error
-        if found.ndim != 2 or found.shape[1] != 3:
-            raise ValueError(f"{path}: got shape {found.shape}, expected (R, 3): rows x,y,z in metres")
-        return np.asarray(found, dtype=np.float64)
+        return check_array(f"{path}: rows x,y,z in metres", found, (None, 3))
     try:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)
     except ValueError as error:

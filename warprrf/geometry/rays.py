@@ -8,13 +8,13 @@ float64 from the plane of that face (:mod:`warprrf.kernels.rays.mesh`), so the t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warprrf import device as _device
+from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_array
 from warprrf.geometry import o3d
 from warprrf.kernels.rays.mesh import (
@@ -105,26 +105,23 @@ class RaySearch:
         self._planes = np.column_stack([face_normals, offset])
         self._vertices = (vertices - self._center).astype(np.float32)
         self._faces = faces
-        self._on_device: dict[str, tuple[wp.Mesh, wp.array]] = {}
-        self._scene: EmbreeScene | None = None
+        self._on_device = Cache(8)
 
     def on_device(self, device: wp.Device) -> tuple[wp.Mesh, wp.array]:
         """The Warp mesh on ``device``, its vertices relative to the middle of the bounds, and the faces' planes."""
-        with _device.building:
-            if str(device) not in self._on_device:
-                mesh = wp.Mesh(
-                    points=wp.array(self._vertices, dtype=wp.vec3, device=device),
-                    indices=wp.array(self._faces.reshape(-1), dtype=wp.int32, device=device),
-                )
-                self._on_device[str(device)] = mesh, wp.array(self._planes, dtype=wp.vec4d, device=device)
-            return self._on_device[str(device)]
 
+        def build() -> tuple[wp.Mesh, wp.array]:
+            mesh = wp.Mesh(
+                points=wp.array(self._vertices, dtype=wp.vec3, device=device),
+                indices=wp.array(self._faces.reshape(-1), dtype=wp.int32, device=device),
+            )
+            return mesh, wp.array(self._planes, dtype=wp.vec4d, device=device)
+
+        return self._on_device.get(str(device), build)
+
+    @cached_property
     def _embree(self) -> EmbreeScene:
-        with _device.building:
-            if self._scene is None:
-                has_area = self._planes[:, :3].any(axis=1)
-                self._scene = EmbreeScene(self._vertices, self._faces, np.flatnonzero(has_area))
-            return self._scene
+        return EmbreeScene(self._vertices, self._faces, np.flatnonzero(self._planes[:, :3].any(axis=1)))
 
     def nearest(
         self,
@@ -181,7 +178,7 @@ class RaySearch:
         self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device
     ) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`nearest`. Rays that met a surface at their start are cast again from behind it, until none is."""
-        scene, planes = self._embree(), _given(self._planes, wp.vec4d, cpu)
+        scene, planes = self._embree, _given(self._planes, wp.vec4d, cpu)
         count = max(len(o), len(d))
         t, face = np.empty(count), np.full(count, AGAIN, dtype=np.int32)
         which: slice | np.ndarray = slice(None)
@@ -224,7 +221,7 @@ class RaySearch:
             rays = self._pack(start, way[which], clearance, np.empty(0), device)
             margin = 2.0 * ROUNDING * (self._radius + float(np.abs(start - self._center).sum(axis=1).max()))
             rays[:, 3:] *= np.minimum(length[which] - 2.0 * clearance + margin, _LONGEST)[:, None]
-            which = which[self._embree().blocked(rays)]
+            which = which[self._embree.blocked(rays)]
         inner = length[which] - clearance
         t, _ = self.nearest(
             rows(a, which), way[which], reach=inner, clearance=clearance, device=device, backend=chosen

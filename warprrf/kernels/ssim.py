@@ -6,12 +6,13 @@ filter is its own adjoint, so the derivative filters the slopes once more. Image
 ``(row * width + column) * channels + channel``, views one after another.
 """
 
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import warp as wp
+
+from warprrf.cache import once
 
 RADIUS = 5  # pixels: 11 taps
 WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
@@ -19,7 +20,7 @@ WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2  # the paper's constants for a range of one
 
 
-@cache
+@once
 def _filters(real: type) -> tuple[Any, Any]:
     """The kernels that average over the window, along rows and along columns."""
     vec3 = wp.types.vector(3, real)
@@ -70,7 +71,7 @@ def _filters(real: type) -> tuple[Any, Any]:
     return filter_rows, filter_columns
 
 
-@cache
+@once
 def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)

@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_number, check_type
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.materials import Material, load_materials
+
+T = TypeVar("T")
 
 
 class Scene:
@@ -44,17 +47,18 @@ class Scene:
         object_names: Sequence[str] = ("object",),
         xml_path: str | os.PathLike[str] | None = None,
     ) -> None:
-        if not isinstance(mesh, Mesh):
-            raise TypeError(f"mesh: got {type(mesh).__name__}, expected a warprrf Mesh")
+        check_type("mesh", mesh, Mesh)
         faces = len(mesh.faces)
         if face_object is None:
             face_object = np.zeros(faces, dtype=np.int32)
         self.mesh = mesh
-        self.materials = list(materials)
+        self.materials = _named_list("materials", materials, Material)
         self.face_material = check_array("face_material", face_material, (faces,), dtype=np.int32)
         self.face_object = check_array("face_object", face_object, (faces,), dtype=np.int32)
-        self.object_names = list(object_names)
+        self.object_names = _named_list("object_names", object_names, str)
         self.xml_path = None if xml_path is None else Path(xml_path)
+        if len(set(self.object_names)) < len(self.object_names):
+            raise ValueError("object_names: got a name twice, expected each once")
         for name, index, table in (
             ("face_material", self.face_material, self.materials),
             ("face_object", self.face_object, self.object_names),
@@ -64,17 +68,31 @@ class Scene:
                     f"{name}: got indices {index.min()} to {index.max()}, expected 0 to {len(table) - 1}"
                 )
 
+    def __repr__(self) -> str:
+        return (
+            f"Scene({len(self.mesh.faces)} faces, {len(self.object_names)} objects, materials "
+            f"{', '.join(material.name for material in self.materials)})"
+        )
+
     @classmethod
-    def load(cls, xml: str | os.PathLike[str], *, materials: str | os.PathLike[str] | None = None) -> Scene:
+    def load(
+        cls,
+        xml: str | os.PathLike[str],
+        *,
+        materials: str | os.PathLike[str] | None = None,
+        allow_outside: bool = False,
+    ) -> Scene:
         """Read a scene.
 
         Args:
             xml: the scene file.
             materials: table of materials; ``materials.json`` beside ``xml`` by default.
+            allow_outside: read meshes outside the folder of ``xml`` too. A scene from elsewhere may name any file.
 
         Raises:
             FileNotFoundError: if the XML, a mesh or the table is missing.
-            ValueError: if the XML cannot be parsed, uses what we don't read, or names a material without an entry.
+            ValueError: if the XML cannot be parsed, uses what we don't read, names a material without an entry, or a
+                mesh outside its folder.
         """
         xml = Path(xml)
         if not xml.is_file():
@@ -82,7 +100,7 @@ class Scene:
         table = load_materials(xml.parent / "materials.json" if materials is None else materials)
         try:
             root = ElementTree.parse(xml).getroot()
-        except ElementTree.ParseError as error:
+        except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: of its encoding
             raise ValueError(f"xml: {xml} is not well-formed: {error}") from error
         shapes = root.findall("shape")
         if not shapes:
@@ -100,7 +118,7 @@ class Scene:
                     f"xml: object {name!r} of {xml} is made of {material!r}, which the table of materials lacks; "
                     f"it has {', '.join(sorted(table))}"
                 )
-            part = read_mesh(_mesh_path(shape, name, xml))
+            part = read_mesh(_mesh_path(shape, name, xml, allow_outside))
             vertices.append(part.vertices)
             faces.append(part.faces + start)
             start += len(part.vertices)
@@ -123,6 +141,7 @@ class Scene:
         Raises:
             ValueError: if there are not as many.
         """
+        materials = _named_list("materials", materials, Material)
         if len(materials) != len(self.materials):
             raise ValueError(f"materials: got {len(materials)}, expected {len(self.materials)}, one for each")
         return Scene(
@@ -155,6 +174,7 @@ class Scene:
         ``clearance_m`` asks for that distance [m] from every surface besides.
         """
         points = check_array("points", points, (None, 3))
+        check_number("clearance_m", clearance_m, 0.0)
         free = np.ones(len(points), dtype=bool)
         for direction in ((0.021, 0.013, 1.0), (0.017, -0.011, -1.0), (1.0, 0.37, 0.113)):
             unit = np.asarray(direction) / np.linalg.norm(direction)
@@ -182,7 +202,17 @@ def _material_name(shape: ElementTree.Element, name: str, xml: Path) -> str:
     return identifier[4:] if identifier.startswith(("itu_", "itu-")) else identifier
 
 
-def _mesh_path(shape: ElementTree.Element, name: str, xml: Path) -> Path:
+def _named_list(name: str, values: Iterable[T], kind: type[T]) -> list[T]:
+    """``values`` as a list whose items are all of ``kind``."""
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise TypeError(f"{name}: got {values!r:.60}, expected a list of {kind.__name__}")
+    found = list(values)
+    for k, value in enumerate(found):
+        check_type(f"{name}[{k}]", value, kind)
+    return found
+
+
+def _mesh_path(shape: ElementTree.Element, name: str, xml: Path, allow_outside: bool) -> Path:
     if shape.get("type") not in ("ply", "obj"):
         raise ValueError(
             f"xml: object {name!r} of {xml} is a {shape.get('type')!r}, expected 'ply' or 'obj'; export it as a mesh"
@@ -193,6 +223,11 @@ def _mesh_path(shape: ElementTree.Element, name: str, xml: Path) -> Path:
     if filename is None:
         raise ValueError(f"xml: object {name!r} of {xml} names no mesh file")
     path = xml.parent / filename
+    if not allow_outside and not path.resolve().is_relative_to(xml.parent.resolve()):
+        raise ValueError(
+            f"xml: object {name!r} of {xml} names the mesh {filename}, which lies outside the scene's folder; move it "
+            "there, or trust the scene and load it with allow_outside=True"
+        )
     if not path.is_file():
         raise FileNotFoundError(f"xml: object {name!r} of {xml} needs the mesh {path}, which is missing")
     return path

@@ -12,6 +12,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel import sums
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.band_plan import thz_channel
+from warprrf.rf.channel.response import random_turns
 from warprrf.rf.em.absorption import Air, gas_attenuation_db_per_m
 from warprrf.rf.em.fresnel import slab_reflection
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -287,6 +288,36 @@ def test_diffuse_phases_must_be_chosen():
     still = p.cfr([CARRIER], diffuse="power")[0, 0, 0]
     assert np.mean(np.abs(drawn - still) ** 2) == pytest.approx(float(p.diffuse_power()), rel=0.2)
     assert float(p.diffuse_power()) == pytest.approx(p.power[3:].sum())
+
+
+def test_random_phases_hang_on_what_a_path_is_not_on_what_it_is_asked_with():
+    receivers = [[5.0, 1.0, -1.0], [5.0, 1.0, -0.5], [-3.0, 2.0, 0.0]]
+    each = [
+        replace(random_paths(50 + 10 * k, seed=k, kind="diffuse"), receiver=np.array(place))
+        for k, place in enumerate(receivers)
+    ]
+    link = {"diffuse": "random_phase", "seed": 3}
+    alone = [p.cfr([CARRIER], **link) for p in each]
+    for order in ([0, 1, 2], [2, 0], [1]):
+        together = Paths.stack([each[k] for k in order]).cfr([CARRIER], **link)
+        np.testing.assert_allclose(together, [alone[k] for k in order], rtol=1e-12)
+    path = each[0]
+    turned = path.select(np.arange(50)[::-1])
+    coefficient, _ = path.cir(**link)
+    np.testing.assert_allclose(turned.cir(**link)[0][..., ::-1], coefficient, rtol=1e-12)
+    np.testing.assert_allclose(path.select(np.arange(9)).cir(**link)[0], coefficient[..., :9], rtol=1e-12)
+
+
+def test_random_phases_are_even_and_independent():
+    p = random_paths(20_000, kind="diffuse")
+    turns = random_turns(p, 0)
+    others = [random_turns(p, 1), random_turns(replace(p, receiver=p.receiver + [0, 0, 1e-3]), 0)]
+    for change in (turns, np.roll(turns, 1) - turns, *(o - turns for o in others)):
+        for k in (1, 2, 3):  # the mean of n unit phasors is 1 / sqrt(n) = 0.007 rms: 4 times that
+            assert abs(np.exp(2j * np.pi * k * change).mean()) < 4.0 / np.sqrt(len(turns))
+    assert turns.min() >= 0 and turns.max() < 1
+    with pytest.raises(ValueError, match="seed"):
+        p.cir(diffuse="random_phase", seed=-1)
 
 
 @pytest.mark.parametrize("method", ["dense", "grid"])

@@ -6,9 +6,11 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from places import ROOT
 
+from warprrf.rf.em.fresnel import slab_reflection, slab_transmission
 from warprrf.rf.em.materials import Band, Material, load_materials, roughness_scattering, table_entry
 
 TABLE = ROOT / "data" / "lobby" / "materials.json"
@@ -89,7 +91,19 @@ def test_the_first_row_that_holds_counts() -> None:
         ({"thickness_m": 0.0}, "thickness_m"),
         ({"roughness_m": float("nan")}, "roughness_m"),
         ({"alpha_r": 0}, "alpha_r"),
+        ({"alpha_r": 1001}, "alpha_r.*1 to 1000"),
+        ({"alpha_r": 2.5}, "alpha_r"),
         ({"bands": ()}, "bands"),
+        ({"thickness_m": -0.1}, "thickness_m"),
+        ({"thickness_m": math.nan}, "thickness_m"),
+        ({"thickness_m": "0.1"}, "thickness_m"),
+        ({"thickness_m": None}, "thickness_m"),
+        ({"scattering": math.nan}, "scattering"),
+        ({"scattering": -0.1}, "scattering"),
+        ({"scattering": "0.1"}, "scattering"),
+        ({"roughness_m": -1e-3}, "roughness_m"),
+        ({"roughness_m": 150.0}, "roughness_m"),
+        ({"pattern": None}, "pattern"),
     ],
 )
 def test_bad_values_are_refused_by_name(change: dict, message: str) -> None:
@@ -98,12 +112,135 @@ def test_bad_values_are_refused_by_name(change: dict, message: str) -> None:
         Material(**(good | change))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"relative_permittivity": -2.0}, "relative_permittivity"),
+        ({"relative_permittivity": 0.5}, "relative_permittivity"),
+        ({"relative_permittivity": math.nan}, "relative_permittivity"),
+        ({"relative_permittivity": math.inf}, "relative_permittivity"),
+        ({"relative_permittivity": 3 - 1j}, "relative_permittivity"),
+        ({"relative_permittivity": "3"}, "relative_permittivity"),
+        ({"conductivity": -0.1}, "conductivity"),
+        ({"conductivity": math.nan}, "conductivity"),
+        ({"conductivity": None}, "conductivity"),
+        ({"thickness_m": -1.0}, "thickness_m.*'m'"),
+        ({"scattering": 2.0}, "scattering.*'m'"),
+    ],
+)
+def test_a_custom_material_gives_no_power(change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Material.custom("m", **({"relative_permittivity": 3.0} | change))
+
+
+def test_no_material_gives_back_more_than_comes() -> None:
+    """|r|^2 + |t|^2 <= 1 for both polarisations, of any material that is accepted, thin, thick or endless."""
+    rng = np.random.default_rng(5)
+    frequencies, cosines = 10 ** rng.uniform(6, 13, 400), rng.uniform(0, 1, (200, 1))
+    given = [
+        Material.custom(
+            "m",
+            relative_permittivity=1 + 10 ** rng.uniform(-4, 8),
+            conductivity=rng.choice([0.0, 10 ** rng.uniform(-9, 12)]),
+            thickness_m=rng.choice([10 ** rng.uniform(-6, 3), np.inf]),
+        )
+        for _ in frequencies
+    ]
+    eta = np.array([m.permittivity(f) for m, f in zip(given, frequencies, strict=True)])
+    thickness, wavelength = np.array([m.thickness_m for m in given]), 299792458.0 / frequencies
+    assert (eta.imag <= 0).all()
+    reflected = slab_reflection(cosines, eta, thickness, wavelength)
+    through = slab_transmission(cosines, eta, thickness, wavelength)
+    for r, t in zip(reflected, through, strict=True):
+        power = np.abs(r) ** 2 + np.abs(t) ** 2
+        assert np.isfinite(power).all()
+        assert power.max() <= 1 + 1e-9
+        assert power.min() < 0.9  # some absorb
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ((0.0, 1e9, 3, 0, 0, 0), "low_hz"),
+        ((2e9, 1e9, 3, 0, 0, 0), "low_hz, high_hz"),
+        ((1e9, math.inf, 3, 0, 0, 0), "high_hz"),
+        ((1e9, 2e9, math.nan, 0, 0, 0), "^a:"),
+        ((1e9, 2e9, 3, "0", 0, 0), "^b:"),
+        ((1e9, 2e9, -3, 0, 0, 0), "relative_permittivity.* at 1 GHz"),
+        ((1e9, 100e9, 1.5, -0.4, 0, 0), "relative_permittivity.* at 100 GHz"),  # 1.5 / 100^0.4 = 0.24
+        ((1e9, 100e9, 3, 0, -0.01, 1), "conductivity.* at 1 GHz"),
+        ((1e9, 100e9, 3, 0, 0.01, 400), "conductivity.* at 100 GHz"),
+    ],
+)
+def test_a_row_that_gives_power_somewhere_in_its_band_is_refused(row: tuple, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Band(*row)
+
+
+@pytest.mark.parametrize("frequency", [0.0, -1e9, math.nan, None, "1e9"])
+def test_a_material_is_asked_at_a_frequency(frequency: float) -> None:
+    for question in ("permittivity", "scattering_coefficient", "band"):
+        with pytest.raises((ValueError, TypeError), match="^frequency_hz"):
+            getattr(Material.conductor(), question)(frequency)
+    with pytest.raises((ValueError, TypeError), match="^frequency_hz"):
+        roughness_scattering(1e-4, frequency)
+
+
+HOSTILE = {
+    "a list": [5],
+    "no list": {"materials": 5},
+    "a number for a material": {"materials": [5]},
+    "a nameless one": {"materials": [{"name": 5}]},
+    "permittivity no list": {"permittivity": {}},
+    "a row that is no row": {"permittivity": [5]},
+    "a row of text": {"permittivity": [{"low_ghz": "1"}]},
+    "no row": {"permittivity": []},
+    "thickness without a value": {"thickness_m": 0.1},
+    "thickness null": {"thickness_m": {"value": None}},
+    "a lobe of text": {"pattern": {"value": "directive", "alpha_r": "4"}},
+    "a lobe too narrow": {"pattern": {"value": "directive", "alpha_r": 10**9}},
+    "a pattern of a list": {"pattern": {"value": [1]}},
+    "negative roughness": {"roughness_m": {"value": -1.0}},
+}
+
+
+@pytest.mark.parametrize("case", sorted(HOSTILE))
+def test_a_hostile_table_is_a_value_error_that_names_the_file(case: str, tmp_path: Path) -> None:
+    content = HOSTILE[case]
+    if isinstance(content, dict) and "materials" not in content:
+        content = {"materials": [json.loads(TABLE.read_text())["materials"][0] | content]}
+    file = tmp_path / "hostile.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"hostile\.json"):
+        load_materials(file)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [b"\xff\xfe", b"[" * 100_000, b'{"materials": [{"name": "m", "permittivity": [{"low_ghz": 1e999}]}]}'],
+)
+def test_bytes_that_are_no_table_are_a_value_error_that_names_the_file(text: bytes, tmp_path: Path) -> None:
+    file = tmp_path / "hostile.json"
+    file.write_bytes(text)
+    with pytest.raises(ValueError, match=r"hostile\.json"):
+        load_materials(file)
+
+
+def test_a_table_names_a_material_once(tmp_path: Path) -> None:
+    content = json.loads(TABLE.read_text())
+    content["materials"].append(content["materials"][0])
+    file = tmp_path / "materials.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"materials\.json has two .*'marble'"):
+        load_materials(file)
+
+
 def test_a_broken_table_says_which_material_and_what(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no table"):
         load_materials(tmp_path / "none.json")
     broken = tmp_path / "broken.json"
     broken.write_text("{")
-    with pytest.raises(ValueError, match="not JSON"):
+    with pytest.raises(ValueError, match=r"broken\.json: .*no JSON"):
         load_materials(broken)
     content = json.loads(TABLE.read_text())
     del content["materials"][0]["thickness_m"]
@@ -128,7 +265,7 @@ def test_a_table_may_give_the_scattering_coefficient_itself(tmp_path: Path) -> N
     assert read.sources["scattering"] == "fitted"
     brick["scattering"]["value"] = 1.43
     file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"scattering.*1\.43.*brick"):
+    with pytest.raises(ValueError, match=r"brick.*scattering.*1\.43"):
         load_materials(file)
 
 

@@ -13,6 +13,7 @@ from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, squa
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.fresnel import lobe, slab_reflection
+from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.trace import trace_paths
 
@@ -167,7 +168,7 @@ def test_slab_limits():
     assert abs(slab_reflection(0.5, 4.0 - 0.1j, 0.0, WAVELENGTH)[0]) < 1e-12
 
 
-@pytest.mark.parametrize("alpha_r", [0, 1, 2, 5, 10, 30])
+@pytest.mark.parametrize("alpha_r", [0, 1, 2, 5, 10, 30, NARROWEST_LOBE])
 @pytest.mark.parametrize("cos_incidence", [0.02, 0.5, 1.0])
 def test_lobes_integrate_to_one_over_the_hemisphere(alpha_r, cos_incidence):
     x, weight = np.polynomial.legendre.leggauss(200)

@@ -1,9 +1,13 @@
 """A data set comes back from disk as it was, splits nest, and damaged files say so."""
 
 import os
+import subprocess
+import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from damage import survey
 
 from warprrf.rf.spectra.dataset import SpectrumDataset, assign_roles
 from warprrf.rf.spectra.dataset_files import COMPACT_AOD_STEP_RAD, COMPACT_DELAY_STEP_S
@@ -31,7 +35,7 @@ def dataset(count=40, shape=(12, 24), seed=0):
         beam_sigma_rad=0.03,
         engine="exact",
         seed=3,
-        role=assign_roles(count, test=10, seed=1),
+        role=assign_roles(count, test=count // 4, seed=1),
         attributes={"depth": 1, "version_warprrf": "0.1.0"},
     )
 
@@ -127,38 +131,296 @@ def test_missing_and_damaged_files_are_named(tmp_path):
             SpectrumDataset.load(path)
     import xarray
 
-    xarray.Dataset({"path_gain": ("x", np.zeros(3))}).to_netcdf(path, engine="h5netcdf")
+    xarray.Dataset({"temperature": ("x", np.zeros(3))}).to_netcdf(path, engine="h5netcdf")
     with pytest.raises(ValueError, match="lacks.*delay"):
         SpectrumDataset.load(path)
 
 
-def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):
+def same(a, b):
+    for name in ("receivers", "transmitter", "path_gain", "delay_s", "aod", "role", "line_of_sight"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+def by_columns(data):
+    """Columns told from 0 to 2 pi."""
+    return data.assign_coords(azimuth=data.azimuth.values % (2 * np.pi)).sortby("azimuth")
+
+
+REORDERED = {
+    "reversed rows": lambda data: data.isel(zenith=slice(None, None, -1)),
+    "reversed columns": lambda data: data.isel(azimuth=slice(None, None, -1)),
+    "rolled columns": lambda data: data.roll(azimuth=7, roll_coords=True),
+    "columns from 0 to 2 pi": by_columns,
+    "transposed": lambda data: data.transpose("angle", "azimuth", "xyz", "zenith", "receiver"),
+    "axes reversed": lambda data: data.isel(xyz=[2, 1, 0], angle=[1, 0]),
+    "labels dropped": lambda data: data.drop_vars(["xyz", "angle"]),
+    "empty as a number": lambda data: data.fillna({"delay": -1.0}).assign(
+        delay=data.delay.fillna(-1.0).assign_attrs(data.delay.attrs, missing_value=-1.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("change", REORDERED.values(), ids=REORDERED)
+def test_what_other_tools_reorder_is_read_by_its_coordinates(tmp_path, change):
+    xarray = pytest.importorskip("xarray")
+    before = dataset(8)
+    before.save(tmp_path / "a.nc")
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
+        change(opened.load()).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    same(SpectrumDataset.load(tmp_path / "b.nc"), before)
+
+
+def test_receivers_reordered_by_other_tools_keep_their_spectra(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    before = dataset(8)
+    before.save(tmp_path / "a.nc")
+    order = [5, 0, 7, 2]
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
+        opened.isel(receiver=order).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    same(SpectrumDataset.load(tmp_path / "b.nc"), before.subset(order))
+
+
+REFUSED = {
+    "zenith: got no such coordinate": lambda data: data.drop_vars("zenith"),
+    "zenith: got the places": lambda data: data.isel(zenith=slice(0, 6)),
+    "azimuth: got the places": lambda data: data.assign_coords(azimuth=data.azimuth + 0.1),
+    "azimuth: got the unit 'degrees'": lambda data: data.assign_coords(
+        azimuth=("azimuth", np.rad2deg(data.azimuth.values), {"units": "degrees"})
+    ),
+    "xyz: got the places": lambda data: data.assign_coords(xyz=["x", "y", "t"]),
+    "delay: got the unit 'ns'": lambda data: data.assign(delay=(data.delay * 1e9).assign_attrs(units="ns")),
+    "delay: got values packed by scale_factor": lambda data: data.assign(
+        delay=data.delay.assign_attrs(scale_factor=2.0)
+    ),
+    "path_gain: got dimensions": lambda data: data.assign(path_gain=data.path_gain[:, 0]),
+    "lacks aod, role": lambda data: data.drop_vars(["aod", "role"]),
+    "lacks beam_sigma_rad, engine, floor": lambda data: data.drop_attrs().assign_attrs(frequency_hz=1.0),
+    r"role: got \[0, 1, 7\]": lambda data: data.assign(
+        role=("receiver", np.array([0, 1, 7, 0, 0, 0, 1, 0], np.int8))
+    ),
+    "floor: got -1": lambda data: data.assign_attrs(floor=-1.0),
+    "path_gain: got .* NaN": lambda data: data.assign(path_gain=data.path_gain.where(data.path_gain > 0)),
+}
+
+
+@pytest.mark.parametrize(("match", "change"), REFUSED.items(), ids=REFUSED)
+def test_what_cannot_be_put_in_order_is_refused(tmp_path, match, change):
+    xarray = pytest.importorskip("xarray")
+    dataset(8).save(tmp_path / "a.nc")
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
+        change(opened.load()).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    with pytest.raises(ValueError, match=rf"b\.nc: {match}"):
+        SpectrumDataset.load(tmp_path / "b.nc")
+
+
+def test_a_file_that_states_more_than_it_can_hold_is_refused(tmp_path):
+    h5netcdf = pytest.importorskip("h5netcdf")
+    with h5netcdf.File(tmp_path / "a.nc", "w") as file:
+        file.dimensions = {"receiver": 10**6, "zenith": 1000, "azimuth": 1000}
+        file.create_variable("path_gain", ("receiver", "zenith", "azimuth"), "f4", chunks=(1, 100, 100))
+    with pytest.raises(ValueError, match=r"a\.nc: damaged.* it states 4\d+ bytes"):
+        SpectrumDataset.load(tmp_path / "a.nc")
+
+
+def test_damaged_files_are_refused(tmp_path):
+    for compact in (False, True):
+        dataset(8, (6, 12)).save(tmp_path / "a.nc", compact=compact)
+        found = survey(tmp_path / "a.nc", "file_formats:read_dataset")
+        assert found.copies == 260 and not found.changed and not found.wrong, found
+
+
+def test_damaged_exr_files_are_refused(tmp_path):
+    pytest.importorskip("OpenEXR")
+    dataset(4, (6, 12)).export_exr(tmp_path / "a.exr", 1)
+    found = survey(tmp_path / "a.exr", "file_formats:read_exr")
+    assert found.copies == 260 and not found.changed and not found.wrong, found
+
+
+def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path):
     path = tmp_path / "a.nc"
-    dataset().save(path)
-    before = path.read_bytes()
-    import xarray
+    dataset(8).save(path)
+    path.chmod(0)
+    tmp_path.chmod(0o755)
+    nobody = "import os; os.geteuid() or os.seteuid(65534)\n"
+    read = (
+        "import sys; from warprrf.rf.spectra.dataset import SpectrumDataset as D; import h5netcdf, h5py\n"
+        f"{nobody}"
+        "try: D.load(sys.argv[1])\n"
+        "except PermissionError as e: print(e.filename)"
+    )
+    for folder in list(tmp_path.parents)[:2]:
+        folder.chmod(folder.stat().st_mode | 0o055)
+    done = subprocess.run([sys.executable, "-c", read, path], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == str(path), done.stderr
 
-    def fail(self, part, **options):
-        part.write_bytes(b"half")
-        raise OSError("disk full")
 
-    monkeypatch.setattr(xarray.Dataset, "to_netcdf", fail)
-    with pytest.raises(OSError, match="disk full"):
-        dataset(seed=9).save(path)
-    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.nc"]
+FULL_DISK = """
+import resource, signal, sys
+from pathlib import Path
+import warprrf as wr
+from warprrf.rf.spectra.exr import export_exr
+ds = wr.SpectrumDataset.load(sys.argv[1])
+ds[0].plot
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
+for path in sys.argv[1:]:
+    for k in range(3):
+        try:
+            ds.export_exr(path, 0) if path.endswith("exr") else ds.save(path, compact=k > 0)
+        except OSError as error:
+            print(Path(error.filename).name)
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+ds.save(sys.argv[1])
+wr.SpectrumDataset.load(sys.argv[1])
+print("lives")
+"""
 
 
-def test_bad_values_are_refused():
+def test_the_process_outlives_a_full_disk(tmp_path):
+    pytest.importorskip("OpenEXR")
+    paths = [tmp_path / "a.nc", tmp_path / "a.exr"]
+    dataset(8).save(paths[0])
+    dataset(8).export_exr(paths[1], 0)
+    whole = [path.read_bytes() for path in paths]
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, *paths], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.stdout.split() == ["a.nc"] * 3 + ["a.exr"] * 3 + ["lives"], done.stderr
+    assert done.returncode == 0 and sorted(os.listdir(tmp_path)) == ["a.exr", "a.nc"]
+    assert paths[1].read_bytes() == whole[1]
+    same(SpectrumDataset.load(paths[0]), dataset(8))
+
+
+@pytest.mark.parametrize(
+    "name", ["floor", "frequency_hz", "range_low_db", "receivers", "title", "compact", "a/b", "", "_x", 5]
+)
+def test_names_that_the_file_needs_are_no_attributes(name):
+    with pytest.raises(ValueError, match=f"attributes: got .*{name}"):
+        replace(dataset(), attributes={name: 1.0})
+
+
+@pytest.mark.parametrize("value", [None, {}, [[1.0]], [None], 1j, b"x", np.zeros(10_000), object()])
+def test_attributes_are_text_and_numbers(value):
+    with pytest.raises(TypeError, match="attributes: 'mine' is a "):
+        replace(dataset(), attributes={"mine": value})
+
+
+def test_attributes_come_back(tmp_path):
+    held = {
+        "text": "größer",
+        "none": "",
+        "number": 1.5,
+        "whole": 3,
+        "yes": True,
+        "list": [1.0, 2.0],
+        "words": ["a", "b"],
+    }
+    replace(dataset(), attributes=held).save(tmp_path / "a.nc")
+    found = SpectrumDataset.load(tmp_path / "a.nc").attributes
+    assert {**found, "list": list(found["list"])} == held
+
+
+def test_a_data_set_says_what_it_is_in_a_line():
+    text = repr(dataset())
+    assert len(text) < 250 and "\n" not in text
+    assert "40 receivers: 30 train, 10 test; 12 x 24 pixels of 'exact' at 300 GHz" in text
+
+
+def test_compact_files_of_the_faintest_floors_hold_numbers(tmp_path):
+    before = dataset(4)
+    faint = replace(before, path_gain=before.path_gain * 1e-28, floor=1e-44)
+    faint.save(tmp_path / "a.nc", compact=True)
+    np.testing.assert_allclose(
+        SpectrumDataset.load(tmp_path / "a.nc").path_gain, faint.path_gain, rtol=2**-8, atol=1e-40
+    )  # float32 ends there
+
+
+BAD_FIELDS = [
+    ("receivers", np.full((40, 3), np.nan), ValueError),
+    ("receivers", np.zeros((40, 2)), ValueError),
+    ("receivers", "here", TypeError),
+    ("transmitter", [1.0, np.nan, 0.0], ValueError),
+    ("transmitter", [1.0, 2.0], ValueError),
+    ("frequency_hz", 0.0, ValueError),
+    ("frequency_hz", np.inf, ValueError),
+    ("frequency_hz", None, (TypeError, ValueError)),
+    ("path_gain", -np.ones((40, 12, 24)), ValueError),
+    ("path_gain", np.full((40, 12, 24), 1e300), ValueError),
+    ("path_gain", np.ones((40, 12)), ValueError),
+    ("path_gain", np.ones((39, 12, 24)), ValueError),
+    ("delay_s", np.ones((3, 12, 24)), ValueError),
+    ("delay_s", np.full((40, 12, 24), -1e-9), ValueError),
+    ("delay_s", np.full((40, 12, 24), np.inf), ValueError),
+    ("aod", np.ones((40, 12, 24)), ValueError),
+    ("aod", np.full((40, 12, 24, 2), 3.5), ValueError),
+    ("floor", -1.0, ValueError),
+    ("floor", 0.0, ValueError),
+    ("floor", np.nan, ValueError),
+    ("range_db", (1.0, np.nan), ValueError),
+    ("range_db", (-80.0, -170.0), ValueError),
+    ("range_db", -80.0, ValueError),
+    ("beam_sigma_rad", 0.0, ValueError),
+    ("beam_sigma_rad", -0.03, ValueError),
+    ("beam_sigma_rad", np.nan, ValueError),
+    ("engine", 5, TypeError),
+    ("polarisation", None, TypeError),
+    ("seed", 1.5, ValueError),
+    ("seed", -1, ValueError),
+    ("role", ["training"] * 40, ValueError),
+    ("role", ["train"] * 39, ValueError),
+    ("line_of_sight", np.full(40, np.nan), ValueError),
+    ("line_of_sight", np.full(40, 2), ValueError),
+    ("line_of_sight", ["no"] * 40, TypeError),
+    ("attributes", [1], TypeError),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"), BAD_FIELDS, ids=[f"{n}{k}" for k, (n, *_) in enumerate(BAD_FIELDS)]
+)
+def test_fields_that_no_data_set_has_are_refused(name, value, kind):
+    with pytest.raises(kind, match=f"^{name}: "):
+        replace(dataset(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("path_gain", np.ones(4), ValueError),
+        ("path_gain", -np.ones((2, 4)), ValueError),
+        ("path_gain", np.full((2, 4), np.nan), ValueError),
+        ("delay_s", np.ones((2, 3)), ValueError),
+        ("aod", np.ones((2, 4)), ValueError),
+        ("floor", -1.0, ValueError),
+        ("range_db", (0.0, np.nan), ValueError),
+        ("std_db", np.ones(3), ValueError),
+    ],
+)
+def test_fields_that_no_spectrum_has_are_refused(name, value, kind):
+    with pytest.raises(kind, match=f"^{name}: "):
+        replace(Spectrum(np.ones((2, 4))), **{name: value})
+
+
+def test_bad_choices_are_refused():
     ds = dataset()
-    from dataclasses import replace
+    for n in (31, 0, 1.5):
+        with pytest.raises(ValueError, match="n_train"):
+            ds.split(n)
+    for indices in ([99], [-41], [0.5], [[0]], [True, False]):
+        with pytest.raises(ValueError, match="indices"):
+            ds.subset(indices)
+    for index in (slice(3), 1.0, [0]):
+        with pytest.raises(TypeError, match="index"):
+            ds[index]
+    assert len(ds.subset([])) == 0 and len(ds.subset(np.arange(40) < 3)) == 3
+    with pytest.raises(ValueError, match="path_gain: got no spectra"):
+        SpectrumDataset.from_spectra(
+            receivers=np.zeros((0, 3)), transmitter=[0, 0, 0], frequency_hz=1e9, path_gain=np.zeros((0, 4, 8)),
+            delay_s=np.zeros((0, 4, 8)), aod=np.zeros((0, 4, 8, 2)), line_of_sight=[], beam_sigma_rad=0.1, engine="x",
+        )  # fmt: skip
 
-    with pytest.raises(ValueError, match="receivers.*NaN"):
-        replace(ds, receivers=np.full((40, 3), np.nan))
-    with pytest.raises(ValueError, match="delay_s.*expected"):
-        replace(ds, delay_s=ds.delay_s[:3])
-    with pytest.raises(ValueError, match="path_gain.*negative"):
-        replace(ds, path_gain=-ds.path_gain)
-    with pytest.raises(ValueError, match="n_train"):
-        ds.split(31)
-    with pytest.raises(ValueError, match="indices"):
-        ds.subset([99])
+
+def test_a_data_set_of_no_receivers_comes_back(tmp_path):
+    none = dataset().subset([])
+    none.save(tmp_path / "a.nc")
+    same(SpectrumDataset.load(tmp_path / "a.nc"), none)

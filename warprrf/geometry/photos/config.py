@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warprrf.checks import check_positive
+from warprrf.checks import check_count, check_positive, check_seed
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 
@@ -147,8 +147,8 @@ class RefineConfig:
 
     def __post_init__(self) -> None:
         for name in ("iterations", "downscale", "densify_every", "max_gaussians", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected at least 1")
+            check_count(name, getattr(self, name))
+        check_seed(self.seed)
         if self.sh_degree not in COEFFICIENTS:
             raise ValueError(f"sh_degree: got {self.sh_degree!r}, expected 0, 1, 2 or 3")
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from warprrf.cache import cached_property
 from warprrf.checks import check_array
 from warprrf.geometry.photos.config import PlaneConfig
 

@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_positive
+from warprrf.checks import check_array, check_count, check_number, check_positive, check_type
+
+KINDS = ("pinhole", "spherical")
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,11 @@ class Camera:
         kind: ``"pinhole"`` or ``"spherical"``.
         width, height: image size [pixels].
         fx, fy, cx, cy: pinhole intrinsics [pixels]; zero for a spherical camera.
-        world_to_camera: rigid transform, shape ``(4, 4)`` float64.
+        world_to_camera: rigid transform, shape ``(4, 4)`` float64; of a spherical camera, a shift alone.
+
+    Raises:
+        TypeError, ValueError: for another kind, sizes or focal lengths that are not positive, or a transform that is
+            not rigid.
     """
 
     kind: str
@@ -34,6 +40,29 @@ class Camera:
     fy: float = 0.0
     cx: float = 0.0
     cy: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind: got {self.kind!r}, expected one of {', '.join(KINDS)}")
+        checked: dict[str, object] = {
+            "width": check_count("width", self.width),
+            "height": check_count("height", self.height),
+            "world_to_camera": _check_pose(self.world_to_camera),
+        }
+        for name in ("fx", "fy", "cx", "cy"):
+            value = getattr(self, name)
+            if self.kind == "spherical":
+                checked[name] = check_number(f"{name} of a spherical camera", value, 0.0, 0.0)
+            elif name in ("fx", "fy"):
+                checked[name] = check_positive(name, value, "focal length in pixels")
+            else:
+                checked[name] = check_number(name, value)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        if self.kind == "spherical" and not np.allclose(self.rotation, np.eye(3), atol=1e-12):
+            raise ValueError(
+                "world_to_camera: got a spherical camera that is turned, expected axes along the world's"
+            )
 
     @classmethod
     def pinhole(
@@ -47,35 +76,16 @@ class Camera:
         cy: float,
         world_to_camera: ArrayLike,
     ) -> Camera:
-        """A pinhole camera without distortion.
-
-        Raises:
-            ValueError: for sizes or focal lengths that are not positive, or a transform that is not rigid.
-        """
-        _check_size(width, height)
-        for name, value in (("fx", fx), ("fy", fy)):
-            check_positive(name, value, "focal length in pixels")
-        for name, value in (("cx", cx), ("cy", cy)):
-            if not np.isfinite(value):
-                raise ValueError(f"{name}: got {value!r}, expected a finite pixel coordinate")
+        """A pinhole camera without distortion."""
         pose = check_array("world_to_camera", world_to_camera, (4, 4))
-        rotation = pose[:3, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
-            raise ValueError(
-                "world_to_camera: its upper left 3x3 block is not a rotation; expected a rigid transform with OpenCV "
-                "axes (x right, y down, z forward); a scaled or mirrored pose must be normalised first"
-            )
-        if not np.allclose(pose[3], [0, 0, 0, 1]):
-            raise ValueError(f"world_to_camera: got last row {pose[3]}, expected [0, 0, 0, 1]")
-        return cls("pinhole", int(width), int(height), pose, float(fx), float(fy), float(cx), float(cy))
+        return cls("pinhole", width, height, pose, fx, fy, cx, cy)
 
     @classmethod
     def spherical(cls, width: int, height: int, *, position: ArrayLike) -> Camera:
         """An equirectangular full-sphere camera at ``position`` (3,) [m], axes along the world's, z up."""
-        _check_size(width, height)
         pose = np.eye(4)
         pose[:3, 3] = -check_array("position", position, (3,))
-        return cls("spherical", int(width), int(height), pose)
+        return cls("spherical", width, height, pose)
 
     @property
     def rotation(self) -> np.ndarray:
@@ -102,8 +112,8 @@ class Camera:
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution; pinhole intrinsics scale along."""
-        _check_size(width, height)
-        sx, sy = width / self.width, height / self.height
+        sx = check_count("width", width) / self.width
+        sy = check_count("height", height) / self.height
         return Camera(
             self.kind,
             width,
@@ -134,12 +144,18 @@ class Camera:
 
 def check_camera(cam: object) -> None:
     """Raise TypeError unless ``cam`` is a :class:`Camera`."""
-    if not isinstance(cam, Camera):
-        raise TypeError(
-            f"cam: got {type(cam).__name__}, expected warprrf.Camera (Camera.pinhole or Camera.spherical)"
+    check_type("cam", cam, Camera, " (Camera.pinhole or Camera.spherical)")
+
+
+def _check_pose(pose: ArrayLike) -> np.ndarray:
+    """``pose`` as a rigid transform, shape ``(4, 4)``."""
+    found = check_array("world_to_camera", pose, (4, 4))
+    rotation = found[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            "world_to_camera: its upper left 3x3 block is not a rotation; expected a rigid transform with OpenCV "
+            "axes (x right, y down, z forward); a scaled or mirrored pose must be normalised first"
         )
-
-
-def _check_size(width: int, height: int) -> None:
-    for name, value in (("width", width), ("height", height)):
-        check_count(name, value)
+    if not np.allclose(found[3], [0, 0, 0, 1]):
+        raise ValueError(f"world_to_camera: got last row {found[3]}, expected [0, 0, 0, 1]")
+    return found

@@ -15,7 +15,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf import device as devices
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.splats.blending import RADIO as RADIO
 from warprrf.geometry.splats.blending import Blending as Blending
@@ -150,12 +149,12 @@ class Rasterizer:
     def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
         """Write the colours to ``out``; returns the ray origin that :meth:`colors_adjoint` wants. Records nothing."""
         origin = wp.array([cam.position], dtype=self.vector(3), device=self.device)
-        launch(self._built(harmonics.build).colors, len(means), [means, sh, origin, out], device=self.device)
+        launch(harmonics.build(self.real).colors, len(means), [means, sh, origin, out], device=self.device)
         return origin
 
     def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
         """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
-        kernel = self._built(harmonics.build).colors
+        kernel = harmonics.build(self.real).colors
         launch(kernel, len(means), [means, sh, origin, out], device=self.device, adjoint=True)
 
     def prepare(
@@ -174,7 +173,7 @@ class Rasterizer:
         distance = wp.empty(n, dtype=float, device=device)
         splats = wp.empty(n, dtype=projection.splat_of(self.real), device=device)
         outputs = [span, count, distance, splats]
-        project = self._built(projection.build_project)
+        project = projection.build_project(self.real)
         launch(project, n, [*inputs, view, self.blending.rules, *outputs], device=device)
         ids, starts = _listed(span, count, distance, view)
         return Prepared(cam, view, inputs, splats, ids, starts)
@@ -219,14 +218,9 @@ class Rasterizer:
             wp.zeros(shape, dtype=self.real, device=self.device),
             wp.zeros(shape[:2], dtype=self.real, device=self.device),
         )
-        kernel = self._built(self.kernels.build_strongest)
+        kernel = self.kernels.build_strongest(self.real)
         self._launch_tiles(kernel, prepared, [*self._scene(prepared), *out])
         return out
-
-    def _built(self, build: Callable[..., Any], *arguments: Any) -> Any:
-        """A kernel of this precision; threads that want it first wait for one of them to make it."""
-        with devices.building:
-            return build(self.real, *arguments)
 
     def _background(self, features: wp.array, background: ArrayLike | None) -> wp.array:
         if isinstance(background, wp.array):
@@ -261,7 +255,7 @@ class Rasterizer:
         )
         outputs = [image.features, image.alpha, image.depth, image.transmittance, image.dominant, image.peak]
         for first in range(0, channels, projection.CHANNELS):
-            kernel = self._built(self.kernels.build_blend, min(channels - first, projection.CHANNELS))
+            kernel = self.kernels.build_blend(self.real, min(channels - first, projection.CHANNELS))
             inputs = [*self._scene(prepared), features, first, background, *outputs]
             self._launch_tiles(kernel, prepared, inputs)
         return image
@@ -278,19 +272,19 @@ class Rasterizer:
         sums_of_one = self.vector(projection.SUMS)
         seen = wp.zeros(n, dtype=self.real, device=self.device)
         for first in range(0, channels, projection.CHANNELS):
-            kernel = self._built(self.kernels.build_adjoint, min(channels - first, projection.CHANNELS))
+            kernel = self.kernels.build_adjoint(self.real, min(channels - first, projection.CHANNELS))
             sums = wp.zeros((len(cuts) - 1, n), dtype=sums_of_one, device=self.device)
             pixels = [*image.differentiable, *slopes]
             inputs = [*self._scene(prepared), parts, features, first, *pixels, sums]
             self._launch_tiles(kernel, prepared, inputs, cuts)
             launch(
-                self._built(projection.build_chain),
+                projection.build_chain(self.real),
                 n,
                 [*prepared.inputs, prepared.view, first, sums, *parameter_gradients, feature_gradient, seen],
                 device=self.device,
             )
         if background.requires_grad:
-            kernel = self._built(reference.build_background)
+            kernel = reference.build_background(self.real)
             launch(kernel, channels, [image.transmittance, slopes[0], background.grad], device=self.device)
         return seen
 

@@ -14,13 +14,13 @@ the same bits as one thread: rows own their contributions and gradients, pixels 
 SSIM is that of :mod:`warprrf.kernels.ssim`, zero beyond the poles, periodic in azimuth.
 """
 
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warprrf.cache import once
 from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.raster import sh as _sh
 
@@ -30,7 +30,7 @@ EXPONENT_LIMIT = 60.0  # nepers: keeps a runaway gain finite in float32; 260 dB 
 PER_NEPER = 10.0 / np.log(10.0)  # dB per unit of natural logarithm of power
 
 
-@cache
+@once
 def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}

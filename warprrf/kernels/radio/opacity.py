@@ -9,13 +9,14 @@ and, with contributions ``c_e = w_e u_g A_e`` to the pixel's sum C and v = dL/dC
     dL/do_g = sum_e v r_e (c_e / alpha_e - (C - C_<=e) / (1 - alpha_e)),      zero where alpha is clamped.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
+from warprrf.cache import once
 
-@cache
+
+@once
 def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
 

@@ -5,12 +5,12 @@ each. A block is a tile of its own, with tile size ``BLOCK``, and has one thread
 ``view.tile``: to a constant they would be unrolled, and its vectors taken apart into single numbers.
 """
 
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
+from warprrf.cache import once
 from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, SUMS, splat_of
 from warprrf.kernels.raster.reference import keep_weight
 from warprrf.kernels.raster.view import PRODUCT, Rules, View, pixel_ray
@@ -25,7 +25,7 @@ VECTORISED = {
 }
 
 
-@cache
+@once
 def exponential(real: type) -> Any:
     """exp(-q/2) of a block's numbers, for one scalar type."""
     per_pixel = wp.types.vector(PIXELS, real)
@@ -59,7 +59,7 @@ def exponential(real: type) -> Any:
     return response
 
 
-@cache
+@once
 def vector_functions(real: type) -> SimpleNamespace:
     """What Warp's vectors lack, for ``wp.float32`` or ``wp.float64``: comparisons, choices, sums, a quick exponential."""
     per_pixel = wp.types.vector(PIXELS, real)
@@ -144,7 +144,7 @@ def vector_functions(real: type) -> SimpleNamespace:
     )
 
 
-@cache
+@once
 def block_functions(real: type) -> SimpleNamespace:
     """The steps of blending that the kernels share, for one scalar type; :mod:`.reference` has them for one pixel."""
     per_pixel = wp.types.vector(PIXELS, real)
@@ -221,7 +221,7 @@ def block_functions(real: type) -> SimpleNamespace:
     return SimpleNamespace(rays=rays, meet=meet, behind=behind, pair_sums=pair_sums)
 
 
-@cache
+@once
 def build_blend(real: type, width: int) -> Any:
     """As :func:`.reference.build_blend`."""
     per_pixel = wp.types.vector(PIXELS, real)
@@ -312,7 +312,7 @@ def build_blend(real: type, width: int) -> Any:
     return blend
 
 
-@cache
+@once
 def build_adjoint(real: type, width: int) -> Any:
     """As :func:`.reference.build_adjoint`."""
     per_pixel = wp.types.vector(PIXELS, real)
@@ -410,7 +410,7 @@ def build_adjoint(real: type, width: int) -> Any:
     return blend_adjoint
 
 
-@cache
+@once
 def build_strongest(real: type) -> Any:
     """As :func:`.reference.build_strongest`."""
     per_pixel = wp.types.vector(PIXELS, real)

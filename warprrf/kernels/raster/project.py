@@ -17,11 +17,11 @@ gradients of mean, quaternion and scale. In the turned coordinates of the linear
 ``y = (-|M m| (g1^2 + g2^2), |M m| g0 g1, |M m| g0 g2)/|g|^2``.
 """
 
-from functools import cache
 from typing import Any
 
 import warp as wp
 
+from warprrf.cache import once
 from warprrf.kernels.raster.cover import covered_tiles
 from warprrf.kernels.raster.view import Rules, View, rotation_matrix
 
@@ -37,7 +37,7 @@ sums_d = wp.types.vector(SUMS, wp.float64)
 STEEPEST = 1.0e15
 
 
-@cache
+@once
 def splat_of(real: type) -> Any:
     """The struct of a Gaussian seen from the ray origin. Forms are those of :func:`.view.pixel_ray`'s axes."""
     vec3 = wp.types.vector(3, real)
@@ -77,7 +77,7 @@ def whitened_frame(a: wp.vec3d):
     )  # fmt: skip
 
 
-@cache
+@once
 def build_project(real: type) -> Any:
     """The kernel for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)
@@ -179,7 +179,7 @@ def quaternion_gradient(q: wp.vec4d, y2: wp.mat33d, s: wp.vec3d):
     return turned * (two / wp.dot(q, q))
 
 
-@cache
+@once
 def build_chain(real: type) -> Any:
     """The kernel for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)

@@ -4,11 +4,11 @@ A GPU runs these. On a CPU :mod:`.blocks` computes the same 16 pixels at a time,
 tile by tile; a tile's entries ``ids[starts[tile]:starts[tile + 1]]`` are the Gaussians that it may see, near to far.
 """
 
-from functools import cache
 from typing import Any
 
 import warp as wp
 
+from warprrf.cache import once
 from warprrf.kernels.raster.project import OF_FEATURES, OF_OPACITY, OF_WEIGHT, SUMS, splat_of
 from warprrf.kernels.raster.view import PRODUCT, Rules, View, pixel_of, pixel_ray
 
@@ -51,7 +51,7 @@ def pair_sums(s: Any, slope: Any, q: Any, y1: Any, y2: Any, h0: Any, h1: Any, h2
     return s
 
 
-@cache
+@once
 def build_blend(real: type, width: int) -> Any:
     """The kernel that blends ``width`` channels (1 to 4) at once, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)
@@ -122,7 +122,7 @@ def build_blend(real: type, width: int) -> Any:
     return blend
 
 
-@cache
+@once
 def build_adjoint(real: type, width: int) -> Any:
     """The adjoint of ``blend``, as :func:`build_blend` makes it."""
     vec3 = wp.types.vector(3, real)
@@ -210,7 +210,7 @@ def build_adjoint(real: type, width: int) -> Any:
     return blend_adjoint
 
 
-@cache
+@once
 def build_background(real: type) -> Any:
     """The adjoint of ``blend`` with respect to the background, for ``wp.float32`` or ``wp.float64``."""
 
@@ -232,7 +232,7 @@ def build_background(real: type) -> Any:
     return background_adjoint
 
 
-@cache
+@once
 def build_strongest(real: type) -> Any:
     """The kernel that finds each pixel's largest blending weights, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)

@@ -4,15 +4,16 @@ Signs and order are those of the INRIA splat layout (degree 1: -y, z, -x), so th
 Constants: the orthonormal real harmonics, e.g. Sloan, "Stupid Spherical Harmonics Tricks" (2008), appendix A2.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
+from warprrf.cache import once
+
 COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}  # degree -> number of basis functions
 
 
-@cache
+@once
 def build(real: type) -> SimpleNamespace:
     """Functions and kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     vec3 = wp.types.vector(3, real)

@@ -14,11 +14,11 @@ every pair adds to a 3-vector and a symmetric 3x3 per Gaussian, which :func:`cha
 and quaternion.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
+from warprrf.cache import once
 from warprrf.kernels.raster.project import quaternion_gradient
 from warprrf.kernels.raster.view import PRODUCT, Rules, rotation_matrix
 
@@ -331,7 +331,7 @@ def collect_adjoint(
             add_pair(sums, piece, k, met, wp.float64(-0.5) * slope * raw, t_grad[i, place], slope * response)
 
 
-@cache
+@once
 def build(real: type) -> SimpleNamespace:
     """The kernels that read and write the parameters, for ``wp.float32`` or ``wp.float64``."""
     vec3 = wp.types.vector(3, real)

@@ -18,11 +18,11 @@ polarisation by polarisation, then element by element.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.cache import cached_property
 from warprrf.checks import check_array, check_count, check_positive
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern

@@ -16,8 +16,9 @@ a wavelength is 1 mm. Three choices are the caller's:
 - ``squint``: whether x_mn counts as a delay, so that beams turn with frequency, or as a phase at the carrier alone, as
   Sionna RT has it.
 - ``diffuse``: a diffuse path is the power of many scatterers, without a phase. "random_phase" turns each by a phase
-  drawn from ``seed``; "power" leaves them out of the sum, their power is :func:`diffuse_power`'s; "given" takes the
-  phases that are in the gains (those of a ray tracer). It must be stated where there are diffuse paths.
+  drawn from ``seed`` and from what the path is (:func:`random_turns`); "power" leaves them out of the sum, their power is
+  :func:`diffuse_power`'s; "given" takes the phases that are in the gains (those of a ray tracer). It must be stated where
+  there are diffuse paths.
 
 Amplitudes hold at the carrier. Over a wide band, ``amplitude="friis"`` adds the factor f_c / f of free space between
 isotropic antennas. Absorption that is in the gains (:meth:`Paths.with_gas`) follows its own frequency dependence.
@@ -33,7 +34,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_count, check_positive, check_seed
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
 from warprrf.rf.channel.lengths import PairLengths, plane_lengths, scattered_lengths, spherical_lengths
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -147,8 +148,7 @@ def channel_taps(
         ValueError: naming the argument.
     """
     check_positive("bandwidth_hz", bandwidth_hz)
-    if l_max < l_min:
-        raise ValueError(f"l_max: got {l_max}, expected at least l_min, {l_min}")
+    check_count("l_max", l_max, check_count("l_min", l_min, -(2**31)))
     lags = np.arange(l_min, l_max + 1)
 
     def taps(one: _Link) -> np.ndarray:
@@ -263,6 +263,30 @@ class _Link:
         return np.log(10.0) / 20.0 * change
 
 
+def random_turns(paths: PathArrays, seed: int) -> np.ndarray:
+    """A phase [turns] for each path of one receiver, shape ``(L,)``, evenly distributed.
+
+    It hangs on the receiver's position (to 1 um), the directions (1e-6 rad) and the delay (1 ps) of the path: on what it
+    is, not on its place in a list, on others in it, or on which receivers are asked together.
+
+    Source: the mixing function of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014).
+
+    Raises:
+        ValueError: for a seed that is not a whole number of at least 0.
+    """
+    state = np.full(len(paths.gain), check_seed(seed), dtype=np.uint64)
+    place = np.zeros(3) if paths.receiver is None else paths.receiver
+    angles = (paths.theta_r, paths.phi_r, paths.theta_t, paths.phi_t)
+    for value, step in (*((x, 1e-6) for x in (*place, *angles)), (paths.tau, 1e-12)):
+        steps = np.nan_to_num(np.round(np.asarray(value, dtype=np.float64) / step)) + 0.0  # no -0
+        state ^= steps.view(np.uint64)
+        state += np.uint64(0x9E3779B97F4A7C15)
+        state = (state ^ state >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ state >> np.uint64(27)) * np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(31)
+    return (state >> np.uint64(11)) * 2.0**-53
+
+
 def _links(
     paths: PathArrays,
     tx_array: PlanarArray | None = None,
@@ -282,6 +306,7 @@ def _links(
             "diffuse: got None with diffuse paths, which have no phase; expected 'random_phase' (with a seed), 'power' "
             "(left out of the sum) or 'given' (phases as they are)"
         )
+    check_seed(seed)
     tx, rx = tx_array or ISOTROPIC, rx_array or ISOTROPIC
     carrier = paths.carrier_hz
     places = [array.positions(SPEED_OF_LIGHT / carrier) for array in (tx, rx)]
@@ -294,7 +319,7 @@ def _links(
         amplitude = _amplitudes(chosen, tx, rx)
         if diffuse == "random_phase":
             turns = np.zeros(len(own.gain))
-            turns[scattered] = np.random.default_rng([seed, k]).random(int(scattered.sum()))
+            turns[scattered] = random_turns(own.select(np.flatnonzero(scattered)), seed)
             amplitude = amplitude * carrier_phase(-1.0, turns[index])
         if wave == "plane":
             groups = [(np.arange(len(index)), plane_lengths(chosen, *places))]

@@ -9,7 +9,6 @@ incidence (Ament 1953; Degli-Esposti et al. 2007, eq. (2), for the power that le
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,10 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.checks import check_count, check_number, check_positive, check_type
+from warprrf.files import read_json
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # F/m, CODATA 2018
 PATTERNS = ("lambertian", "directive")
+
+NARROWEST_LOBE = 1000
+"""Largest exponent of a scattering lobe: half its power lies within 3 degrees of the mirror direction. From 1023 on
+the sums of binomials that normalise it leave double precision; what is narrower is a mirror reflection."""
+
+ROUGHEST_M = 1.0  # rms height; from a few wavelengths on nothing is reflected as by a mirror
 
 
 @dataclass(frozen=True)
@@ -33,6 +40,10 @@ class Band:
         a, b: relative permittivity a f^b, f in GHz.
         c, d: conductivity c f^d [S/m], f in GHz.
         source: where the row comes from; starts with "assumed" where nothing was measured.
+
+    Raises:
+        ValueError: for numbers that are not finite, a band without width, or one at an end of which the relative
+            permittivity is less than 1 or the conductivity negative: such a surface would give power.
     """
 
     low_hz: float
@@ -44,8 +55,26 @@ class Band:
     source: str = "assumed"
 
     def __post_init__(self) -> None:
-        if not 0 < self.low_hz < self.high_hz:
+        for name in ("a", "b", "c", "d"):
+            check_number(name, getattr(self, name))
+        if not check_positive("low_hz", self.low_hz) < check_positive("high_hz", self.high_hz):
             raise ValueError(f"low_hz, high_hz: got {self.low_hz}, {self.high_hz}, expected 0 < low < high")
+        for frequency_hz in (self.low_hz, self.high_hz):  # both laws are monotonic in between
+            what = f" at {frequency_hz / 1e9:g} GHz"
+            check_number(
+                "relative_permittivity (a f^b)" + what, self.relative_permittivity(frequency_hz), 1.0
+            )
+            check_number("conductivity (c f^d) [S/m]" + what, self.conductivity(frequency_hz), 0.0)
+
+    def relative_permittivity(self, frequency_hz: float) -> float:
+        """a f^b, f in GHz."""
+        with np.errstate(over="ignore"):
+            return float(self.a * np.float64(frequency_hz / 1e9) ** self.b)
+
+    def conductivity(self, frequency_hz: float) -> float:
+        """c f^d [S/m], f in GHz."""
+        with np.errstate(over="ignore"):
+            return float(self.c * np.float64(frequency_hz / 1e9) ** self.d)
 
 
 @dataclass(frozen=True)
@@ -59,9 +88,14 @@ class Material:
         roughness_m: rms height of the surface sigma_h [m]; gives the scattering coefficient.
         scattering: scattering coefficient S in [0, 1] at every frequency, instead of one from ``roughness_m``.
         pattern: ``"lambertian"`` or ``"directive"``.
-        alpha_r: width of the directive lobe ((1 + cos psi) / 2)^alpha_r, a whole number of at least 1.
+        alpha_r: width of the directive lobe ((1 + cos psi) / 2)^alpha_r, a whole number from 1 to 1000.
         itu: the P.2040 name, or None for a custom material.
         sources: where thickness, roughness and pattern come from.
+        reciprocal: whether it scatters alike when transmitter and receiver change places. Degli-Esposti's lobes, the
+            default and Sionna RT's, do not; see :func:`warprrf.rf.em.fresnel.lobe`. ``engine="exact"`` takes either.
+
+    Raises:
+        TypeError, ValueError: naming what is no such number, and the material.
     """
 
     name: str
@@ -73,26 +107,24 @@ class Material:
     alpha_r: int = 4
     itu: str | None = None
     sources: Mapping[str, str] | None = None
+    reciprocal: bool = False
 
     def __post_init__(self) -> None:
+        check_type("name", self.name, str)
         if not self.bands:
             raise ValueError(f"bands: material {self.name!r} has none, expected at least one row")
-        if not self.thickness_m > 0:
-            raise ValueError(f"thickness_m: got {self.thickness_m} for {self.name!r}, expected more than 0")
-        if not (np.isfinite(self.roughness_m) and self.roughness_m >= 0):
-            raise ValueError(f"roughness_m: got {self.roughness_m} for {self.name!r}, expected at least 0")
-        if self.scattering is not None and not 0 <= self.scattering <= 1:
-            raise ValueError(
-                f"scattering: got {self.scattering} for {self.name!r}, expected a number in [0, 1]"
-            )
+        for k, band in enumerate(self.bands):
+            check_type(f"bands[{k}]", band, Band)
+        of = f" of {self.name!r}"
+        if self.thickness_m != np.inf:
+            check_positive("thickness_m" + of, self.thickness_m, "number of metres, or inf for a half-space")
+        check_number("roughness_m" + of, self.roughness_m, 0.0, ROUGHEST_M)
+        if self.scattering is not None:
+            check_number("scattering" + of, self.scattering, 0.0, 1.0)
         if self.pattern not in PATTERNS:
-            raise ValueError(
-                f"pattern: got {self.pattern!r} for {self.name!r}, expected one of {', '.join(PATTERNS)}"
-            )
-        if self.alpha_r != int(self.alpha_r) or self.alpha_r < 1:
-            raise ValueError(
-                f"alpha_r: got {self.alpha_r} for {self.name!r}, expected a whole number of at least 1"
-            )
+            raise ValueError(f"pattern{of}: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}")
+        check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
+        check_type("reciprocal" + of, self.reciprocal, bool)
 
     @classmethod
     def custom(
@@ -105,10 +137,17 @@ class Material:
         scattering: float = 0.0,
         pattern: str = "lambertian",
         alpha_r: int = 4,
+        reciprocal: bool = False,
     ) -> Material:
-        """A material with the same permittivity and conductivity [S/m] at every frequency up to 10 THz."""
+        """A material with the same permittivity and conductivity [S/m] at every frequency up to 10 THz.
+
+        Raises:
+            ValueError: for a relative permittivity below 1, a negative conductivity, and as :class:`Material`.
+        """
+        check_number("relative_permittivity", relative_permittivity, 1.0)
+        check_number("conductivity", conductivity, 0.0)
         band = Band(1e6, 1e13, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
-        return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r)
+        return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, reciprocal=reciprocal)
 
     @classmethod
     def conductor(cls, *, scattering: float = 0.0, pattern: str = "lambertian", alpha_r: int = 4) -> Material:
@@ -128,6 +167,7 @@ class Material:
         Raises:
             ValueError: naming material, frequency and bands, if none does.
         """
+        check_frequency(frequency_hz)
         for band in self.bands:
             if band.low_hz <= frequency_hz <= band.high_hz:
                 return band
@@ -148,13 +188,11 @@ class Material:
 
     def relative_permittivity(self, frequency_hz: float) -> float:
         """Real part of the relative permittivity; ValueError outside the bands."""
-        band = self.band(frequency_hz)
-        return float(band.a * (frequency_hz / 1e9) ** band.b)
+        return self.band(frequency_hz).relative_permittivity(frequency_hz)
 
     def conductivity(self, frequency_hz: float) -> float:
         """Conductivity [S/m]; ValueError outside the bands."""
-        band = self.band(frequency_hz)
-        return float(band.c * (frequency_hz / 1e9) ** band.d)
+        return self.band(frequency_hz).conductivity(frequency_hz)
 
     def scattering_coefficient(self, frequency_hz: float) -> float:
         """Scattering coefficient S in [0, 1]; ValueError outside the bands."""
@@ -166,7 +204,8 @@ class Material:
 
 def roughness_scattering(roughness_m: float, frequency_hz: float) -> float:
     """Scattering coefficient of a surface of rms height ``roughness_m`` [m] at normal incidence, in [0, 1]."""
-    exponent = 8 * (np.pi * roughness_m * frequency_hz / SPEED_OF_LIGHT) ** 2
+    height = check_number("roughness_m", roughness_m, 0.0, ROUGHEST_M)
+    exponent = 8 * (np.pi * height * check_frequency(frequency_hz) / SPEED_OF_LIGHT) ** 2
     return float(np.sqrt(-np.expm1(-2 * exponent)))
 
 
@@ -192,51 +231,66 @@ def table_entry(material: Material) -> dict[str, Any]:
         entry[key] = {"value": values[key], "source": sources.get(key, "assumed")}
     if material.pattern == "directive":
         entry["pattern"]["alpha_r"] = int(material.alpha_r)
+    if material.reciprocal:
+        entry["pattern"]["reciprocal"] = True
     return entry
 
 
-def _number(entry: Mapping[str, Any], key: str, where: str) -> float:
-    value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"{where}: {key!r} is {value!r}, expected a number")
-    return float(value)
+def _mapping(value: object, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{where}: got {value!r:.60}, expected a mapping {{...}}")
+    return value
 
 
-def _material(entry: Mapping[str, Any], path: Path) -> Material:
+def _number(entry: object, key: str, where: str) -> float:
+    return check_number(f"{where}: {key!r}", _mapping(entry, where).get(key))
+
+
+def _material(entry: object, where: str) -> Material:
+    entry = _mapping(entry, where)
     name = entry.get("name")
     if not isinstance(name, str):
-        raise ValueError(f"path: an entry of {path} has no 'name'")
-    where = f"path: material {name!r} in {path}"
+        raise ValueError(f"{where} has no 'name'")
+    where = f"{where}, material {name!r}"
     for key in ("permittivity", "thickness_m", "pattern"):
         if key not in entry:
             raise ValueError(f"{where} has no {key!r}")
     if "roughness_m" not in entry and "scattering" not in entry:
         raise ValueError(f"{where} has neither 'roughness_m' nor 'scattering', expected one of them")
-    bands = tuple(
-        Band(
-            low_hz=_number(row, "low_ghz", where) * 1e9,
-            high_hz=_number(row, "high_ghz", where) * 1e9,
-            a=_number(row, "a", where),
-            b=_number(row, "b", where),
-            c=_number(row, "c", where),
-            d=_number(row, "d", where),
-            source=str(row.get("source", "assumed")),
+    if not isinstance(entry["permittivity"], list):
+        raise ValueError(f"{where}: 'permittivity' is no list of rows")
+    parts = {key: _mapping(entry[key], f"{where}, {key!r}") for key in _PARTS if key in entry}
+    alpha_r = check_count(f"{where}: 'alpha_r'", parts["pattern"].get("alpha_r", 4), 1, NARROWEST_LOBE)
+    reciprocal = parts["pattern"].get("reciprocal", False)
+    if not isinstance(reciprocal, bool):
+        raise ValueError(f"{where}: 'reciprocal' is {reciprocal!r}, expected true or false")
+    try:
+        bands = tuple(
+            Band(
+                low_hz=_number(row, "low_ghz", where) * 1e9,
+                high_hz=_number(row, "high_ghz", where) * 1e9,
+                a=_number(row, "a", where),
+                b=_number(row, "b", where),
+                c=_number(row, "c", where),
+                d=_number(row, "d", where),
+                source=str(row.get("source", "assumed")),
+            )
+            for row in entry["permittivity"]
         )
-        for row in entry["permittivity"]
-    )
-    parts = {key: entry[key] for key in _PARTS if key in entry}
-    scattering = _number(parts["scattering"], "value", where) if "scattering" in parts else None
-    return Material(
-        name=name,
-        bands=bands,
-        thickness_m=_number(parts["thickness_m"], "value", where),
-        roughness_m=_number(parts["roughness_m"], "value", where) if "roughness_m" in parts else 0.0,
-        scattering=scattering,
-        pattern=str(parts["pattern"].get("value")),
-        alpha_r=int(parts["pattern"].get("alpha_r", 4)),
-        itu=entry.get("itu"),
-        sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
-    )
+        return Material(
+            name=name,
+            bands=bands,
+            thickness_m=_number(parts["thickness_m"], "value", where),
+            roughness_m=_number(parts["roughness_m"], "value", where) if "roughness_m" in parts else 0.0,
+            scattering=_number(parts["scattering"], "value", where) if "scattering" in parts else None,
+            pattern=str(parts["pattern"].get("value")),
+            alpha_r=alpha_r,
+            itu=entry.get("itu"),
+            sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
+            reciprocal=reciprocal,
+        )
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
 
 
 def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
@@ -251,11 +305,15 @@ def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no table of materials {path}")
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise ValueError(f"path: {path} is not JSON: {error}") from error
-    if not isinstance(table, dict) or not isinstance(table.get("materials"), list):
+    table = read_json(path).get("materials")
+    if not isinstance(table, list):
         raise ValueError(f"path: {path} holds no list 'materials'")
-    found = [_material(entry, path) for entry in table["materials"]]
-    return {material.name: material for material in found}
+    found: dict[str, Material] = {}
+    for k, entry in enumerate(table):
+        material = _material(entry, f"path: {path}, entry {k}")
+        if material.name in found:
+            raise ValueError(
+                f"path: {path} has two materials named {material.name!r}, expected one of each name"
+            )
+        found[material.name] = material
+    return found

@@ -8,7 +8,6 @@ data is an outside check: nothing in it was computed by this package.
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from warprrf.checks import check_array
+from warprrf.files import read_arrays
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
@@ -140,14 +140,10 @@ def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     names = ("transmitter", "receivers", "frequency_hz", "last_point", "gain", "rays", "line_of_sight", "csi")
-    try:
-        with np.load(path, allow_pickle=False) as opened:
-            data = {name: opened[name] for name in names if name in opened}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-        raise ValueError(f"folder: {path} does not read as an npz file ({error}); is it whole?") from error
+    data = read_arrays(path)
     missing = [name for name in names if name not in data]
     if missing:
-        raise ValueError(f"folder: {path} lacks {', '.join(missing)}")
+        raise ValueError(f"{path}: lacks {', '.join(missing)}")
     return data
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.materials import Material
@@ -26,6 +26,9 @@ from warprrf.rf.interop.llvm import select_llvm
 from warprrf.rf.paths.sionna import DIFFUSE, repeated
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
+
+NARROWEST_SIONNA_LOBE = 127
+"""Largest exponent that Sionna RT can normalise: it divides by 2^alpha_r in single precision."""
 
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
@@ -78,9 +81,20 @@ def load_sionna_scene(scene: Scene | str | os.PathLike[str], *, frequency_hz: fl
 
 def _radio_material(loaded: Any, rt: Any, material: Material, frequency: float) -> Any:
     """The material of this name in Sionna's scene, added if it has none that can be set, with our values."""
+    directive = material.pattern == "directive"
+    if directive and material.alpha_r > NARROWEST_SIONNA_LOBE:
+        raise ValueError(
+            f"material {material.name!r}: alpha_r is {material.alpha_r}, but in Sionna's single precision a lobe of more "
+            f'than {NARROWEST_SIONNA_LOBE} scatters nothing; take engine="exact" or a wider lobe'
+        )
     if not np.isfinite(material.thickness_m):
         raise ValueError(
             f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
+        )
+    if material.reciprocal and material.scattering_coefficient(frequency) > 0:
+        raise ValueError(
+            f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
+            'take its lobe of the same width, or use engine="exact"'
         )
     radio = loaded.radio_materials.get(material.name)
     if type(radio) is not rt.RadioMaterial:  # an ITU material keeps its own permittivity
@@ -91,7 +105,6 @@ def _radio_material(loaded: Any, rt: Any, material: Material, frequency: float) 
     radio.thickness = float(material.thickness_m)
     radio.scattering_coefficient = float(material.scattering_coefficient(frequency))
     radio.xpd_coefficient = 0.0
-    directive = material.pattern == "directive"
     radio.scattering_pattern = (
         rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
     )
@@ -130,10 +143,9 @@ class Sampling:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("depth", 0), ("samples", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or int(value) != value or value < least:
-                raise ValueError(f"{name}: got {value!r}, expected a whole number of at least {least}")
+        check_count("depth", self.depth, 0)
+        check_count("samples", self.samples)
+        check_count("seed", self.seed, 0)
 
 
 class SionnaEngine:

@@ -1,26 +1,30 @@
 """Radio maps: what a link gets at every place of a floor plan.
 
-A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room or on
-a surface hold NaN. Which they are is decided by the mesh alone, open and torn as a reconstructed one may be: rays from
-the centre over the whole sphere meet surfaces from their outer side in the air and from behind anywhere else, and three
-in four decide. Which side is the outer one is decided at the transmitter, which stands in the air.
+A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room, on a
+surface or in the transmitter's reactive near field hold NaN. Which are inside or outside is decided by the mesh alone,
+open and torn as a reconstructed one may be: rays from the centre over the whole sphere meet surfaces from their outer
+side in the air and from behind anywhere else, and three in four decide. Which side is the outer one is decided at the
+transmitter, which stands in the air.
 """
 
 from __future__ import annotations
 
+import io
 import os
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_positive
-from warprrf.files import write_atomically
+from warprrf import netcdf_files
+from warprrf.checks import check_array, check_number, check_positive
+from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
+from warprrf.netcdf_files import Variable
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions, Links
-from warprrf.rf.receivers import ON_A_WALL_M
+from warprrf.rf.positions import NEAR_FIELD, WALL_CLEARANCE_M, check_positions
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
 ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
@@ -67,8 +71,8 @@ class RadioMap:
         outline: floor plan, line segments where the mesh meets this height [m], shape ``(S, 2, 2)``.
     """
 
-    x: np.ndarray
-    y: np.ndarray
+    x: np.ndarray = field(repr=False)
+    y: np.ndarray = field(repr=False)
     height_m: float
     cell_m: float
     transmitter: np.ndarray
@@ -81,6 +85,31 @@ class RadioMap:
     transmit_power_dbm: float
     noise_power_dbm: float
     outline: np.ndarray = field(repr=False)
+
+    def __post_init__(self) -> None:
+        """Check shapes and values; ValueError or TypeError names the field."""
+        x, y = (check_array(name, getattr(self, name), (None,)) for name in ("x", "y"))
+        fields: dict[str, Any] = {
+            "x": x,
+            "y": y,
+            "transmitter": check_array("transmitter", self.transmitter, (3,)),
+            "outline": check_array("outline", self.outline, (None, 2, 2)),
+        }
+        for name in _PLAIN:
+            fields[name] = check_number(name, getattr(self, name))
+        for name in ("cell_m", "frequency_hz", "beam_sigma_rad"):
+            check_positive(name, fields[name])
+        for name in ("x", "y"):
+            if not (np.abs(np.diff(fields[name]) - self.cell_m) < 1e-3 * self.cell_m).all():
+                raise ValueError(f"{name}: got {fields[name]}, expected steps of cell_m, {self.cell_m:g} m")
+        for name in _LAYERS:
+            fields[name] = check_array(name, getattr(self, name), (len(y), len(x)), finite=False)
+            if not (np.isnan(fields[name]) | (fields[name] >= 0) & np.isfinite(fields[name])).all():
+                raise ValueError(
+                    f"{name}: got negative or infinite values, expected none, or NaN outside the air"
+                )
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
 
     @property
     def free(self) -> np.ndarray:
@@ -163,48 +192,45 @@ class RadioMap:
             f"{np.rad2deg(self.beam_sigma_rad):.3g} degrees, {budget}",
             fontsize=11,
         )
-        write_atomically(path, lambda file: figure.savefig(file, dpi=110, format="png"))
+        picture = io.BytesIO()
+        figure.savefig(picture, dpi=110, format="png")
+        write_bytes(path, picture.getbuffer())
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a NetCDF-4 file, whole or not at all: the four quantities over ``y`` and ``x``, and the outline."""
-        xarray = _device.require("xarray", extra="all")
-        variables: dict[str, Any] = {
-            name: (("y", "x"), getattr(self, name), {"units": unit, "long_name": text})
-            for name, (unit, text) in _LAYERS.items()
-        }
-        variables["outline"] = (("segment", "end", "xy"), self.outline, {"units": "m"})
-        variables["transmitter"] = (("xyz",), self.transmitter, {"units": "m"})
-        coordinates = {
-            name: ((name,), getattr(self, name), {"units": "m", "long_name": "centre of the cell"})
-            for name in ("x", "y")
-        }
+        arrays = {name: getattr(self, name) for name in _VARIABLES}
         attributes = {name: float(getattr(self, name)) for name in _PLAIN} | {"format": _FORMAT}
-        data = xarray.Dataset(variables, coords=coordinates, attrs=attributes)
-        write_atomically(path, lambda file: data.to_netcdf(file, engine="h5netcdf"))
+        netcdf_files.write(path, arrays, _VARIABLES, {}, attributes)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> RadioMap:
         """Read what :meth:`save` wrote.
 
         Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if it is corrupt, or holds something else.
+            OSError: naming the file, if it cannot be read.
+            ValueError: naming it, if it is damaged, or holds something else.
         """
-        xarray = _device.require("xarray", extra="all")
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"path: there is no file {path}")
+        arrays, attributes = netcdf_files.read(path, _VARIABLES, {})
         try:
-            with xarray.open_dataset(path, engine="h5netcdf") as data:
-                if data.attrs.get("format") != _FORMAT:
-                    raise ValueError(f"it holds {data.attrs.get('format')!r}, expected {_FORMAT!r}")
-                held: dict[str, Any] = {n: np.asarray(data[n].values) for n in (*_LAYERS, *_ARRAYS)}
-                return cls(**held | {name: float(data.attrs[name]) for name in _PLAIN})
-        except (OSError, KeyError, ValueError) as error:
-            raise ValueError(f"path: {os.fspath(path)} is corrupt or no radio map: {error}") from error
+            if attributes.get("format") != _FORMAT:
+                raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
+            for axis, name in enumerate(("y", "x")):
+                order = np.argsort(arrays[name])  # as another tool may have turned it
+                for held in (name, *_LAYERS):
+                    arrays[held] = arrays[held].take(order, axis=min(axis, arrays[held].ndim - 1))
+            fields: dict[str, Any] = {**arrays, **{name: attributes[name] for name in _PLAIN}}
+            return cls(**fields)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise ValueError(f"{os.fspath(path)}: damaged, or no radio map: {error}") from error
 
 
 _PLAIN = ("height_m", "cell_m", "frequency_hz", "beam_sigma_rad", "transmit_power_dbm", "noise_power_dbm")
-_ARRAYS = ("x", "y", "transmitter", "outline")
+_VARIABLES = {
+    **{name: Variable(("y", "x"), unit, {"long_name": text}) for name, (unit, text) in _LAYERS.items()},
+    **{name: Variable((name,), "m", {"long_name": "centre of the cell"}) for name in ("x", "y")},
+    "outline": Variable(("segment", "end", "xy"), "m"),
+    "transmitter": Variable(("xyz",), "m"),
+}
 
 
 @dataclass(frozen=True)
@@ -227,18 +253,13 @@ class MapOptions(LinkOptions):
         super().__post_init__()
         check_positive("bandwidth_hz", self.bandwidth_hz)
         for name in ("transmit_power_dbm", "noise_figure_db"):
-            _check_finite(name, getattr(self, name))
+            check_number(name, getattr(self, name))
 
     @property
     def noise_power_dbm(self) -> float:
         """Of the receiver, k T B F [dBm]."""
         noise_w = BOLTZMANN * ROOM_TEMPERATURE_K * self.bandwidth_hz
         return float(10.0 * np.log10(noise_w) + 30.0 + self.noise_figure_db)
-
-
-def _check_finite(name: str, value: float) -> None:
-    if not np.isfinite(value):
-        raise ValueError(f"{name}: got {value!r}, expected a finite number")
 
 
 class LinkField(Protocol):
@@ -283,8 +304,11 @@ def radio_map(
     if not isinstance(mesh, Mesh):
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
-    source = check_array("transmitter", source, (3,))
-    _check_finite("height", height)
+    source, wavelength_m = check_array("transmitter", source, (3,)), SPEED_OF_LIGHT / field.frequency_hz
+    check_positions(
+        mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device
+    )
+    check_number("height", height)
     check_positive("cell", cell)
     low, high = mesh.bounds
     if not low[2] < height < high[2]:
@@ -295,7 +319,7 @@ def radio_map(
     across, along = np.meshgrid(x, y)
     places = np.stack([across, along, np.full_like(across, float(height))], axis=-1)
     free = in_the_air(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
-    free &= (places != source).any(axis=-1)
+    free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
     if not free.any():
         raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")
     links = field.trace_links(places[free], source, o)
@@ -338,7 +362,7 @@ def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any
     outer = np.where(meets, -np.sign(slope), 0.0).reshape(len(places), -1).mean(axis=1)
     inside = (points >= mesh.bounds[0]).all(axis=1) & (points <= mesh.bounds[1]).all(axis=1)
     free = inside & (outer[1:] * np.sign(outer[0]) > _OUTER_SHARE)
-    free[free] = mesh.distance(points[free], device=device) > ON_A_WALL_M
+    free[free] = mesh.distance(points[free], device=device) > WALL_CLEARANCE_M
     return free
 
 

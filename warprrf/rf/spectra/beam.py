@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 from numpy.typing import DTypeLike
 from scipy.fft import irfft, rfft
 from scipy.sparse import csr_matrix
 
-from warprrf.cache import Cache
+from warprrf.cache import Cache, cached_property
 from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions
 

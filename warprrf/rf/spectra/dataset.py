@@ -9,21 +9,31 @@ from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_count, check_positive, check_seed, check_type
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
 from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
-from warprrf.rf.spectra.spectrum import Spectrum, check_shape, default_floor, to_db
+from warprrf.rf.spectra.spectrum import (
+    Spectrum,
+    check_pixels,
+    check_range_db,
+    check_shape,
+    default_floor,
+    to_db,
+)
 
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 
 _ROLES = ("train", "test")
+SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
+_MOST_ATTRIBUTE_BYTES = 60_000  # HDF5 takes 64 kB
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SpectrumDataset:
     """Spectra at R receivers.
 
@@ -42,7 +52,8 @@ class SpectrumDataset:
         seed: Seed of the engine.
         role: "train" or "test" for each receiver, shape ``(R,)``.
         line_of_sight: Whether the receiver sees the transmitter, shape ``(R,)``, bool.
-        attributes: Anything else worth keeping: depth, samples, versions; the air (:attr:`air`).
+        attributes: Anything else worth keeping: depth, samples, versions; the air (:attr:`air`). Text, numbers and
+            lists of them, under names that the file does not need itself.
     """
 
     receivers: np.ndarray
@@ -63,36 +74,39 @@ class SpectrumDataset:
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        check = check_array
-        receivers = check("receivers", self.receivers, (None, 3))
+        receivers = check_array("receivers", self.receivers, (None, 3))
         count = len(receivers)
-        gain = check("path_gain", self.path_gain, (count, None, None), dtype=np.float32)
-        if (gain < 0).any():
-            raise ValueError(
-                f"path_gain: got {int((gain < 0).sum())} negative values, expected linear path gain"
-            )
+        gain = check_array("path_gain", self.path_gain, (count, None, None), dtype=np.float32)
         shape = check_shape(gain.shape[1:])
-        role = np.asarray(self.role, dtype="<U5")
-        if role.shape != (count,) or not np.isin(role, _ROLES).all():
-            raise ValueError(f"role: got shape {role.shape}, expected ({count},) of 'train' and 'test'")
         fields: dict[str, Any] = {
             "receivers": receivers,
-            "transmitter": check("transmitter", self.transmitter, (3,)),
+            "transmitter": check_array("transmitter", self.transmitter, (3,)),
             "frequency_hz": check_frequency(self.frequency_hz),
             "path_gain": gain,
-            "delay_s": check("delay_s", self.delay_s, (count, *shape), finite=False),
-            "aod": check("aod", self.aod, (count, *shape, 2), dtype=np.float32, finite=False),
-            "floor": float(check("floor", self.floor, ())),
-            "range_db": (float(self.range_db[0]), float(self.range_db[1])),
-            "beam_sigma_rad": float(check("beam_sigma_rad", self.beam_sigma_rad, ())),
-            "seed": int(self.seed),
-            "role": role,
-            "line_of_sight": check("line_of_sight", self.line_of_sight, (count,), dtype=bool),
+            "delay_s": check_array("delay_s", self.delay_s, (count, *shape), finite=False),
+            "aod": check_array("aod", self.aod, (count, *shape, 2), dtype=np.float32, finite=False),
+            "floor": check_positive("floor", self.floor, "linear noise floor"),
+            "range_db": check_range_db(self.range_db),
+            "beam_sigma_rad": check_positive("beam_sigma_rad", self.beam_sigma_rad, "beam width in radians"),
+            "seed": check_seed(self.seed),
+            "role": _check_roles(self.role, count),
+            "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
+            "attributes": _check_attributes(self.attributes),
         }
-        if not fields["floor"] > 0:
-            raise ValueError(f"floor: got {self.floor!r}, expected a positive linear noise floor")
+        for name in ("engine", "polarisation"):
+            check_type(name, getattr(self, name), str)
+        check_pixels(gain, fields["delay_s"], fields["aod"])
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        train = int((self.role == "train").sum())
+        rows, columns = self.shape
+        return (
+            f"SpectrumDataset({len(self)} receivers: {train} train, {len(self) - train} test; {rows} x {columns} pixels "
+            f"of {self.engine!r} at {self.frequency_hz / 1e9:g} GHz, beam {np.rad2deg(self.beam_sigma_rad):.3g} degrees, "
+            f"range {self.range_db[0]:.1f} to {self.range_db[1]:.1f} dB, transmitter {self.transmitter.tolist()} m)"
+        )
 
     @classmethod
     def from_spectra(
@@ -113,8 +127,10 @@ class SpectrumDataset:
         attributes: Mapping[str, Any] | None = None,
     ) -> SpectrumDataset:
         """A data set with N0, its dB range and, if none are given, roles chosen for it."""
-        gain = np.asarray(path_gain, dtype=np.float32)
-        noise = default_floor(gain) if floor is None else float(floor)
+        gain = check_array("path_gain", path_gain, (None, None, None), dtype=np.float32)
+        if len(gain) == 0:
+            raise ValueError("path_gain: got no spectra, expected one receiver's or more")
+        noise = default_floor(gain) if floor is None else check_positive("floor", floor, "linear noise floor")
         return cls(
             receivers=receivers,
             transmitter=transmitter,
@@ -130,14 +146,23 @@ class SpectrumDataset:
             seed=seed,
             role=assign_roles(len(gain), seed=seed) if role is None else np.asarray(role),
             line_of_sight=line_of_sight,
-            attributes=dict(attributes or {}),
+            attributes={} if attributes is None else attributes,
         )
 
     def __len__(self) -> int:
         return len(self.receivers)
 
     def __getitem__(self, index: int) -> Spectrum:
-        """The spectrum of one receiver."""
+        """The spectrum of one receiver.
+
+        Raises:
+            IndexError: for a receiver that there is not.
+            TypeError: for anything but a whole number.
+        """
+        if isinstance(index, bool) or not isinstance(index, int | np.integer):
+            raise TypeError(
+                f"index: got {index!r}, expected a whole number; subset() takes several receivers"
+            )
         return Spectrum(
             path_gain=self.path_gain[index],
             delay_s=self.delay_s[index],
@@ -174,13 +199,14 @@ class SpectrumDataset:
     def subset(self, indices: ArrayLike) -> SpectrumDataset:
         """The receivers named by ``indices`` (whole numbers or a mask); floor and range stay those of the whole set."""
         chosen = np.asarray(indices)
-        if chosen.dtype == bool:
+        if chosen.dtype == bool and chosen.shape == (len(self),):
             chosen = np.flatnonzero(chosen)
-        chosen = chosen.astype(np.int64)
-        if chosen.ndim != 1 or (len(chosen) and (chosen.min() < -len(self) or chosen.max() >= len(self))):
+        whole = chosen.dtype.kind in "iu" or chosen.size == 0
+        if chosen.ndim != 1 or not whole or (np.abs(chosen + 0.5) > len(self)).any():
             raise ValueError(
-                f"indices: got {indices!r}, expected a list of receivers from 0 to {len(self) - 1}"
+                f"indices: got {indices!r}, expected whole numbers from 0 to {len(self) - 1}, or a mask ({len(self)},)"
             )
+        chosen = chosen.astype(np.int64)
         per_receiver = ("receivers", "path_gain", "delay_s", "aod", "role", "line_of_sight")
         return replace(self, **{name: getattr(self, name)[chosen] for name in per_receiver})
 
@@ -195,15 +221,12 @@ class SpectrumDataset:
             ValueError: if the set has fewer training receivers, or no test receivers.
         """
         train, test = np.flatnonzero(self.role == "train"), np.flatnonzero(self.role == "test")
-        if not 1 <= n_train <= len(train):
-            raise ValueError(
-                f"n_train: got {n_train}, expected 1 to {len(train)}, the training receivers there are"
-            )
+        check_count("n_train", n_train, most=len(train))
         if len(test) == 0:
             raise ValueError(
                 "role: there are no test receivers; give simulate(..., roles=) or assign_roles some"
             )
-        if seed != 0:
+        if check_seed(seed) != 0:
             train = np.random.default_rng(seed).permutation(train)
         return self.subset(train[:n_train]), self.subset(test)
 
@@ -297,11 +320,17 @@ class SpectrumDataset:
     def load(cls, path: str | os.PathLike[str]) -> SpectrumDataset:
         """Read what :meth:`save` wrote.
 
+        Dimensions and coordinates may stand in another order, as other tools leave them.
+
         Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if it is not a readable NetCDF file of spectra.
+            OSError: naming the file, if it cannot be read.
+            ValueError: naming it, if it is damaged, no NetCDF file of spectra, or holds what no data set may.
         """
-        return cls(**dataset_files.read(path))
+        values = dataset_files.read(path)
+        try:
+            return cls(**values)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{os.fspath(path)}: {error}") from error
 
     def export_exr(self, path: str | os.PathLike[str], index: int) -> None:
         """Write one spectrum as OpenEXR: channels path_gain, delay, aod_zenith, aod_azimuth, 32-bit.
@@ -318,9 +347,53 @@ class SpectrumDataset:
 
 def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.ndarray:
     """ "train" or "test" for each of ``count`` receivers, ``test`` of them (an eighth by default) drawn at random."""
-    wanted = count // 8 if test is None else test
-    if not 0 <= wanted <= count:
-        raise ValueError(f"test: got {wanted}, expected 0 to {count}, the receivers there are")
+    check_count("count", count, least=0)
+    wanted = count // 8 if test is None else check_count("test", test, least=0, most=count)
+    check_seed(seed)
     role = np.full(count, "train", dtype="<U5")
     role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
     return role
+
+
+def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
+    """Which spectra of ``ds`` are of ``receivers`` (K, 3) under ``transmitter`` (3,) [m], shape ``(R,)`` bool."""
+    if len(receivers) == 0 or np.linalg.norm(ds.transmitter - transmitter) > SAME_PLACE_M:
+        return np.zeros(len(ds.receivers), dtype=bool)
+    return np.asarray(cKDTree(receivers).query(ds.receivers)[0] <= SAME_PLACE_M)
+
+
+def _check_roles(role: ArrayLike, count: int) -> np.ndarray:
+    found = np.asarray(role)
+    if found.shape != (count,) or not np.isin(found, _ROLES).all():
+        held = f" of {', '.join(sorted(map(repr, found.astype(str).tolist())))[:80]}" * (found.ndim == 1)
+        raise ValueError(f"role: got shape {found.shape}{held}, expected ({count},) of 'train' and 'test'")
+    return found.astype("<U5")
+
+
+def _check_flags(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    found = check_array(name, value, (count,))
+    if not np.isin(found, (0.0, 1.0)).all():
+        raise ValueError(f"{name}: got {found[~np.isin(found, (0.0, 1.0))][0]:g}, expected True and False")
+    return found.astype(bool)
+
+
+def _check_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """What a file can hold beside the fields, under names of its own."""
+    check_type("attributes", attributes, Mapping)
+    for name, value in attributes.items():
+        if not isinstance(name, str) or not name or name.startswith("_") or {"/", "\0"} & set(name):
+            raise ValueError(
+                f"attributes: got the name {name!r}, expected text without / that does not begin with _"
+            )
+        if name in dataset_files.RESERVED:
+            raise ValueError(
+                f"attributes: got {name!r}, which a data set's file needs itself; take another name"
+            )
+        held = np.asarray(value)
+        if held.dtype.kind not in "biufU" or held.ndim > 1 or held.nbytes > _MOST_ATTRIBUTE_BYTES:
+            raise TypeError(
+                f"attributes: {name!r} is a {type(value).__name__}, expected text, a number, or a short list of these"
+            )
+        if "\0" in "".join(held.astype(str).ravel()):
+            raise ValueError(f"attributes: {name!r} holds a zero character, expected text without")
+    return dict(attributes)

@@ -1,4 +1,4 @@
-"""Spectra of one transmitter as a NetCDF-4 file (xarray over h5netcdf), SI units, with all that is needed to read it.
+"""Spectra of one transmitter as a NetCDF-4 file (h5netcdf), SI units, with all that is needed to read it.
 
 What goes in and comes out are the fields of :class:`~warprrf.rf.spectra.dataset.SpectrumDataset`, by name. A compact file holds
 the same variables with mantissas rounded to what matters, so that zlib finds something to compress.
@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warprrf.device import require
-from warprrf.files import write_atomically
-from warprrf.rf.spectra.spectrum import pixel_angles
+from warprrf import netcdf_files
+from warprrf.netcdf_files import XYZ, Axis, Variable
 
 # What a compact file keeps. A relative step of 2^-7 errs by at most 0.017 dB, half of N0 / 64 moves the dB image by at
 # most 0.034 dB.
@@ -23,27 +21,42 @@ COMPACT_GAIN_BITS = 7  # explicit mantissa bits
 COMPACT_GAIN_OF_FLOOR = 2.0**-6  # absolute step, times N0
 COMPACT_DELAY_STEP_S = 2.0**-39  # 1.8 ps between values: errors below 0.91 ps, 0.27 mm
 COMPACT_AOD_STEP_RAD = 2.0**-10  # 9.8e-4 rad between values: errors below 4.9e-4 rad
-_CHUNK_BYTES = 2_000_000  # spectra are packed several to a chunk
 
 _PIXEL = ("receiver", "zenith", "azimuth")
-_VARIABLES: dict[str, tuple[str, tuple[str, ...], dict[str, Any]]] = {
-    "receiver_position": ("receivers", ("receiver", "xyz"), {"units": "m"}),
-    "transmitter_position": ("transmitter", ("xyz",), {"units": "m"}),
-    "path_gain": ("path_gain", _PIXEL, {"units": "1", "long_name": "path gain per pixel, linear"}),
-    "delay": ("delay_s", _PIXEL, {"units": "s", "long_name": "delay of the pixel's strongest path"}),
-    "aod": (
-        "aod",
-        (*_PIXEL, "angle"),
-        {"units": "rad", "long_name": "zenith and azimuth of departure of the pixel's strongest path"},
-    ),
-    "role": (
-        "role",
-        ("receiver",),
-        {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "train test"},
-    ),
-    "line_of_sight": ("line_of_sight", ("receiver",), {"units": "1"}),
+_FIELD_OF = {
+    "receiver_position": "receivers",
+    "transmitter_position": "transmitter",
+    "path_gain": "path_gain",
+    "delay": "delay_s",
+    "aod": "aod",
+    "role": "role",
+    "line_of_sight": "line_of_sight",
 }
-"""Field, dimensions and attributes of each variable."""
+"""Field of each variable."""
+_VARIABLES = {
+    "receiver_position": Variable(("receiver", "xyz"), "m"),
+    "transmitter_position": Variable(("xyz",), "m"),
+    "path_gain": Variable(_PIXEL, "1", {"long_name": "path gain per pixel, linear"}, packed=True),
+    "delay": Variable(_PIXEL, "s", {"long_name": "delay of the pixel's strongest path"}, packed=True),
+    "aod": Variable(
+        (*_PIXEL, "angle"),
+        "rad",
+        {"long_name": "zenith and azimuth of departure of the pixel's strongest path"},
+        packed=True,
+    ),
+    "role": Variable(
+        ("receiver",), about={"flag_values": np.array([0, 1], np.int8), "flag_meanings": "train test"}
+    ),
+    "line_of_sight": Variable(("receiver",), "1"),
+}
+_AXES = {
+    "zenith": Axis(lambda rows: (np.arange(rows) + 0.5) * np.pi / rows, "rad"),
+    "azimuth": Axis(
+        lambda columns: -np.pi + (np.arange(columns) + 0.5) * 2.0 * np.pi / columns, "rad", 2.0 * np.pi
+    ),
+    "xyz": XYZ,
+    "angle": Axis(lambda _: np.array(["zenith", "azimuth"])),
+}
 _FIELDS = ("frequency_hz", "beam_sigma_rad", "floor", "engine", "polarisation", "seed")
 """Fields that are attributes of the file by the same name."""
 _EXPLAINED = {
@@ -53,12 +66,16 @@ _EXPLAINED = {
     "axes": "metres, z up; zenith 0 to pi, azimuth -pi to pi; arrival points from the receiver",
 }
 
+RESERVED = {
+    *_FIELDS, *_FIELD_OF.values(), "range_db", "attributes", "range_low_db", "range_high_db", *_EXPLAINED, "compact",
+    "compact_rounding", "CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST",
+}  # fmt: skip
+"""Names that the file needs itself, fields among them, and those of HDF5's dimensions."""
+
 
 def write(path: str | os.PathLike[str], values: Mapping[str, Any], *, compact: bool = False) -> None:
     """Write the fields ``values`` of a data set; see :meth:`~warprrf.rf.spectra.dataset.SpectrumDataset.save`."""
-    xarray = require("xarray", extra="all")
-    require("h5netcdf", extra="all")
-    arrays = {name: values[field] for name, (field, _, _) in _VARIABLES.items()}
+    arrays = {name: values[field] for name, field in _FIELD_OF.items()}
     arrays["role"] = (arrays["role"] == "test").astype(np.int8)
     arrays["line_of_sight"] = arrays["line_of_sight"].astype(np.int8)
     attributes: dict[str, Any] = {
@@ -75,57 +92,30 @@ def write(path: str | os.PathLike[str], values: Mapping[str, Any], *, compact: b
             f"path_gain: {COMPACT_GAIN_BITS} mantissa bits and steps of floor * {COMPACT_GAIN_OF_FLOOR:g}; "
             f"delay: {COMPACT_DELAY_STEP_S:g} s; aod: {COMPACT_AOD_STEP_RAD:g} rad"
         )
-    gain = arrays["path_gain"]
-    zenith, azimuth = pixel_angles(gain.shape[1:])
-    data = xarray.Dataset(
-        {name: (sizes, arrays[name], about) for name, (_, sizes, about) in _VARIABLES.items()},
-        coords={
-            "zenith": (("zenith",), zenith, {"units": "rad"}),
-            "azimuth": (("azimuth",), azimuth, {"units": "rad"}),
-            "xyz": ["x", "y", "z"],
-            "angle": ["zenith", "azimuth"],
-        },
-        attrs=attributes,
-    )
-    packing: dict[str, Any] = {"zlib": True, "shuffle": True, "complevel": 9 if compact else 4}
-    encoding = {}
-    for name in ("path_gain", "delay", "aod"):
-        one = data[name][0].nbytes if len(gain) else 1
-        chunk = (max(1, min(len(gain), _CHUNK_BYTES // one)), *data[name].shape[1:])
-        encoding[name] = {**packing, "_FillValue": None, "chunksizes": chunk}
-    write_atomically(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=encoding))
+    netcdf_files.write(path, arrays, _VARIABLES, _AXES, attributes, level=9 if compact else 4)
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The fields of the data set in a file that :func:`write` wrote.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a readable NetCDF file of spectra.
+        OSError: naming the file, if it cannot be read.
+        ValueError: if it is damaged, or no NetCDF file of spectra.
     """
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"path: there is no data set {file}; warprrf simulate makes one")
-    xarray = require("xarray", extra="all")
-    require("h5netcdf", extra="all")
-    try:
-        with xarray.open_dataset(file, engine="h5netcdf", decode_cf=False) as opened:
-            data = opened.load()
-    except (OSError, ValueError, RuntimeError, KeyError) as error:
-        raise ValueError(f"path: {file} does not read as NetCDF-4 ({error}); is it whole?") from error
-    known = {*_FIELDS, "range_low_db", "range_high_db"}
-    missing = sorted((known - set(data.attrs)) | (set(_VARIABLES) - set(data.variables)))
-    if missing:
-        raise ValueError(f"path: {file} lacks {', '.join(missing)}, expected a data set saved by warprrf")
-    attributes = {name: _plain(value) for name, value in data.attrs.items()}
-    spare = {*known, *_EXPLAINED, "compact", "compact_rounding"}
+    file = os.fspath(path)
+    arrays, attributes = netcdf_files.read(path, _VARIABLES, _AXES)
+    if lacking := sorted({*_FIELDS, "range_low_db", "range_high_db"} - set(attributes)):
+        raise ValueError(f"{file}: lacks {', '.join(lacking)}, expected a data set saved by warprrf")
+    for name in ("role", "line_of_sight"):
+        if not np.isin(arrays[name], (0, 1)).all():
+            raise ValueError(f"{file}: {name}: got {sorted(set(arrays[name].tolist()))}, expected 0 and 1")
     return {
-        **{field: data[name].values for name, (field, _, _) in _VARIABLES.items()},
+        **{field: arrays[name] for name, field in _FIELD_OF.items()},
         **{name: attributes[name] for name in _FIELDS},
         "range_db": (attributes["range_low_db"], attributes["range_high_db"]),
-        "role": np.where(data["role"].values == 1, "test", "train"),
-        "line_of_sight": data["line_of_sight"].values.astype(bool),
-        "attributes": {name: value for name, value in attributes.items() if name not in spare},
+        "role": np.where(arrays["role"] == 1, "test", "train"),
+        "line_of_sight": arrays["line_of_sight"].astype(bool),
+        "attributes": {name: value for name, value in attributes.items() if name not in RESERVED},
     }
 
 
@@ -143,18 +133,9 @@ def _rounded(arrays: Mapping[str, np.ndarray], floor: float) -> dict[str, np.nda
 def _round_mantissa(values: np.ndarray, bits: int, step: float) -> np.ndarray:
     """float32 values with ``bits`` explicit mantissa bits, and no finer than a power of two of at most ``step``."""
     step = 2.0 ** np.floor(np.log2(step))
-    coarse = np.round(values / np.float32(step)) * np.float32(step)
+    coarse = np.round(values.astype(np.float64) / step) * step  # steps below float32's range
     rounded = np.where(values < step * 2.0**bits, coarse, values).astype(np.float32)
     drop = 23 - bits
     whole = rounded.view(np.uint32)
     half = np.uint32((1 << (drop - 1)) - 1) + ((whole >> np.uint32(drop)) & np.uint32(1))  # ties to even
     return ((whole + half) & np.uint32(0xFFFFFFFF ^ ((1 << drop) - 1))).view(np.float32)
-
-
-def _plain(value: Any) -> Any:
-    """A NetCDF attribute as a Python value."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.reshape(-1)[0]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value.decode() if isinstance(value, bytes) else value

@@ -19,7 +19,8 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_positive
+from warprrf.brief import one_line
+from warprrf.checks import check_array, check_number, check_positive
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -35,11 +36,16 @@ BEAM_CUTOFF = 7.0
 FLOOR_BELOW_MEDIAN_DB = 60.0
 """The default N0 lies this far below the median over views of the view's maximum."""
 
+_ANGLE_ROUNDING = 1e-3  # radians by which angles of departure may lie out of range: what compact files round
+
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
+MOST_PIXELS = 1 << 24  # a sixteenth of a degree each
+
+
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
-    """``shape`` as (rows, columns), each at least 2.
+    """``shape`` as (rows, columns), each at least 2, at most :data:`MOST_PIXELS` in all.
 
     Raises:
         ValueError: otherwise.
@@ -50,7 +56,42 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
         raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
     if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
         raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")
+    if rows * columns > MOST_PIXELS:
+        raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {MOST_PIXELS} in all")
     return rows, columns
+
+
+def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
+    """``range_db`` as lowest and highest value [dB].
+
+    Raises:
+        TypeError, ValueError: if it is not two finite numbers, or the first lies above the second.
+    """
+    low, high = (float(value) for value in check_array("range_db", range_db, (2,)))
+    if low > high:
+        raise ValueError(f"range_db: got {low:g} to {high:g}, expected the lowest value first")
+    return low, high
+
+
+def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndarray | None) -> None:
+    """Refuse what no pixel holds; NaN is an empty delay or direction.
+
+    Raises:
+        ValueError: naming the array, for negative gains, negative or infinite delays, angles that are out of range.
+    """
+    if (path_gain < 0).any():
+        bad = int((path_gain < 0).sum())
+        raise ValueError(f"path_gain: got {bad} negative values, expected linear path gain")
+    if delay_s is not None and not (np.isnan(delay_s) | (delay_s >= 0) & (delay_s < np.inf)).all():
+        raise ValueError(
+            "delay_s: got values that are negative or infinite, expected seconds, or NaN where empty"
+        )
+    if aod is not None:
+        zenith, azimuth, most = aod[..., 0], aod[..., 1], np.pi + _ANGLE_ROUNDING
+        if ((zenith < -_ANGLE_ROUNDING) | (zenith > most) | (azimuth < -most) | (azimuth > most)).any():
+            raise ValueError(
+                "aod: got angles out of range, expected zeniths 0 to pi and azimuths -pi to pi, or NaN where empty"
+            )
 
 
 def pixel_angles(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -365,6 +406,8 @@ class Spectrum:
         std_db: Standard deviation of the dB image per pixel [dB], shape ``(H, W)``; None where it is not known.
     """
 
+    __repr__ = one_line
+
     path_gain: np.ndarray
     delay_s: np.ndarray | None = None
     aod: np.ndarray | None = None
@@ -372,6 +415,18 @@ class Spectrum:
     range_db: tuple[float, float] | None = None
     std_db: np.ndarray | None = None
     attributes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Check shapes and values; ValueError or TypeError names the field."""
+        shape = check_array("path_gain", self.path_gain, (None, None)).shape
+        for name, rest in (("path_gain", ()), ("delay_s", ()), ("aod", (2,)), ("std_db", ())):
+            if (value := getattr(self, name)) is not None:
+                check_array(name, value, (*shape, *rest), finite=False)
+                object.__setattr__(self, name, np.asarray(value))
+        check_pixels(self.path_gain, self.delay_s, self.aod)
+        check_number("floor", self.floor, least=0.0)
+        if self.range_db is not None:
+            check_range_db(self.range_db)
 
     @property
     def shape(self) -> tuple[int, int]:

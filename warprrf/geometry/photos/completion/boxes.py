@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from warprrf.cache import cached_property
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion.room_planes import Level
 from warprrf.geometry.photos.config import CompletionConfig

@@ -28,6 +28,10 @@ from warprrf.rf.spectra.spectrum import unit_beams
 MIRROR_SUB_PIXELS = 2
 """Square root of the rays per pixel that look into mirrors: what they show is seen a second time already."""
 
+_TRACED = Cache(
+    6
+)  # a lobby's take up to 90 MB each; kept here, not by surfaces, so that the bound is the process's
+
 
 @dataclass(frozen=True)
 class MirrorShown:
@@ -141,15 +145,15 @@ class Transport:
         loss_per_m: float = 0.0,
         device: DeviceLike = None,
     ) -> Transport:
-        """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few of a surface are kept."""
+        """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few are kept."""
         place = np.asarray(transmitter, np.float64).tobytes()
-        key = place, frequency_hz, shape, sub_pixels, beam_sigma_rad, loss_per_m, str(device)
+        key = surface, place, frequency_hz, shape, sub_pixels, beam_sigma_rad, loss_per_m, str(device)
 
         def make() -> Transport:
             grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss_per_m, device=device)
             return cls(surface, transmitter, frequency_hz, grid, beam_sigma_rad)
 
-        return surface.transports.get(key, make)
+        return _TRACED.get(key, make)
 
     def on_grid(self, shape: tuple[int, int], sub_pixels: int, mirror_sub_pixels: int) -> Transport:
         """The same for receivers with other rays and no beams; what belongs to the transmitter is shared."""

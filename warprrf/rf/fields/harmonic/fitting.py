@@ -8,6 +8,7 @@ rasteriser runs here. Each sum has one owner, so the result depends on the seed 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -99,9 +100,10 @@ class Checkpoint:
             raise ValueError(
                 f"checkpoint: {self.path} belongs to a fit with other data or options; delete it or name another file"
             )
-        for name, losses in header["losses"].items():
-            own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
-            self.states[name] = State(**own, losses=losses)
+        with tensor_files.named(self.path, "checkpoint: corrupt"):
+            for name, losses in header["losses"].items():
+                own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
+                self.states[name] = State(**own, losses=losses)
 
     def save(self, name: str, state: State) -> None:
         """Keep the state of layer ``name``."""
@@ -279,7 +281,7 @@ def fit_layer(
         index = p.batch_at(step)
         losses.append(layer.step(index, coefficients))
         # one pixel's L1 pull on a neper of gain, so that the ridge counts in pixels
-        pull = np.log10(np.e) * 10 / (target.high - target.low) if target.mask is None else 1.0
+        pull = np.log10(math.e) * 10 / (target.high - target.low) if target.mask is None else 1.0
         ridge = firm * (pull / layer.data[index].count)
         falling = FINAL_RATE ** (step / max(steps - 1, 1))
         p.launch(

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from warprrf.checks import check_count
+from warprrf.checks import check_count, check_seed
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.interaction import INTERACTION_POINTS
 from warprrf.rf.fields.harmonic.transport import TOP_K, TRANSMITTANCE
@@ -88,6 +88,7 @@ class FieldOptions:
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected one of {known}")
         for name, least in (("top_k", 1), ("iterations", 0), ("batch", 1)):
             check_count(name, getattr(self, name), least)
+        check_seed(self.seed)
         if self.train_opacity and self.transmittance != "product":
             raise ValueError(f"train_opacity: got transmittance {self.transmittance!r}, expected 'product'")
 

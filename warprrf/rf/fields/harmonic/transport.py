@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.cache import cached_property
 from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.splats.camera import Camera

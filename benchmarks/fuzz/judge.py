@@ -1,0 +1,89 @@
+"""What is right of what came back: an answer without NaN, or an error that names what is wrong with what was given."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from benchmarks.fuzz.values import is_numbers
+
+REFUSED = (ValueError, TypeError, OSError, ImportError)
+_DEEPEST = 6
+
+Leaves = dict[str, np.ndarray]
+"""Numbers of an answer, by where they stand in it."""
+
+
+def leaves(answer: Any) -> Leaves:
+    """All numbers that ``answer`` holds."""
+    return dict(_leaves(answer, "", 0))
+
+
+def _leaves(value: Any, where: str, depth: int) -> Iterator[tuple[str, np.ndarray]]:
+    if depth > _DEEPEST or value is None or isinstance(value, (str, bytes, type)):
+        return
+    if isinstance(value, wp.array):
+        value = value.numpy()
+    elif hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    if is_numbers(value):
+        value = np.asarray(value)
+    if isinstance(value, (bool, int, float, complex, np.generic, np.ndarray)):
+        array = np.asarray(value)
+        if array.dtype.kind in "biufc":
+            yield where, array
+        return
+    inside: Iterable[tuple[Any, Any]] = ()
+    if isinstance(value, Mapping):
+        inside = value.items()
+    elif isinstance(value, (list, tuple)) or inspect.isgenerator(value):
+        inside = enumerate(islice(value, 100))
+    elif is_dataclass(value):
+        inside = ((f.name, getattr(value, f.name)) for f in fields(value))
+    elif type(value).__module__.startswith("warprrf"):
+        inside = ((name, own) for name, own in vars(value).items() if not name.startswith("_"))
+    for name, own in inside:
+        yield from _leaves(own, f"{where}.{name}", depth + 1)
+
+
+def complaint(error: BaseException, names: Collection[str]) -> str:
+    """What is wrong with ``error`` as a refusal, where one of ``names`` is expected in its message; nothing if empty."""
+    kind, text = type(error).__name__, str(error)
+    if not isinstance(error, REFUSED):
+        return f"{kind}: {text}"
+    if isinstance(error, OSError) and error.filename is not None:
+        text += f" {error.filename}"
+    if not any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for name in names):
+        return f"names nothing: {kind}: {text}"
+    return ""
+
+
+def wrong(answer: Leaves, usual: Leaves) -> str:
+    """Where ``answer`` holds NaN that the ``usual`` answer does not have there."""
+    for where, array in answer.items():
+        if array.dtype.kind in "fc" and np.isnan(array).any():
+            known = usual.get(where)
+            if known is None or not (known.dtype.kind in "fc" and np.isnan(known).any()):
+                return f"NaN in answer{where}"
+    return ""
+
+
+def differs(answer: Leaves, usual: Leaves, tolerance: float = 0.0) -> str:
+    """Where ``answer`` is another than the ``usual`` one."""
+    if answer.keys() != usual.keys():
+        return f"other parts: {sorted(answer.keys() ^ usual.keys())[:3]}"
+    for where, array in answer.items():
+        known = usual[where]
+        if array.shape != known.shape:
+            return f"shape {array.shape} instead of {known.shape} in answer{where}"
+        scale = float(np.abs(known)[np.isfinite(known)].max(initial=0.0))
+        if not np.allclose(array, known, rtol=tolerance, atol=tolerance * scale, equal_nan=True):
+            return f"other values in answer{where}"
+    return ""

@@ -1,0 +1,90 @@
+"""A minute of fuzzing: part of what `python -m benchmarks fuzz` tries, the same in every run."""
+
+import os
+import time
+from functools import partial
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from benchmarks.fuzz import calls, cases, damage, judge
+from benchmarks.fuzz.command import stated, stream
+from benchmarks.fuzz.place import Place
+from benchmarks.fuzz.workers import Workers
+
+SECONDS = 45.0
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return Place(tmp_path_factory.mktemp("fuzz")).make()
+
+
+def test_every_public_name_has_an_example_with_all_it_needs(place):
+    names = calls.public()
+    assert names.keys() == calls.EXAMPLES.keys()
+    for name, example in calls.EXAMPLES.items():
+        given = calls.parameters(name, example(place))
+        assert not [argument for argument, value in given.items() if value is calls.MISSING], name
+
+
+def test_a_minute_of_fuzzing_kills_no_process(place):
+    findings = []
+    tried = 0
+    with Workers(partial(cases.trial, str(place.folder)), cases.ended) as workers:
+        for case, outcome in workers.run(stream(place, 0, ""), time.monotonic() + SECONDS):
+            tried += 1
+            if outcome.text.startswith("the process died"):
+                findings.append(f"{stated(case)}: {outcome.text}")
+    assert tried > 100
+    assert not findings, "\n".join(findings)
+
+
+def misbehaving(scratch):
+    return {
+        "answers": str,
+        "dies": lambda case: os.abort(),
+        "hangs": lambda case: time.sleep(60.0),
+    }.__getitem__
+
+
+def attempts(scratch):
+    known = misbehaving(scratch)
+    return lambda case: known(case)(case)
+
+
+def test_a_crash_and_a_hang_are_seen_and_others_go_on():
+    asked = ["answers", "dies", "answers", "hangs", "answers", "answers"]
+    with Workers(attempts, lambda words: f"ended: {words}", 1, 2.0) as workers:
+        found = dict(islice(workers.run(asked), len(asked)))
+    assert found["answers"] == "answers"
+    assert "exit code -6" in found["dies"]
+    assert "took more than 2 s" in found["hangs"]
+
+
+def test_errors_of_other_kinds_or_without_a_name_are_findings():
+    assert not judge.complaint(ValueError("rx: got NaN"), ["rx"])
+    assert "KeyError" in judge.complaint(KeyError("rx"), ["rx"])
+    assert "names nothing" in judge.complaint(ValueError("bad prx"), ["rx"])
+
+
+def test_nan_is_a_finding_where_it_is_not_usual():
+    usual = judge.leaves({"a": np.array([1.0, np.nan]), "b": 1.0})
+    assert not judge.wrong(judge.leaves({"a": np.array([np.nan]), "b": 2.0}), usual)
+    assert "b" in judge.wrong(judge.leaves({"a": np.array([1.0]), "b": np.nan}), usual)
+
+
+@pytest.mark.parametrize("name", cases.FORMATS)
+def test_every_format_reads_the_same_when_its_contents_are_put_back(place, name, tmp_path):
+    form = cases.FORMATS[name]
+    path = form.make(place, tmp_path)
+    usual = judge.leaves(form.read(path))
+    assert usual
+    if form.codec:
+        unpack, pack = damage.CODECS[form.codec]
+        pack(path, unpack(path))
+        assert not judge.differs(judge.leaves(form.read(path)), usual)
+    before = path.read_bytes()
+    damage.damage(path, form.codec, (("flip", 3, 1),))
+    assert path.read_bytes() != before

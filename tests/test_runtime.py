@@ -1,0 +1,76 @@
+"""Warp starts without a word on a machine without a GPU, and works where its cache of kernels cannot be written."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import warp as wp
+from places import ROOT
+
+from warprrf import runtime
+
+
+def _started(cache: Path) -> subprocess.CompletedProcess[str]:
+    code = (
+        "from warprrf.device import resolve; import warp; resolve('cpu'); print(warp.config.kernel_cache_dir)"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        timeout=300,
+        env={**os.environ, "WARP_CACHE_PATH": str(cache)},
+    )
+
+
+def test_nothing_is_said_at_a_start_without_a_gpu(tmp_path: Path) -> None:
+    done = _started(tmp_path)
+    assert done.stderr == ""
+    assert done.stdout.startswith(str(tmp_path))
+
+
+def test_kernels_go_to_a_temporary_folder_where_the_cache_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = _started(tmp_path / "file" / "cache")
+    assert done.returncode == 0
+    assert "UserWarning: kernel cache: " in done.stderr
+    assert str(tmp_path / "file" / "cache") in done.stderr
+    assert "WARP_CACHE_PATH" in done.stderr
+    assert "warprrf-kernels-" in done.stdout
+    assert not Path(done.stdout.strip()).exists()  # it is gone with the process
+
+
+def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(runtime, "_temporary", [])
+
+    class Module:
+        folders: tuple[str, ...] = ()
+
+        def load(self, device: str, block_dim: int) -> None:
+            self.folders += (wp.config.kernel_cache_dir,)
+            if len(self.folders) == 1:
+                raise PermissionError(13, "Permission denied", str(tmp_path))
+
+    module = Module()
+    with pytest.warns(UserWarning, match=rf"kernel cache: .*{tmp_path}.*WARP_CACHE_PATH"):
+        runtime.load(module, "cpu", 1)
+    assert module.folders[0] == str(tmp_path)
+    assert Path(module.folders[1]).is_dir()
+    assert "warprrf-kernels-" in module.folders[1]
+
+
+def test_other_words_on_standard_error_are_kept(capfd: pytest.CaptureFixture[str]) -> None:
+    with runtime._without_cuda_warning():
+        os.write(
+            2, b"before\nWarp CUDA warning: Could not find or load the NVIDIA CUDA driver. None.\nafter\n"
+        )
+    os.write(2, b"later\n")
+    assert capfd.readouterr().err == "before\nafter\nlater\n"
