@@ -7,8 +7,8 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable
-from dataclasses import is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
 
@@ -142,62 +142,123 @@ def _number(value: object) -> float:
         return np.nan
 
 
+LARGEST_M = 1e8
+"""No coordinate is larger [m]: beyond, single precision overflows in products of lengths."""
+_KINDS = {"f": "real numbers", "i": "whole numbers", "u": "unsigned ones", "b": "truth values"}
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What an array must be: of a class and of its files, said in one place.
+
+    Attributes:
+        shape: its axes, numbers or names of sizes that arrays of one class share: ``"F 3"``; empty for one value.
+        least, most: limits of its values; NaN is within none.
+        index: name of the size that its values are indices to, from ``least`` on; -1 is none.
+        kind: of its numbers, as in ``dtype.kind``: any of "f", "i", "u", "b".
+        nan: whether NaN stands for what is unknown.
+    """
+
+    shape: str
+    least: float = -np.inf
+    most: float = 3.4e38  # all of single precision
+    index: str = ""
+    kind: str = "f"
+    nan: bool = False
+
+
+def check_arrays(
+    arrays: Mapping[str, np.ndarray], expected: Mapping[str, Expected], **sizes: int
+) -> dict[str, int]:
+    """The sizes by name, once every array is as ``expected``; ``sizes`` are known beforehand.
+
+    Raises:
+        KeyError: if one is missing.
+        TypeError, ValueError: naming the array, what came and what was expected.
+    """
+    for name, wanted in expected.items():
+        array = np.asarray(arrays[name])
+        if array.dtype.kind not in wanted.kind:
+            kinds = " or ".join(_KINDS[k] for k in wanted.kind)
+            raise TypeError(f"{name}: got an array of {array.dtype}, expected {kinds}")
+        axes = wanted.shape.split()
+        if len(axes) == array.ndim:
+            sizes = dict(zip(axes, array.shape, strict=True)) | sizes
+        shape = tuple(int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes)
+        if array.shape != shape:
+            told = ", ".join(str(axis if n is None else n) for axis, n in zip(axes, shape, strict=True))
+            raise ValueError(f"{name}: got shape {array.shape}, expected ({told})")
+    for name, wanted in expected.items():
+        array = np.asarray(arrays[name])
+        most = sizes[wanted.index] - 1 if wanted.index else wanted.most
+        within = (array >= wanted.least) & (array <= most)
+        if not (within | np.isnan(array) if wanted.nan else within).all():
+            bad = array[~within][0]
+            raise ValueError(f"{name}: got {bad}, expected values from {wanted.least:g} to {most:g}")
+    return sizes
+
+
+def index_to(size: str, shape: str, least: int = 0) -> Expected:
+    """Whole numbers that are indices to what there are ``size`` of."""
+    return Expected(shape, least, index=size, kind="iu")
+
+
+def lengths(shape: str, least: float = -LARGEST_M) -> Expected:
+    """Coordinates or lengths [m]."""
+    return Expected(shape, least, LARGEST_M)
+
+
 Public = TypeVar("Public", bound=Callable[..., Any])
 
 
 def checked(public: Public) -> Public:
     """A function, or a class with its public methods, whose arguments come as their annotations say.
 
-    Numbers of other kinds become Python's, arrays of other kinds (Warp's, torch's, lists, Python objects) NumPy's, unless
-    an annotation names them. What a sequence or a mapping holds is not looked at, and values are checked by the function itself.
+    Numbers of other kinds become Python's, arrays of other kinds (Warp's, torch's, lists, Python objects) NumPy's. What
+    a sequence or a mapping holds is not looked at, and values are checked by the function itself.
 
     Raises:
         TypeError: when called with something else, naming the argument.
     """
-    if isinstance(public, type):
-        for name, member in list(vars(public).items()):
-            inner = member.__func__ if isinstance(member, classmethod) else member
-            if inspect.isfunction(inner) and (name == "__init__" or not name.startswith("_")):
-                by_field = name == "__init__" and is_dataclass(
-                    public
-                )  # inherited ones have names of other modules
-                wrapped = _checked_call(inner, public if by_field else inner)
-                setattr(public, name, classmethod(wrapped) if isinstance(member, classmethod) else wrapped)
-        return public
-    return _checked_call(public, public)  # type: ignore[return-value]
+    if not isinstance(public, type):
+        return _checked_call(public, public)  # type: ignore[return-value]
+    for name, member in list(vars(public).items()):
+        inner = getattr(member, "__func__", member)  # of a class method
+        if inspect.isfunction(inner) and (name == "__init__" or not name.startswith("_")):
+            # A field's annotation names what the module of its own class imports.
+            call = _checked_call(inner, public if name == "__init__" and is_dataclass(public) else inner)
+            setattr(public, name, call if member is inner else type(member)(call))
+    return public
 
 
 def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[..., Any]:
     parameters = inspect.signature(function).parameters
-    names = list(parameters)
+    defaults = {name: one.default for name, one in parameters.items()}
 
     @functools.cache
-    def kinds() -> dict[str, Any]:
-        """By argument, when first asked for: annotations name what modules import last."""
-        found = typing.get_type_hints(annotated)
+    def converters() -> dict[str, Callable[[Any], object]]:
+        """By argument, when first called: annotations name what modules import last."""
+        kinds = typing.get_type_hints(annotated)
         for one in parameters.values():
-            if one.kind is one.VAR_KEYWORD:
-                options = found.pop(one.name, Any)
-                if typing.get_origin(options) is typing.Unpack:
-                    found |= typing.get_type_hints(typing.get_args(options)[0])
-        return found
+            if one.kind is one.VAR_KEYWORD and typing.get_origin(kinds[one.name]) is typing.Unpack:
+                kinds |= typing.get_type_hints(typing.get_args(kinds[one.name])[0])
+        return {name: _converter(kind) for name, kind in kinds.items()}
 
     def taken(name: str, value: object) -> object:
-        kind = kinds().get(name, Any)
-        if name in parameters and value is parameters[name].default:
+        convert = converters().get(name)
+        if convert is None or value is defaults.get(name, _OTHER):
             return value
-        found = _as(value, kind)
+        found = convert(value)
         if found is _OTHER:
-            what = inspect.formatannotation(kind).replace("typing.", "").replace("collections.abc.", "")
-            raise TypeError(f"{name}: got {_shown(value)}, expected {what}")
+            expected = function.__annotations__.get(name, "another type")
+            raise TypeError(f"{name}: got {_shown(value)}, expected {expected}")
         return found
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        given = [taken(name, value) for name, value in zip(names, args, strict=False)]
-        return function(
-            *given, *args[len(given) :], **{name: taken(name, value) for name, value in kwargs.items()}
-        )
+        given = [taken(name, value) for name, value in zip(parameters, args, strict=False)]
+        named = {name: taken(name, value) for name, value in kwargs.items()}
+        return function(*given, *args[len(given) :], **named)
 
     return call
 
@@ -211,54 +272,63 @@ def _shown(value: object) -> str:
     return type(value).__name__ + (written if len(written) < 60 else "")
 
 
-def _as(value: object, kind: Any) -> object:
-    """A value as the annotation ``kind`` says, or :data:`_OTHER`."""
+@functools.cache
+def _converter(kind: Any) -> Callable[[Any], object]:
+    """What turns a value into one of the annotation ``kind``, or into :data:`_OTHER`."""
     origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        if bytes in inside:  # those of ArrayLike
-            inside = tuple(one for one in inside if one not in (bytes, str, complex))
-        inside = tuple(sorted(inside, key=_is_of_numpy))  # what need not be turned into an array comes first
-        return next((found for one in inside if (found := _as(value, one)) is not _OTHER), _OTHER)
-    if kind in (bool, int, float, complex):
-        return _as_number(value, kind)
-    if _is_of_numpy(kind):  # an array, or one of what ArrayLike stands for
-        found = _as_array(value, "U" if "str_" in repr(inside) else "biufc")
-        plain = origin is np.ndarray and isinstance(found, (bool, int, float, complex))
-        return np.asarray(found) if plain else found
+        if bytes in inside:  # ArrayLike, whose numbers are arrays too
+            inside = tuple(one for one in inside if one not in _NUMBERS and one not in (bool, str, bytes))
+        # What need not become an array comes first.
+        every = [_converter(one) for one in sorted(inside, key=_is_of_numpy)]
+        return lambda value: next((found for one in every if (found := one(value)) is not _OTHER), _OTHER)
+    if kind is bool:
+        return _as_bool
+    if kind in _NUMBERS:
+        return functools.partial(_as_number, kind)
+    if _is_of_numpy(kind):
+        return functools.partial(_as_array, "U" if "str_" in repr(inside) else "biufc", origin is np.ndarray)
     if origin is tuple:
-        row = isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim)
-        return value if row and (Ellipsis in inside or len(value) == len(inside)) else _OTHER  # type: ignore[arg-type]
+        length = None if Ellipsis in inside else len(inside)
+        return lambda value: value if _is_row(value) and length in (None, len(value)) else _OTHER
     if origin is Callable:
-        return value if callable(value) else _OTHER
-    if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
-        return value
-    if isinstance(value, str):
-        return value if origin is object or (origin is str and "\0" not in value) else _OTHER
-    # One's own class may stand for one of ours, as long as it is an object with attributes.
-    own = origin.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
-    fits = isinstance(value, origin) or (own and not isinstance(value, wp.array))
-    return value if fits and not isinstance(value, bytes) else _OTHER
+        return lambda value: value if callable(value) else _OTHER
+    if isinstance(origin, type) and not getattr(origin, "_is_protocol", False):
+        return functools.partial(_as_object, origin)
+    return lambda value: value
 
 
 def _is_of_numpy(kind: Any) -> bool:
     return str(getattr(typing.get_origin(kind) or kind, "__module__", "")).startswith("numpy")
 
 
-def _as_number(value: object, kind: type) -> object:
+def _is_row(value: object) -> bool:
+    return isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
+def _as_bool(value: object) -> object:
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value) if kind is bool else _OTHER
-    if kind is bool:
-        return bool(value) if isinstance(value, (int, np.integer)) and value in (0, 1) else _OTHER
-    wanted = {int: numbers.Integral, float: numbers.Real, complex: numbers.Complex}[kind]
-    if not isinstance(value, wanted):
+    whole = isinstance(value, (int, np.integer)) and value in (0, 1)
+    return bool(value) if whole or isinstance(value, np.bool_) else _OTHER
+
+
+_NUMBERS: dict[type, type] = {int: numbers.Integral, float: numbers.Real, complex: numbers.Complex}
+
+
+def _as_number(kind: type, value: object) -> object:
+    if type(value) is kind and kind is not int:
+        return value
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, _NUMBERS[kind]):
         return _OTHER
     number = int(value) if isinstance(value, numbers.Integral) else kind(value)
     return number if not isinstance(number, int) or abs(number) < 2**63 else _OTHER
 
 
-def _as_array(value: Any, letters: str) -> object:
+def _as_array(letters: str, of_axes: bool, value: Any) -> object:
+    """An array of one of the kinds ``letters``, a Python number where that is enough, or :data:`_OTHER`."""
     if isinstance(value, wp.array):
         value = value.numpy()
     try:
@@ -272,6 +342,15 @@ def _as_array(value: Any, letters: str) -> object:
         return _OTHER
     if array.dtype.kind not in letters:
         return _OTHER
-    if isinstance(value, (numbers.Number, np.generic)):
+    if isinstance(value, (numbers.Number, np.generic)) and not of_axes:
         return array[()].item()
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+
+
+def _as_object(kind: type, value: object) -> object:
+    if isinstance(value, str):
+        return value if kind is object or (kind is str and "\0" not in value) else _OTHER
+    # One's own class may stand for one of ours, as long as it is an object with attributes.
+    own = kind.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
+    fits = isinstance(value, kind) or (own and not isinstance(value, wp.array))
+    return value if fits and not isinstance(value, bytes) else _OTHER
