@@ -293,9 +293,9 @@ def _converter(kind: Any) -> Callable[[Any], object]:
         return lambda value: value if _is_row(value) and length in (None, len(value)) else _OTHER
     if origin is Callable:
         return lambda value: value if callable(value) else _OTHER
-    if isinstance(origin, type) and not getattr(origin, "_is_protocol", False):
-        return functools.partial(_as_object, origin)
-    return lambda value: value
+    if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+        return lambda value: value
+    return functools.partial(_as_object, origin)
 
 
 def _is_of_numpy(kind: Any) -> bool:
@@ -317,8 +317,8 @@ _NUMBERS: dict[type, type] = {int: numbers.Integral, float: numbers.Real, comple
 
 
 def _as_number(kind: type, value: object) -> object:
-    if type(value) is kind and kind is not int:
-        return value
+    if type(value) is kind and (kind is not int or abs(value) < 2**63):  # type: ignore[arg-type]
+        return value  # in a hurry
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value[()]
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, _NUMBERS[kind]):
@@ -329,6 +329,8 @@ def _as_number(kind: type, value: object) -> object:
 
 def _as_array(letters: str, of_axes: bool, value: Any) -> object:
     """An array of one of the kinds ``letters``, a Python number where that is enough, or :data:`_OTHER`."""
+    if type(value) is np.ndarray and value.dtype.kind in letters and value.dtype.isnative:
+        return value  # in a hurry
     if isinstance(value, wp.array):
         value = value.numpy()
     try:

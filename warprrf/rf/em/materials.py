@@ -112,7 +112,6 @@ class Material:
     reciprocal: bool = False
 
     def __post_init__(self) -> None:
-        check_type("name", self.name, str)
         if not self.bands:
             raise ValueError(f"bands: material {self.name!r} has none, expected at least one row")
         for k, band in enumerate(self.bands):
@@ -126,7 +125,6 @@ class Material:
         if self.pattern not in PATTERNS:
             raise ValueError(f"pattern{of}: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}")
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
-        check_type("reciprocal" + of, self.reciprocal, bool)
 
     @classmethod
     def custom(

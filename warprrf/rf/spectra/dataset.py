@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_positive, check_seed, check_type, checked
+from warprrf.checks import check_array, check_count, check_positive, check_seed, checked
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
@@ -94,8 +94,6 @@ class SpectrumDataset:
             "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
             "attributes": _check_attributes(self.attributes),
         }
-        for name in ("engine", "polarisation"):
-            check_type(name, getattr(self, name), str)
         check_pixels(gain, fields["delay_s"], fields["aod"])
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -380,7 +378,6 @@ def _check_flags(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 def _check_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """What a file can hold beside the fields, under names of its own."""
-    check_type("attributes", attributes, Mapping)
     for name, value in attributes.items():
         if not isinstance(name, str) or not name or name.startswith("_") or {"/", "\0"} & set(name):
             raise ValueError(
