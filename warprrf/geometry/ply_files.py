@@ -100,9 +100,23 @@ def _elements(data: bytes) -> dict[str, Element]:
         if element.count * least > len(rest):
             raise ValueError(f"cut short: {element.count} rows of {element.name!r} are not there")
         found[element.name], rest = _rows(element, order, rest)
+        if not order:
+            _set_types(element, found[element.name])
     if len(rest) and (not order or bytes(rest).strip()):
         raise ValueError(f"holds more than its header states, {len(rest)} bytes")
     return found
+
+
+def _set_types(stated: _Stated, element: Element) -> None:
+    """Give the words of ASCII the types that the header states."""
+    for name, kind, _ in stated.columns:
+        column = element[name]
+        words = column.values if isinstance(column, Lists) else column
+        with np.errstate(invalid="ignore", over="ignore"):
+            values = words.astype(kind)
+        if values.dtype.kind in "iu" and not np.array_equal(values, words):
+            raise ValueError(f"{name} of {stated.name!r} holds numbers that are not of type {kind}")
+        element[name] = Lists(column.lengths, values) if isinstance(column, Lists) else values
 
 
 def _header(text: str) -> tuple[str, list[_Stated]]:
