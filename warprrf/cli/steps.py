@@ -13,7 +13,15 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
-from warprrf.cli.inputs import Add, add_point, existing, load_geometry, read_positions, read_receivers
+from warprrf.cli.inputs import (
+    Add,
+    add_out,
+    add_point,
+    existing,
+    load_geometry,
+    read_positions,
+    read_receivers,
+)
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
 
@@ -22,7 +30,7 @@ def add_reconstruct(add: Add) -> None:
     """Define `reconstruct`."""
     rec = add("reconstruct", _reconstruct)
     rec.add_argument("photos", help="folder of JPEG or PNG photos of one static room")
-    rec.add_argument("-o", "--out", required=True, help="folder of the result")
+    add_out(rec, "folder of the result")
     rec.add_argument(
         "--known-positions", metavar="FILE", help="surveyed camera positions, JSON or CSV: sets metres"
     )
@@ -57,7 +65,7 @@ def add_simulate(add: Add) -> None:
     """Define `simulate`."""
     sim = add("simulate", _simulate)
     sim.add_argument("scene", help="scene XML (Mitsuba/Sionna RT), with materials.json beside it")
-    sim.add_argument("-o", "--out", required=True, help="NetCDF file")
+    add_out(sim, "NetCDF file")
     add_point(sim, "--transmitter", "metres", required=True)
     sim.add_argument(
         "--receivers", nargs="+", required=True, help="CSV or NPY file of x,y,z rows, or x,y,z words"
@@ -118,7 +126,7 @@ def add_fit(add: Add) -> None:
     fit = add("fit", _fit)
     fit.add_argument("geometry", help="a reconstruction's folder, splats (.ply) or a scene (.xml)")
     fit.add_argument("spectra", help="NetCDF file of spectra")
-    fit.add_argument("-o", "--out", required=True, help="field file (.safetensors)")
+    add_out(fit, "field file (.safetensors)")
     fit.add_argument(
         "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
     )
@@ -137,6 +145,11 @@ def add_fit(add: Add) -> None:
         "--quick",
         action="store_true",
         help="bistatic: no term is tried, one ray a pixel; two or three dB less, in seconds",
+    )
+    fit.add_argument(
+        "--reciprocal",
+        action="store_true",
+        help="bistatic: scattering that is the same when transmitter and receiver change places",
     )
 
 
@@ -163,8 +176,7 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
     options: dict[str, Any] = {}
     if args.relevance is not None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
-    if args.quick:
-        options["quick"] = True
+    options |= {name: True for name in ("quick", "reciprocal") if getattr(args, name)}
     for option in options:
         if args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
@@ -195,7 +207,7 @@ def add_evaluate(add: Add) -> None:
         help="training receivers that the lookups see (default: as many as the field)",
     )
     eva.add_argument("--no-lookups", dest="lookups", action="store_false", help="the field alone")
-    eva.add_argument("-o", "--out", help="JSON file of the figures")
+    add_out(eva, "JSON file of the figures", required=False)
 
 
 def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
@@ -244,7 +256,7 @@ def add_relevance(add: Add) -> None:
     rel.add_argument(
         "source", help="scene (.xml), reconstruction's folder, splats (.ply) or field (.safetensors)"
     )
-    rel.add_argument("-o", "--out", help="JSON file; the table goes beside it as Markdown")
+    add_out(rel, "JSON file; the table goes beside it as Markdown", required=False)
     rel.add_argument("--spectra", help="NetCDF file whose transmitter, carrier and receivers are used")
     add_point(rel, "--transmitter", "metres")
     rel.add_argument("--receivers", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")

@@ -24,6 +24,7 @@ PATCH_ARRAYS = {
     "patch_offset": lengths("P"),
     "patch_area": Expected("P", 0.0, LARGEST_M**2),
     "patch_group": Expected("P", -1, kind="iu"),
+    "patch_first": index_to("F", "F"),
 }
 """What the arrays of patches must be: F faces, P patches."""
 PLANE_ARRAYS = {
