@@ -309,7 +309,7 @@ def _face_colours(part: Any, corner: np.ndarray, material: _Colour) -> np.ndarra
     colour = np.broadcast_to(material.factor, (len(corner), 3)).copy()
     uv, vertex = part.visual.uv, part.visual.vertex_attributes.get("color")
     plain = material.picture is None or uv is None
-    if not plain:
+    if material.picture is not None and uv is not None:
         if not np.isfinite(uv).all():
             raise ValueError("texture coordinates that are not finite")
         colour *= sampled(material.picture, np.asarray(uv, dtype=np.float64)[corner])

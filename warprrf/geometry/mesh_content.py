@@ -43,12 +43,14 @@ class MeshContent:
 
     def with_faces(self, vertices: np.ndarray, faces: np.ndarray, parent: np.ndarray) -> MeshContent:
         """Other vertices and faces, each made of its ``parent`` (F,) among the faces now."""
-        own = {
-            name: None if held is None else held[parent]
-            for name, held in vars(self).items()
-            if name.startswith("face_")
-        }
-        return replace(self, vertices=vertices, faces=faces, uv=None, **own)
+        colours, material, thing = (
+            None if held is None else held[parent]
+            for held in (self.face_colours, self.face_material, self.face_object)
+        )
+        return replace(
+            self, vertices=vertices, faces=faces, uv=None, face_colours=colours, face_material=material,
+            face_object=thing,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -110,8 +110,8 @@ def read_obj(folder: Folder) -> MeshContent:
             warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=4)
     material = [None, *(name for _, name, _ in lines.runs)]
     pages = {name for name, found in known.items() if found.picture is not None}
-    names = numbered([material_name(name, name in pages) for name in material], counts)
-    objects = numbered([None, *(name or None for _, _, name in lines.runs)], counts)
+    names = numbered([material_name(name, name in pages) for name in material], counts.tolist())
+    objects = numbered([None, *(name or None for _, _, name in lines.runs)], counts.tolist())
     return MeshContent(
         vertices, faces.astype(np.int32), face_colours=_colours(lines, faces, material, counts, known),
         face_material=names[0], material_names=names[1], face_object=objects[0], object_names=objects[1],

@@ -23,6 +23,7 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _END = b"end_header"
+_LONGEST_HEADER = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,25 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, Element]:
         return _elements(data)
     except (ValueError, OverflowError) as error:
         raise ValueError(f"{os.fspath(path)}: {error}") from error
+
+
+def ply_columns(path: str | os.PathLike[str]) -> dict[str, list[str]]:
+    """Names of the columns of each element that the header of a PLY file states.
+
+    Raises:
+        OSError: naming the file, if it cannot be read.
+        ValueError: naming it, if it is no PLY file.
+    """
+    with Path(path).open("rb") as file:
+        data = file.read(_LONGEST_HEADER)
+    end = data.find(b"\n" + _END)
+    try:
+        if not data.startswith(b"ply") or end < 0:
+            raise ValueError("not a PLY file (no 'ply' ... 'end_header')")
+        stated = _header(data[:end].decode("ascii", "replace"))[1]
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {error}") from error
+    return {element.name: [name for name, _, _ in element.columns] for element in stated}
 
 
 def write_ply(
