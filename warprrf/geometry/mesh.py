@@ -25,7 +25,6 @@ from warprrf.brief import one_line
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import LARGEST_M, check_array, check_number
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh_content import MeshContent
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, look_around
@@ -160,15 +159,7 @@ class Mesh:
             >>> mesh = Mesh.load("room.stl", unit="mm")  # doctest: +SKIP
         """
         content = load_mesh(path, MeshOptions(unit, up, simplify, allow_outside))
-        return cls.of_content(content)
-
-    @classmethod
-    def of_content(cls, content: MeshContent) -> Mesh:
-        """The mesh that a file holds."""
-        return cls(
-            content.vertices, content.faces, face_colours=content.face_colours,
-            face_material=content.face_material, material_names=content.material_names,
-        )  # fmt: skip
+        return cls(content.vertices, content.faces, **content.known)
 
     def __repr__(self) -> str:
         known = f", materials {', '.join(self.material_names)}" if self.material_names else ""

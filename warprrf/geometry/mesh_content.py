@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -40,6 +41,11 @@ class MeshContent:
     material_names: tuple[str, ...] = ()
     face_object: np.ndarray | None = None
     object_names: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """What a mesh keeps of its faces, by the names that it has for it."""
+        return {name: getattr(self, name) for name in ("face_colours", "face_material", "material_names")}
 
     def with_faces(self, vertices: np.ndarray, faces: np.ndarray, parent: np.ndarray) -> MeshContent:
         """Other vertices and faces, each made of its ``parent`` (F,) among the faces now."""
