@@ -126,7 +126,6 @@ def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
             raise ValueError(f"{name}: got NaN or infinite values among the rays that are there")
     if (gain[valid] == 0).any():
         raise ValueError("gain: got rays with a gain of zero, expected them left out")
-    room = read_mesh(base / MESH_FILE)
     return NewrfRays(
         transmitter=check_array("transmitter", data["transmitter"], (3,)),
         receivers=check_array("receivers", data["receivers"], (count, 3)),
@@ -136,7 +135,7 @@ def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
         valid=valid,
         line_of_sight=_array(data, "line_of_sight", (count,), bool),
         csi=check_array("csi", _array(data, "csi", (count,), complex), (count,), dtype=complex),
-        mesh=Mesh(room.vertices, room.faces),
+        mesh=_room(base / MESH_FILE),
     )
 
 
@@ -158,3 +157,8 @@ def _shape(data: dict[str, np.ndarray], path: Path) -> tuple[int, int]:
 
 def _array(data: dict[str, np.ndarray], name: str, shape: tuple[int, ...], dtype: DTypeLike) -> np.ndarray:
     return check_array(name, data[name], shape, dtype=dtype, finite=False)
+
+
+def _room(path: Path) -> Mesh:
+    content = read_mesh(path)
+    return Mesh(content.vertices, content.faces)
