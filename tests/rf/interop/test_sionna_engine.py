@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from sionna_room import sionna_or_skip, write_scene
 
+from warprrf.rf import sionna_package
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.interop import llvm
 from warprrf.rf.interop.sionna_engine import Sampling
 from warprrf.rf.paths.sionna import repeated
 from warprrf.rf.scene import Scene
@@ -130,12 +130,12 @@ def test_a_scene_without_a_file_is_refused(scene):
 def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(
-        llvm, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
+        sionna_package, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
     )
-    assert llvm.select_llvm() == Path("c")
+    assert sionna_package.select_llvm() == Path("c")
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH")
-    monkeypatch.setattr(llvm, "installed_llvm", lambda: {15: Path("b")})
+    monkeypatch.setattr(sionna_package, "installed_llvm", lambda: {15: Path("b")})
     with pytest.raises(ImportError, match="15.*libllvm19"):
-        llvm.select_llvm()
+        sionna_package.select_llvm()
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/mine.so")
-    assert llvm.select_llvm() == Path("/mine.so")
+    assert sionna_package.select_llvm() == Path("/mine.so")
