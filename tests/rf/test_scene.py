@@ -77,9 +77,8 @@ def test_missing_files_and_materials_are_named(copy: Path) -> None:
     with pytest.raises(ValueError, match="not well-formed"):
         Scene.load(copy / "scene.xml")
     (copy / "scene.xml").write_text(text)
-    (copy / "materials.json").unlink()
-    with pytest.raises(FileNotFoundError, match=r"materials\.json"):
-        Scene.load(copy / "scene.xml")
+    with pytest.raises(FileNotFoundError, match=r"other\.json"):
+        Scene.load(copy / "scene.xml", materials=copy / "other.json")
 
 
 def test_a_corrupt_mesh_is_named(copy: Path) -> None:

@@ -17,7 +17,7 @@ from warprrf.rf.em.itu import itu_material
 from warprrf.rf.em.materials import Band, Material
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
-from warprrf.rf.sionna_package import sionna_rt
+from warprrf.rf.sionna_package import select_variant, sionna_rt
 
 SIONNA_FREQUENCY_HZ = 3.5e9  # that a scene of Sionna RT has before it is set
 
@@ -114,8 +114,7 @@ def to_sionna_scene(
     """A ``sionna.rt.Scene`` of these objects and devices; see :meth:`Scene.to_sionna`."""
     frequency = check_frequency(frequency_hz)
     rt = sionna_rt()
-    import mitsuba as mi
-
+    mi = select_variant()
     taken = {part.name for part in parts} | set(transmitters) | set(receivers)
     radio: dict[int, Any] = {}
     for part in parts:
@@ -127,7 +126,7 @@ def to_sionna_scene(
             taken.add(name)
             radio[id(material)] = _radio_material(rt, material, name, frequency)
     shapes: dict[str, Any] = {"type": "scene"}
-    for part in parts:
+    for k, part in enumerate(parts):
         properties = mi.Properties()
         properties.set_id(part.name)
         properties["face_normals"] = True
@@ -137,9 +136,13 @@ def to_sionna_scene(
         values["faces"] = np.ravel(part.faces).astype(np.uint32)
         values.update()
         mesh.set_bsdf(radio[id(part.material)])
-        shapes[part.name] = mesh
+        shapes[f"object{k}"] = mesh  # a key may not have all letters of a name, which the mesh keeps
     scene = rt.Scene(mi.load_dict(shapes, optimize=False))
     scene.frequency = frequency
+    for material in {id(part.material): part.material for part in parts}.values():
+        _follow_frequency(
+            radio[id(material)], material
+        )  # not before: a new scene has Sionna's default frequency
     for name, position in transmitters.items():
         scene.add(rt.Transmitter(name, position=np.asarray(position, float).tolist()))
     for name, position in receivers.items():
@@ -148,7 +151,7 @@ def to_sionna_scene(
 
 
 def _radio_material(rt: Any, material: Material, name: str, frequency: float) -> Any:
-    """Sionna's material of ours; it follows the scene's frequency."""
+    """Sionna's material of ours at this frequency."""
     directive = material.pattern == "directive"
     if directive and material.alpha_r > NARROWEST_SIONNA_LOBE:
         raise ValueError(
@@ -159,16 +162,22 @@ def _radio_material(rt: Any, material: Material, name: str, frequency: float) ->
         raise ValueError(
             f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
         )
-    material.band(frequency)  # an error of ours, before Sionna calls back
     radio = rt.RadioMaterial(
         name,
         thickness=float(material.thickness_m),
+        relative_permittivity=material.relative_permittivity(frequency),
+        conductivity=material.conductivity(frequency),
         scattering_coefficient=material.scattering_coefficient(frequency),
         xpd_coefficient=float(material.xpd),
     )
     radio.scattering_pattern = (
         rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
     )
+    return radio
+
+
+def _follow_frequency(radio: Any, material: Material) -> None:
+    """Let Sionna's material take our values whenever its scene's frequency is set."""
 
     def law(frequency: Any) -> tuple[float, float]:
         hertz = float(np.asarray(frequency).reshape(-1)[0])
@@ -176,4 +185,3 @@ def _radio_material(rt: Any, material: Material, name: str, frequency: float) ->
         return material.relative_permittivity(hertz), material.conductivity(hertz)
 
     radio.frequency_update_callback = law
-    return radio

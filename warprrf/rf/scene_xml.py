@@ -349,9 +349,11 @@ def _unit(vector: np.ndarray, what: str) -> np.ndarray:
 
 
 def _rotate(part: Element) -> np.ndarray:
-    axis = _unit(_vector(part, "axis", 0.0), "a rotation about an axis")
+    axis = _vector(part, "axis", 0.0)
+    if not np.isclose(np.linalg.norm(axis), 1.0, rtol=1e-4):  # Mitsuba takes it as it is, and bends the shape
+        raise ValueError(f"has a rotation about {axis.tolist()}, expected an axis of length 1")
     angle = np.deg2rad(_numbers(part.get("angle", "0"), "the rotation angle", 1)[0])
-    cross = np.cross(np.eye(3), axis).T  # Rodrigues' formula
+    cross = np.cross(np.eye(3), axis)  # cross @ v is axis x v; Rodrigues' formula
     return _affine(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 

@@ -120,11 +120,13 @@ def test_a_mirror_found_twice_counts_once():
     assert repeated(tau[:0], arrival[:0], aod[:0], bounces[:0]).shape == (0,)
 
 
-def test_a_scene_without_a_file_is_refused(scene):
-    sionna = sionna_or_skip()
-    bare = Scene(scene.mesh, scene.materials, scene.face_material)
-    with pytest.raises(ValueError, match="xml|XML"):
-        sionna(bare, transmitter=TX, frequency_hz=F, shape=SHAPE)
+def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, scene):
+    bare = Scene(
+        scene.mesh, scene.materials, scene.face_material, transmitters={"tx": TX + 1}, receivers={"rx": SEES}
+    )
+    engine = type(engines[1])(bare, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=1))
+    found, usual = (e.solve(SEES)["power"].sum() for e in (engine, engines[1]))
+    assert found == pytest.approx(usual, rel=2e-3)
 
 
 def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):
