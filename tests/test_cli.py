@@ -16,7 +16,7 @@ from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.maps.radio_map import RadioMap
-from warprrf.rf.simulate import check_positions
+from warprrf.rf.positions import check_positions
 
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = (
@@ -49,7 +49,7 @@ def test_examples_that_need_the_repository_alone_run(
     import warprrf as wr
 
     def placed(scene: wr.Scene, *, transmitter: np.ndarray, receivers: np.ndarray, **options: object) -> None:
-        check_positions(scene, np.asarray(transmitter), receivers)
+        check_positions(scene.mesh, np.asarray(transmitter), receivers, 1e-3)
         raise ValueError("positions are fine")
 
     (tmp_path / "data").symlink_to(ROOT / "data")
@@ -216,6 +216,14 @@ BAD = {
         "words.txt",
     ),
 }
+
+
+def test_an_empty_name_of_the_result_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
+    words = [word.format(tmp="", scene=SCENE) for word in SIMULATE]
+    words[words.index("-o") + 1] = ""
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([*words, "7,4,1.5"])
+    assert "-o/--out: got ''" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("case", sorted(BAD))

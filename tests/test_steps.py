@@ -7,8 +7,10 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -104,10 +106,35 @@ def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path: Path) -> N
         np.testing.assert_array_equal(found["gain"], value)
     assert made == [1, 2]
     whole = (tmp_path / "receiver.npz").read_bytes()
-    for damage in (b"", whole[: len(whole) // 2]):
+    flipped = bytearray(whole)
+    flipped[whole.index(np.float32(2).tobytes()) + 3] ^= 1
+    for damage in (b"", whole[: len(whole) // 2], bytes(flipped)):
         (tmp_path / "receiver.npz").write_bytes(damage)
         np.testing.assert_array_equal(ask(2)["gain"], 2)
-    assert made == [1, 2, 2, 2]
+    assert made == [1, 2, 2, 2, 2]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: text.replace("0.5", "0.7"),
+        lambda text: "[5]",
+        lambda text: '{"key": 5}',
+        lambda text: text[: len(text) // 2],
+        lambda text: text.replace("true", "null"),
+    ],
+)
+def test_a_step_whose_record_is_damaged_is_done_again(tmp_path: Path, change: Callable[[str], str]) -> None:
+    calls: list[int] = []
+
+    def ask() -> dict[str, Any]:
+        with Steps(tmp_path) as steps:
+            return steps.run("one", lambda _: calls.append(1) or {"gain": 0.5}, version=1, inputs=[])
+
+    assert ask() == ask() == {"gain": 0.5} and len(calls) == 1
+    record = tmp_path / ".steps/one.json"
+    record.write_text(change(record.read_text()))
+    assert ask() == {"gain": 0.5} and len(calls) == 2
 
 
 def test_digest_follows_names_and_content_of_files_not_dates(tmp_path: Path) -> None:

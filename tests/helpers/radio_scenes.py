@@ -23,6 +23,7 @@ class SlabMaterial:
     scattering: float = 0.0
     pattern: str = "lambertian"
     alpha_r: int = 1
+    reciprocal: bool = False
 
     def permittivity(self, frequency_hz):
         return self.relative_permittivity - 1j * self.conductivity / (2 * np.pi * frequency_hz * EPSILON_0)

@@ -203,7 +203,7 @@ def test_scattered_light_seen_in_a_mirror_has_all_three_legs(scene: RadioScene, 
     ratio = images[1][lit] / (images[0][lit] * passed(length[lit]))
     assert np.abs(10.0 * np.log10(ratio)).max() < 0.06 * LOSS
     # elements that send on evenly: two legs from them
-    sent = np.ones(len(field.surface.element_area))
+    sent = np.ones(field.surface.element_sides)
     dark = replace(field.parameters, log_weight=np.full_like(field.parameters.log_weight, -np.inf))
     glow = []
     for view in views:
@@ -242,7 +242,7 @@ def test_irradiance_by_a_mirror_has_its_images_length(dry: SpectrumDataset) -> N
     before, after = (
         one.transport().mirror_light.irradiance(field.parameters) for one in (field, field.with_gas())
     )
-    centre = field.surface.element_centre
+    centre = np.tile(field.surface.element_centre, (2, 1))  # of both sides
     lid = (centre[:, 2] > 3.9) & (before > 0)
     assert lid.sum() > 20
     length = np.linalg.norm(centre[lid] - TX * [1, 1, -1], axis=1)
@@ -294,7 +294,7 @@ def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: Spec
     found = further_bounces(view, humid.materials, humid.sent_radiance(view.transport))
     assert found.by_ray().sum() == pytest.approx(expected, rel=1e-9)
     measured = SpectrumPixels(BeamOperator(SHAPE, humid.beam_sigma_rad), np.arange(SHAPE[0] * SHAPE[1]))
-    response = respond(view, measured, humid.terms.lobes, humid.floor)  # what a fit of it is made on
+    response = respond(view, measured, humid.terms, humid.floor)  # what a fit of it is made on
     assert response.indirect.sum() * humid.floor == pytest.approx(expected, rel=1e-5)
 
 

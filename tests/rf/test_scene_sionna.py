@@ -48,7 +48,7 @@ def test_a_scene_goes_to_sionna_and_back(rt, tmp_path):
     back = Scene.from_sionna(live)
     np.testing.assert_allclose(back.mesh.triangles, scene.mesh.triangles, atol=1e-6)
     np.testing.assert_array_equal(back.face_material, scene.face_material)
-    assert back.object_names == scene.object_names
+    assert back.object_names == ["walls of_001", "board"]  # Mitsuba has no dots in names
     for mine, theirs in zip(scene.materials, back.materials, strict=True):
         assert (theirs.thickness_m, theirs.scattering, theirs.pattern, theirs.alpha_r, theirs.xpd) == (
             mine.thickness_m, mine.scattering, mine.pattern, mine.alpha_r, mine.xpd,

@@ -14,13 +14,17 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.cache import cached_property
-from warprrf.checks import check_array
+from warprrf.brief import one_line
+from warprrf.cache import Cache, cached_property
+from warprrf.checks import LARGEST_M, check_array, check_number
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
-from warprrf.kernels.rays.mesh import closest_faces
+from warprrf.kernels.rays.mesh import closest_faces, look_around
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
@@ -35,6 +39,8 @@ class Closest:
         point: Nearest point on the surface [m], shape ``(N, 3)``.
         face: Its face, shape ``(N,)``, int32.
     """
+
+    __repr__ = one_line
 
     distance: np.ndarray
     point: np.ndarray
@@ -55,6 +61,10 @@ class Mesh:
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
         self.vertices: np.ndarray = check_array("vertices", vertices, (None, 3)).copy()
+        if np.abs(self.vertices).max(initial=0.0) > LARGEST_M:
+            raise ValueError(
+                f"vertices: got coordinates up to {np.abs(self.vertices).max():g} m, expected at most {LARGEST_M:g}"
+            )
         self.faces: np.ndarray = check_array("faces", faces, (None, 3), dtype=np.int32).copy()
         if len(self.faces) == 0:
             raise ValueError("faces: got none, expected at least one triangle")
@@ -104,11 +114,34 @@ class Mesh:
         return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
     @cached_property
+    def rounding_m(self) -> float:
+        """What float32 may have rounded coordinates by [m]: about the mesh's own centre, or where they were rounded.
+
+        A mesh that was rounded far from its centre has coordinates that are odd multiples of float32's spacing there.
+        """
+        near = float(np.spacing(np.float32(0.5 * np.ptp(self.bounds, axis=0).max())))
+        step = np.spacing(np.abs(self.vertices).astype(np.float32)).astype(float)
+        count = self.vertices / step
+        if not (count == np.rint(count)).all():
+            return near
+        return max(near, float(step[count % 2 == 1].max(initial=0.0)))
+
+    @cached_property
     def welded_faces(self) -> np.ndarray:
-        """Faces with vertices at one place (to 1e-7 of the box) given one index, shape ``(F, 3)``."""
-        step = 1e-7 * max(float(np.ptp(self.bounds, axis=0).max()), 1e-12)
-        cells = np.round((self.vertices - self.bounds[0]) / step).astype(np.int64)
-        return np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)[self.faces]
+        """Faces with vertices at one place (to 1e-6 of the box's half diagonal) given one index, shape ``(F, 3)``."""
+        point, index = np.unique(self.vertices, axis=0, return_inverse=True)
+        reach = max(2.0 * self.rounding_m, 0.5e-6 * float(np.linalg.norm(np.ptp(self.bounds, axis=0))))
+        near = cKDTree(point - self.center).query_pairs(reach, output_type="ndarray")
+        link = sparse.coo_array((np.ones(len(near), bool), near.T), shape=(len(point), len(point)))
+        place = csgraph.connected_components(link, directed=False)[1]
+        return np.asarray(place[index.reshape(-1)][self.faces])
+
+    @cached_property
+    def first_at_place(self) -> np.ndarray:
+        """The first face with the same three corners: itself unless it repeats one, however wound, shape ``(F,)``."""
+        corner = np.sort(self.welded_faces, axis=1)
+        first, index = np.unique(corner, axis=0, return_index=True, return_inverse=True)[1:]
+        return np.asarray(first[index.reshape(-1)])
 
     @cached_property
     def is_closed(self) -> bool:
@@ -123,6 +156,12 @@ class Mesh:
         faces = np.unique(np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1), axis=0)
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         return len(edges) > 0 and bool((np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all())
+
+    @cached_property
+    def distinct_faces(self) -> np.ndarray:
+        """Faces of which no earlier one has the same three corners, however wound, shape ``(K,)``."""
+        corner = np.sort(self.welded_faces, axis=1)
+        return np.sort(np.unique(corner, axis=0, return_index=True)[1])
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -188,6 +227,7 @@ class Mesh:
             Shape ``(N,)``, bool.
         """
         start, end = check_rows(("a", a), ("b", b))
+        clearance = check_number("clearance", clearance, 0.0)
         where = _device.resolve(device)
         return self._rays.free(start, end, clearance=clearance, device=where, backend=backend)
 
@@ -213,9 +253,45 @@ class Mesh:
         """Distance from each of ``points`` (N, 3) [m] to the surface [m], shape ``(N,)``."""
         return self.closest(points, device=device).distance
 
+    def look_around(
+        self, points: ArrayLike, directions: ArrayLike, *, device: DeviceLike = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What rays in the same ``directions`` (D, 3) cross from each of ``points`` (N, 3) [m].
+
+        Returns:
+            How many surfaces they leave less those that they enter, by the surfaces' normals, repeated faces once; of a
+            closed mesh that is the winding number, whatever the direction. And the side from which they meet the first:
+            1 where its normal points to the point, -1 where it points away, 0 where there is none. Shapes ``(N, D)``,
+            int32.
+        """
+        p, d = check_array("points", points, (None, 3)), check_array("directions", directions, (None, 3))
+        where = _device.resolve(device)
+        bvh, corners = self._boxes(where)
+        winding, side = (wp.zeros(len(p) * len(d), dtype=wp.int32, device=where) for _ in range(2))
+        start, toward = (wp.array(x, dtype=wp.vec3d, device=where) for x in (p - self.center, d))
+        inputs = [bvh.id, corners, start, toward, winding, side]
+        _device.launch(look_around, len(p) * len(d), inputs, device=where)
+        return winding.numpy().reshape(len(p), -1), side.numpy().reshape(len(p), -1)
+
+    @cached_property
+    def _boxed(self) -> Cache:
+        return Cache(8)
+
+    def _boxes(self, where: wp.Device) -> tuple[wp.Bvh, wp.array]:
+        """Boxes of the distinct faces, which a ray can be asked for all of, and their corners about the centre."""
+
+        def build() -> tuple[wp.Bvh, wp.array]:
+            corners = self.triangles[self.distinct_faces] - self.center
+            margin = 1e-6 * float(np.ptp(self.bounds, axis=0).max())
+            bounds = [corners.min(axis=1) - margin, corners.max(axis=1) + margin]
+            low, high = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=where) for x in bounds)
+            return wp.Bvh(low, high), wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
+
+        return self._boxed.get(str(where), build)
+
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
-        above = self.triangles[:, :, 2] > height
+        above = self.triangles[:, :, 2] > check_number("height", height)
         cut = (above.sum(axis=1) % 3) > 0
         corners, above = self.triangles[cut], above[cut]
         ends = []

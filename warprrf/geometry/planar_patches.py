@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from warprrf.cache import cached_property
 from warprrf.geometry.mesh import Mesh, vectors_across
@@ -37,7 +36,7 @@ class PlanarPatches:
         offset: The plane is ``normal . x = offset`` [m], shape ``(P,)``.
         area: Area, repeated faces counted once [m^2], shape ``(P,)``.
         group: What :func:`planar_patches` was told to keep apart, shape ``(P,)``, int32; -1 where nothing was.
-        once: Faces of a patch that repeat no other, shape ``(F,)``, bool.
+        first: The first face at the place of each, shape ``(F,)``: itself unless it repeats one.
         tolerance_m: Corners of a patch lie this near to its plane [m]; rays that end on it ignore what is nearer.
         two_sided: Whether both sides are surfaces. False: only the side that ``normal`` points to.
     """
@@ -48,7 +47,7 @@ class PlanarPatches:
     offset: np.ndarray
     area: np.ndarray
     group: np.ndarray
-    once: np.ndarray
+    first: np.ndarray
     tolerance_m: float
     two_sided: bool = True
 
@@ -84,7 +83,12 @@ class PlanarPatches:
         own = label >= 0
         area = np.bincount(label[own], mesh.areas[own], minlength=len(planes[1]))
         group = np.full(len(planes[1]), -1, np.int32)
-        return cls(mesh, label, *planes, area, group, np.ones(len(label), bool), tolerance_m, two_sided)
+        return cls(mesh, label, *planes, area, group, np.arange(len(label)), tolerance_m, two_sided)
+
+    @property
+    def once(self) -> np.ndarray:
+        """Faces that repeat no other, shape ``(F,)``, bool."""
+        return np.asarray(self.first == np.arange(len(self.first)))
 
     @cached_property
     def _faces_and_ends(self) -> tuple[np.ndarray, np.ndarray]:
@@ -151,9 +155,8 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
     group = np.full(count, -1, np.int32) if groups is None else np.asarray(groups, np.int32)
     if group.shape != (count,):
         raise ValueError(f"groups: got shape {group.shape}, expected ({count},), one index a face")
-    rounding = float(np.spacing(np.float32(np.abs(mesh.bounds).max())))
-    corner = _welded(mesh, 2.0 * rounding)
-    first = _first_at_place(corner, group)
+    rounding, corner, first = mesh.rounding_m, mesh.welded_faces, mesh.first_at_place
+    _check_repeats(first, group)
     once = first == np.arange(count)
     longest = np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, 1, axis=1), axis=2).max(axis=1)
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
@@ -214,17 +217,8 @@ class _Faces:
         )
 
 
-def _welded(mesh: Mesh, distance_m: float) -> np.ndarray:
-    """Faces with vertices of one place given one index, shape ``(F, 3)``."""
-    point, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    near = cKDTree(point).query_pairs(distance_m, output_type="ndarray")
-    return components(len(point), near)[index.reshape(-1)][mesh.faces]
-
-
-def _first_at_place(corner: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """The first face with the same three corners, shape ``(F,)``."""
-    _, first, index = np.unique(np.sort(corner, axis=1), axis=0, return_index=True, return_inverse=True)
-    first = first[index.reshape(-1)]
+def _check_repeats(first: np.ndarray, group: np.ndarray) -> None:
+    """Warn of faces that lie on one of another group."""
     differ = int((group[first] != group).sum())
     if differ:
         warnings.warn(
@@ -232,7 +226,6 @@ def _first_at_place(corner: np.ndarray, group: np.ndarray) -> np.ndarray:
             UserWarning,
             stacklevel=3,
         )
-    return first
 
 
 def _is_sliver(corner: np.ndarray, height: np.ndarray, rounding: float) -> np.ndarray:
@@ -371,7 +364,7 @@ def _assembled(faces: _Faces, piece: np.ndarray, first: np.ndarray) -> PlanarPat
         offset=offset,
         area=np.sort(area)[::-1],
         group=group,
-        once=once,
+        first=first,
         tolerance_m=faces.distance_m,
     )
 

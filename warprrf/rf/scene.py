@@ -166,8 +166,8 @@ class Scene:
     def to_sionna(self, *, frequency_hz: float = SIONNA_FREQUENCY_HZ) -> Any:
         """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters and receivers.
 
-        Objects keep their names and are not merged; one of several materials becomes one object for each. Materials
-        follow ``frequency`` of what comes back.
+        Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
+        for each. Materials follow ``frequency`` of what comes back.
 
         Args:
             frequency_hz: carrier frequency [Hz]; Sionna RT's own default if none is given.

@@ -8,6 +8,7 @@ Radio devices are read as positions; antennas and orientations stay with Sionna.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -99,7 +100,8 @@ def _read(rt: Any, radio: Any, name: str, frequency: float) -> Material:
         return itu_material(radio.itu_type, name=name, **common)
     permittivity, conductivity = value("relative_permittivity"), value("conductivity")
     if radio.frequency_update_callback is None:
-        return Material.custom(name, relative_permittivity=permittivity, conductivity=conductivity, **common)
+        constant = Material.custom(name, relative_permittivity=permittivity, conductivity=conductivity)
+        return replace(constant, **common)
     ends = frequency * (1 - 1e-6), frequency * (1 + 1e-6)
     source = f"a law in Python of Sionna RT's material, at {frequency / 1e9:g} GHz"
     return Material(name, (Band(*ends, permittivity, 0.0, conductivity, 0.0, source),), **common)
@@ -115,7 +117,14 @@ def to_sionna_scene(
     frequency = check_frequency(frequency_hz)
     rt = sionna_rt()
     mi = select_variant()
-    taken = {part.name for part in parts} | set(transmitters) | set(receivers)
+    taken = set(transmitters) | set(receivers)
+    names = []
+    for part in parts:
+        name = part.name.replace(".", "_")  # Mitsuba parts its paths by it
+        while name in taken:
+            name += "_"
+        taken.add(name)
+        names.append(name)
     radio: dict[int, Any] = {}
     for part in parts:
         material = part.material
@@ -126,17 +135,17 @@ def to_sionna_scene(
             taken.add(name)
             radio[id(material)] = _radio_material(rt, material, name, frequency)
     shapes: dict[str, Any] = {"type": "scene"}
-    for k, part in enumerate(parts):
+    for part, name in zip(parts, names, strict=True):
         properties = mi.Properties()
-        properties.set_id(part.name)
+        properties.set_id(name)
         properties["face_normals"] = True
-        mesh = mi.Mesh(part.name, len(part.vertices), len(part.faces), props=properties)
+        mesh = mi.Mesh(name, len(part.vertices), len(part.faces), props=properties)
         values = mi.traverse(mesh)
         values["vertex_positions"] = np.ravel(part.vertices).astype(np.float32)
         values["faces"] = np.ravel(part.faces).astype(np.uint32)
         values.update()
         mesh.set_bsdf(radio[id(part.material)])
-        shapes[f"object{k}"] = mesh  # a key may not have all letters of a name, which the mesh keeps
+        shapes[name] = mesh
     scene = rt.Scene(mi.load_dict(shapes, optimize=False))
     scene.frequency = frequency
     for material in {id(part.material): part.material for part in parts}.values():
@@ -161,6 +170,11 @@ def _radio_material(rt: Any, material: Material, name: str, frequency: float) ->
     if not np.isfinite(material.thickness_m):
         raise ValueError(
             f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
+        )
+    if material.reciprocal and material.scattering_coefficient(frequency) > 0:
+        raise ValueError(
+            f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
+            'take its lobe of the same width, or use engine="exact"'
         )
     radio = rt.RadioMaterial(
         name,

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -297,12 +298,12 @@ def _radio_material(element: Element, label: str) -> Material | None:
     if kind == "absorber-radio-material":  # nothing comes back
         return Material.custom(label, relative_permittivity=1.0)
     if kind == "radio-material":
-        return Material.custom(
+        constant = Material.custom(
             label,
             relative_permittivity=_value(element, "relative_permittivity", 1.0),
             conductivity=_value(element, "conductivity", 0.0),
-            **common,
         )
+        return replace(constant, **common)
     return itu_material(identifier, name=label, **common) if itu_name(identifier) else None
 
 

@@ -12,21 +12,19 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, check_number, check_seed
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import GeometryLike, as_mesh
+from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
+from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
 from warprrf.steps import Steps, digest
 
 ENGINES = ("exact", "sionna")
-WALL_CLEARANCE_M = 1e-4
-"""Positions nearer to a surface than this count as on it [m]."""
-
 # Receivers drawn at a time before those without clearance are dropped; a scene with less than one free place in
 # _TRIES * _BATCH has none worth the name.
 _BATCH = 1000
@@ -78,8 +76,9 @@ def simulate(
         device: Where our own kernels run.
 
     Raises:
-        ValueError: on a position that is NaN, outside the scene, inside a solid or on a surface; on a frequency outside
-            a material's band, or P.676's with ``gas``; on an unknown engine.
+        ValueError: on a position that is NaN, outside the scene, inside a solid, on a surface, or within the reactive
+            near field of the transmitter; on a frequency outside a material's band, or P.676's with ``gas``; on an
+            unknown engine.
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
     """
     if not hasattr(scene, "face_material"):
@@ -87,12 +86,14 @@ def simulate(
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
-    points = check_array("receivers", receivers, (None, 3))
+    points = check_receivers("receivers", check_array("receivers", receivers, (None, 3)))
     source = check_array("transmitter", transmitter, (3,))
     frequency = check_frequency(frequency_hz)
     table = surface_table(scene.materials, frequency)
     air = air_of(gas, frequency)
-    check_positions(scene, source, points, device=device)
+    mesh, wavelength_m = as_mesh(scene, "scene"), SPEED_OF_LIGHT / frequency
+    question_unit(mesh, wavelength_m)
+    check_positions(mesh, source, points, wavelength_m, device=device)
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
     common |= {"shape": check_shape(shape), "beam_sigma_rad": beam_sigma_rad}
@@ -135,39 +136,6 @@ def simulate(
         | ({} if air is None else air.attributes)
         | {f"version_{name}": value for name, value in versions.items()},
     )
-
-
-def check_positions(
-    scene: GeometryLike, transmitter: np.ndarray, receivers: np.ndarray, *, device: DeviceLike = None
-) -> None:
-    """Refuse positions outside the scene, on a surface, or in another solid than the transmitter's air.
-
-    Raises:
-        ValueError: naming the first such position.
-    """
-    if len(receivers) == 0:
-        raise ValueError("receivers: got none, expected at least one position")
-    mesh = as_mesh(scene)
-    points = np.concatenate([transmitter[None], receivers])
-    low, high = mesh.bounds
-    solid = mesh.is_closed
-    outside = ((points < low) | (points > high)).any(axis=1) if solid else np.zeros(len(points), dtype=bool)
-    near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
-    inside = np.zeros(len(points), dtype=bool)
-    if solid:
-        winding = mesh.winding_number(points)
-        inside = np.abs(winding - winding[0]) > 0.5
-        # Of solids wound outward the air has winding number 0; of one hollow room, its inside is the air.
-        inside[0] = winding[0] > 1.5
-    for bad, what in ((outside, "outside the scene"), (near, "on a surface"), (inside, "inside a solid")):
-        if bad.any():
-            k = int(np.flatnonzero(bad)[0])
-            name = "transmitter" if k == 0 else f"receivers[{k - 1}]"
-            box = f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()}"
-            raise ValueError(
-                f"{name}: {points[k].tolist()} is {what} ({int(bad.sum())} such in all), expected a place in the air "
-                f"of the scene ({box}); sample_receivers finds some"
-            )
 
 
 def sample_receivers(

@@ -1,5 +1,6 @@
 """Sionna RT and our own evaluation check each other on a room with a solid in it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,21 @@ def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, scene):
     engine = type(engines[1])(bare, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=1))
     found, usual = (e.solve(SEES)["power"].sum() for e in (engine, engines[1]))
     assert found == pytest.approx(usual, rel=2e-3)
+
+
+def test_reciprocal_materials_are_refused(scene):
+    sionna = sionna_or_skip()
+    materials = [replace(m, reciprocal=True) for m in scene.materials]
+    other = Scene(
+        scene.mesh,
+        materials,
+        scene.face_material,
+        face_object=scene.face_object,
+        object_names=scene.object_names,
+        xml_path=scene.xml_path,
+    )
+    with pytest.raises(ValueError, match="reciprocal=False"):
+        sionna(other, transmitter=TX, frequency_hz=F, shape=SHAPE)
 
 
 def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):

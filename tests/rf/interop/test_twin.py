@@ -226,6 +226,15 @@ def test_what_no_material_can_hold_is_said(field, tmp_path):
     assert "indirect" in indirect
     about = json.loads((tmp_path / "rich" / "materials.json").read_text())["about"]
     assert gain in about
+    alike = replace(field, terms=Terms(lobes=LOBES, reciprocal=True))
+    assert "reciprocity" in wr.write_twin(alike, tmp_path / "alike").left_out[0]
+
+
+def test_a_reciprocal_lobe_becomes_the_nearest_of_the_other_kind():
+    assert twins.project_lobes((0,), np.ones(1), reciprocal=True) == (0, 0.0)  # Lambertian lobes are both
+    found, error = twins.project_lobes((0, 12), np.array([0.0, 0.3]), reciprocal=True)
+    assert 6 < found < 24
+    assert 0.3 < error < 2.0
 
 
 # ------------------------------------------------------------------------------------------------ files

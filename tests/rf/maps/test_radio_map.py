@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from damage import survey
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
 from warprrf.geometry.mesh import Mesh
@@ -206,6 +207,52 @@ def test_file_round_trip(found: RadioMap, tmp_path: Path) -> None:
         RadioMap.load(file)
     with pytest.raises(FileNotFoundError, match=r"none\.nc"):
         RadioMap.load(tmp_path / "none.nc")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: data.isel(y=slice(None, None, -1)),
+        lambda data: data.roll(x=3, roll_coords=True),
+        lambda data: data.transpose("x", "y", ...),
+    ],
+)
+def test_a_map_that_other_tools_turned_is_read_by_its_coordinates(found, tmp_path, change) -> None:
+    xarray = pytest.importorskip("xarray")
+    found.save(tmp_path / "a.nc")
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
+        change(opened.load()).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    again = RadioMap.load(tmp_path / "b.nc")
+    for name, value in vars(found).items():
+        np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
+
+
+def test_damaged_maps_are_refused(found: RadioMap, tmp_path: Path) -> None:
+    found.save(tmp_path / "map.nc")
+    seen = survey(tmp_path / "map.nc", "file_formats:read_map")
+    assert seen.copies == 260 and not seen.changed and not seen.wrong, seen
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("x", [0.0, 1.0]),
+        ("y", np.nan),
+        ("cell_m", 0.0),
+        ("frequency_hz", -1.0),
+        ("beam_sigma_rad", 0.0),
+        ("height_m", np.nan),
+        ("transmitter", [0.0, 0.0]),
+        ("total_path_gain", -1.0),
+        ("best_beam_gain", np.inf),
+        ("outline", np.zeros((3, 2))),
+    ],
+)
+def test_fields_that_no_map_has_are_refused(found: RadioMap, name: str, value: object) -> None:
+    before = np.asarray(getattr(found, name))
+    same_shape = isinstance(value, float) and before.ndim > 0
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        replace(found, **{name: np.full_like(before, value) if same_shape else value})
 
 
 def test_pictures_show_every_quantity(found: RadioMap, tmp_path: Path) -> None:

@@ -188,6 +188,12 @@ def test_table_and_file_say_the_same(several: list[Relevance], tmp_path: Path) -
     assert "| mirrors, order 1 |" in table
     found.save(tmp_path / "r.json")
     assert Relevance.load(tmp_path / "r.json") == found
+    text = (tmp_path / "r.json").read_text()
+    for damage in ("{}", "[5]", text.replace('"tolerance_db": 0', '"tolerance_db": 1'), text[:500]):
+        assert damage != text
+        (tmp_path / "r.json").write_text(damage)
+        with pytest.raises(ValueError, match=r"r\.json"):
+            Relevance.load(tmp_path / "r.json")
     (tmp_path / "r.json").write_text("{}")
     with pytest.raises(ValueError, match=r"r\.json"):
         Relevance.load(tmp_path / "r.json")

@@ -229,6 +229,13 @@ def test_damaged_files_are_refused(tmp_path):
         assert found.copies == 260 and not found.changed and not found.wrong, found
 
 
+def test_damaged_exr_files_are_refused(tmp_path):
+    pytest.importorskip("OpenEXR")
+    dataset(4, (6, 12)).export_exr(tmp_path / "a.exr", 1)
+    found = survey(tmp_path / "a.exr", "file_formats:read_exr")
+    assert found.copies == 260 and not found.changed and not found.wrong, found
+
+
 def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path):
     path = tmp_path / "a.nc"
     dataset(8).save(path)
@@ -261,7 +268,7 @@ for path in sys.argv[1:]:
         try:
             ds.export_exr(path, 0) if path.endswith("exr") else ds.save(path, compact=k > 0)
         except OSError as error:
-            print(Path(error.filename or str(error)).name)
+            print(Path(error.filename).name)
 resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
 ds.save(sys.argv[1])
 wr.SpectrumDataset.load(sys.argv[1])
@@ -270,13 +277,18 @@ print("lives")
 
 
 def test_the_process_outlives_a_full_disk(tmp_path):
-    path = tmp_path / "a.nc"
-    dataset(8).save(path)
+    pytest.importorskip("OpenEXR")
+    paths = [tmp_path / "a.nc", tmp_path / "a.exr"]
+    dataset(8).save(paths[0])
+    dataset(8).export_exr(paths[1], 0)
+    whole = [path.read_bytes() for path in paths]
     done = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, path], capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-c", FULL_DISK, *paths], capture_output=True, text=True, check=False, timeout=60
     )
-    assert done.stdout.split() == ["a.nc"] * 3 + ["lives"] and done.returncode == 0, done.stderr
-    assert os.listdir(tmp_path) == ["a.nc"]
+    assert done.stdout.split() == ["a.nc"] * 3 + ["a.exr"] * 3 + ["lives"], done.stderr
+    assert done.returncode == 0 and sorted(os.listdir(tmp_path)) == ["a.exr", "a.nc"]
+    assert paths[1].read_bytes() == whole[1]
+    same(SpectrumDataset.load(paths[0]), dataset(8))
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, seed: int = 0) -> Gaussian
     """
     check_count("count", count)
     rng = np.random.default_rng(seed)
-    area = mesh.areas
+    area = np.where(mesh.first_at_place == np.arange(len(mesh.faces)), mesh.areas, 0.0)
     spacing = float(np.sqrt(area.sum() / count))
     face = rng.choice(len(area), size=OVERSAMPLING * count, p=area / area.sum())
     root, v = np.sqrt(rng.random(len(face))), rng.random(len(face))
@@ -38,7 +38,7 @@ def discs_on_mesh(mesh: Mesh, count: int = 30_000, *, seed: int = 0) -> Gaussian
     points = np.einsum("nk,nkj->nj", barycentric, mesh.triangles[face])
     # One disc per cell and side of the surface: opposite faces of a thin plate keep theirs.
     side = np.round(2 * mesh.face_normals[face]).astype(np.int64)
-    cells = np.concatenate([np.floor(points / spacing).astype(np.int64), side], axis=1)
+    cells = np.concatenate([np.floor((points - mesh.bounds[0]) / spacing).astype(np.int64), side], axis=1)
     kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     points, normal = points[kept], mesh.face_normals[face[kept]]
     radius = RADIUS * spacing

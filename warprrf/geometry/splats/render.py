@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from warprrf.brief import one_line
 from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.splats.blending import RADIO, Blending
@@ -28,6 +29,8 @@ class Rendering:
         peak: range of the dominant Gaussian's peak [m]; inf where none.
     """
 
+    __repr__ = one_line
+
     features: np.ndarray = field(repr=False)
     alpha: np.ndarray = field(repr=False)
     depth: np.ndarray = field(repr=False)
@@ -47,6 +50,8 @@ class BlendWeights:
         alpha: sum of all weights, shape ``(H, W)``.
         dropped: sum of the weights left out by the limit K, shape ``(H, W)``.
     """
+
+    __repr__ = one_line
 
     index: np.ndarray = field(repr=False)
     weight: np.ndarray = field(repr=False)

@@ -41,6 +41,7 @@ def light_surface(
     loss: float,
     strength: wp.array(dtype=wp.float32),
     cos_in: wp.array(dtype=wp.float32),
+    cos_out: wp.array(dtype=wp.float32),
     cos_mirror: wp.array(dtype=wp.float32),
     grazing: wp.array(dtype=wp.float32),
 ):
@@ -48,8 +49,8 @@ def light_surface(
 
     Ray k starts at origin k / per_origin; ``directions`` holds one for each ray, or one set for every origin. Writes
     ``strength`` = Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] less what air of ``loss`` [neper/m] absorbs from the source
-    over the hit to the ray's origin, the cosine of incidence, that of the angle between the scattered and the mirror
-    direction, and the mean of 1 / cos(theta_s) over +-``half_width`` (what lies below the horizon left out).
+    over the hit to the ray's origin, the cosines of incidence and of scattering, that of the angle between the scattered
+    and the mirror direction, and the mean of 1 / cos(theta_s) over +-``half_width`` (what lies below the horizon left out).
     ``nearest`` [m] bounds d1 from below: an element at the source spans directions.
     """
     k = offset + wp.tid()
@@ -75,6 +76,7 @@ def light_surface(
                 air * solid_angle[k % solid_angle.shape[0]] * cos_i / (157.91367041742973 * reach * reach)
             )
             cos_in[k] = wp.min(cos_i, 1.0)
+            cos_out[k] = wp.min(cos_s, 1.0)
             cos_mirror[k] = wp.clamp(2.0 * cos_i * cos_s - wp.dot(toward, look), -1.0, 1.0)
             high = cos_s + half_width
             low = wp.max(cos_s - half_width, 0.01 * half_width)
@@ -91,19 +93,38 @@ def table_value(table: wp.array2d(dtype=wp.float32), row: int, cosine: float):
     return (1.0 - s) * table[row, i] + s * table[row, i + 1]
 
 
+@wp.struct
+class Lobes:
+    """A mix of lobes: their exponents, and of each a row of a table over the cosine.
+
+    ``scale`` holds 1 / norm at the angle of incidence; if ``reciprocal`` is 1, a factor that counts at both angles.
+    """
+
+    exponent: wp.array(dtype=wp.float32)
+    scale: wp.array2d(dtype=wp.float32)
+    reciprocal: int
+
+
 @wp.func
-def lobe_value(
-    exponent: wp.array(dtype=wp.float32),
-    norm: wp.array2d(dtype=wp.float32),
-    which: int,
-    cos_in: float,
-    cos_mirror: float,
-    grazing: float,
-):
+def lobe_value(lobes: Lobes, which: int, cos_in: float, cos_out: float, cos_mirror: float, grazing: float):
     """f_s / cos(theta_s) [1/sr] of lobe ``which``; exponent 0 is Lambertian, whose cosine cancels."""
     value = INV_PI
-    if exponent[which] > 0.0:
-        value = wp.pow(0.5 * (1.0 + cos_mirror), exponent[which]) * grazing * table_value(norm, which, cos_in)
+    n = lobes.exponent[which]
+    if n > 0.0:
+        value = wp.pow(0.5 * (1.0 + cos_mirror), n)
+        if lobes.reciprocal == 1:
+            value *= table_value(lobes.scale, which, cos_in) * table_value(lobes.scale, which, cos_out)
+        else:
+            value *= grazing * table_value(lobes.scale, which, cos_in)
+    return value
+
+
+@wp.func
+def reflected(table: wp.array2d(dtype=wp.float32), row: int, lobes: Lobes, cos_in: float, cos_out: float):
+    """|Gamma|^2 by a row of a table: at incidence; if the lobes are reciprocal, the mean of that at both angles."""
+    value = table_value(table, row, cos_in)
+    if lobes.reciprocal == 1:
+        value = 0.5 * (value + table_value(table, row, cos_out))
     return value
 
 
@@ -117,10 +138,10 @@ def resolve_bounces(
     face: wp.array(dtype=wp.int32),
     strength: wp.array(dtype=wp.float32),
     cos_in: wp.array(dtype=wp.float32),
+    cos_out: wp.array(dtype=wp.float32),
     cos_mirror: wp.array(dtype=wp.float32),
     grazing: wp.array(dtype=wp.float32),
-    exponent: wp.array(dtype=wp.float32),
-    norm: wp.array2d(dtype=wp.float32),
+    lobes: Lobes,
     moments: wp.array2d(dtype=wp.float32),
     out: wp.array2d(dtype=wp.float32),
 ):
@@ -129,16 +150,17 @@ def resolve_bounces(
     The rays of row p are ``order[first[p]]`` to ``order[first[p + 1] - 1]``.
     """
     p = offset + wp.tid()
-    lobes = exponent.shape[0]
+    count = lobes.exponent.shape[0]
     for s in range(first[p], first[p + 1]):
         k = order[s]
         if strength[k] > 0.0:
-            base = place[surface.group[face[k]]] * lobes * MOMENTS
-            for j in range(lobes):
-                value = strength[k] * lobe_value(exponent, norm, j, cos_in[k], cos_mirror[k], grazing[k])
+            base = place[surface.group[face[k]]] * count * MOMENTS
+            for j in range(count):
+                value = strength[k] * lobe_value(lobes, j, cos_in[k], cos_out[k], cos_mirror[k], grazing[k])
                 for m in range(MOMENTS):
                     column = base + j * MOMENTS + m
-                    out[p, column] = out[p, column] + value * table_value(moments, m, cos_in[k])
+                    part = value * reflected(moments, m, lobes, cos_in[k], cos_out[k])
+                    out[p, column] = out[p, column] + part
 
 
 @wp.kernel
@@ -148,10 +170,10 @@ def scatter_bounces(
     face: wp.array(dtype=wp.int32),
     strength: wp.array(dtype=wp.float32),
     cos_in: wp.array(dtype=wp.float32),
+    cos_out: wp.array(dtype=wp.float32),
     cos_mirror: wp.array(dtype=wp.float32),
     grazing: wp.array(dtype=wp.float32),
-    exponent: wp.array(dtype=wp.float32),
-    norm: wp.array2d(dtype=wp.float32),
+    lobes: Lobes,
     fresnel: wp.array2d(dtype=wp.float32),
     weight: wp.array2d(dtype=wp.float32),
     power: wp.array(dtype=wp.float32),
@@ -161,7 +183,7 @@ def scatter_bounces(
     value = float(0.0)
     if strength[k] > 0.0:
         g = surface.group[face[k]]
-        for j in range(exponent.shape[0]):
-            value += weight[g, j] * lobe_value(exponent, norm, j, cos_in[k], cos_mirror[k], grazing[k])
-        value *= strength[k] * table_value(fresnel, g, cos_in[k])
+        for j in range(lobes.exponent.shape[0]):
+            value += weight[g, j] * lobe_value(lobes, j, cos_in[k], cos_out[k], cos_mirror[k], grazing[k])
+        value *= strength[k] * reflected(fresnel, g, lobes, cos_in[k], cos_out[k])
     power[k] = value

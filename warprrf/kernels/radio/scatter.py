@@ -1,7 +1,8 @@
 """Single-bounce diffuse scattering seen from a receiver: one ray, one shadow ray and the surface's lobe per sub-pixel.
 
 The hierarchy is float32; every length, angle and coefficient is float64. Reflection: ITU-R P.2040-4 slab, eqs. (37),
-(43a), (44). Lobes: Degli-Esposti et al. (2007). Complex numbers are vec2d (real, imaginary).
+(43a), (44). Lobes: Degli-Esposti et al. (2007), or reciprocal ones of the same shape. Complex numbers are vec2d (real,
+imaginary).
 """
 
 import warp as wp
@@ -94,6 +95,58 @@ def lobe_over_cosine(
 
 
 @wp.func
+def factor_at(factor: wp.array2d(dtype=wp.float64), row: int, cosine: wp.float64):
+    """Row of a table over cosine in [0, 1], interpolated linearly."""
+    last = factor.shape[1] - 1
+    x = wp.min(cosine, wp.float64(1.0)) * wp.float64(last)
+    i = wp.min(int(x), last - 1)
+    s = x - wp.float64(i)
+    return (wp.float64(1.0) - s) * factor[row, i] + s * factor[row, i + 1]
+
+
+@wp.struct
+class Materials:
+    """What each material does to a wave, arrays by material.
+
+    ``reciprocal`` is 1 where its lobe is the reciprocal one, whose factors b over the cosine are the rows of ``factor``.
+    """
+
+    permittivity: wp.array(dtype=wp.vec2d)
+    thickness: wp.array(dtype=wp.float64)
+    scattering: wp.array(dtype=wp.float64)
+    alpha_r: wp.array(dtype=wp.int32)
+    reciprocal: wp.array(dtype=wp.int32)
+    factor: wp.array2d(dtype=wp.float64)
+
+
+@wp.func
+def scattered(
+    m: Materials,
+    k: int,
+    cos_i: wp.float64,
+    cos_s: wp.float64,
+    cos_psi: wp.float64,
+    half_width: wp.float64,
+    wavelength: wp.float64,
+):
+    """S^2 |Gamma|^2 f_s / cos(theta_s) of material ``k`` [1/sr].
+
+    Reciprocal: the mean of |Gamma|^2 at both angles times b(theta_i) b(theta_s) ((1 + cos psi) / 2)^alpha, which does not
+    change when the angles are swapped, and has no pole at grazing.
+    """
+    gamma = slab_power_reflection(cos_i, m.permittivity[k], m.thickness[k], wavelength)
+    lobe = wp.float64(0.0)
+    if m.reciprocal[k] == 1:
+        back = slab_power_reflection(cos_s, m.permittivity[k], m.thickness[k], wavelength)
+        gamma = wp.float64(0.5) * (gamma + back)
+        shape = wp.pow(wp.float64(0.5) * (wp.float64(1.0) + cos_psi), wp.float64(m.alpha_r[k]))
+        lobe = shape * (factor_at(m.factor, k, cos_i) * factor_at(m.factor, k, cos_s))
+    else:
+        lobe = lobe_over_cosine(m.alpha_r[k], cos_i, cos_s, cos_psi, half_width)
+    return m.scattering[k] * m.scattering[k] * gamma * lobe
+
+
+@wp.func
 def local(point: wp.vec3d, center: wp.vec3d):
     """A point in the float32 frame of the mesh's hierarchy."""
     p = point - center
@@ -108,10 +161,7 @@ def scatter_to_receiver(
     corners: wp.array(dtype=wp.vec3d),
     normals: wp.array(dtype=wp.vec3d),
     face_material: wp.array(dtype=wp.int32),
-    permittivity: wp.array(dtype=wp.vec2d),
-    thickness: wp.array(dtype=wp.float64),
-    scattering: wp.array(dtype=wp.float64),
-    alpha_r: wp.array(dtype=wp.int32),
+    materials: Materials,
     transmitter: wp.vec3d,
     receiver: wp.vec3d,
     wavelength: wp.float64,
@@ -166,8 +216,8 @@ def scatter_to_receiver(
         if cos_s < wp.float64(0.0):
             cos_s = -cos_s
             cos_i = -cos_i
-        s = scattering[material]
-        if cos_i > wp.float64(0.0) and cos_s > wp.float64(0.0) and s > wp.float64(0.0):
+        rough = materials.scattering[material] > wp.float64(0.0)
+        if cos_i > wp.float64(0.0) and cos_s > wp.float64(0.0) and rough:
             back = -to_tx / d1
             shadow = wp.mesh_query_ray(
                 mesh,
@@ -187,7 +237,6 @@ def scatter_to_receiver(
             if lit:
                 # Mirror direction of the wave from the transmitter, against the direction to the receiver.
                 cos_psi = wp.float64(2.0) * cos_i * cos_s - wp.dot(to_tx, -d) / d1
-                gamma = slab_power_reflection(cos_i, permittivity[material], thickness[material], wavelength)
-                lobe = lobe_over_cosine(alpha_r[material], cos_i, cos_s, cos_psi, half_width)
+                share = scattered(materials, material, cos_i, cos_s, cos_psi, half_width, wavelength)
                 spread = wavelength / (wp.float64(4.0) * PI * d1)
-                radiance[k] = spread * spread * s * s * gamma * lobe * cos_i
+                radiance[k] = spread * spread * share * cos_i

@@ -221,3 +221,55 @@ def closest_faces(
         face[i] = query.face
     else:
         face[i] = -1
+
+
+@wp.kernel(enable_backward=False)
+def look_around(
+    offset: int,
+    bvh: wp.uint64,
+    corners: wp.array2d(dtype=wp.vec3d),
+    points: wp.array(dtype=wp.vec3d),
+    directions: wp.array(dtype=wp.vec3d),
+    winding: wp.array(dtype=wp.int32),
+    side: wp.array(dtype=wp.int32),
+):
+    """Surfaces that each of ``directions`` from each point leaves less those that it enters, and the first one's side.
+
+    ``side`` is 1 where the first surface's normal points towards the point, -1 where it points away, 0 where nothing is
+    met. Source: Moeller and Trumbore, "Fast, minimum storage ray-triangle intersection", J. Graphics Tools 2 (1997).
+    """
+    i = offset + wp.tid()
+    point = points[i // directions.shape[0]]
+    direction = directions[i % directions.shape[0]]
+    crossed = int(0)
+    first = int(0)
+    nearest = wp.float64(wp.inf)
+    query = wp.bvh_query_ray(bvh, narrow(point), narrow(direction))
+    face = int(0)
+    while wp.bvh_query_next(query, face):
+        a = corners[face, 0]
+        ab = corners[face, 1] - a
+        ac = corners[face, 2] - a
+        across = wp.cross(direction, ac)
+        volume = wp.dot(ab, across)
+        if volume != wp.float64(0.0):
+            away = point - a
+            turned = wp.cross(away, ab)
+            u = wp.dot(away, across) / volume
+            v = wp.dot(direction, turned) / volume
+            t = wp.dot(ac, turned) / volume
+            if (
+                u >= wp.float64(0.0)
+                and v >= wp.float64(0.0)
+                and u + v <= wp.float64(1.0)
+                and t > wp.float64(0.0)
+            ):
+                enters = int(1)
+                if volume < wp.float64(0.0):  # the ray goes along the normal
+                    enters = -1
+                crossed -= enters
+                if t < nearest:
+                    nearest = t
+                    first = enters
+    winding[i] = crossed
+    side[i] = first

@@ -18,6 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from warprrf.brief import one_line
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -51,6 +52,8 @@ class PathArrays:
         receiver: Position ``(3,)`` or positions ``(R, 3)`` [m]; None if not known.
         air: The air whose absorption (ITU-R P.676) is in ``gain`` and ``jones``; None for none.
     """
+
+    __repr__ = one_line
 
     gain: np.ndarray
     tau: np.ndarray

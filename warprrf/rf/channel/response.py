@@ -34,7 +34,7 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive, check_seed
+from warprrf.checks import check_array, check_count, check_positive, check_seed
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
 from warprrf.rf.channel.lengths import PairLengths, plane_lengths, scattered_lengths, spherical_lengths
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -148,8 +148,7 @@ def channel_taps(
         ValueError: naming the argument.
     """
     check_positive("bandwidth_hz", bandwidth_hz)
-    if l_max < l_min:
-        raise ValueError(f"l_max: got {l_max}, expected at least l_min, {l_min}")
+    check_count("l_max", l_max, check_count("l_min", l_min, -(2**31)))
     lags = np.arange(l_min, l_max + 1)
 
     def taps(one: _Link) -> np.ndarray:

@@ -15,6 +15,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.checks import check_array, check_number
+
 LOW_HZ, HIGH_HZ = 1e9, 1000e9
 """Where the recommendation's sum holds."""
 TEMPERATURE_K = 288.15  # ITU-R P.835, mean annual global reference atmosphere at sea level
@@ -31,11 +33,19 @@ class Air:
         temperature_k: temperature [K].
         pressure_hpa: pressure of the dry air [hPa].
         water_vapour_g_m3: density of water vapour [g/m^3].
+
+    Raises:
+        ValueError: for less than 100 K, or a negative pressure or density.
     """
 
     temperature_k: float = TEMPERATURE_K
     pressure_hpa: float = PRESSURE_HPA
     water_vapour_g_m3: float = WATER_VAPOUR_G_M3
+
+    def __post_init__(self) -> None:
+        check_number("temperature_k", self.temperature_k, 100.0)
+        check_number("pressure_hpa", self.pressure_hpa, 0.0)
+        check_number("water_vapour_g_m3", self.water_vapour_g_m3, 0.0)
 
     def attenuation_db_per_m(self, frequency_hz: ArrayLike) -> Any:
         """Specific attenuation [dB/m], shape as ``frequency_hz``; see :func:`gas_attenuation_db_per_m`."""
@@ -114,18 +124,12 @@ def gas_attenuation_db_per_m(
     Raises:
         ValueError: for a frequency outside the band, or a state of the air that cannot be.
     """
-    f_hz = np.asarray(frequency_hz, dtype=np.float64)
+    f_hz = check_array("frequency_hz", frequency_hz, finite=False)
     if not np.all((f_hz >= LOW_HZ) & (f_hz <= HIGH_HZ)):
         raise ValueError(
             f"frequency_hz: got {frequency_hz!r}, expected {LOW_HZ:g} to {HIGH_HZ:g} Hz, where ITU-R P.676 holds"
         )
-    for name, value, least in (
-        ("temperature_k", temperature_k, 100.0),
-        ("pressure_hpa", pressure_hpa, 0.0),
-        ("water_vapour_g_m3", water_vapour_g_m3, 0.0),
-    ):
-        if not (np.isfinite(value) and value >= least):
-            raise ValueError(f"{name}: got {value!r}, expected a number of at least {least:g}")
+    Air(temperature_k, pressure_hpa, water_vapour_g_m3)  # which checks them
     f = f_hz[..., None] * 1e-9
     theta = 300.0 / temperature_k
     vapour_hpa = water_vapour_g_m3 * temperature_k / 216.7  # eq. (4)

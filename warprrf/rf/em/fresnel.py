@@ -3,17 +3,25 @@
 Reflection: ITU-R P.2040-4, section 2.2.2, the single-layer slab in vacuum, in float64. Scattering lobes: Degli-Esposti
 et al., "Measurement and modelling of scattering from buildings", IEEE Trans. AP 55 (2007), normalised so that a lobe
 integrates to one over the hemisphere.
+
+That normalisation belongs to the direction of incidence, so the power that such a surface passes on is another when the
+ends are swapped (f_s |Gamma|^2 cos(theta_i) is not symmetric: rms 2 dB over both directions, 6 dB and more at grazing). A
+reciprocal lobe is of the same shape and integrates to one as well, and is symmetric: Lewis (1994) and Lafortune and
+Willems (1994) state what reciprocity asks of such lobes, Sinkhorn and Knopp (1967) how to scale a symmetric kernel so that
+it sums to one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.rf.em.materials import Material
+from warprrf.checks import check_count
+from warprrf.rf.em.materials import NARROWEST_LOBE, Material
 
 LAMBERTIAN = 0
 """Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""
@@ -28,12 +36,14 @@ class SurfaceTable:
         thickness_m: Slab thickness [m], shape ``(M,)``.
         scattering: Scattering coefficient S, shape ``(M,)``.
         alpha_r: Exponent of the directive lobe, shape ``(M,)``, int32; 0 for a Lambertian one.
+        reciprocal: Whether scattering stays the same when the ends are swapped, shape ``(M,)``, bool.
     """
 
     permittivity: np.ndarray
     thickness_m: np.ndarray
     scattering: np.ndarray
     alpha_r: np.ndarray
+    reciprocal: np.ndarray
 
 
 def surface_table(materials: Sequence[Material], frequency_hz: float) -> SurfaceTable:
@@ -48,6 +58,7 @@ def surface_table(materials: Sequence[Material], frequency_hz: float) -> Surface
         thickness_m=np.array([float(m.thickness_m) for m in materials]),
         scattering=np.array([m.scattering_coefficient(frequency_hz) for m in materials]),
         alpha_r=np.array(alpha, dtype=np.int32),
+        reciprocal=np.array([m.reciprocal for m in materials], dtype=bool),
     )
 
 
@@ -89,18 +100,73 @@ def _slab(
 
 
 def lobe(
-    alpha_r: int, cos_incidence: ArrayLike, cos_scatter: ArrayLike, cos_to_mirror: ArrayLike
+    alpha_r: int,
+    cos_incidence: ArrayLike,
+    cos_scatter: ArrayLike,
+    cos_to_mirror: ArrayLike,
+    *,
+    reciprocal: bool = False,
 ) -> np.ndarray:
     """Scattering lobe f_s [1/sr]: Lambertian for ``alpha_r`` 0, else ((1 + cos psi) / 2)^alpha_r, normalised.
+
+    The directive lobe of Degli-Esposti et al. is not reciprocal: f_s cos(theta_i) changes when the ends are swapped.
 
     Args:
         cos_incidence: Cosine of the incidence angle.
         cos_scatter: Cosine of the scattering angle.
         cos_to_mirror: Cosine of the angle psi between the scattered and the mirror direction.
+        reciprocal: The reciprocal lobe: cos(theta_s) b(theta_i) b(theta_s) ((1 + cos psi) / 2)^alpha_r, with b of
+            :func:`reciprocal_factor`.
     """
-    if alpha_r == LAMBERTIAN:
+    if check_count("alpha_r", alpha_r, 0, NARROWEST_LOBE) == LAMBERTIAN:
         return np.asarray(cos_scatter) / np.pi
-    return (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r / lobe_norm(alpha_r, cos_incidence)
+    shape = (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r
+    if reciprocal:
+        both = reciprocal_factor(alpha_r, cos_incidence) * reciprocal_factor(alpha_r, cos_scatter)
+        return np.asarray(np.asarray(cos_scatter) * shape * both)
+    return np.asarray(shape / lobe_norm(alpha_r, cos_incidence))
+
+
+def reciprocal_factor(alpha_r: int, cosine: ArrayLike) -> np.ndarray:
+    """b(theta) of the reciprocal lobe [1/sr^(1/2)], at cosines in [0, 1].
+
+    It makes the lobe cos(theta_s) b(theta_i) b(theta_s) ((1 + cos psi) / 2)^alpha_r integrate to one over the hemisphere
+    for every incidence: b(theta_i) int cos(theta_s) ((1 + cos psi) / 2)^alpha_r b(theta_s) dOmega_s = 1.
+    """
+    cos = np.clip(np.asarray(cosine, dtype=np.float64), 0.0, 1.0)
+    node, weighed = _reciprocal_nodes(int(alpha_r))
+    return np.asarray(
+        1.0 / (_around_the_normal(int(alpha_r), cos.ravel(), node) @ weighed).reshape(cos.shape)
+    )
+
+
+@lru_cache(maxsize=64)
+def _reciprocal_nodes(alpha_r: int) -> tuple[np.ndarray, np.ndarray]:
+    """Cosines of a Gauss-Legendre rule on [0, 1], and cos(theta) b(theta) there times their weights.
+
+    Sinkhorn and Knopp's scaling, whose plain steps swing about the solution: their geometric mean is taken.
+    """
+    node, weight = np.polynomial.legendre.leggauss(64 + 4 * int(np.sqrt(alpha_r)))
+    node, weight = 0.5 * (node + 1.0), 0.5 * weight * 0.5 * (node + 1.0)
+    kernel = _around_the_normal(alpha_r, node, node)
+    b = 1.0 / np.sqrt(kernel @ weight)
+    for _ in range(100):
+        before, b = b, np.sqrt(b / (kernel @ (weight * b)))
+        if np.abs(b / before - 1.0).max() < 1e-14:
+            break
+    return node, weight * b
+
+
+def _around_the_normal(alpha_r: int, cos_a: np.ndarray, cos_b: np.ndarray) -> np.ndarray:
+    """((1 + cos psi) / 2)^alpha_r integrated over azimuth, shape ``(A, B)``: a trapezium rule, exact to rounding."""
+    count = min(alpha_r + 1, 16 + 8 * int(np.sqrt(alpha_r)))
+    turn = 2.0 * np.pi * (np.arange(count) + 0.5) / count
+    middle = 0.5 * (1.0 + np.multiply.outer(cos_a, cos_b))
+    swing = 0.5 * np.sqrt(np.multiply.outer(1.0 - cos_a**2, 1.0 - cos_b**2))
+    total = np.zeros_like(middle)
+    for cos_turn in np.cos(turn):
+        total += (middle + swing * cos_turn) ** alpha_r
+    return total * (2.0 * np.pi / count)
 
 
 def lobe_norm(alpha_r: int, cos_incidence: ArrayLike) -> np.ndarray:

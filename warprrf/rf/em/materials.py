@@ -111,6 +111,8 @@ class Material:
         alpha_r: width of the directive lobe ((1 + cos psi) / 2)^alpha_r, a whole number from 1 to 1000.
         itu: the P.2040 name, or None for a custom material.
         sources: where thickness, roughness and pattern come from.
+        reciprocal: whether it scatters alike when transmitter and receiver change places. Degli-Esposti's lobes, the
+            default and Sionna RT's, do not; see :func:`warprrf.rf.em.fresnel.lobe`. ``engine="exact"`` takes either.
         xpd: share K_x of scattered power in the other polarisation, in [0, 1]. Path gains sum over both received
             polarisations, so ours do not depend on it; Sionna RT is given it.
 
@@ -127,6 +129,7 @@ class Material:
     alpha_r: int = 4
     itu: str | None = None
     sources: Mapping[str, str] | None = None
+    reciprocal: bool = False
     xpd: float = 0.0
 
     def __post_init__(self) -> None:
@@ -144,6 +147,7 @@ class Material:
         if self.pattern not in PATTERNS:
             raise ValueError(f"pattern{of}: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}")
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
+        check_type("reciprocal" + of, self.reciprocal, bool)
         check_number("xpd" + of, self.xpd, 0.0, 1.0)
 
     @classmethod
@@ -157,6 +161,7 @@ class Material:
         scattering: float = 0.0,
         pattern: str = "lambertian",
         alpha_r: int = 4,
+        reciprocal: bool = False,
         xpd: float = 0.0,
     ) -> Material:
         """A material with the same permittivity and conductivity [S/m] at every frequency up to 10 THz.
@@ -166,8 +171,8 @@ class Material:
         """
         check_number("relative_permittivity", relative_permittivity, 1.0)
         check_number("conductivity", conductivity, 0.0)
-        band = Band(*WIDEST_HZ, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
-        return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, xpd=xpd)
+        band = Band(1e6, 1e13, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
+        return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, reciprocal=reciprocal)
 
     @classmethod
     def conductor(cls, *, scattering: float = 0.0, pattern: str = "lambertian", alpha_r: int = 4) -> Material:
@@ -273,6 +278,8 @@ def table_entry(material: Material) -> dict[str, Any]:
         entry[key] = {"value": values[key], "source": sources.get(key, "assumed")}
     if material.pattern == "directive":
         entry["pattern"]["alpha_r"] = int(material.alpha_r)
+    if material.reciprocal:
+        entry["pattern"]["reciprocal"] = True
     return entry
 
 
@@ -301,6 +308,9 @@ def _material(entry: object, where: str) -> Material:
         raise ValueError(f"{where}: 'permittivity' is no list of rows")
     parts = {key: _mapping(entry[key], f"{where}, {key!r}") for key in _PARTS if key in entry}
     alpha_r = check_count(f"{where}: 'alpha_r'", parts["pattern"].get("alpha_r", 4), 1, NARROWEST_LOBE)
+    reciprocal = parts["pattern"].get("reciprocal", False)
+    if not isinstance(reciprocal, bool):
+        raise ValueError(f"{where}: 'reciprocal' is {reciprocal!r}, expected true or false")
     try:
         bands = tuple(
             Band(
@@ -324,7 +334,7 @@ def _material(entry: object, where: str) -> Material:
             alpha_r=alpha_r,
             itu=entry.get("itu"),
             sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
-            xpd=_number(parts["xpd"], "value", where) if "xpd" in parts else 0.0,
+            reciprocal=reciprocal,
         )
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error

@@ -10,13 +10,13 @@ S^2 |Gamma|^2 f_s and mirrors (1 - S^2) |Gamma|^2 (Degli-Esposti et al. 2007). E
 - the lobe is the one exponent nearest to the mix, in dB over both hemispheres, weighted by the solid angle that a
   receiver sees and with a floor where scattered power is lost in noise.
 
-What cannot be said is stated: both errors of each group, and what has no place in a material at all.
+Sionna RT has no reciprocal lobes: those of a field become its own, the nearest, and lose that property. What cannot be
+said is stated: both errors of each group, and what has no place in a material at all.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import re
 import shutil
@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from warprrf.files import partial_path
+from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import LAMBERTIAN, lobe, slab_reflection
 from warprrf.rf.em.half_spaces import fresnel_curves
@@ -187,7 +187,7 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
                 surface.mesh.vertices[kept],
                 faces.reshape(-1, 3),
             )
-        (part / "materials.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        write_json(part / "materials.json", table, seal=True)
         (part / "scene.xml").write_text(
             _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
         )
@@ -253,20 +253,24 @@ def project_reflection(log_excess: float, scattered: float, mirrored: float) -> 
     )
 
 
-def project_lobes(exponents: Sequence[int], weight: np.ndarray) -> tuple[int, float]:
-    """The one exponent (0: Lambertian) whose lobe is nearest to a mix, and its error.
+def project_lobes(
+    exponents: Sequence[int], weight: np.ndarray, *, reciprocal: bool = False
+) -> tuple[int, float]:
+    """The one exponent (0: Lambertian) whose lobe, Degli-Esposti's, is nearest to a mix, and its error.
 
     Args:
         exponents: of the mixed lobes, 0 for Lambertian.
         weight: of each, shape ``(L,)``; their scale plays no part.
+        reciprocal: whether the mixed lobes are the reciprocal ones.
 
     Returns:
         The exponent, and the rms difference of the lobes [dB] over cosines of incidence (evenly) and the projected
         hemisphere of scattering, both raised by :data:`LOST_IN_NOISE`.
     """
     most = max(NARROWEST_LOBE, *exponents)
-    lobes, solid_angle = _lobe_table(most)
-    mix = np.asarray(weight, float) @ lobes[list(exponents)] / np.sum(weight)
+    lobes, solid_angle = _lobe_table(most, False)
+    mixed = _lobe_table(most, True)[0] if reciprocal else lobes
+    mix = np.asarray(weight, float) @ mixed[list(exponents)] / np.sum(weight)
     gap = NEPER * np.log((lobes + LOST_IN_NOISE) / (mix + LOST_IN_NOISE))
     error = np.sqrt(gap**2 @ solid_angle)
     best = int(error.argmin())
@@ -280,7 +284,9 @@ def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
     mirrored = float(np.exp(p.log_mirror[g])) if terms.mirror_order > 0 else 0.0
     reflection = project_reflection(float(p.log_excess[g]), scattered, mirrored)
     permittivity = reflection.relative_permittivity
-    alpha_r, lobe_error = project_lobes(terms.lobes, p.weight[g]) if scattered > 0 else (LAMBERTIAN, 0.0)
+    alpha_r, lobe_error = LAMBERTIAN, 0.0
+    if scattered > 0:
+        alpha_r, lobe_error = project_lobes(terms.lobes, p.weight[g], reciprocal=terms.reciprocal)
     conductivity = LOSS_TANGENT * permittivity * 2.0 * np.pi * frequency * VACUUM_PERMITTIVITY
     low, high = (1.0 - BAND_SHARE) * frequency, (1.0 + BAND_SHARE) * frequency
     fitted = f"fitted at {frequency / 1e9:g} GHz"
@@ -321,6 +327,8 @@ def _left_out(field: BistaticField) -> tuple[str, ...]:
         found.append(f"residuals within groups, {NEPER * np.sqrt(squares):.2f} dB rms over area")
     if field.terms.indirect:
         found.append("indirect radiance of each group: further bounces are the ray tracer's")
+    if field.terms.diffuse and field.terms.reciprocal:
+        found.append("reciprocity: scattered power changes when transmitter and receiver are swapped")
     return tuple(found)
 
 
@@ -333,8 +341,8 @@ def _half_spaces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return cosine, step * cosine, NEPER * np.log(0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2))
 
 
-@lru_cache(maxsize=2)
-def _lobe_table(most: int) -> tuple[np.ndarray, np.ndarray]:
+@lru_cache(maxsize=4)
+def _lobe_table(most: int, reciprocal: bool) -> tuple[np.ndarray, np.ndarray]:
     """Lobes of exponents 0 to ``most`` at pairs of directions [1/sr], ``(most + 1, N)``, and weights that sum to 1."""
     incidence, di = np.polynomial.legendre.leggauss(10)
     scatter, ds = np.polynomial.legendre.leggauss(28)
@@ -342,7 +350,7 @@ def _lobe_table(most: int) -> tuple[np.ndarray, np.ndarray]:
     ci, cs, az = np.meshgrid(0.5 * (1.0 + incidence), 0.5 * (1.0 + scatter), turn, indexing="ij")
     psi = ci * cs + np.sqrt((1.0 - ci**2) * (1.0 - cs**2)) * np.cos(az)
     weight = di[:, None, None] * ds[None, :, None] * cs
-    lobes = np.stack([lobe(n, ci, cs, psi).ravel() for n in range(most + 1)])
+    lobes = np.stack([lobe(n, ci, cs, psi, reciprocal=reciprocal).ravel() for n in range(most + 1)])
     return lobes, weight.ravel() / weight.sum()
 
 
@@ -397,7 +405,7 @@ def _check_replaceable(folder: Path) -> None:
     if not found:
         return
     try:
-        table = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
+        table = read_json(folder / "materials.json")
         twin = found <= _FILES and table["about"][0] == ABOUT
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         twin = False

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.brief import one_line
 from warprrf.checks import check_positive
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
@@ -33,6 +34,8 @@ class Links:
         delay_spread_s: root mean square over all paths, weighted by power [s]; NaN without power.
         best_beam_gain: of the receiver's beam in its best direction: path gain times array gain [linear].
     """
+
+    __repr__ = one_line
 
     total_path_gain: np.ndarray
     best_path_gain: np.ndarray

@@ -1,9 +1,10 @@
 """Radio maps: what a link gets at every place of a floor plan.
 
-A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room or on
-a surface hold NaN. Which they are is decided by the mesh alone, open and torn as a reconstructed one may be: rays from
-the centre over the whole sphere meet surfaces from their outer side in the air and from behind anywhere else, and three
-in four decide. Which side is the outer one is decided at the transmitter, which stands in the air.
+A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room, on a
+surface or in the transmitter's reactive near field hold NaN. Which are inside or outside is decided by the mesh alone,
+open and torn as a reconstructed one may be: rays from the centre over the whole sphere meet surfaces from their outer
+side in the air and from behind anywhere else, and three in four decide. Which side is the outer one is decided at the
+transmitter, which stands in the air.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from warprrf.checks import check_array, check_number, check_positive
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions, Links
-from warprrf.rf.receivers import ON_A_WALL_M
+from warprrf.rf.positions import NEAR_FIELD, WALL_CLEARANCE_M, check_positions
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
 ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
@@ -302,7 +304,10 @@ def radio_map(
     if not isinstance(mesh, Mesh):
         raise ValueError("field: got one without a mesh, expected one that knows walls from air")
     source = field.transmitter if transmitter is None else transmitter
-    source = check_array("transmitter", source, (3,))
+    source, wavelength_m = check_array("transmitter", source, (3,)), SPEED_OF_LIGHT / field.frequency_hz
+    check_positions(
+        mesh, source, np.zeros((0, 3)), wavelength_m, known=field.transmitter, device=field.device
+    )
     check_number("height", height)
     check_positive("cell", cell)
     low, high = mesh.bounds
@@ -314,7 +319,7 @@ def radio_map(
     across, along = np.meshgrid(x, y)
     places = np.stack([across, along, np.full_like(across, float(height))], axis=-1)
     free = in_the_air(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
-    free &= (places != source).any(axis=-1)
+    free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
     if not free.any():
         raise ValueError(f"bounds: no cell of the {free.size} at {height!r} m lies in the air")
     links = field.trace_links(places[free], source, o)
@@ -357,7 +362,7 @@ def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any
     outer = np.where(meets, -np.sign(slope), 0.0).reshape(len(places), -1).mean(axis=1)
     inside = (points >= mesh.bounds[0]).all(axis=1) & (points <= mesh.bounds[1]).all(axis=1)
     free = inside & (outer[1:] * np.sign(outer[0]) > _OUTER_SHARE)
-    free[free] = mesh.distance(points[free], device=device) > ON_A_WALL_M
+    free[free] = mesh.distance(points[free], device=device) > WALL_CLEARANCE_M
     return free
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import vectors_across
+from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.polarisation import turns
@@ -87,7 +87,8 @@ def exact_paths(images: MirrorImages, receivers: np.ndarray, order: int) -> Mirr
             row, patch, point = row[own], patch[own], point[own]
         free = _unobstructed(patches, source, receivers[row], patch, point, images.device)
         row, patch, point = row[free], patch[free], point[free]
-        once = _distinct(row, point, max(1e-6, patches.tolerance_m))
+        # Sheets closer than the tolerance don't hide each other: seen at a slant, their mirror points lie further apart.
+        once = _distinct(row, point, 3.0 * patches.tolerance_m)
         parts.append(
             _described(
                 patches, source, receivers, (row[once], patch[once], point[once], np.ones(len(once))), order
@@ -241,19 +242,33 @@ def _unobstructed(
     point: np.ndarray,
     device: DeviceLike,
 ) -> np.ndarray:
-    """Whether every leg of each path is free, shape ``(L,)``; the mirrors' own faces, true to a tolerance, are not met."""
+    """Whether every leg of each path is free, shape ``(L,)``.
+
+    A leg begins off its mirror by the patches' tolerance, so that the mirror's own faces are not met; it is drawn out by
+    the clearance that :meth:`Mesh.visible` leaves at ends, so that whatever lies further off than the tolerance is.
+    """
     stops = stops_of(source, point, ends)
     free = np.ones(len(patch), bool)
     for k in range(patch.shape[1] + 1):
         own = np.flatnonzero(free)
-        a, b = stops[own, k].copy(), stops[own, k + 1].copy()
-        for end, other, j in ((a, stops[own, k + 1], k - 1), (b, stops[own, k], k)):
-            if 0 <= j < patch.shape[1]:
-                normal, offset = patches.normal[patch[own, j]], patches.offset[patch[own, j]]
-                side = np.sign((other * normal).sum(axis=1) - offset)
-                end += (patches.tolerance_m * side)[:, None] * normal
-        free[own] = patches.mesh.visible(a, b, device=device) if len(own) else False
+        a, b = stops[own, k], stops[own, k + 1]
+        toward = (b - a) / np.maximum(np.linalg.norm(b - a, axis=1, keepdims=True), 1e-12)
+        begin = _off_mirror(patches, patch[own], a, b, k - 1) - (k > 0) * ENDPOINT_CLEARANCE * toward
+        end = _off_mirror(patches, patch[own], b, a, k) + (k < patch.shape[1]) * ENDPOINT_CLEARANCE * toward
+        free[own] = patches.mesh.visible(begin, end, device=device) if len(own) else False
     return free
+
+
+def _off_mirror(
+    patches: PlanarPatches, patch: np.ndarray, point: np.ndarray, other: np.ndarray, k: int
+) -> np.ndarray:
+    """``point`` (L, 3) on mirror k of each path, off it by the mirrors' tolerance on the side of ``other``; as it is for
+    the ends of the path."""
+    if not 0 <= k < patch.shape[1]:
+        return point
+    normal, offset = patches.normal[patch[:, k]], patches.offset[patch[:, k]]
+    side = np.sign((other * normal).sum(axis=1) - offset)
+    return point + (patches.tolerance_m * side)[:, None] * normal
 
 
 def _distinct(row: np.ndarray, point: np.ndarray, distance_m: float) -> np.ndarray:

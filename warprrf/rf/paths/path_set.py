@@ -12,6 +12,7 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf.brief import one_line
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.dispersion import Dispersion, dispersion
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -33,6 +34,8 @@ class Paths(PathArrays):
     ``vertices`` [m], ``kind``, ``valid`` and, where known, ``jones``, ``frequency_hz``, ``transmitter``, ``receiver`` and
     ``air``: see :class:`~warprrf.rf.channel.path_arrays.PathArrays`.
     """
+
+    __repr__ = one_line
 
     def cir(self, **link: Unpack[LinkOptions]) -> tuple[np.ndarray, np.ndarray]:
         """Impulse response, one coefficient a path; see :func:`warprrf.rf.channel.response.impulse_response`."""
@@ -115,8 +118,8 @@ class Paths(PathArrays):
         """Read what :meth:`save` wrote.
 
         Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file holds something else.
+            OSError: naming the file, if it cannot be read.
+            ValueError: naming it, if it is damaged, or holds something else.
         """
         arrays, one_receiver = files.read(path)
         several = cls(**arrays)

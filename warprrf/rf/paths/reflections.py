@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_positive
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components
@@ -21,6 +21,7 @@ from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import MirrorPaths
 from warprrf.rf.paths.trace import MirrorTracer
+from warprrf.rf.positions import check_positions, check_receivers, question_unit
 
 REGULARISATION = 1e-4
 """Default weight of the prior; see :func:`fit_reflections`."""
@@ -58,9 +59,12 @@ class Reflections:
         """Complex channel between isotropic antennas at ``receivers`` (R, 3) or (3,) [m], shape ``(R,)``.
 
         Raises:
-            ValueError: on another shape, NaN, or a receiver at the transmitter's place.
+            ValueError: on another shape, NaN, or a place where :func:`trace_paths` refuses to answer.
         """
-        points = np.atleast_2d(check_array("receivers", receivers))
+        points, t = np.atleast_2d(check_receivers("receivers", receivers)), self._tracer
+        check_positions(
+            t.mesh, t.transmitter, points, t.wavelength_m, on_surfaces=True, device=t.images.device
+        )
         return self.channel(self._tracer.find(points, self.order), len(points))
 
     def channel(self, paths: MirrorPaths, count: int) -> np.ndarray:
@@ -112,12 +116,14 @@ def fit_reflections(
         raise ValueError("csi: got NaN or infinite values, expected finite complex channels")
     if len(channel) and not channel.any():
         raise ValueError("csi: got channels that are all zero, expected some power")
-    if not (np.isfinite(regularisation) and regularisation > 0):
+    if check_positive("regularisation", regularisation) <= 0:
         raise ValueError(f"regularisation: got {regularisation!r}, expected a positive number")
     if not np.isfinite(prior):
         raise ValueError(f"prior: got {prior!r}, expected a finite complex number")
     begin = time.perf_counter()
     tracer = MirrorTracer(surface, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
+    question_unit(surface, tracer.wavelength_m)
+    check_positions(surface, tracer.transmitter, points, tracer.wavelength_m, on_surfaces=True, device=device)
     patch_group, count = _patch_groups(surface, tracer.patches, groups)
     if chains is None:
         chains = tracer.find(points, order)

@@ -20,6 +20,7 @@ from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
+from warprrf.rf.positions import check_positions, check_receivers, question_unit
 
 
 def trace_paths(
@@ -52,12 +53,16 @@ def trace_paths(
         Arrays ``(L,)`` for one receiver, ``(R, L)`` for several; line of sight first, then by order, then by delay.
 
     Raises:
-        ValueError: on bad positions, a frequency that is not positive or outside a material's band, another order.
+        ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near
+            field of the transmitter; on a frequency that is not positive or outside a material's band, or
+            another order.
     """
-    tracer = MirrorTracer(mesh_or_scene, transmitter=transmitter, frequency_hz=frequency_hz, device=device)
-    points = check_array("receivers", receivers)
-    if points.ndim not in (1, 2) or points.shape[-1] != 3:
-        raise ValueError(f"receivers: got shape {points.shape}, expected (3,) or (R, 3)")
+    points = check_receivers("receivers", receivers)
+    source, frequency = check_array("transmitter", transmitter, (3,)), check_frequency(frequency_hz)
+    mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
+    question_unit(mesh, wavelength_m)
+    check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
+    tracer = MirrorTracer(mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device)
     if points.ndim == 1:
         return tracer.trace(points, mirror_order).with_gas(gas)
     return Paths.stack(tracer.trace_each(points, mirror_order)).with_gas(gas)

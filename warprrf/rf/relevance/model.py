@@ -123,9 +123,10 @@ def full_field(
         parameters, lobes = material_parameters(geometry.materials, frequency_hz)
         table = surface_table(list(geometry.materials), frequency_hz)
         face = np.asarray(geometry.face_material)
+        reciprocal = bool(table.reciprocal[table.scattering > 0].any())  # a field's lobes are of one kind
         walls = Walls(geometry.mesh, table.permittivity[face], table.thickness_m[face], False)
     else:
-        parameters, lobes = Parameters.prior(surface.groups, len(LOBES)), LOBES
+        parameters, lobes, reciprocal = Parameters.prior(surface.groups, len(LOBES)), LOBES, False
         walls = _unknown_walls(surface.mesh)
     field = BistaticField(
         surface=surface,
@@ -135,7 +136,7 @@ def full_field(
         floor=1.0,
         range_db=(0.0, 1.0),
         beam_sigma_rad=beam_sigma_rad,
-        terms=Terms(lobes=lobes, **further),
+        terms=Terms(lobes=lobes, reciprocal=reciprocal, **further),
         parameters=parameters,
         material=surface.material,
         residual=np.zeros((2, surface.cells)),

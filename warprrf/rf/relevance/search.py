@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_positive
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -28,7 +28,7 @@ from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.receivers import check_receiver
+from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.relevance.choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
 from warprrf.rf.relevance.model import FullModel, full_field, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
@@ -296,8 +296,7 @@ def relevances(
 ) -> list[Relevance]:
     """:func:`relevance` at several tolerances, for little more than the time of one; arguments and errors as there."""
     for tolerance in tolerances_db:
-        if not (np.isfinite(tolerance) and tolerance > 0):
-            raise ValueError(f"tolerance_db: got {tolerance!r}, expected more than 0")
+        check_positive("tolerance_db", tolerance, "number of decibels")
     asked = Setting(**setting).of(geometry)
     full, walls, source = full_field(
         geometry,
@@ -307,7 +306,9 @@ def relevances(
         beam_sigma_rad=asked.beam_sigma_rad,
         device=device,
     )
-    places = np.atleast_2d(check_receiver("receivers", receivers, full.surface.mesh))
+    places = np.atleast_2d(check_receivers("receivers", receivers))
+    known = geometry.transmitter if isinstance(geometry, BistaticField) else None
+    check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
     tick: Progress = progress or (lambda stage, done, total: None)
     model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
     gaussians = getattr(geometry, "gaussians", None)
@@ -357,6 +358,7 @@ def _terms(full: Terms, kept: frozenset[str]) -> Terms:
         diffuse=diffuse,
         mirror_order=2 if "mirror_2" in kept else int("mirror_1" in kept),
         lobes=tuple(n for n in full.lobes if f"lobe_{n}" in kept) if diffuse else full.lobes[:1],
+        reciprocal=full.reciprocal,
         mirror_scatter="mirror_scatter" in kept,
         scatter_mirror="scatter_mirror" in kept,
         diffuse_order=full.diffuse_order if "diffuse_2" in kept else 1,

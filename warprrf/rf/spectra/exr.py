@@ -5,7 +5,9 @@ Numbers in the header are text, because EXR headers hold 32-bit floats only.
 
 from __future__ import annotations
 
+import errno
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,7 @@ def export_exr(path: str | os.PathLike[str], spectrum: Spectrum) -> None:
     """Write ``spectrum`` with its floor, range, and of its attributes position, frequency, beam and engine.
 
     Raises:
+        OSError: naming the file, if the system does not take it.
         ValueError: if it lacks delay, angles of departure or a range.
         ImportError: if OpenEXR is not installed.
     """
@@ -40,7 +43,14 @@ def export_exr(path: str | os.PathLike[str], spectrum: Spectrum) -> None:
         header[f"warprrf_{name}"] = " ".join(repr(float(v)) for v in np.atleast_1d(value))
     for name in _WORDS:
         header[f"warprrf_{name}"] = str(spectrum.attributes.get(name, ""))
-    write_atomically(path, lambda file: exr.File(header, channels).write(str(file)), seal=True)
+
+    def write(file: Path) -> None:
+        try:
+            exr.File(header, channels).write(str(file))
+        except RuntimeError as error:
+            raise OSError(errno.EIO, f"OpenEXR could not write it ({error})", os.fspath(path)) from error
+
+    write_atomically(path, write, seal=True)
 
 
 def import_exr(path: str | os.PathLike[str]) -> Spectrum:

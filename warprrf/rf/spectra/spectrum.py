@@ -19,6 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
+from warprrf.brief import one_line
 from warprrf.checks import check_array, check_number, check_positive
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
@@ -40,8 +41,11 @@ _ANGLE_ROUNDING = 1e-3  # radians by which angles of departure may lie out of ra
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
+MOST_PIXELS = 1 << 24  # a sixteenth of a degree each
+
+
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
-    """``shape`` as (rows, columns), each at least 2.
+    """``shape`` as (rows, columns), each at least 2, at most :data:`MOST_PIXELS` in all.
 
     Raises:
         ValueError: otherwise.
@@ -52,6 +56,8 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
         raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
     if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
         raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")
+    if rows * columns > MOST_PIXELS:
+        raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {MOST_PIXELS} in all")
     return rows, columns
 
 
@@ -399,6 +405,8 @@ class Spectrum:
         range_db: Lowest and highest value of the data set's dB images [dB].
         std_db: Standard deviation of the dB image per pixel [dB], shape ``(H, W)``; None where it is not known.
     """
+
+    __repr__ = one_line
 
     path_gain: np.ndarray
     delay_s: np.ndarray | None = None

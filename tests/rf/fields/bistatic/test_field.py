@@ -134,7 +134,7 @@ def test_jacobian_against_differences(scene: RadioScene, data: SpectrumDataset) 
     seen = trace(scene, data.subset([0]))
     measured = SpectrumPixels(BeamOperator(SHAPE, SIGMA), np.arange(0, SHAPE[0] * SHAPE[1], 7))
     lobes = Terms().lobes
-    response = respond(seen.views[0], measured, lobes, data.floor)
+    response = respond(seen.views[0], measured, Terms(), data.floor)
     layout = Layout(2, len(lobes), indirect=True, gain=True)
     rng = np.random.default_rng(0)
     p = layout.unpack(rng.normal(-1.0, 0.2, layout.size))
@@ -298,7 +298,9 @@ def test_a_tracer_on_true_materials_matches_the_exact_engine(scene: RadioScene) 
     grid = RayGrid(surface, SHAPE, 3)
     hits = grid.hit(RECEIVERS[0])
     weight = np.array([[0.0, 0.25], [0.64, 0.0]])
-    power = scatter(surface, hits.face, grid.light(hits, TX), (0, 4), weight, np.log([2.0, 5.0]), WAVELENGTH)
+    power = scatter(
+        surface, hits.face, grid.light(hits, TX), Terms(lobes=(0, 4)), weight, np.log([2.0, 5.0]), WAVELENGTH
+    )
     engine = ExactEngine(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
     assert power.sum() == pytest.approx(engine.diffuse(RECEIVERS[0]).power.sum(), rel=0.02)
 

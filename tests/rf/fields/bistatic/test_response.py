@@ -53,7 +53,7 @@ def field() -> BistaticField:
 
 def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
     view, profile = field.view(RX), DelayProfile(np.arange(0.0, 50e-9, 2e-9))
-    response = respond(view, profile, field.terms.lobes, field.floor)
+    response = respond(view, profile, field.terms, field.floor)
     found = predict(response, field.parameters) * field.floor
     powers = path_powers(view, field.materials, None)
     tap, count = profile.bins(view)
@@ -67,7 +67,7 @@ def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
 
 def test_its_jacobian_is_that_of_differences(field: BistaticField) -> None:
     view, profile = field.view(RX), DelayProfile(np.arange(0.0, 50e-9, 2e-9))
-    response = respond(view, profile, field.terms.lobes, field.floor)
+    response = respond(view, profile, field.terms, field.floor)
     layout = Layout(*field.parameters.log_weight.shape, indirect=False, gain=True)
     x = layout.pack(replace(field.parameters, log_gain=0.1))
     values, table, index = jacobian(response, layout.unpack(x), layout)

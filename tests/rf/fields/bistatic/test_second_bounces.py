@@ -114,7 +114,7 @@ def test_what_groups_send_on_adds_up(scene: RadioScene) -> None:
     field = BistaticField.prior(surface, ds, terms=terms)
     view, beam = field.view(RECEIVERS[0]), BeamOperator(SHAPE, np.radians(5.0))
     measured = SpectrumPixels(beam, np.arange(SHAPE[0] * SHAPE[1]))
-    bare, sent = respond(view, measured, terms.lobes, ds.floor), field.sent_radiance(view.transport)
+    bare, sent = respond(view, measured, terms, ds.floor), field.sent_radiance(view.transport)
     follows, held = (
         with_further_bounces(bare, view, measured, field.materials, sent, ds.floor, follow=follow)
         for follow in (True, False)
@@ -156,7 +156,7 @@ def readings(scene: RadioScene) -> list[Reading]:
     target = to_db(ds.path_gain, ds.floor) - 10 * np.log10(ds.floor)
     measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)), np.arange(SHAPE[0] * SHAPE[1]))
     return [
-        Reading(respond(view, measured, Terms().lobes, ds.floor), t.ravel())
+        Reading(respond(view, measured, Terms(), ds.floor), t.ravel())
         for view, t in zip(trace(scene, ds).views, target, strict=True)
     ]
 

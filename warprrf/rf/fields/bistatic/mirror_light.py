@@ -67,7 +67,7 @@ class MirrorLight:
         way = self._image[patch] - centre[face]
         length = np.linalg.norm(way, axis=1)
         toward = way / np.maximum(length, 1e-12)[:, None]
-        self._face, self._patch = face, patch
+        self._face, self._patch, self._side = face, patch, s.side_met(face, -normal)
         self._cosine = np.abs((toward * s.plane_normal[patch]).sum(axis=1))
         cos_in = np.maximum((toward * normal).sum(axis=1), 0.0)
         share = s.mesh.areas[face] / s.element_area[s.element[face]]
@@ -77,12 +77,12 @@ class MirrorLight:
         self._first = np.searchsorted(face[order], np.arange(len(s.mesh.faces) + 1))
 
     def irradiance(self, p: Parameters) -> np.ndarray:
-        """Mean irradiance of each element, shape ``(E,)``, where the transmitter gives cos(theta_i) / d1^2 [1/m^2]."""
-        elements = len(self.surface.element_area)
+        """Mean irradiance of each element's sides, shape ``(S,)``, where the transmitter gives cos(theta_i) / d1^2 [1/m^2]."""
+        sides = self.surface.element_sides
         if len(self._face) == 0:
-            return np.zeros(elements)
+            return np.zeros(sides)
         share = mirror_share(p, self.surface.patch_group[self._patch], self._cosine)
-        return np.bincount(self.surface.element[self._face], share * self._irradiance, minlength=elements)
+        return np.bincount(self._side, share * self._irradiance, minlength=sides)
 
     def view(self, grid: RayGrid, receivers: np.ndarray, hits: Hits) -> MirrorIllumination:
         """Mirrored light that the rays of ``grid`` from ``receivers``, (3,) or (O, 3), see where they hit faces."""
@@ -103,7 +103,7 @@ class MirrorLight:
         points = start + hits.range_m.numpy()[rays, None] * direction
         if len(row) == 0:
             none = np.zeros(0, int)
-            return _packed(grid, none, none, np.zeros(0), none, *[np.zeros(0)] * 4)
+            return _packed(grid, none, none, np.zeros(0), none, *[np.zeros(0)] * 5)
         patch = self._mirror[pair]
         normal = s.normal[face]
         turned = (s.mesh.face_normals[face] * direction).sum(axis=1) > 0
@@ -128,6 +128,7 @@ class MirrorLight:
             face[row[k]],
             strength,
             np.minimum(cos_in[k], 1.0),
+            np.minimum(cos_s, 1.0),
             np.clip(2.0 * cos_in[k] * cos_s - (toward[k] * to_receiver[k]).sum(axis=1), -1.0, 1.0),
             np.log(high / low) / (high - low),
         )

@@ -64,19 +64,21 @@ class Illumination:
     Attributes:
         strength: Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2], 0 in the source's shadow; less what the air absorbs.
         cos_in: cosine of incidence.
+        cos_out: cosine of scattering.
         cos_mirror: cosine of the angle between the scattered and the mirror direction.
         grazing: mean of 1 / cos(theta_s) over the ray's width.
     """
 
     strength: wp.array
     cos_in: wp.array
+    cos_out: wp.array
     cos_mirror: wp.array
     grazing: wp.array
 
     @property
     def inputs(self) -> list[wp.array]:
         """In the order that kernels take them."""
-        return [self.strength, self.cos_in, self.cos_mirror, self.grazing]
+        return [self.strength, self.cos_in, self.cos_out, self.cos_mirror, self.grazing]
 
 
 class RayGrid:
@@ -149,7 +151,7 @@ class RayGrid:
     def light(self, hits: Hits, source: np.ndarray) -> Illumination:
         """How a transmitter at ``source`` (3,) [m] illuminates what was hit; shadows included."""
         count = len(hits.face)
-        found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(4)))
+        found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
         position = wp.vec3d(*source)
         inputs = [
             self.surface.on_device(self.device), position, *hits.inputs, hits.solid_angle, float(self.half_width),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warprrf.rf.fields.bistatic.elements import RAYS
-from warprrf.rf.fields.bistatic.materials import Materials, Parameters, mirror_power, mirror_share
+from warprrf.rf.fields.bistatic.materials import Materials, mirror_power, mirror_share
 from warprrf.rf.fields.bistatic.scattering import scatter
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.spectra.beam import BeamOperator
@@ -113,7 +113,7 @@ def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | Non
     single = np.zeros(len(view.hits.face))
     if terms.diffuse:
         face = view.hits.face
-        power = scatter(t.surface, face, view.light, terms.lobes, p.weight, p.log_excess, t.wavelength_m)
+        power = scatter(t.surface, face, view.light, terms, p.weight, p.log_excess, t.wavelength_m)
         single = p.gain * power * materials.cell_gain(t.surface.cell[np.maximum(face.numpy(), 0)])
     return PathPowers(single, mirror, further_bounces(view, materials, sent))
 
@@ -132,14 +132,12 @@ def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -
     rows = [(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0))]
     if sent is not None:
         ray, face, unit = view.seen()
-        power = unit * sent[t.surface.element[face]]
+        power = unit * sent[t.surface.side_met(face, t.grid.directions[ray % len(t.grid.directions)])]
         some = power > 0
         rows.append((ray[some], face[some], power[some]))
     m = view.mirror_illumination if materials.terms.diffuse and materials.terms.mirror_scatter else None
     if m is not None and len(m.ray):
-        power = scatter(
-            t.surface, m.face, m.light, materials.terms.lobes, p.weight, p.log_excess, t.wavelength_m
-        )
+        power = scatter(t.surface, m.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
         rows.append(
             (m.ray, m.face.numpy(), power * mirror_share(p, t.surface.patch_group[m.patch], m.cosine))
         )
@@ -156,43 +154,46 @@ def mirror_shown(
     if not wanted or m is None or len(m.ray) == 0:
         return np.zeros(0, int), np.zeros(0)
     wavelength, face = t.wavelength_m, m.hits.face.numpy()
-    power = scatter(
-        t.surface, m.hits.face, m.light, materials.terms.lobes, p.weight, p.log_excess, wavelength
-    )
+    power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, wavelength)
     power = power.astype(float)
     if sent is not None:
-        radiance = np.where(face >= 0, sent[t.surface.element[np.maximum(face, 0)]], 0.0)
+        side = t.surface.side_met(np.maximum(face, 0), m.hits.directions.numpy())
+        radiance = np.where(face >= 0, sent[side], 0.0)
         air = t.grid.transmittance(np.where(face >= 0, m.hits.range_m.numpy(), 0.0))
         power += (wavelength / (4.0 * np.pi)) ** 2 * m.hits.solid_angle.numpy() * radiance * air
     return m.ray, mirror_share(p, m.group, m.cosine) * power * m.air
 
 
 def sent_radiance(transport: Transport, materials: Materials) -> np.ndarray | None:
-    """Radiance that elements send on besides first bounces [1/(m^2 sr)], shape ``(E,)``; None where there is none.
+    """Radiance that elements' sides send on besides first bounces [1/(m^2 sr)], shape ``(S,)``; None where there is none.
 
     Radiance is in units in which the transmitter gives an irradiance of cos(theta_i) / d1^2 [1/m^2].
     """
     terms, p, surface = materials.terms, materials.parameters, transport.surface
     if not (terms.further or terms.indirect):
         return None
-    sent = np.zeros(len(surface.element_area))
+    sent = np.zeros(surface.element_sides)
+    group = np.tile(surface.element_group, 1 + surface.two_sided)
     if terms.further:
-        sent += _element_radiance(transport, p, materials)
+        sent += _element_radiance(transport, materials, p.scattered_share[group] / np.pi)
     if terms.indirect:
-        sent += np.exp(p.log_indirect)[surface.element_group]
+        sent += np.exp(p.log_indirect)[group]
     return sent
 
 
-def _element_radiance(transport: Transport, p: Parameters, materials: Materials) -> np.ndarray:
-    """Radiance of light that elements got from other surfaces, one or two diffuse bounces before, shape ``(E,)``."""
-    terms, links, wavelength = materials.terms, transport.elements, transport.wavelength_m
-    power = scatter(
-        transport.surface, links.hits.face, links.light, terms.lobes, p.weight, p.log_excess, wavelength
-    )
-    # rays are drawn by the cosine: pi times the mean radiance that they see is the irradiance
-    got = np.pi * (power.reshape(-1, RAYS) * (4.0 * np.pi / wavelength) ** 2).mean(axis=1)
-    share = p.scattered_share[transport.surface.element_group] / np.pi
+def _element_radiance(transport: Transport, materials: Materials, share: np.ndarray) -> np.ndarray:
+    """Radiance of light that elements' sides got from other surfaces, one or two diffuse bounces before, shape ``(S,)``;
+    ``share`` (S,) is what they send of it per steradian."""
+    terms, p, wavelength = materials.terms, materials.parameters, transport.wavelength_m
+    got = np.zeros(len(share))
+    for rays in transport.elements.rays:
+        power = scatter(
+            transport.surface, rays.hits.face, rays.light, terms, p.weight, p.log_excess, wavelength
+        )
+        # rays are drawn by the cosine: pi times the mean radiance that they see is the irradiance
+        got[rays.side] = np.pi * (power.reshape(-1, RAYS) * (4.0 * np.pi / wavelength) ** 2).mean(axis=1)
     if terms.diffuse_order > 2:
-        before = got + transport.mirror_light.irradiance(p) if terms.mirror_scatter else got
-        got = got + np.pi * ((share * before)[links.element] * links.air).mean(axis=1)
+        before = share * (got + transport.mirror_light.irradiance(p) if terms.mirror_scatter else got)
+        for rays in transport.elements.rays:
+            got[rays.side] += np.pi * (before[rays.met] * rays.air).mean(axis=1)
     return share * got

@@ -129,18 +129,18 @@ def _summed(owner: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndar
     return found, out
 
 
-def respond(view: ReceiverView, measurement: Measurement, lobes: tuple[int, ...], floor: float) -> Response:
+def respond(view: ReceiverView, measurement: Measurement, terms: Terms, floor: float) -> Response:
     """How ``measurement`` of one receiver answers to the parameters of all groups, light of second bounces left out.
 
     Args:
         view: what the receiver sees.
         measurement: what is read.
-        lobes: exponents of the scattering lobes.
+        terms: which lobes there are.
         floor: unit of the readings, path gain.
     """
     t = view.transport
     bins, count = measurement.bins(view)
-    group, images = resolve(t.surface, view.hits.face, view.light, lobes, t.wavelength_m, bins, count)
+    group, images = resolve(t.surface, view.hits.face, view.light, terms, t.wavelength_m, bins, count)
     read = measurement.of_bins(images.reshape(count, -1)) / np.float32(floor)
     bounce = np.ascontiguousarray(read.T).reshape(*images.shape[1:], len(read))
     strong = np.abs(bounce).max(axis=(1, 2, 3), initial=0.0) > NEGLIGIBLE

@@ -4,7 +4,9 @@ Path gain per ray, after Degli-Esposti et al. (2007), eq. (5), over the footprin
 
     (lambda / 4 pi)^2 Omega f_s |Gamma|^2 cos(theta_i) / (cos(theta_s) d1^2)
 
-with f_s a mix of normalised lobes and |Gamma|^2 a Fresnel curve of one permittivity per material group.
+with f_s a mix of normalised lobes and |Gamma|^2 a Fresnel curve of one permittivity per material group. As in that model
+each lobe is normalised by its incidence, and power changes when the ends are swapped. Reciprocal lobes
+(:func:`warprrf.rf.em.fresnel.lobe`), with the mean of |Gamma|^2 at both angles, keep it.
 """
 
 from __future__ import annotations
@@ -16,28 +18,29 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.kernels.radio import bounce
-from warprrf.rf.em.fresnel import lobe_norm
+from warprrf.rf.em.fresnel import lobe_norm, reciprocal_factor
 from warprrf.rf.em.half_spaces import COSINES, fresnel_curves
 from warprrf.rf.fields.bistatic.rays import Illumination
 from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.terms import Terms
 
 
 @lru_cache(maxsize=8)
-def _lobe_tables(exponents: tuple[int, ...], device: str) -> tuple[wp.array, wp.array]:
-    """Exponents (L,) and 1 / norm of each lobe over the cosine of incidence (L, 257)."""
-    cosine = np.linspace(0.0, 1.0, COSINES)
-    inverse = np.array([np.ones(COSINES) if n == 0 else 1.0 / lobe_norm(n, cosine) for n in exponents])
-    return (
-        wp.array(np.array(exponents, np.float32), dtype=wp.float32, device=device),
-        wp.array(inverse.astype(np.float32), dtype=wp.float32, device=device),
-    )
+def _lobes(exponents: tuple[int, ...], reciprocal: bool, device: str) -> bounce.Lobes:
+    """A mix of lobes with its table, on the device."""
+    cosine, found = np.linspace(0.0, 1.0, COSINES), bounce.Lobes()
+    scale = [reciprocal_factor(n, cosine) if reciprocal else 1.0 / lobe_norm(n, cosine) for n in exponents]
+    found.exponent = wp.array(np.array(exponents, np.float32), dtype=wp.float32, device=device)
+    found.scale = wp.array(np.array(scale, np.float32), dtype=wp.float32, device=device)
+    found.reciprocal = int(reciprocal)
+    return found
 
 
 def scatter(
     surface: Surface,
     face: wp.array,
     light: Illumination,
-    lobes: tuple[int, ...],
+    terms: Terms,
     weight: np.ndarray,
     log_excess: np.ndarray,
     wavelength_m: float,
@@ -48,7 +51,7 @@ def scatter(
         surface: what was hit.
         face: faces that rays hit, shape ``(K,)``, -1 for none.
         light: how those are illuminated.
-        lobes: exponents of the scattering lobes.
+        terms: which lobes there are.
         weight: of each group and lobe, shape ``(G, L)``.
         log_excess: ln(epsilon_r - 1) of each group, shape ``(G,)``.
         wavelength_m: wavelength.
@@ -57,7 +60,7 @@ def scatter(
     fresnel = curves.at(curves.curves, log_excess)[0]
     power = wp.empty(len(face), dtype=wp.float32, device=where)
     inputs = [
-        surface.on_device(where), face, *light.inputs, *_lobe_tables(lobes, str(where)),
+        surface.on_device(where), face, *light.inputs, _lobes(terms.lobes, terms.reciprocal, str(where)),
         wp.array(fresnel, dtype=wp.float32, device=where),
         wp.array(weight * wavelength_m**2, dtype=wp.float32, device=where), power,
     ]  # fmt: skip
@@ -69,7 +72,7 @@ def resolve(
     surface: Surface,
     face: wp.array,
     light: Illumination,
-    lobes: tuple[int, ...],
+    terms: Terms,
     wavelength_m: float,
     bins: np.ndarray,
     count: int,
@@ -89,13 +92,14 @@ def resolve(
     groups = np.unique(surface.group[face.numpy()[light.strength.numpy() > 0]])
     place = np.zeros(surface.groups, np.int32)
     place[groups] = np.arange(len(groups))
-    columns = len(groups) * len(lobes) * bounce.MOMENTS
+    columns = len(groups) * len(terms.lobes) * bounce.MOMENTS
     out = wp.zeros((count, max(columns, 1)), dtype=wp.float32, device=where)
     inputs = [
         *(wp.array(a, dtype=wp.int32, device=where) for a in (first, order)), surface.on_device(where),
-        wp.array(place, dtype=wp.int32, device=where), face, *light.inputs, *_lobe_tables(lobes, str(where)),
+        wp.array(place, dtype=wp.int32, device=where), face, *light.inputs,
+        _lobes(terms.lobes, terms.reciprocal, str(where)),
         wp.array(fresnel_curves().moments, dtype=wp.float32, device=where), out,
     ]  # fmt: skip
     _device.launch(bounce.resolve_bounces, count, inputs, device=where)
     image = out.numpy()[:, :columns] * np.float32(wavelength_m**2)
-    return groups, image.reshape(count, len(groups), len(lobes), bounce.MOMENTS)
+    return groups, image.reshape(count, len(groups), len(terms.lobes), bounce.MOMENTS)

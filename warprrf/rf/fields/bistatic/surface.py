@@ -8,17 +8,19 @@ told apart at both scales.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
+from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
+from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
-from warprrf.geometry.mesh_topology import smoothed_normals
+from warprrf.geometry.mesh_topology import components, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import bounce
@@ -26,10 +28,30 @@ from warprrf.rf.fields.bistatic.colours import colour_groups
 
 ELEMENT_M = 0.5  # width of an element
 CELLS = 3  # along an element
+MOST_ELEMENTS = 500_000
+"""More elements are refused: light between them takes 5 kB each. It is 125,000 m^2 of surfaces, a large hall's."""
 LARGEST_FACE_M = 0.6  # longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
 SKIN_M = 0.02  # depth of a reconstructed surface's skin: shadow rays ignore it
 TRUE_SKIN_M = 1e-4
+_UNIT = Expected("F 3", -1.001, 1.001)
+ARRAYS = {
+    "normal": _UNIT,
+    "patch": index_to("P", "F", -1),
+    "plane_normal": replace(_UNIT, shape="P 3"),
+    "plane_offset": lengths("P"),
+    "group": index_to("G", "F"),
+    "material": index_to("G", "G"),
+    "colour": Expected("G 4", nan=True),
+    "patch_group": index_to("G", "P"),
+    "element": index_to("E", "F"),
+    "cell": index_to("X", "F"),
+    "cell_element": index_to("E", "X"),
+    "element_centre": lengths("E 3"),
+    "element_area": Expected("E", 0.0, LARGEST_M**2),
+    "element_group": index_to("G", "E"),
+}
+"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +74,11 @@ class Surface:
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
-        two_sided: whether mirrors have two sides; False: only that of ``plane_normal``, of a surface that photos saw.
+        two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
+            that photos saw.
+
+    Raises:
+        TypeError, ValueError: for arrays that do not fit each other, or indices and values out of range.
     """
 
     mesh: Mesh = field(repr=False)
@@ -75,11 +101,37 @@ class Surface:
     two_sided: bool = False
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
+    def __post_init__(self) -> None:
+        check_arrays(vars(self), ARRAYS, F=len(self.mesh.faces), G=len(self.group_names))
+        check_number("skin_m", self.skin_m, 0.0, 10.0)
+
     @cached_property
     def front_normal(self) -> np.ndarray:
         """``normal`` on the side that each face is wound for, shape ``(F, 3)``."""
         behind = (self.normal * self.mesh.face_normals).sum(axis=1, keepdims=True) < 0
         return np.where(behind, -self.normal, self.normal)
+
+    @cached_property
+    def side_normal(self) -> np.ndarray:
+        """What the first side of each face's element faces, however its faces are wound, shape ``(F, 3)``."""
+        if not self.two_sided:
+            return self.front_normal
+        own, normal = self.patch >= 0, self.front_normal.copy()
+        normal[own] = self.plane_normal[self.patch[own]]
+        return normal
+
+    @property
+    def element_sides(self) -> int:
+        """Number of elements' sides: two each, or that of a reconstructed surface which photos saw."""
+        return (1 + self.two_sided) * len(self.element_area)
+
+    def side_met(self, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Side of an element that a ray of ``direction`` (N, 3) meets at ``face`` (N,): second sides stand after all the
+        first ones, shape ``(N,)``."""
+        if not self.two_sided:
+            return self.element[face]
+        behind = np.einsum("ni,ni->n", self.side_normal[face], direction) > 0
+        return self.element[face] + behind * len(self.element_area)
 
     @property
     def groups(self) -> int:
@@ -98,10 +150,12 @@ class Surface:
 
         Raises:
             TypeError: if it has no mesh.
+            ValueError: if it is so large that it would take more than :data:`MOST_ELEMENTS` elements.
         """
         if isinstance(geometry, Surface):
             return geometry
         mesh = as_mesh(geometry, "geometry")
+        _check_size(mesh)
         material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
@@ -113,11 +167,7 @@ class Surface:
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
             patches = planar_patches(mesh, material)
-            large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
-            order = np.full(len(patches) + 1, -1)
-            order[large] = np.arange(len(large))
-            patch = order[patches.face_patch].astype(np.int32)
-            planes = patches.normal[large], patches.offset[large]
+            patch, planes = _mirrors(patches)
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
             normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
             if material is None:
@@ -127,7 +177,7 @@ class Surface:
                 names = tuple(m.name for m in materials)
             sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         sides = patches.two_sided
-        mesh, parent = _split_long(mesh)
+        mesh, parent = _split_long(mesh, np.flatnonzero(patches.once))
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
@@ -190,13 +240,49 @@ def _largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: i
     return area.argmax(axis=1).astype(np.int32)
 
 
-def _split_long(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
-    """``mesh`` with faces halved across their longest edge until none is long, and each face's parent.
+def _check_size(mesh: Mesh) -> None:
+    area = float(mesh.areas.sum())
+    elements = area / ELEMENT_M**2
+    if elements > MOST_ELEMENTS:
+        size = " x ".join(f"{e:.4g}" for e in np.ptp(mesh.bounds, axis=0))
+        raise ValueError(
+            f"geometry: its {area:.3g} m^2 of surfaces make about {elements:.2g} elements of {ELEMENT_M} m, which take "
+            f"{5e-6 * elements:.2g} GB and more, expected at most {MOST_ELEMENTS}; its box is {size} m: if that is not in "
+            "metres but in millimetres, give Mesh(1e-3 * vertices, faces), else the part of it that was measured"
+        )
+
+
+def _mirrors(patches: PlanarPatches) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Patches large enough to mirror, those of one group in one plane as one: patch of each face, -1 for none, and planes.
+
+    Faces that overlap in a plane, or sheets closer than the tolerance, would mirror twice.
+    """
+    large = np.flatnonzero(patches.area >= MIN_MIRROR_M2)
+    middle = patches.mesh.center
+    height = patches.offset[large] - patches.normal[large] @ middle
+    reach = 0.5 * float(np.linalg.norm(np.ptp(patches.mesh.bounds, axis=0)))
+    plane = np.column_stack([reach * patches.normal[large], height])
+    count = len(large)
+    near = cKDTree(np.concatenate([plane, -plane])).query_pairs(patches.tolerance_m, output_type="ndarray")
+    near = near[(near[:, 0] < count) | (near[:, 1] < count)] % max(count, 1)
+    near = near[patches.group[large][near[:, 0]] == patches.group[large][near[:, 1]]]
+    piece = components(count, near)
+    first, piece = np.unique(piece, return_index=True, return_inverse=True)[
+        1:
+    ]  # the largest: they stand by area
+    order = np.full(len(patches) + 1, -1)
+    order[large] = piece.reshape(-1)
+    own = large[first]
+    return order[patches.face_patch].astype(np.int32), (patches.normal[own], patches.offset[own])
+
+
+def _split_long(mesh: Mesh, chosen: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    """Faces ``chosen`` of ``mesh``, halved across their longest edge until none is long, and each face's parent.
 
     Both faces at an edge are split at its midpoint or not at all, because the edge's length alone decides: no cracks.
     """
-    vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
-    parent = np.arange(len(faces))
+    vertices, faces = mesh.vertices, mesh.faces[chosen].astype(np.int64)
+    parent = chosen
     done_faces, done_parent = [], []
     for _ in range(64):
         edge = np.linalg.norm(vertices[np.roll(faces, -1, axis=1)] - vertices[faces], axis=2)
@@ -219,10 +305,11 @@ def _split_long(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
 
 
 def _on_patches(patches: PlanarPatches, normal: np.ndarray) -> np.ndarray:
-    """``normal`` (F, 3), but of its patch where a face has one, on the side that the face is wound for."""
+    """``normal`` (F, 3), but of its patch where a face has one, on the side that the face is wound for; upward for faces
+    without area."""
     own = patches.face_patch >= 0
     flat = patches.normal[patches.face_patch[own]]
     turned = (flat * patches.mesh.face_normals[own]).sum(axis=1, keepdims=True) < 0
-    result = normal.copy()
+    result = np.where(normal.any(axis=1, keepdims=True), normal, [0.0, 0.0, 1.0])
     result[own] = np.where(turned, -flat, flat)
     return result

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, check_type
 from warprrf.rf.em.materials import NARROWEST_LOBE
 
 LOBES = (0, 2, 5, 12, 30)
@@ -21,6 +21,8 @@ class Terms:
         line_of_sight, diffuse: whether there are such paths.
         mirror_order: most mirror reflections on a path, 0 to 3.
         lobes: exponents of the scattering lobes, 0 for Lambertian, at most 1000 and each once.
+        reciprocal: whether single bounces keep their power when the ends are swapped; see
+            :mod:`warprrf.rf.fields.bistatic.scattering`.
         mirror_scatter: whether mirrors light surfaces.
         scatter_mirror: whether mirrors show the lit scene.
         diffuse_order: diffuse bounces on a path, 1 to 3.
@@ -33,6 +35,7 @@ class Terms:
     diffuse: bool = True
     mirror_order: int = 1
     lobes: tuple[int, ...] = LOBES
+    reciprocal: bool = False
     mirror_scatter: bool = False
     scatter_mirror: bool = False
     diffuse_order: int = 1
@@ -44,6 +47,7 @@ class Terms:
         whole = {"mirror_order": (0, 3), "diffuse_order": (1, 3), "sub_pixels": (1, 16)}
         for name, (least, most) in whole.items():
             check_count(name, getattr(self, name), least, most)
+        check_type("reciprocal", self.reciprocal, bool)
         lobes = check_array("lobes", self.lobes, (None,), dtype=np.int64).tolist()
         if not lobes or len(set(lobes)) < len(lobes) or not 0 <= min(lobes) <= max(lobes) <= NARROWEST_LOBE:
             raise ValueError(

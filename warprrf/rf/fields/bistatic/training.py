@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from warprrf.checks import check_array, check_count, check_seed
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry.mesh import GeometryLike
+from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import Regrouping, regroup
@@ -25,7 +25,7 @@ from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
-from warprrf.rf.receivers import check_receiver
+from warprrf.rf.positions import check_dataset
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
@@ -104,6 +104,8 @@ class FitOptions:
         line_of_sight, diffuse: switches of those terms.
         mirror_order: mirror reflections on a path: 0 to 3.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
+        reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
+            Degli-Esposti et al. (2007), Sionna RT's, which do not.
         mirror_scatter: surfaces lit by mirrors.
         scatter_mirror: the lit scene seen in mirrors.
         diffuse_order: diffuse bounces on a path: 1, 2 or 3.
@@ -125,6 +127,7 @@ class FitOptions:
     diffuse: bool = True
     mirror_order: int | None = None
     lobes: tuple[int, ...] | None = None
+    reciprocal: bool = False
     mirror_scatter: bool | None = None
     scatter_mirror: bool | None = None
     diffuse_order: int | None = None
@@ -182,7 +185,7 @@ class FitOptions:
         Raises:
             ValueError: naming an option out of range.
         """
-        names = ("line_of_sight", "diffuse", "lobes", "sub_pixels", *TERMS)
+        names = ("line_of_sight", "diffuse", "lobes", "reciprocal", "sub_pixels", *TERMS)
         return Terms(**{name: getattr(self, name) for name in names if getattr(self, name) is not None})
 
 
@@ -254,13 +257,13 @@ def trace(
         TypeError: for a geometry without a mesh.
     """
     started = time.perf_counter()
+    receivers, transmitter = check_dataset(as_mesh(geometry, "geometry"), ds, device=device)
     surface = Surface.of(geometry)
-    receivers = check_receiver("ds.receivers", np.asarray(ds.receivers, np.float64), surface.mesh)
     order = 3 if mirror_order is None else mirror_order
     terms = Terms(mirror_order=order, sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels)
     frequency_hz, air = float(ds.frequency_hz), getattr(ds, "air", None)
     transport = Transport.of(
-        surface, check_array("ds.transmitter", ds.transmitter, (3,)), frequency_hz,
+        surface, transmitter, frequency_hz,
         (int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])), terms.sub_pixels,
         beam_sigma_rad=float(ds.beam_sigma_rad), loss_per_m=0.0 if air is None else air.loss_per_m(frequency_hz),
         device=device,
@@ -348,11 +351,11 @@ class _Training:
         pixels = self.target[0].size
         most = min(pixels, max(200, self.choose.readings // self.count))
         self.measured, self.readings = [], []
-        lobes = options.terms().lobes
+        terms = options.terms()
         for r in range(self.count):
             chosen = np.sort(rng.choice(pixels, most, replace=False))
             self.measured.append(SpectrumPixels(self.beam, chosen))
-            response = respond(self.views[r], self.measured[r], lobes, self.floor)
+            response = respond(self.views[r], self.measured[r], terms, self.floor)
             self.readings.append(Reading(response, self.target[r].ravel()[chosen]))
             self.progress("fit", r, 2 * self.count)
         self.log: list[dict[str, Any]] = []

@@ -1,0 +1,225 @@
+"""Positions: every verb refuses what lies in solids, outside rooms or in the near field; what is in the air passes."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from radio_scenes import box_mesh, joined
+
+import warprrf as wr
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.materials import Material
+from warprrf.rf.positions import NEAR_FIELD, check_positions, in_another_solid
+from warprrf.rf.scene import Scene
+
+F = 300e9
+WAVELENGTH = 299_792_458.0 / F
+LOW, HIGH = np.array([0.0, 0.0, 0.0]), np.array([6.0, 5.0, 3.0])
+CUPBOARD = np.array([4.0, 3.0, 0.0]), np.array([5.0, 4.5, 2.0])  # stands on the floor, faces to faces
+PILLAR = np.array([4.5, 3.5, 1.0]), np.array([5.5, 4.0, 2.5])  # reaches into the cupboard
+TX = np.array([1.0, 1.0, 2.2])
+IN_CUPBOARD, BEHIND, AIR = np.array([4.3, 3.3, 0.7]), np.array([5.4, 4.7, 0.5]), np.array([2.0, 3.0, 1.5])
+STONE = Material.custom("stone", relative_permittivity=5.0, conductivity=0.5, scattering=0.5)
+
+
+def room(*more, inward=True):
+    return joined(box_mesh(LOW, HIGH, inward=inward), box_mesh(*CUPBOARD), *more)[0]
+
+
+def scene():
+    mesh = room()
+    return Scene(mesh, [STONE], np.zeros(len(mesh.faces), int))
+
+
+def sheet(a, b, c, d):
+    return np.array([a, b, c, d], float), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def subdivided(mesh, noise_m, holes, seed=0):
+    """Faces cut into many with noise on their corners, shared ones alike, and some faces missing."""
+    vertices, faces = mesh.vertices, mesh.faces
+    for _ in range(4):
+        middle = 0.5 * (vertices[faces] + vertices[np.roll(faces, -1, axis=1)])
+        n = len(vertices) + np.arange(3 * len(faces)).reshape(-1, 3)
+        vertices = np.concatenate([vertices, middle.reshape(-1, 3)])
+        a, b, c = faces.T
+        ab, bc, ca = n.T
+        faces = np.concatenate(
+            [np.column_stack(k) for k in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+    place, index = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)
+    rng = np.random.default_rng(seed)
+    place = place + noise_m * rng.standard_normal(place.shape)
+    return Mesh(place, index.reshape(-1)[faces][rng.random(len(faces)) > holes])
+
+
+@pytest.fixture(scope="module")
+def field():
+    s = scene()
+    ds = wr.simulate(
+        s,
+        transmitter=TX,
+        receivers=[AIR, AIR + 0.7, AIR - 0.4],
+        frequency_hz=F,
+        shape=(16, 32),
+        roles=["train"] * 3,
+    )
+    return wr.RadioField.fit(s, ds, quick=True, mirror_order=1)
+
+
+@pytest.mark.parametrize(
+    "verb", ["spectrum", "paths", "links", "view", "relevance", "trace_paths", "simulate"]
+)
+@pytest.mark.parametrize(
+    ("receiver", "transmitter", "words"),
+    [
+        (IN_CUPBOARD, TX, r"(rx|receivers).*inside a solid"),
+        (AIR, IN_CUPBOARD, "transmitter.*inside a solid"),
+        (AIR, TX + [1e6, 0, 0], "transmitter.*outside the scene"),
+        (TX + 1e-6, TX, "wavelengths"),
+    ],
+)
+def test_every_verb_refuses_the_same_places(field, verb, receiver, transmitter, words):
+    traced = {"transmitter": transmitter, "receivers": [receiver], "frequency_hz": F}
+    ask = {
+        "links": lambda: field.links([receiver], transmitter),
+        "relevance": lambda: wr.relevance(field, receivers=[receiver], transmitter=transmitter),
+        "trace_paths": lambda: wr.trace_paths(scene(), **traced),
+        "simulate": lambda: wr.simulate(scene(), shape=(16, 32), **traced),
+    }.get(verb, lambda: getattr(field, verb)(receiver, transmitter))
+    with pytest.raises(ValueError, match=words):
+        ask()
+
+
+def test_a_data_set_measured_in_a_solid_is_refused(field):
+    s = scene()
+    ds = wr.simulate(s, transmitter=TX, receivers=[AIR, AIR + 0.5], frequency_hz=F, shape=(16, 32))
+    filled = joined(box_mesh(LOW, HIGH, inward=True), box_mesh(AIR - 0.2, AIR + 0.2))[0]
+    for model in ("bistatic", "rf3dgs+"):
+        with pytest.raises(ValueError, match=r"ds.receivers\[0\].*inside a solid"):
+            wr.RadioField.fit(filled, ds, model=model)
+
+
+def test_a_map_marks_what_it_does_not_answer(field):
+    cells = field.radio_map(0.7, 0.5)
+    inside = ((cells.positions > CUPBOARD[0]) & (cells.positions < CUPBOARD[1])).all(axis=-1)
+    assert inside.any() and not cells.free[inside].any() and cells.free[~inside].all()
+    with pytest.raises(ValueError, match="transmitter.*inside a solid"):
+        field.radio_map(0.7, 0.5, transmitter=IN_CUPBOARD)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        room(),
+        room(inward=False),  # a shell wound outward
+        room(box_mesh(*PILLAR)),  # solids that overlap
+        Mesh(room().vertices, np.concatenate([room().faces, room().faces[:, ::-1]])),  # every face twice
+        subdivided(room(), 0.0, 0.05),  # holes
+        subdivided(room(), 0.01, 0.03),  # a scan
+    ],
+    ids=["closed", "outward", "overlapping", "doubled", "holes", "scan"],
+)
+def test_solids_are_known_and_air_passes_however_the_mesh_is(mesh):
+    rng = np.random.default_rng(1)
+    points = rng.uniform(LOW + 0.1, HIGH - 0.1, (600, 3))
+    low, high = CUPBOARD
+    solid = points[((points > low + 0.05) & (points < high - 0.05)).all(axis=1)]
+    air = points[((points < low - 0.1) | (points > high + 0.1)).any(axis=1)]
+    if mesh.is_closed and len(mesh.faces) > 24:  # the pillar's faces
+        air = air[((air < PILLAR[0] - 0.05) | (air > PILLAR[1] + 0.05)).any(axis=1)]
+    assert in_another_solid(mesh, solid, TX).mean() > (0.6 if len(mesh.faces) > 100 else 0.99)
+    assert not in_another_solid(mesh, air, TX).any()
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [sheet([3, 0, 0], [3, 5, 0], [3, 5, 3], [3, 0, 3])],  # a partition from wall to wall
+        [sheet([3, 5, 0], [3, 0, 0], [3, 0, 3], [3, 5, 3])],
+        [sheet([1.2, 0.2, 1], [5.5, 0.2, 1], [5.5, 4.8, 1], [1.2, 4.8, 1])],  # a table top
+        [
+            sheet([3, 0, 0], [3, 5, 0], [3, 5, 3], [3, 0, 3]),
+            sheet([3, 2.5, 0], [6, 2.5, 0], [6, 2.5, 3], [3, 2.5, 3]),
+        ],
+    ],
+)
+def test_sheets_in_a_room_hold_no_solid(parts):
+    mesh = joined(box_mesh(LOW, HIGH, inward=True), *parts)[0]
+    points = np.random.default_rng(2).uniform(LOW + 0.05, HIGH - 0.05, (500, 3))
+    assert (~mesh.visible(points, TX)).sum() > 50
+    assert not in_another_solid(mesh, points, TX).any()
+
+
+def test_two_rooms_with_a_door_are_one_air():
+    """Each room a shell of its own, one wound the other way, with a doorway in both shells."""
+
+    def shell(low, high, door_x, inward):
+        vertices, faces = (
+            subdivided(joined(box_mesh(low, high, inward=inward))[0], 0.0, 0.0).__getstate__().values()
+        )
+        centre = vertices[faces].mean(axis=1)
+        doorway = (np.abs(centre[:, 0] - door_x) < 1e-6) & (centre[:, 1] < 1.0) & (centre[:, 2] < 2.0)
+        return vertices, faces[~doorway]
+
+    for inward in (True, False):
+        mesh = joined(shell(LOW, HIGH, 6.0, True), shell([6.2, 0, 0], [10.0, 5, 3], 6.2, inward))[0]
+        points = np.random.default_rng(3).uniform([6.4, 0.2, 0.2], [9.8, 4.8, 2.8], (300, 3))
+        assert (~mesh.visible(points, TX)).sum() > 50
+        assert not in_another_solid(mesh, points, TX).any()
+
+
+def test_an_open_scene_reaches_beyond_its_bounds_and_a_room_does_not():
+    house = joined(
+        box_mesh([0, 0, 0], [10, 8, 6]), sheet([-20, -20, 0], [20, -20, 0], [20, 20, 0], [-20, 20, 0])
+    )[0]
+    mast, drone, indoors = np.array([15.0, 0, 20]), np.array([-30.0, 3, 40]), np.array([5.0, 4, 3])
+    check_positions(house, mast, np.array([drone, [15.0, 15, 1.5]]), 0.1)
+    with pytest.raises(ValueError, match=r"receivers\[1\].*inside a solid"):
+        check_positions(house, np.array([14.0, 3, 3.5]), np.array([drone, indoors]), 0.1)
+    with pytest.raises(ValueError, match=r"receivers\[0\].*outside"):
+        check_positions(room(), TX, AIR[None] + [10, 0, 0], WAVELENGTH)
+
+
+def test_paths_may_end_flush_with_a_wall():
+    paths = wr.trace_paths(room(), transmitter=[0.0, 2.0, 1.5], receivers=AIR, frequency_hz=F)
+    assert paths.kind[0] == "los"
+    with pytest.raises(ValueError, match="on a surface"):
+        wr.simulate(scene(), transmitter=[0.0, 2.0, 1.5], receivers=[AIR], frequency_hz=F, shape=(16, 32))
+
+
+def test_a_gain_above_one_is_never_given():
+    """Friis gives one at a distance of lambda / (4 pi): half of where positions are refused."""
+    for apart in (0.1, 0.5 / NEAR_FIELD / 40):
+        with pytest.raises(ValueError, match="reactive near field"):
+            check_positions(None, TX, TX + [apart * WAVELENGTH, 0, 0], WAVELENGTH)
+    with pytest.warns(UserWarning, match="receivers.*within a wavelength"):
+        check_positions(None, TX, TX + [0.5 * WAVELENGTH, 0, 0], WAVELENGTH)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_positions(None, TX, TX + [1.01 * WAVELENGTH, 0, 0], WAVELENGTH)
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"), [(3e3, "millimetres"), (1e-3, "kilometres"), (1.0, None), (100.0, None)]
+)
+def test_sizes_that_are_no_metres_are_questioned(scale, unit):
+    mesh = joined(box_mesh(scale * LOW, scale * HIGH, inward=True))[0]
+    places = {"transmitter": scale * TX, "receivers": scale * AIR, "frequency_hz": F}
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        wr.trace_paths(mesh, **places)
+    assert [unit in str(w.message) for w in told if unit] == ([True] if unit else [])
+    assert len(told) == (unit is not None)
+
+
+def test_a_room_in_millimetres_is_refused_by_a_fit_before_it_is_cut_to_elements():
+    s = scene()
+    ds = wr.simulate(s, transmitter=TX, receivers=[AIR], frequency_hz=F, shape=(16, 32))
+    ds = replace(ds, receivers=1e3 * ds.receivers, transmitter=1e3 * ds.transmitter)
+    with (
+        pytest.warns(UserWarning, match="coordinates look like millimetres"),
+        pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
+    ):
+        wr.RadioField.fit(Mesh(1e3 * s.mesh.vertices, s.mesh.faces), ds)

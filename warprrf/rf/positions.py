@@ -1,0 +1,239 @@
+"""Where transmitters and receivers may be: in the air of the scene, off its surfaces, and not at each other's place.
+
+Whether a place is inside a solid is asked against a place that is in the air (a transmitter that was measured with,
+say), because a mesh may be a room of closed solids, one hollow shell, a torn scan or open sheets. A place that sees the
+other is in the same air. Else rays in many directions are counted: of a closed mesh they give the winding number. Of an
+open one a place is taken for solid only if nearly all rays from it cross one surface more or fewer than those from the
+air, and most of them meet a surface from behind where those from the air meet one from the front (or the other way
+round): places behind a partition or under a table top do not, nor do those in rooms whose mesh has holes.
+"""
+
+from __future__ import annotations
+
+import warnings
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from warprrf.checks import check_array
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.spectra.dataset import SpectrumDataset
+
+WALL_CLEARANCE_M = 1e-4
+"""Positions nearer to a surface than this count as on it [m]."""
+NEAR_FIELD = 1.0 / (2.0 * np.pi)
+"""Distance of two antennas, in wavelengths, within which their reactive fields outweigh what they radiate, however
+small they are: Friis's formula does not hold, and gives gains above one within half of it. Source: H. A. Wheeler, "The
+radiansphere around a small antenna", Proc. IRE 47 (1959)."""
+FAR_FIELD = 1.0
+"""Distance in wavelengths above which Friis's formula is trusted: 2 D^2 / lambda for an antenna 0.7 wavelengths wide.
+Source: H. T. Friis, "A note on a simple transmission formula", Proc. IRE 34 (1946)."""
+LARGEST_M = 20e3
+HIGHEST_M = 1e3
+MOST_WAVELENGTHS = 5e6
+SMALLEST_M = 0.05
+
+_DIRECTIONS = 24
+_AGREED = 0.75  # share of rays that must say the same
+_BEHIND = -0.3  # mean of the sides (1 front, -1 back) from which rays meet surfaces: 65 % from behind
+_AT_ONCE = 20_000  # places whose rays are cast in one launch
+
+
+def check_receivers(name: str, value: ArrayLike) -> np.ndarray:
+    """``value`` as positions (3,) or (R, 3) [m], R at least 1.
+
+    Raises:
+        ValueError: on another shape or numbers that are not finite.
+    """
+    array = check_array(name, value)
+    if array.ndim not in (1, 2) or array.shape[-1] != 3 or array.size == 0:
+        raise ValueError(f"{name}: got shape {array.shape}, expected (3,) or (R, 3) with R at least 1")
+    return array
+
+
+def check_positions(
+    mesh: Mesh | None,
+    transmitter: np.ndarray,
+    receivers: np.ndarray,
+    wavelength_m: float,
+    *,
+    names: tuple[str, str] = ("transmitter", "receivers"),
+    known: np.ndarray | None = None,
+    on_surfaces: bool = False,
+    device: DeviceLike = None,
+) -> None:
+    """Refuse places where no answer would be right.
+
+    Args:
+        mesh: What blocks; None checks distances between antennas alone.
+        transmitter: Position [m], shape ``(3,)``.
+        receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
+        wavelength_m: Wavelength [m].
+        names: Of the two arguments.
+        known: A place that is in the air for certain [m], shape ``(3,)``; the transmitter by default.
+        on_surfaces: Whether antennas may be mounted flush with a surface.
+        device: Where rays are cast.
+
+    Raises:
+        ValueError: naming the first place outside the scene, on a surface, inside a solid, or so near to the
+            transmitter that it lies within its reactive field.
+
+    Warns:
+        UserWarning: if a receiver is within a wavelength of the transmitter.
+    """
+    many = np.ndim(receivers) == 2
+    points = np.concatenate([transmitter[None], np.reshape(receivers, (-1, 3))])
+    labels = [names[0], *((f"{names[1]}[{k}]" for k in range(len(points) - 1)) if many else names[1:])]
+    _check_apart(points, wavelength_m, labels)
+    if mesh is None:
+        return
+    reference = transmitter if known is None else known
+    low, high = mesh.bounds
+    outside = ((points < low) | (points > high)).any(axis=1)
+    if outside.any() and not mesh.is_closed:
+        within = np.concatenate([reference[None], points])
+        within = within[((within >= low) & (within <= high)).all(axis=1)]
+        outside &= len(within) > 0 and _are_enclosed(mesh, within[:_DIRECTIONS], device)
+    _refuse(outside, "outside the scene", points, labels, mesh)
+    if not on_surfaces:
+        near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
+        _refuse(near, "on a surface", points, labels, mesh)
+    inside = in_another_solid(mesh, points, reference, device=device)
+    if (
+        known is None
+        and inside[1:].sum() > 0.5 * (len(points) - 1)
+        and _sees_backs(mesh, transmitter, device)
+    ):
+        inside = np.arange(len(points)) == 0
+    _refuse(inside, "inside a solid", points, labels, mesh)
+
+
+def check_dataset(
+    mesh: Mesh | None, ds: SpectrumDataset, *, device: DeviceLike = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Receivers (R, 3) and transmitter (3,) of ``ds`` [m], if a field of this mesh can be fitted to what they measured.
+
+    Raises, warns: as :func:`check_positions` and :func:`question_unit`.
+    """
+    receivers = check_array("ds.receivers", ds.receivers, (None, 3))
+    transmitter, wavelength_m = (
+        check_array("ds.transmitter", ds.transmitter, (3,)),
+        SPEED_OF_LIGHT / ds.frequency_hz,
+    )
+    if mesh is not None:
+        question_unit(mesh, wavelength_m)
+    check_positions(
+        mesh, transmitter, receivers, wavelength_m, names=("ds.transmitter", "ds.receivers"), device=device
+    )
+    return receivers, transmitter
+
+
+def in_another_solid(
+    mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: DeviceLike = None
+) -> np.ndarray:
+    """Whether surfaces part each of ``points`` (N, 3) [m] from the air around ``known`` (3,), shape ``(N,)``, bool.
+
+    In doubt they don't: see the module's text for what counts.
+    """
+    found = np.zeros(len(points), dtype=bool)
+    blocked = np.flatnonzero(~mesh.visible(points, known, device=device))
+    if len(blocked) == 0:
+        return found
+    of_known, side_of_known = mesh.look_around(known[None], _fan(), device=device)
+    front_of_known = _mean_side(side_of_known)[0]
+    for first in range(0, len(blocked), _AT_ONCE):
+        some = blocked[first : first + _AT_ONCE]
+        winding, side = mesh.look_around(points[some], _fan(), device=device)
+        differs = winding - of_known
+        parted = (differs % 2).mean(axis=1) >= _AGREED
+        if mesh.is_closed:  # solids may overlap: their winding numbers add up
+            middle = np.median(differs, axis=1, keepdims=True)
+            parted |= (middle[:, 0] != 0) & ((differs == middle).mean(axis=1) >= _AGREED)
+        else:
+            parted &= (np.sign(front_of_known) * _mean_side(side) < _BEHIND) & (
+                abs(front_of_known) > -_BEHIND
+            )
+        found[some] = parted
+    return found
+
+
+def question_unit(mesh: Mesh, wavelength_m: float) -> None:
+    """Warn if the mesh is too large, too high or too small to be in metres.
+
+    Rooms and cities pass: no scene of them is larger than 20 km or 5 million wavelengths (5 km at 300 GHz, where ITU-R
+    P.676 takes 5 dB a kilometre), 1 km in its smallest extent, or smaller than 5 cm.
+    """
+    extent = np.ptp(mesh.bounds, axis=0)
+    largest = float(extent.max())
+    unit, metres = "millimetres", "1e-3"
+    if largest < SMALLEST_M:
+        unit, metres = "kilometres", "1e3"
+    elif largest <= min(LARGEST_M, MOST_WAVELENGTHS * wavelength_m) and extent.min() <= HIGHEST_M:
+        return
+    size = " x ".join(f"{e:.4g}" for e in extent)
+    warnings.warn(
+        f"mesh: it is {size} m large ({largest / wavelength_m:.2g} wavelengths); coordinates look like {unit}, expected "
+        f"metres: Mesh({metres} * vertices, faces)",
+        UserWarning,
+        stacklevel=3,
+    )
+
+
+def _check_apart(points: np.ndarray, wavelength_m: float, labels: list[str]) -> None:
+    apart = np.linalg.norm(points[1:] - points[0], axis=1) / wavelength_m
+    if len(apart) == 0 or apart.min() >= FAR_FIELD:
+        return
+    k = int(apart.argmin())
+    where = f"{apart[k]:.3g} wavelengths ({apart[k] * wavelength_m:.3g} m) from the transmitter"
+    if apart[k] == 0:
+        where = "the transmitter's own position"
+    what = f"{labels[1 + k]}: {points[1 + k].tolist()} is {where}"
+    if apart[k] < NEAR_FIELD:
+        raise ValueError(
+            f"{what}, within its reactive near field, where path gain has no meaning (it would exceed one); expected "
+            f"more than {NEAR_FIELD * wavelength_m:.3g} m, better {FAR_FIELD * wavelength_m:.3g} m"
+        )
+    warnings.warn(
+        f"{what}; within a wavelength ({wavelength_m:.3g} m) path gain by Friis's formula is a rough guide",
+        UserWarning,
+        stacklevel=4,
+    )
+
+
+def _refuse(bad: np.ndarray, what: str, points: np.ndarray, labels: list[str], mesh: Mesh) -> None:
+    if bad.any():
+        k = int(np.flatnonzero(bad)[0])
+        box = " to ".join(str(np.round(corner, 3).tolist()) for corner in mesh.bounds)
+        raise ValueError(
+            f"{labels[k]}: {points[k].tolist()} is {what} ({int(bad.sum())} such in all), expected a place in the air "
+            f"of the scene ({box} m), more than {WALL_CLEARANCE_M} m off its surfaces; sample_receivers finds some"
+        )
+
+
+def _are_enclosed(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> bool:
+    """Whether nearly all ways from each of ``points`` (N, 3) end on a surface: no sky, no open side."""
+    side = mesh.look_around(points, _fan(), device=device)[1]
+    return bool(((side != 0).mean(axis=1) >= 0.95).all())
+
+
+def _sees_backs(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
+    return bool(_mean_side(mesh.look_around(point[None], _fan(), device=device)[1])[0] < 0)
+
+
+def _mean_side(side: np.ndarray) -> np.ndarray:
+    """Mean of the sides of those rays that meet something, shape ``(N,)``."""
+    mean: np.ndarray = side.sum(axis=1) / np.maximum((side != 0).sum(axis=1), 1)
+    return mean
+
+
+@lru_cache(maxsize=1)
+def _fan() -> np.ndarray:
+    """Directions spread over the sphere: a Fibonacci lattice, of which none runs along a wall."""
+    k = np.arange(_DIRECTIONS) + 0.5
+    zenith, azimuth = np.arccos(1.0 - 2.0 * k / _DIRECTIONS), np.pi * (1.0 + np.sqrt(5.0)) * k
+    return np.column_stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
+    )
