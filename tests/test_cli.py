@@ -218,6 +218,14 @@ BAD = {
 }
 
 
+def test_an_empty_name_of_the_result_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
+    words = [word.format(tmp="", scene=SCENE) for word in SIMULATE]
+    words[words.index("-o") + 1] = ""
+    with pytest.raises(SystemExit, match="2"):
+        cli.main([*words, "7,4,1.5"])
+    assert "-o/--out: got ''" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("case", sorted(BAD))
 def test_bad_input_is_one_line_and_status_2(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

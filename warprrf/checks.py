@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, DTypeLike
@@ -115,3 +118,69 @@ def _number(value: object) -> float:
         return float(value) if array.ndim == 0 and array.dtype.kind in "iufO" else np.nan  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return np.nan
+
+
+LARGEST_M = 1e8
+"""No coordinate is larger [m]: beyond, single precision overflows in products of lengths."""
+_KINDS = {"f": "real numbers", "i": "whole numbers", "u": "unsigned ones", "b": "truth values"}
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What an array must be: of a class and of its files, said in one place.
+
+    Attributes:
+        shape: its axes, numbers or names of sizes that arrays of one class share: ``"F 3"``; empty for one value.
+        least, most: limits of its values; NaN is within none.
+        index: name of the size that its values are indices to, from ``least`` on; -1 is none.
+        kind: of its numbers, as in ``dtype.kind``: any of "f", "i", "u", "b".
+        nan: whether NaN stands for what is unknown.
+    """
+
+    shape: str
+    least: float = -np.inf
+    most: float = 3.4e38  # all of single precision
+    index: str = ""
+    kind: str = "f"
+    nan: bool = False
+
+
+def check_arrays(
+    arrays: Mapping[str, np.ndarray], expected: Mapping[str, Expected], **sizes: int
+) -> dict[str, int]:
+    """The sizes by name, once every array is as ``expected``; ``sizes`` are known beforehand.
+
+    Raises:
+        KeyError: if one is missing.
+        TypeError, ValueError: naming the array, what came and what was expected.
+    """
+    for name, wanted in expected.items():
+        array = np.asarray(arrays[name])
+        if array.dtype.kind not in wanted.kind:
+            kinds = " or ".join(_KINDS[k] for k in wanted.kind)
+            raise TypeError(f"{name}: got an array of {array.dtype}, expected {kinds}")
+        axes = wanted.shape.split()
+        if len(axes) == array.ndim:
+            sizes = dict(zip(axes, array.shape, strict=True)) | sizes
+        shape = tuple(int(axis) if axis.isdigit() else sizes.get(axis) for axis in axes)
+        if array.shape != shape:
+            told = ", ".join(str(axis if n is None else n) for axis, n in zip(axes, shape, strict=True))
+            raise ValueError(f"{name}: got shape {array.shape}, expected ({told})")
+    for name, wanted in expected.items():
+        array = np.asarray(arrays[name])
+        most = sizes[wanted.index] - 1 if wanted.index else wanted.most
+        within = (array >= wanted.least) & (array <= most)
+        if not (within | np.isnan(array) if wanted.nan else within).all():
+            bad = array[~within][0]
+            raise ValueError(f"{name}: got {bad}, expected values from {wanted.least:g} to {most:g}")
+    return sizes
+
+
+def index_to(size: str, shape: str, least: int = 0) -> Expected:
+    """Whole numbers that are indices to what there are ``size`` of."""
+    return Expected(shape, least, index=size, kind="iu")
+
+
+def lengths(shape: str, least: float = -LARGEST_M) -> Expected:
+    """Coordinates or lengths [m]."""
+    return Expected(shape, least, LARGEST_M)

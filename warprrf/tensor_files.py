@@ -1,10 +1,16 @@
-"""Arrays by name on disk: safetensors (no pickle), plain values as JSON in the header, replaced at once."""
+"""Arrays by name on disk: safetensors (no pickle), plain values as JSON in the header, replaced at once.
+
+Files carry a SHA-256 of all that they hold, in their metadata: other tools open them as they are, and what a disk or a
+transfer changed is found before anything is computed from it. Files without one, of older versions, are read too.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +20,7 @@ from warprrf.files import write_atomically
 
 FORMAT = "warprrf field 1"
 """Of radio fields."""
+_CHECKSUM = "sha256"
 
 
 def write(
@@ -25,8 +32,9 @@ def write(
     """Write ``tensors`` and ``header`` (plain values) to ``path``, as a file of a ``kind``."""
     from safetensors.numpy import save_file
 
-    whole = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
+    whole = {name: np.asarray(value, order="C") for name, value in tensors.items()}
     about = {"header": json.dumps(dict(header))} | ({} if kind is None else {"format": kind})
+    about[_CHECKSUM] = _checksum(whole, about)
     write_atomically(path, lambda file: save_file(whole, file, metadata=about))
 
 
@@ -37,7 +45,7 @@ def read(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if it is no safetensors file, cut short, or of another kind.
+        ValueError: if it is no safetensors file, cut short, not what was written, or of another kind.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -48,11 +56,44 @@ def read(
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}
-    except (SafetensorError, OSError) as error:
+    except (
+        SafetensorError,
+        OSError,
+        AttributeError,
+        TypeError,
+    ) as error:  # the latter two: types NumPy lacks
         raise ValueError(f"{name}: corrupt or no safetensors file: {error}") from error
     if kind is not None and metadata.get("format") != kind:
         raise ValueError(f"{name}: got format {metadata.get('format')!r}, expected {kind!r}")
+    checksum = metadata.pop(_CHECKSUM, None)
+    if checksum not in (None, _checksum(tensors, metadata)):
+        raise ValueError(
+            f"{name}: corrupt: its checksum is not that of what it holds; take another copy, or make it again"
+        )
+    with named(path, "corrupt header"):
+        header = json.loads(metadata["header"])
+        if not isinstance(header, dict):
+            raise TypeError(f"got {type(header).__name__}, expected names and values")
+    return tensors, header
+
+
+@contextmanager
+def named(path: str | os.PathLike[str], what: str) -> Iterator[None]:
+    """Whatever does not fit in here is a ValueError that names the file at ``path`` and says ``what`` is wrong."""
     try:
-        return tensors, json.loads(metadata["header"])
-    except (KeyError, json.JSONDecodeError) as error:
-        raise ValueError(f"{name}: corrupt header: {error}") from error
+        yield
+    except KeyError as error:
+        raise ValueError(f"{os.fspath(path)}: {what}: it lacks {error}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(f"{os.fspath(path)}: {what}: {error}") from error
+
+
+def _checksum(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
+    """SHA-256 [hex] of names, types, shapes and bytes, whatever their order."""
+    total = hashlib.sha256()
+    for key, text in sorted(metadata.items()):
+        total.update(f"\0{key}\0{text}".encode())
+    for name, tensor in sorted(tensors.items()):
+        total.update(f"\0{name}\0{tensor.dtype.str}{tensor.shape}".encode())
+        total.update(tensor.tobytes())
+    return total.hexdigest()

@@ -106,7 +106,7 @@ class Place:
             last_point=rng.uniform(0.5, 3.0, (10, 4, 3)), gain=rng.normal(size=(10, 4)) * (1e-3 + 1e-3j),
             rays=np.full(10, 3), csi=rng.normal(size=10) * (1e-3 + 1e-3j), line_of_sight=np.ones(10, bool),
         )  # fmt: skip
-        for suffix in ("ply", "obj", "stl", "glb"):
+        for suffix in ("ply", "obj", "stl"):
             write_mesh(meshes / f"mesh.{suffix}", self.mesh.vertices, self.mesh.faces)
         (newrf / "conferenceroom.stl").write_bytes((meshes / "mesh.stl").read_bytes())
         options = pycolmap.SyntheticDatasetOptions(

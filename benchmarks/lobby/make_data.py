@@ -18,6 +18,7 @@ kept, so that a killed run continues.
 examples:
   python -m benchmarks data
   python -m benchmarks data --only spectra
+  python -m benchmarks data --look plain --data data/lobby_plain --only scene photos
 """
 
 
@@ -27,11 +28,13 @@ class Options:
 
     Attributes:
         data: folder to write.
+        look: ``"patterned"`` all over, or ``"plain"`` walls, ceiling and pillars; spectra are the same for both.
         only: steps to do, of ``"scene"``, ``"photos"``, ``"spectra"``.
         full: also all 800 receivers, beside the committed sample (``*_full.nc``).
     """
 
     data: str = option("data/lobby", "folder to write")
+    look: str = option("patterned", "what walls look like", choices=scene.LOOKS)
     only: tuple[str, ...] = option(STEPS, "steps to do", choices=STEPS)
     full: bool = option(False, "all 800 receivers too (spectra_full.nc and spectra_sionna_full.nc)")
 
@@ -48,7 +51,7 @@ def run(options: Options, job: Job) -> None:
         raise ValueError(f"only: got {', '.join(unknown)}, expected some of {', '.join(STEPS)}")
     data = Path(options.data)
     if "scene" in options.only:
-        scene.build(data, progress=job.progress)
+        scene.build(data, look=options.look, progress=job.progress)
     if not (data / "scene.xml").is_file():
         raise ValueError(f"data: {data} holds no scene.xml; make the scene first (step scene)")
     if "photos" in options.only:

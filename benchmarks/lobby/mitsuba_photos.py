@@ -26,6 +26,7 @@ SIONNA_VARIANT = (
     "llvm_ad_mono_polarized"  # Sionna RT registers its plugins with the variant it is imported in
 )
 JPEG_QUALITY = 90
+PANE_SAMPLES = 4  # times as many paths a pixel where a pane mirrors the room: grain as of a sensor is left
 
 
 @contextmanager
@@ -104,7 +105,24 @@ def _radiance(mi: Any, scene: Any, camera: Camera, spp: int, seed: int, max_dept
     path = {"type": "path", "max_depth": max_depth}
     noisy = _layers(mi, scene, camera, guides, path, spp, seed)
     texture = _layers(mi, scene, camera, "albedo:albedo", None, 4 * spp, seed)[..., -3:]
-    return denoise(noisy[..., :3], noisy[..., -9:-6], noisy[..., -6:-3], noisy[..., -3:], texture)
+    image = denoise(noisy[..., :3], noisy[..., -9:-6], noisy[..., -6:-3], noisy[..., -3:], texture)
+    pane = _mirrors(mi, scene, camera)
+    if pane.any():  # what a pane mirrors would be smoothed away
+        image[pane] = _layers(mi, scene, camera, "position:position", path, PANE_SAMPLES * spp, seed)[
+            pane, :3
+        ]
+    return image
+
+
+def _mirrors(mi: Any, scene: Any, camera: Camera) -> np.ndarray:
+    """Which pixels show a surface with a mirror reflection, shape ``(height, width)``, bool."""
+    directions = camera.directions().reshape(-1, 3)
+    origin = mi.Point3f(*(float(x) for x in camera.position))
+    hit = scene.ray_intersect(
+        mi.Ray3f(origin, mi.Vector3f(np.ascontiguousarray(directions.T, dtype=np.float32)))
+    )
+    smooth = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaReflection) & hit.is_valid()
+    return np.asarray(smooth, dtype=bool).reshape(camera.height, camera.width)
 
 
 def denoise(

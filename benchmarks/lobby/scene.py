@@ -154,6 +154,37 @@ def lobby() -> list[Solid]:
     ]
 
 
+PLAIN_STYLES = {
+    "ceiling": "luminous paint", "wall_south": "grey paint", "wall_north": "clay paint", "wall_west": "dark pane",
+    "wall_east": "cream paint", "pillar": "white paint", "gallery": "white paint", "partition": "cream paint",
+}  # fmt: skip
+"""Styles of the plain lobby by the start of a solid's name; the floor, signs and furniture keep their patterns."""
+
+LOOKS = ("patterned", "plain")
+
+
+def solids_of(look: str) -> list[Solid]:
+    """All solids, patterned all over or with plain walls, ceiling and pillars, as real lobbies have them.
+
+    Raises:
+        ValueError: for an unknown look.
+    """
+    if look not in LOOKS:
+        raise ValueError(f"look: got {look!r}, expected one of {', '.join(LOOKS)}")
+    if look == "patterned":
+        return lobby()
+    plain = [
+        (
+            solid,
+            next(
+                (style for start, style in PLAIN_STYLES.items() if solid.name.startswith(start)), solid.style
+            ),
+        )
+        for solid in lobby()
+    ]
+    return [replace(solid, style=style) for solid, style in plain]
+
+
 @dataclass
 class _Face:
     """One planar face: its corners (a fan from the first), and where its texture lies."""
@@ -239,16 +270,23 @@ class _Atlas:
 
 
 def scene_xml(solids: Sequence[Solid]) -> str:
-    """The scene description: one textured ``bsdf`` a radio material, one ``shape`` an object."""
+    """The scene description: one textured ``bsdf`` a radio material, one ``shape`` an object.
+
+    A dark pane mirrors what stands before it: it is a smooth dielectric over its colour (Mitsuba's ``plastic``).
+    """
     lines = [
         '<scene version="3.0.0">',
         "",
         "  <!-- Look: the atlas. Radio: the identifier, see materials.json. -->",
     ]
+    mirrors = {s.material for s in solids if s.style == "dark pane"}
     for material in dict.fromkeys(s.material for s in solids):
+        look, colour = (
+            ("plastic", "diffuse_reflectance") if material in mirrors else ("diffuse", "reflectance")
+        )
         lines += [
-            f'  <bsdf type="diffuse" id="mat-itu_{material}">',
-            '    <texture type="bitmap" name="reflectance">',
+            f'  <bsdf type="{look}" id="mat-itu_{material}">',
+            f'    <texture type="bitmap" name="{colour}">',
             f'      <string name="filename" value="textures/{material}.jpg"/>',
             "    </texture>",
             "  </bsdf>",
@@ -273,13 +311,19 @@ def scene_xml(solids: Sequence[Solid]) -> str:
     return "\n".join([*lines, "", "</scene>", ""])
 
 
-def build(directory: str | os.PathLike[str], *, seed: int = 0, progress: Progress | None = None) -> Path:
+def build(
+    directory: str | os.PathLike[str],
+    *,
+    look: str = "patterned",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Path:
     """Write ``scene.xml``, ``materials.json``, meshes and textures under ``directory``; returns the XML's path."""
     directory = Path(directory)
     (directory / "meshes").mkdir(parents=True, exist_ok=True)
     (directory / "textures").mkdir(exist_ok=True)
     image_module = require("PIL.Image", extra="photos")
-    solids = lobby()
+    solids = solids_of(look)
     materials = list(dict.fromkeys(s.material for s in solids))
     for done, material in enumerate(materials):
         members = [(s, f) for s in solids if s.material == material for f in _faces(s)]

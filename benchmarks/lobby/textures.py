@@ -2,7 +2,7 @@
 
 A texture is an sRGB image in [0, 1], row 0 at the top, painted for one face at its real size in metres. Every style
 carries detail at all scales from a few texels to half a metre that never repeats, since structure from motion matches
-nothing on a plain or periodic wall.
+nothing on a plain or periodic wall; but for the paints of the plain lobby, which carry nothing at all.
 """
 
 from __future__ import annotations
@@ -261,6 +261,11 @@ def _foliage(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarr
     return _scatter(image, texel, rng, density=250, sizes=(0.03, 0.2), palette=greens, kind="ellipse")
 
 
+def _plain(*colour: float) -> Paint:
+    """Paint of one colour."""
+    return lambda h, w, texel, rng: np.ones((h, w, 3)) * colour
+
+
 STYLES: dict[str, Paint] = {
     "terrazzo": _terrazzo,
     "concrete": _concrete,
@@ -272,6 +277,12 @@ STYLES: dict[str, Paint] = {
     "textile": _textile,
     "metal": _metal,
     "foliage": _foliage,
+    "white paint": _plain(0.86, 0.86, 0.84),
+    "cream paint": _plain(0.82, 0.78, 0.68),
+    "grey paint": _plain(0.62, 0.63, 0.64),
+    "clay paint": _plain(0.7, 0.52, 0.44),
+    "dark pane": _plain(0.16, 0.2, 0.22),
+    "luminous paint": _plain(0.8, 0.8, 0.78),
 }
 
 
@@ -297,4 +308,4 @@ def paint(style: str, width_m: float, height_m: float, texel: float, rng: np.ran
         raise ValueError(f"style: got {style!r}, expected one of {', '.join(sorted(STYLES))}")
     rows, columns = max(4, round(height_m / texel)), max(4, round(width_m / texel))
     image = np.clip(soften(STYLES[style](rows, columns, texel, rng), texel), 0.02, 0.97)
-    return image if style == "ceiling" else image**LIFT
+    return image if style in ("ceiling", "luminous paint") else image**LIFT

@@ -12,11 +12,13 @@ from places import LOBBY
 from radio_scenes import enclosed_volume, is_wound_alike
 
 from benchmarks.lobby.photos import HELD_OUT_EVERY, look, read_poses, shown, surface_samples
-from benchmarks.lobby.scene import ROOM, build, lobby
+from benchmarks.lobby.scene import PLAIN_STYLES, ROOM, build, lobby, solids_of
 from benchmarks.lobby.textures import STYLES, paint
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.rf.scene import Scene
+
+PAINTS = set(PLAIN_STYLES.values())
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +88,7 @@ def test_every_shape_shows_its_own_part_of_a_texture() -> None:
             assert np.asarray(image).std() > 15
 
 
-@pytest.mark.parametrize("style", sorted(STYLES))
+@pytest.mark.parametrize("style", sorted(set(STYLES) - PAINTS))
 def test_textures_never_repeat(style: str) -> None:
     image = paint(style, 2.4, 2.4, 0.02, np.random.default_rng(0)).mean(axis=2)
     image = image - image.mean()
@@ -96,6 +98,19 @@ def test_textures_never_repeat(style: str) -> None:
     correlation[:25, :25] = 0
     assert correlation.max() < 0.5
     assert image.std() > 0.05
+
+
+def test_the_plain_lobby_is_the_lobby_in_plain_paint() -> None:
+    plain = LOBBY.parent / "lobby_plain"
+    for patterned, painted in zip(lobby(), solids_of("plain"), strict=True):
+        bare = patterned.name.startswith(("wall", "ceiling", "pillar", "gallery", "partition"))
+        assert (painted.style in PAINTS) == bare, painted.name
+        ours, theirs = (read_mesh(d / f"meshes/{patterned.name}.ply") for d in (plain, LOBBY))
+        np.testing.assert_array_equal(ours.vertices, theirs.vertices)
+    assert (plain / "poses_true.json").read_text() == (LOBBY / "poses_true.json").read_text()
+    assert len(list((plain / "photos").glob("*.jpg"))) == len(read_poses(plain / "poses_true.json"))
+    for style in PAINTS:
+        assert np.ptp(paint(style, 1.0, 1.0, 0.02, np.random.default_rng(0)), axis=(0, 1)).max() < 1e-6
 
 
 def test_unknown_style_is_refused() -> None:

@@ -24,6 +24,17 @@ def add_point(parser: argparse.ArgumentParser, flag: str, text: str, required: b
     parser.add_argument(flag, nargs=3, type=float, metavar=("X", "Y", "Z"), help=text, required=required)
 
 
+def add_out(parser: argparse.ArgumentParser, text: str, required: bool = True) -> None:
+    """Define the option that says where the result goes; an empty name is refused before any work is done."""
+    parser.add_argument("-o", "--out", required=required, type=_file_name, help=text)
+
+
+def _file_name(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected the name of a file or folder")
+    return text
+
+
 def existing(path: str | os.PathLike[str]) -> Path:
     """``path``, which must exist."""
     path = Path(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,15 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
-from warprrf.cli.inputs import Add, add_point, existing, load_geometry, read_positions, read_receivers
+from warprrf.cli.inputs import (
+    Add,
+    add_out,
+    add_point,
+    existing,
+    load_geometry,
+    read_positions,
+    read_receivers,
+)
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
 
@@ -21,7 +30,7 @@ def add_reconstruct(add: Add) -> None:
     """Define `reconstruct`."""
     rec = add("reconstruct", _reconstruct)
     rec.add_argument("photos", help="folder of JPEG or PNG photos of one static room")
-    rec.add_argument("-o", "--out", required=True, help="folder of the result")
+    add_out(rec, "folder of the result")
     rec.add_argument(
         "--known-positions", metavar="FILE", help="surveyed camera positions, JSON or CSV: sets metres"
     )
@@ -56,7 +65,7 @@ def add_simulate(add: Add) -> None:
     """Define `simulate`."""
     sim = add("simulate", _simulate)
     sim.add_argument("scene", help="scene XML (Mitsuba/Sionna RT), with materials.json beside it")
-    sim.add_argument("-o", "--out", required=True, help="NetCDF file")
+    add_out(sim, "NetCDF file")
     add_point(sim, "--transmitter", "metres", required=True)
     sim.add_argument(
         "--receivers", nargs="+", required=True, help="CSV or NPY file of x,y,z rows, or x,y,z words"
@@ -117,7 +126,7 @@ def add_fit(add: Add) -> None:
     fit = add("fit", _fit)
     fit.add_argument("geometry", help="a reconstruction's folder, splats (.ply) or a scene (.xml)")
     fit.add_argument("spectra", help="NetCDF file of spectra")
-    fit.add_argument("-o", "--out", required=True, help="field file (.safetensors)")
+    add_out(fit, "field file (.safetensors)")
     fit.add_argument(
         "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
     )
@@ -136,6 +145,11 @@ def add_fit(add: Add) -> None:
         "--quick",
         action="store_true",
         help="bistatic: no term is tried, one ray a pixel; two or three dB less, in seconds",
+    )
+    fit.add_argument(
+        "--reciprocal",
+        action="store_true",
+        help="bistatic: scattering that is the same when transmitter and receiver change places",
     )
 
 
@@ -162,8 +176,7 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
     options: dict[str, Any] = {}
     if args.relevance is not None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
-    if args.quick:
-        options["quick"] = True
+    options |= {name: True for name in ("quick", "reciprocal") if getattr(args, name)}
     for option in options:
         if args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
@@ -188,10 +201,13 @@ def add_evaluate(add: Add) -> None:
     eva.add_argument("field", help="field file (.safetensors)")
     eva.add_argument("spectra", help="NetCDF file of spectra with held-out receivers")
     eva.add_argument(
-        "--train", type=int, default=50, metavar="N", help="what the lookups may see (default 50)"
+        "--train",
+        type=int,
+        metavar="N",
+        help="training receivers that the lookups see (default: as many as the field)",
     )
     eva.add_argument("--no-lookups", dest="lookups", action="store_false", help="the field alone")
-    eva.add_argument("-o", "--out", help="JSON file of the figures")
+    add_out(eva, "JSON file of the figures", required=False)
 
 
 def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
@@ -199,6 +215,7 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
 
     Whole receivers are held out, the same for every method; beside the field stand lookups that know no geometry (nearest
     measurement, inverse distance, a constant, the mean image). `blocked` counts receivers without line of sight alone.
+    A field knows which receivers it was fitted on: if the file names one of them for test, nothing is scored.
 
     examples:
       warprrf evaluate field.safetensors spectra.nc --train 50 -o figures.json
@@ -207,7 +224,17 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
 
     field = wr.RadioField.load(existing(args.field))
     dataset = wr.SpectrumDataset.load(existing(args.spectra))
-    train, test = dataset.split(args.train, seed=args.seed)
+    if field.fitted_on is None:
+        warnings.warn(f"{args.field}: an older file, which does not say what it was fitted on", stacklevel=1)
+    there = int(np.count_nonzero(dataset.role == "train"))
+    count = there if field.fitted_on is None else min(max(len(field.fitted_on), 1), there)
+    train, test = dataset.split(count if args.train is None else args.train, seed=args.seed)
+    learned = field.was_fitted_on(test)
+    if learned.any():
+        raise ValueError(
+            f"{args.field}: was fitted on {learned.sum()} of the {len(test)} test receivers of {args.spectra}, the first "
+            f"at {test.receivers[learned][0].tolist()}; score it on receivers that it never saw, or fit it again without"
+        )
     methods: dict[str, Any] = {field.model: field.spectrum}
     if args.lookups:
         known = (lookups.nearest, lookups.idw, lookups.constant, lookups.mean)
@@ -229,7 +256,7 @@ def add_relevance(add: Add) -> None:
     rel.add_argument(
         "source", help="scene (.xml), reconstruction's folder, splats (.ply) or field (.safetensors)"
     )
-    rel.add_argument("-o", "--out", help="JSON file; the table goes beside it as Markdown")
+    add_out(rel, "JSON file; the table goes beside it as Markdown", required=False)
     rel.add_argument("--spectra", help="NetCDF file whose transmitter, carrier and receivers are used")
     add_point(rel, "--transmitter", "metres")
     rel.add_argument("--receivers", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")

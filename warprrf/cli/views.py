@@ -11,7 +11,7 @@ import numpy as np
 
 import warprrf as wr
 from warprrf.cli.bars import Bars
-from warprrf.cli.inputs import Add, add_point, existing
+from warprrf.cli.inputs import Add, add_out, add_point, existing
 from warprrf.cli.tables import aligned
 from warprrf.device import require
 from warprrf.files import write_arrays, write_atomically
@@ -21,7 +21,7 @@ def add_render(add: Add) -> None:
     """Define `render`."""
     ren = add("render", _render)
     ren.add_argument("source", help="Gaussians (.ply) or a radio field (.safetensors)")
-    ren.add_argument("-o", "--out", required=True, help="picture (.png), or for a spectrum also .npz")
+    add_out(ren, "picture (.png), or for a spectrum also .npz")
     add_point(ren, "--receiver", "where the spectrum is taken")
     add_point(ren, "--position", "where the camera stands")
     add_point(ren, "--look-at", "a point it looks at")
@@ -99,7 +99,7 @@ def add_map(add: Add) -> None:
     """Define `map`."""
     plan = add("map", _map)
     plan.add_argument("field", help="field file (.safetensors)")
-    plan.add_argument("-o", "--out", required=True, help="NetCDF file (.nc), or the picture alone (.png)")
+    add_out(plan, "NetCDF file (.nc), or the picture alone (.png)")
     plan.add_argument("--height", type=float, default=1.5, metavar="M", help="of receivers (default 1.5)")
     plan.add_argument("--cell", type=float, default=0.25, metavar="M", help="width of a cell (default 0.25)")
     add_point(plan, "--transmitter", "if another than the fitted one")
@@ -160,9 +160,7 @@ def add_twin(add: Add) -> None:
     """Define `twin`."""
     twin = add("twin", _twin)
     twin.add_argument("field", help="field file (.safetensors) of model bistatic")
-    twin.add_argument(
-        "-o", "--out", required=True, help="folder of the twin: new, empty or an earlier twin's"
-    )
+    add_out(twin, "folder of the twin: new, empty or an earlier twin's")
 
 
 def _twin(args: argparse.Namespace, bars: Bars) -> None:

@@ -10,13 +10,29 @@ from typing import Any
 import numpy as np
 
 from warprrf import tensor_files
+from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.gaussians import Gaussians
 
-GAUSSIANS = ("means", "quaternions", "scales", "opacities", "sh")
+GAUSSIANS = tuple(f.name for f in fields(Gaussians))
 PATCHES = tuple(f.name for f in fields(PlanarPatches) if f.name != "mesh")
+PATCH_ARRAYS = {
+    "patch_face_patch": index_to("P", "F", -1),
+    "patch_normal": Expected("P 3", -1.001, 1.001),
+    "patch_offset": lengths("P"),
+    "patch_area": Expected("P", 0.0, LARGEST_M**2),
+    "patch_group": Expected("P", -1, kind="iu"),
+    "patch_first": index_to("F", "F"),
+}
+"""What the arrays of patches must be: F faces, P patches."""
+PLANE_ARRAYS = {
+    "planes": lengths("K 8"),
+    "plane_shapes": Expected("K 2", 0, 2**15, kind="iu"),
+    "plane_cells": Expected("C", kind="b"),
+}
+"""What the arrays of planes must be: K planes, C cells of all of them."""
 Arrays = dict[str, np.ndarray]
 
 
@@ -53,6 +69,7 @@ def of_planes(planes: Sequence[Plane]) -> Arrays:
 
 def to_planes(arrays: Arrays) -> list[Plane]:
     """What :func:`of_planes` took apart."""
+    check_arrays(arrays, PLANE_ARRAYS, C=int(np.prod(arrays["plane_shapes"], axis=-1).sum()))
     shapes, nothing = arrays["plane_shapes"], np.zeros(0, dtype=np.int64)
     cells = np.split(arrays["plane_cells"], np.cumsum(shapes.prod(axis=1))[:-1])
     return [
@@ -69,6 +86,9 @@ def of_patches(patches: PlanarPatches) -> Arrays:
 
 def to_patches(arrays: Arrays) -> PlanarPatches:
     """What :func:`of_patches` took apart."""
+    mesh = Mesh(arrays["vertices"], arrays["faces"])
+    check_arrays(arrays, PATCH_ARRAYS, F=len(mesh.faces))
     own: dict[str, Any] = {name: arrays[f"patch_{name}"] for name in PATCHES}
     own |= {name: own[name].item() for name in ("tolerance_m", "two_sided")}
-    return PlanarPatches(Mesh(arrays["vertices"], arrays["faces"]), **own)
+    check_number("patch_tolerance_m", own["tolerance_m"], 0.0, LARGEST_M)
+    return PlanarPatches(mesh, **own)

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from warprrf import device as _device
 from warprrf.brief import one_line
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import check_array, check_number
+from warprrf.checks import LARGEST_M, check_array, check_number
 from warprrf.device import DeviceLike
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, look_around
@@ -61,6 +61,10 @@ class Mesh:
 
     def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
         self.vertices: np.ndarray = check_array("vertices", vertices, (None, 3)).copy()
+        if np.abs(self.vertices).max(initial=0.0) > LARGEST_M:
+            raise ValueError(
+                f"vertices: got coordinates up to {np.abs(self.vertices).max():g} m, expected at most {LARGEST_M:g}"
+            )
         self.faces: np.ndarray = check_array("faces", faces, (None, 3), dtype=np.int32).copy()
         if len(self.faces) == 0:
             raise ValueError("faces: got none, expected at least one triangle")

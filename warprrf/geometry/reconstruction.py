@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.checks import check_number, check_type
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
@@ -19,6 +20,7 @@ from warprrf.geometry.photos.sfm import read_colmap
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.tensor_files import named
 
 FILE = "reconstruction.safetensors"
 FORMAT = 2  # 1 held a list of patches, each with its faces
@@ -120,24 +122,25 @@ class Reconstruction:
                 f"folder: {path} has format {header.get('format')}, this version reads {FORMAT}; make it again from "
                 "its photos (reconstruct)"
             )
-        try:
+        with named(path, "damaged or incomplete"):
             patches = files.to_patches(arrays) if "patch_face_patch" in arrays else None
             mesh = None if patches is None else patches.mesh
             if mesh is None and "faces" in arrays:
                 mesh = Mesh(arrays["vertices"], arrays["faces"])
             rms = header["scale_rms_m"]
+            check_type("metric", header["metric"], bool)
+            for name in (*header["unposed"], *header["held_out"]):
+                check_type("unposed, held_out", name, str)
             return cls(
                 files.to_gaussians(arrays),
                 mesh,
                 {name: _camera(camera) for name, camera in header["cameras"].items()},
                 patches=patches,
-                scale_rms_m=float("nan") if rms is None else rms,
+                scale_rms_m=float("nan") if rms is None else check_number("scale_rms_m", rms, 0.0),
                 metric=header["metric"],
                 unposed=header["unposed"],
                 held_out=header["held_out"],
             )
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"folder: {path} is incomplete: {error!r} does not fit") from error
 
     @classmethod
     def from_files(

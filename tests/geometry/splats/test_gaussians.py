@@ -67,7 +67,10 @@ def test_ascii_and_shuffled_properties_are_read(tmp_path):
             b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n",
             "lacks the vertex properties",
         ),
-        (b"ply\nformat ascii 1.0\nelement face 1\nend_header\n1\n", "first element is 'face'"),
+        (
+            b"ply\nformat ascii 1.0\nelement face 1\nproperty int x\nend_header\n1\n",
+            "lacks the vertex properties",
+        ),
     ],
 )
 def test_a_corrupt_ply_is_refused_by_name(tmp_path, content, complaint):

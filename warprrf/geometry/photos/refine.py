@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
-from warprrf.checks import check_array
+from warprrf import tensor_files
+from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike, Progress, launch, resolve
-from warprrf.files import write_atomically
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import PARAMETERS, STATISTICS, Arrays, densified, opacity_and_scales
 from warprrf.geometry.photos.photo_loss import PhotoLoss
@@ -28,6 +28,8 @@ from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
 from warprrf.steps import digest
+
+CHECKPOINT = "warprrf refinement 1"
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999  # of Adam's moments
 
@@ -229,28 +231,19 @@ class _Refinement:
 
     def store(self, path: Path, key: str) -> None:
         """Write the whole state; ``key`` tells what it was made from."""
-        from safetensors.numpy import save_file
-
-        metadata = {"iteration": str(self.iteration), "key": key}
-        write_atomically(path, lambda file: save_file(self.arrays(), file, metadata))
+        tensor_files.write(path, self.arrays(), {"iteration": self.iteration, "key": key}, CHECKPOINT)
 
     def restore(self, path: Path, key: str) -> None:
         """Continue from a checkpoint."""
-        from safetensors import SafetensorError, safe_open
-
         try:
-            with safe_open(path, framework="np") as file:
-                metadata = file.metadata() or {}
-                self.iteration, stored = int(metadata["iteration"]), metadata["key"]
-                arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a mapping)
-        except (SafetensorError, OSError, KeyError) as error:
-            raise ValueError(
-                f"checkpoint: {path} cannot be read ({error}); delete it to start over"
-            ) from error
-        if stored != key:
+            arrays, header = tensor_files.read(path, CHECKPOINT)
+        except ValueError as error:
+            raise ValueError(f"checkpoint: it cannot be read; delete it to start over ({error})") from error
+        if header.get("key") != key:
             raise ValueError(
                 f"checkpoint: {path} is of other settings or inputs; delete it or give another file"
             )
+        self.iteration = check_count("iteration", header.get("iteration"), 0)
         self.load(arrays)
 
 

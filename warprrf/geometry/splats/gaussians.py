@@ -13,17 +13,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warprrf.brief import one_line
-from warprrf.checks import check_array
-from warprrf.files import write_atomically
+from warprrf.checks import LARGEST_M, check_array
+from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 # The file holds the logit; beyond this an opacity is as good as 0 or 1 and its logit stays finite in float32.
 OPACITY_MARGIN = 1e-7
-_PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
+LARGEST_SH = 1e6
 
 
 @dataclass(frozen=True)
@@ -59,6 +55,15 @@ class Gaussians:
         sh = check_array("sh", self.sh, (n, None, None), np.float32)
         if sh.shape[1] not in COEFFICIENTS.values():
             raise ValueError(f"sh: got {sh.shape[1]} coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
+        for name, array, most in (
+            ("means", means, LARGEST_M),
+            ("scales", scales, LARGEST_M),
+            ("sh", sh, LARGEST_SH),
+        ):
+            if np.abs(array).max(initial=0.0) > most:
+                raise ValueError(
+                    f"{name}: got values up to {np.abs(array).max():g}, expected at most {most:g}"
+                )
         norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
         if (norm < 1e-12).any():
             raise ValueError(
@@ -122,17 +127,14 @@ class Gaussians:
             *(f"rot_{c}" for c in range(4)),
         ]  # fmt: skip
         opacity = np.clip(self.opacities.astype(np.float64), OPACITY_MARGIN, 1 - OPACITY_MARGIN)
-        columns = np.concatenate(
+        values = np.concatenate(
             [
                 self.means, np.zeros((n, 3)), self.sh[:, 0], self.sh[:, 1:].transpose(0, 2, 1).reshape(n, -1),
                 np.log(opacity / (1 - opacity))[:, None], np.log(self.scales.astype(np.float64)), self.quaternions,
             ],
             axis=1,
-        ).astype("<f4")  # fmt: skip
-        header = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
-        header += [f"property float {name}" for name in names] + ["end_header", ""]
-        data = "\n".join(header).encode("ascii") + columns.tobytes()
-        write_atomically(path, lambda file: file.write_bytes(data))
+        )  # fmt: skip
+        write_ply(path, dict(zip(names, values.T, strict=True)), None)
 
     @classmethod
     def load_ply(cls, path: str | os.PathLike[str]) -> Gaussians:
@@ -142,16 +144,18 @@ class Gaussians:
             FileNotFoundError: if there is no such file.
             ValueError: if it is no PLY, is cut short, or lacks a property of the layout.
         """
-        table = _read_ply(Path(path))
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"{os.fspath(path)}: no such file")
+        table = read_ply(path).get("vertex", {})
 
         def columns(*names: str) -> np.ndarray:
-            missing = [name for name in names if name not in table]
+            missing = [name for name in names if not isinstance(table.get(name), np.ndarray)]
             if missing:
                 raise ValueError(
                     f"{path}: lacks the vertex properties {missing}; expected a splat in the INRIA layout "
                     "(x y z f_dc_* f_rest_* opacity scale_* rot_*), not a mesh or a plain point cloud"
                 )
-            return np.stack([table[name].astype(np.float64) for name in names], axis=1)
+            return np.stack([np.asarray(table[name], dtype=np.float64) for name in names], axis=1)
 
         dc = columns(*(f"f_dc_{c}" for c in range(3)))
         rest = sum(name.startswith("f_rest_") for name in table)
@@ -164,7 +168,7 @@ class Gaussians:
             return cls(
                 columns("x", "y", "z"),
                 columns(*(f"rot_{c}" for c in range(4))),
-                np.exp(columns(*(f"scale_{c}" for c in range(3)))),
+                np.exp(np.clip(columns(*(f"scale_{c}" for c in range(3))), -700.0, 700.0)),
                 0.5 * (1 + np.tanh(0.5 * logit)),  # the sigmoid, without overflow
                 sh,
             )
@@ -180,39 +184,3 @@ def rotations_of(quaternions: np.ndarray) -> np.ndarray:
 def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     """Quaternions wxyz ``(N, 4)`` of rotation matrices ``(N, 3, 3)``."""
     return Rotation.from_matrix(np.asarray(rotations, np.float64)).as_quat()[:, [3, 0, 1, 2]]
-
-
-def _read_ply(path: Path) -> dict[str, np.ndarray]:
-    """Vertex properties of a PLY file whose first element is ``vertex``."""
-    data = path.read_bytes()
-    end = data.find(b"end_header\n")
-    if not data.startswith(b"ply") or end < 0:
-        raise ValueError(f"{path}: not a PLY file (no 'ply' ... 'end_header')")
-    body = data[end + len(b"end_header\n") :]
-    order, count, fields, element = "", -1, [], ""
-    for line in data[:end].decode("ascii", "replace").split("\n"):
-        words = line.split()
-        if words[:1] == ["format"] and len(words) > 1:
-            order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}.get(words[1], "")
-        elif words[:1] == ["element"] and len(words) == 3:
-            element = words[1]
-            if element == "vertex" and words[2].isdigit():
-                count = int(words[2])
-            elif count < 0:
-                raise ValueError(f"{path}: its first element is {element!r}, expected 'vertex'")
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in _PLY_TYPES:
-                raise ValueError(f"{path}: cannot read the vertex property {line!r}")
-            fields.append((words[2], _PLY_TYPES[words[1]]))
-    if not order or count < 0 or not fields:
-        raise ValueError(f"{path}: the PLY header names no known format or no vertices")
-    if order == "=":
-        values = np.array(body.split()[: count * len(fields)], dtype=np.float64)
-        if len(values) < count * len(fields):
-            raise ValueError(f"{path}: cut short: {len(values)} of {count * len(fields)} values")
-        return {name: values.reshape(count, -1)[:, k] for k, (name, _) in enumerate(fields)}
-    dtype = np.dtype([(name, order + kind) for name, kind in fields])
-    if len(body) < count * dtype.itemsize:
-        raise ValueError(f"{path}: cut short: {len(body)} of {count * dtype.itemsize} bytes of vertices")
-    table = np.frombuffer(body, dtype, count)
-    return {name: table[name] for name, _ in fields}

@@ -17,7 +17,6 @@ said is stated: both errors of each group, and what has no place in a material a
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import re
 import shutil
@@ -29,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from warprrf.files import partial_path
+from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import LAMBERTIAN, lobe, slab_reflection
 from warprrf.rf.em.half_spaces import fresnel_curves
@@ -188,7 +187,7 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
                 surface.mesh.vertices[kept],
                 faces.reshape(-1, 3),
             )
-        (part / "materials.json").write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+        write_json(part / "materials.json", table, seal=True)
         (part / "scene.xml").write_text(
             _scene_xml([group.material for group in groups], field.frequency_hz), encoding="utf-8"
         )
@@ -406,7 +405,7 @@ def _check_replaceable(folder: Path) -> None:
     if not found:
         return
     try:
-        table = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
+        table = read_json(folder / "materials.json")
         twin = found <= _FILES and table["about"][0] == ABOUT
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         twin = False

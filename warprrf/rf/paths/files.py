@@ -8,21 +8,23 @@ where known.
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warprrf import device as _device
-from warprrf.files import write_atomically
+from warprrf import netcdf_files
+from warprrf.checks import Expected, check_arrays, check_positive, lengths
+from warprrf.netcdf_files import Variable
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.absorption import Air
+from warprrf.tensor_files import named
 
 KINDS = ("", "los", "mirror", "diffuse")
 """What the values 0, 1, ... of the variable ``kind`` mean."""
 
 _FORMAT = "warprrf paths 1"
 _SEVERAL = ("receiver", "path")
+_MATRIX = (*_SEVERAL, "receive", "transmit")
 _UNITS = {
     "tau": ("s", "delay"),
     "theta_r": ("rad", "zenith of arrival"),
@@ -30,65 +32,86 @@ _UNITS = {
     "theta_t": ("rad", "zenith of departure"),
     "phi_t": ("rad", "azimuth of departure"),
 }
+_FLAGS = {
+    "flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": "none los mirror diffuse",
+}  # fmt: skip
+_VARIABLES = {
+    "vertices": Variable(
+        (*_SEVERAL, "vertex", "xyz"), "m", {"long_name": "interaction points from the transmitter on"}
+    ),
+    "kind": Variable(_SEVERAL, about=_FLAGS),
+    "valid": Variable(_SEVERAL),
+    **{name: Variable(_SEVERAL, unit, {"long_name": text}) for name, (unit, text) in _UNITS.items()},
+    "gain_real": Variable(_SEVERAL, "1"),
+    "gain_imag": Variable(_SEVERAL, "1"),
+    "jones_real": Variable(_MATRIX, "1", optional=True),
+    "jones_imag": Variable(_MATRIX, "1", optional=True),
+    "receiver_position": Variable(("receiver", "xyz"), "m", optional=True),
+    "transmitter_position": Variable(("xyz",), "m", optional=True),
+}
+_ARRAYS = {
+    "gain_real": Expected("R L"),
+    "gain_imag": Expected("R L"),
+    "jones_real": Expected("R L 2 2", nan=True),
+    "jones_imag": Expected("R L 2 2", nan=True),
+    "vertices": Expected("R L D 3", nan=True),
+    "kind": Expected("R L", 0, len(KINDS) - 1, kind="iu"),
+    "valid": Expected("R L", 0, 1, kind="iu"),
+    "tau": Expected("R L", 0.0, 1.0, nan=True),
+    **{name: Expected("R L", -7.0, 7.0, nan=True) for name in list(_UNITS)[1:]},
+    "receiver_position": lengths("R 3"),
+    "transmitter_position": lengths("3"),
+}
+"""What the arrays in a file must be: R receivers, L paths, D interactions."""
 
 
 def write(path: str | os.PathLike[str], paths: PathArrays) -> None:
     """Write ``paths`` to a NetCDF-4 file, whole or not at all."""
-    xarray = _device.require("xarray", extra="all")
     several = paths.as_several()
     codes = sum(k * (several.kind == name) for k, name in enumerate(KINDS))
-    flags = {"flag_values": list(range(len(KINDS))), "flag_meanings": "none los mirror diffuse"}
-    points = {"units": "m", "long_name": "interaction points from the transmitter on"}
-    variables: dict[str, Any] = {
-        "vertices": ((*_SEVERAL, "vertex", "xyz"), several.vertices, points),
-        "kind": (_SEVERAL, np.asarray(codes, dtype=np.int8), flags),
-        "valid": (_SEVERAL, several.valid.astype(np.int8), {}),
+    arrays = {
+        "vertices": several.vertices,
+        "kind": np.asarray(codes, dtype=np.int8),
+        "valid": several.valid.astype(np.int8),
+        "receiver_position": several.receiver,
+        "transmitter_position": several.transmitter,
     }
-    for name, (unit, text) in _UNITS.items():
-        variables[name] = (_SEVERAL, getattr(several, name), {"units": unit, "long_name": text})
-    for part in ("real", "imag"):
-        variables[f"gain_{part}"] = (_SEVERAL, getattr(several.gain, part), {"units": "1"})
-        if several.jones is not None:
-            matrix = (*_SEVERAL, "receive", "transmit")
-            variables[f"jones_{part}"] = (matrix, getattr(several.jones, part), {"units": "1"})
-    if several.receiver is not None:
-        variables["receiver_position"] = (("receiver", "xyz"), several.receiver, {"units": "m"})
-    if several.transmitter is not None:
-        variables["transmitter_position"] = (("xyz",), several.transmitter, {"units": "m"})
+    for name, values in (("gain", several.gain), ("jones", several.jones)):
+        if values is not None:
+            arrays |= {f"{name}_real": values.real, f"{name}_imag": values.imag}
+    arrays |= {name: getattr(several, name) for name in _UNITS}
     attributes: dict[str, Any] = {"format": _FORMAT, "single_receiver": int(not paths.batched)}
     if several.frequency_hz is not None:
         attributes["frequency_hz"] = several.frequency_hz
     if several.air is not None:
         attributes |= several.air.attributes
-    data = xarray.Dataset(variables, attrs=attributes)
-    write_atomically(path, lambda file: data.to_netcdf(file, engine="h5netcdf"))
+    known = {name: np.asarray(array) for name, array in arrays.items() if array is not None}
+    netcdf_files.write(path, known, _VARIABLES, {}, attributes)
 
 
 def read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
     """The fields of what :func:`write` wrote, as paths of several receivers, and whether it was one receiver's.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file holds something else.
+        OSError: naming the file, if it cannot be read.
+        ValueError: naming it, if it is damaged, or holds something else.
     """
-    xarray = _device.require("xarray", extra="all")
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"path: there is no file {path}")
-    with xarray.open_dataset(path, engine="h5netcdf", decode_times=False) as data:
-        if data.attrs.get("format") != _FORMAT:
-            raise ValueError(f"path: {path} holds {data.attrs.get('format')!r}, expected {_FORMAT!r}")
-        held = {name: np.asarray(data[name].values) for name in data.variables}
-        attributes = dict(data.attrs)
-    fields: dict[str, Any] = {
-        "gain": held["gain_real"] + 1j * held["gain_imag"],
-        "vertices": held["vertices"],
-        "kind": np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
-        "valid": held["valid"].astype(bool),
-        "jones": held["jones_real"] + 1j * held["jones_imag"] if "jones_real" in held else None,
-        "frequency_hz": float(attributes["frequency_hz"]) if "frequency_hz" in attributes else None,
-        "transmitter": held.get("transmitter_position"),
-        "receiver": held.get("receiver_position"),
-        "air": Air.from_attributes(attributes),
-        **{name: held[name] for name in _UNITS},
-    }
-    return fields, bool(attributes["single_receiver"])
+    held, attributes = netcdf_files.read(path, _VARIABLES, {})
+    with named(path, "damaged, or no paths"):
+        if attributes.get("format") != _FORMAT:
+            raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
+        check_arrays(held, {name: wanted for name, wanted in _ARRAYS.items() if name in held})
+        carrier = attributes.get("frequency_hz")
+        fields: dict[str, Any] = {
+            "gain": held["gain_real"] + 1j * held["gain_imag"],
+            "vertices": held["vertices"],
+            "kind": np.array(KINDS, dtype="<U7")[held["kind"].astype(int)],
+            "valid": held["valid"].astype(bool),
+            "jones": held["jones_real"] + 1j * held["jones_imag"] if "jones_real" in held else None,
+            "frequency_hz": None if carrier is None else check_positive("frequency_hz", carrier),
+            "transmitter": held.get("transmitter_position"),
+            "receiver": held.get("receiver_position"),
+            "air": Air.from_attributes(attributes),
+            **{name: held[name] for name in _UNITS},
+        }
+        return fields, bool(attributes["single_receiver"])

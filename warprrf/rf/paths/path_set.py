@@ -118,8 +118,8 @@ class Paths(PathArrays):
         """Read what :meth:`save` wrote.
 
         Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file holds something else.
+            OSError: naming the file, if it cannot be read.
+            ValueError: naming it, if it is damaged, or holds something else.
         """
         arrays, one_receiver = files.read(path)
         several = cls(**arrays)

@@ -9,6 +9,7 @@ from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_positive, check_seed, check_type
@@ -28,6 +29,7 @@ from warprrf.rf.spectra.spectrum import (
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 
 _ROLES = ("train", "test")
+SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
 _MOST_ATTRIBUTE_BYTES = 60_000  # HDF5 takes 64 kB
 
 
@@ -351,6 +353,13 @@ def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.nd
     role = np.full(count, "train", dtype="<U5")
     role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
     return role
+
+
+def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
+    """Which spectra of ``ds`` are of ``receivers`` (K, 3) under ``transmitter`` (3,) [m], shape ``(R,)`` bool."""
+    if len(receivers) == 0 or np.linalg.norm(ds.transmitter - transmitter) > SAME_PLACE_M:
+        return np.zeros(len(ds.receivers), dtype=bool)
+    return np.asarray(cKDTree(receivers).query(ds.receivers)[0] <= SAME_PLACE_M)
 
 
 def _check_roles(role: ArrayLike, count: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_positive
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, to_db
 
@@ -28,10 +28,12 @@ class Lookup:
     Attributes:
         name: ``"nearest"``, ``"idw"``, ``"constant"`` or ``"mean"``.
         note: what was chosen while building it, in words (empty if nothing was).
+        train: what it was built from.
     """
 
     name: str
     note: str
+    train: SpectrumDataset = field(repr=False)
     _predict: Callable[[np.ndarray], Spectrum] = field(repr=False)
 
     def __call__(self, receiver: ArrayLike) -> Spectrum:
@@ -43,6 +45,10 @@ class Lookup:
         return self._predict(check_array("receiver", receiver, (3,)))
 
     spectrum = __call__
+
+    def was_fitted_on(self, ds: SpectrumDataset) -> np.ndarray:
+        """Which receivers of ``ds`` it was built from, shape ``(R,)`` bool."""
+        return measured_at(ds, self.train.receivers, self.train.transmitter)
 
 
 def nearest(train: SpectrumDataset) -> Lookup:
@@ -59,7 +65,7 @@ def nearest(train: SpectrumDataset) -> Lookup:
             range_db=train.range_db,
         )
 
-    return Lookup("nearest", "", predict)
+    return Lookup("nearest", "", train, predict)
 
 
 def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> Lookup:
@@ -104,7 +110,7 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
     elif domain not in tables:
         raise ValueError(f'domain: got {domain!r}, expected "db", "linear" or "auto"')
     all_of_them = np.ones(len(receivers), dtype=bool)
-    return Lookup("idw", note, lambda receiver: _bare(gain(receiver, all_of_them, domain), train))
+    return Lookup("idw", note, train, lambda receiver: _bare(gain(receiver, all_of_them, domain), train))
 
 
 def constant(train: SpectrumDataset) -> Lookup:
@@ -112,7 +118,7 @@ def constant(train: SpectrumDataset) -> Lookup:
     _receivers(train)
     level = float(np.mean(to_db(np.asarray(train.path_gain, np.float64), float(train.floor))))
     gain = np.full(train.path_gain.shape[1:], max(10 ** (level / 10) - float(train.floor), 0.0))
-    return Lookup("constant", f"{level:.2f} dB", lambda receiver: _bare(gain, train))
+    return Lookup("constant", f"{level:.2f} dB", train, lambda receiver: _bare(gain, train))
 
 
 def mean(train: SpectrumDataset) -> Lookup:
@@ -120,7 +126,7 @@ def mean(train: SpectrumDataset) -> Lookup:
     _receivers(train)
     images = to_db(np.asarray(train.path_gain, np.float64), float(train.floor))
     gain = np.maximum(10 ** (np.mean(images, axis=0) / 10) - float(train.floor), 0.0)
-    return Lookup("mean", "", lambda receiver: _bare(gain, train))
+    return Lookup("mean", "", train, lambda receiver: _bare(gain, train))
 
 
 def _receivers(train: SpectrumDataset) -> np.ndarray:

@@ -12,9 +12,10 @@ Figures for receivers without line of sight alone carry the suffix ``_blocked``.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -171,6 +172,12 @@ def evaluate(
         sight (None if there are none); ``lpips`` with ``lpips_reason``; ``seconds_per_spectrum`` (median),
         ``receivers``, ``receivers_blocked``, ``beam_width_deg``, and ``per_receiver``: the arrays ``(R,)`` behind them.
 
+        Where ``predict`` belongs to a field or a lookup, which know what they were fitted on,
+        ``receivers_fitted_on`` is how many of ``test`` are among those; else None.
+
+    Warns:
+        UserWarning: if there are any: their scores say how well they were learned by heart.
+
     Raises:
         ValueError: if a prediction has another shape than the truth, or holds NaN, infinite or negative path gain.
     """
@@ -181,6 +188,13 @@ def evaluate(
     count = len(test.receivers)
     if count == 0:
         raise ValueError("test: got no receivers, expected at least one")
+    fitted_on = _fitted_on(predict, test)
+    if fitted_on:
+        warnings.warn(
+            f"test: {fitted_on} of its {count} receivers are among those that the predictor was fitted on: these are "
+            "no errors of prediction; score receivers that were held out (ds.split)",
+            stacklevel=2,
+        )
     floor, range_db = float(test.floor), test.range_db
     names = (
         "psnr_db",
@@ -226,6 +240,7 @@ def evaluate(
         seconds_per_spectrum=float(np.median(seconds)),
         receivers=count,
         receivers_blocked=int(np.count_nonzero(~line_of_sight)),
+        receivers_fitted_on=fitted_on,
         beam_width_deg=float(np.degrees(beam_width_rad)),
         per_receiver={**rows, "line_of_sight": line_of_sight, "seconds": seconds},
     )
@@ -234,6 +249,19 @@ def evaluate(
 
 def _predicts(values: np.ndarray | None) -> bool:
     return values is not None and bool(np.isfinite(values).any())
+
+
+@runtime_checkable
+class _Fitted(Protocol):
+    """A field or a lookup."""
+
+    def was_fitted_on(self, ds: SpectrumDataset) -> np.ndarray: ...
+
+
+def _fitted_on(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) -> int | None:
+    """How many receivers of ``test`` whoever predicts was fitted on; None where that is not known."""
+    owner = getattr(predict, "__self__", predict)
+    return int(np.count_nonzero(owner.was_fitted_on(test))) if isinstance(owner, _Fitted) else None
 
 
 def _checked_gain(prediction: Spectrum | ArrayLike, shape: tuple[int, ...], index: int) -> np.ndarray:

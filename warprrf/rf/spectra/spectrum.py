@@ -41,8 +41,11 @@ _ANGLE_ROUNDING = 1e-3  # radians by which angles of departure may lie out of ra
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
+MOST_PIXELS = 1 << 24  # a sixteenth of a degree each
+
+
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
-    """``shape`` as (rows, columns), each at least 2.
+    """``shape`` as (rows, columns), each at least 2, at most :data:`MOST_PIXELS` in all.
 
     Raises:
         ValueError: otherwise.
@@ -53,6 +56,8 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
         raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
     if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
         raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")
+    if rows * columns > MOST_PIXELS:
+        raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {MOST_PIXELS} in all")
     return rows, columns
 
 

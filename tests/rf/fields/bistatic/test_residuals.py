@@ -180,7 +180,7 @@ def test_the_file_keeps_them_and_refuses_others(field: BistaticField, tmp_path: 
     )
     tensors, header = files.read(tmp_path / "field.safetensors")
     files.write(tmp_path / "wrong.safetensors", tensors | {"residual": textured.residual[:, :-1]}, header)
-    with pytest.raises(ValueError, match="wrong.safetensors: corrupt bistatic field: residual: got shape"):
+    with pytest.raises(ValueError, match="wrong.safetensors: .*residual: got shape"):
         RadioField.load(tmp_path / "wrong.safetensors")
     with pytest.raises(ValueError, match="residual: got shape"):
         replace(textured, residual=np.zeros(len(field.surface.element_area)))

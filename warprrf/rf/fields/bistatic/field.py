@@ -15,7 +15,6 @@ function of both directions and of the path's lengths, the field holds for a tra
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -23,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import check_array, check_count
+from warprrf.checks import Expected, check_array, check_arrays, check_count, index_to
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
@@ -31,7 +30,8 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import LinkTracer
-from warprrf.rf.fields.bistatic.materials import Materials, Parameters
+from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
+from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.render import Rendered, render, sent_radiance
 from warprrf.rf.fields.bistatic.surface import Surface
@@ -62,6 +62,7 @@ class BistaticField(RadioField):
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residuals`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         air: absorption of every path: that of the data set it was fitted to; None for none.
+        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
         report: how the fit went.
         device: where it computes.
     """
@@ -79,21 +80,28 @@ class BistaticField(RadioField):
     residual: np.ndarray = field(repr=False)
     errors: uncertainty.ErrorModel | None = field(default=None, repr=False)
     air: Air | None = None
+    fitted_on: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _sent: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
 
     def __post_init__(self) -> None:
-        wanted = self.surface.groups, len(self.terms.lobes)
-        if self.parameters.log_weight.shape != wanted:
+        super().__post_init__()
+        sizes = {"G": self.surface.groups, "L": len(self.terms.lobes), "X": self.surface.cells}
+        check_arrays(vars(self.parameters), PARAMETER_ARRAYS, **sizes)
+        check_arrays(vars(self), _ARRAYS, **sizes)
+        materials = int(self.material.max()) + 1
+        if len(np.unique(self.material)) != materials:
             raise ValueError(
-                f"parameters: log_weight has shape {self.parameters.log_weight.shape}, expected {wanted}: one row for "
-                "each group of the surface, one column for each lobe"
+                f"material: got {np.unique(self.material)}, expected all of 0 to {materials - 1}"
             )
-        if np.shape(self.residual) != (2, self.surface.cells):
-            raise ValueError(
-                f"residual: got shape {np.shape(self.residual)}, expected {(2, self.surface.cells)} for the surface's cells"
-            )
+        if self.errors is not None:
+            free = Layout(materials, sizes["L"], indirect=self.terms.indirect, gain=False).size
+            if len(self.errors.covariance) not in (free, free + 1):
+                raise ValueError(
+                    f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {free}, or "
+                    f"{free + 1} with a common gain"
+                )
 
     @property
     def model(self) -> str:
@@ -151,7 +159,7 @@ class BistaticField(RadioField):
         return replace(
             cls.prior(found.surface, ds, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report,
+            errors=found.errors, report=found.report, fitted_on=np.array(ds.receivers, np.float64),
         )  # fmt: skip
 
     @classmethod
@@ -190,6 +198,7 @@ class BistaticField(RadioField):
             material=surface.material,
             residual=np.zeros((2, surface.cells)),
             air=getattr(ds, "air", None),
+            fitted_on=np.zeros((0, 3)),
             device=device,
         )
 
@@ -310,15 +319,13 @@ class BistaticField(RadioField):
 
     # ------------------------------------------------------------------------------------------ files
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one safetensors file, in one go: surface, parameters, terms, report."""
-        files.write({f.name: getattr(self, f.name) for f in fields(self)}, path)
+    def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return files.taken_apart({f.name: getattr(self, f.name) for f in fields(self)})
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> BistaticField:
-        """Read a field that :meth:`save` wrote; errors as for :meth:`RadioField.load`."""
-        parts = files.read(path)
-        try:
-            return cls(**parts, device=device)
-        except ValueError as error:
-            raise ValueError(f"{os.fspath(path)}: corrupt bistatic field: {error}") from error
+    def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
+        return files.put_together(tensors, header)
+
+
+_ARRAYS = {"material": index_to("G", "G"), "residual": Expected("2 X", -MOST_NEPERS, MOST_NEPERS)}
+"""What the arrays of a field's own must be: G groups, X cells."""

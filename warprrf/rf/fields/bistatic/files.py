@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from warprrf import tensor_files
+from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.uncertainty import ARRAYS as ERROR_ARRAYS
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 
-_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 _SURFACE = {
     name: name
     for name in ("normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element",
@@ -26,61 +24,53 @@ _SURFACE = {
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")
 
 
-def write(parts: dict[str, Any], path: str | os.PathLike[str]) -> None:
-    """Write all ``parts`` of a field, by the names of its attributes, to one safetensors file, in one go."""
+def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Tensors and header of the ``parts`` of a field, by the names of its attributes, but for what every model has."""
     s, p = parts["surface"], parts["parameters"]
     tensors = {f"surface/{filed}": np.asarray(getattr(s, name)) for name, filed in _SURFACE.items()}
     tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
     tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
-    tensors |= {name: parts[name] for name in ("residual", "material", "transmitter")}
+    tensors |= {name: parts[name] for name in ("residual", "material")}
     if parts["errors"] is not None:
         tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(parts["errors"]).items()}
-    header = {name: parts[name] for name in _PLAIN}
-    header |= {"model": "bistatic", "terms": asdict(parts["terms"]), "report": parts["report"]}
-    header |= {
+    header = {
+        "terms": asdict(parts["terms"]),
         "log_gain": p.log_gain,
         "group_names": s.group_names,
         "skin_m": s.skin_m,
         "two_sided": s.two_sided,
     }
-    header |= {} if parts["air"] is None else parts["air"].attributes
-    tensor_files.write(path, tensors, header)
+    return tensors, header
 
 
-def read(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What makes the field that :func:`write` wrote, by the names of its attributes; errors as for
-    :meth:`RadioField.load`."""
-    tensors, header = tensor_files.read(path)
-    try:
-        surface = Surface(
+def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
+    """What :func:`taken_apart` took apart, by the names of a field's attributes.
+
+    Raises:
+        KeyError, TypeError, ValueError: for what is missing or does not fit.
+    """
+    names, two_sided = header["group_names"], header.get("two_sided", False)
+    check_type("group_names", names, list)
+    check_type("two_sided", two_sided, bool)
+    for name in names:
+        check_type("group_names", name, str)
+    errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
+    errors = {
+        n: t if ERROR_ARRAYS[n].shape else t.squeeze() for n, t in errors.items()
+    }  # older: single values as (1,)
+    return {
+        "surface": Surface(
             mesh=Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]),
-            group_names=tuple(header["group_names"]),
-            skin_m=float(header["skin_m"]),
-            two_sided=bool(header.get("two_sided", False)),
+            group_names=tuple(names),
+            skin_m=header["skin_m"],
+            two_sided=two_sided,
             **{name: tensors[f"surface/{filed}"] for name, filed in _SURFACE.items()},
-        )
-        parameters = Parameters(
+        ),
+        "terms": Terms(**header["terms"] | {"lobes": tuple(header["terms"]["lobes"])}),
+        "parameters": Parameters(
             **{name: tensors[f"parameters/{name}"] for name in _PARAMETERS}, log_gain=header["log_gain"]
-        )
-        if len(surface.patch) != len(surface.mesh.faces):
-            raise ValueError("its surface does not fit its mesh")
-        errors = {n.removeprefix("errors/"): t for n, t in tensors.items() if n.startswith("errors/")}
-        plain = {name: header[name] for name in _PLAIN}
-        return {
-            **plain,
-            "shape": tuple(plain["shape"]),
-            "range_db": tuple(plain["range_db"]),
-            "surface": surface,
-            "transmitter": tensors["transmitter"],
-            "terms": Terms(**header["terms"]),
-            "parameters": parameters,
-            "material": tensors["material"],
-            "residual": tensors["residual"],
-            "errors": ErrorModel(**errors) if errors else None,
-            "air": Air.from_attributes(header),
-            "report": header["report"],
-        }
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{os.fspath(path)}: corrupt or no bistatic field of this version: {error}"
-        ) from error
+        ),
+        "material": tensors["material"],
+        "residual": tensors["residual"],
+        "errors": ErrorModel(**errors) if errors else None,
+    }

@@ -11,9 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from warprrf.checks import Expected, check_arrays, check_number
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.paths.polarisation import chain_reflection
+
+MOST_NEPERS = 40.0  # of any logarithm: 174 dB from one, where no surface is
+ARRAYS = {
+    "log_weight": Expected("G L", most=MOST_NEPERS),
+    "log_excess": Expected("G", -MOST_NEPERS, MOST_NEPERS),
+    "log_mirror": Expected("G", most=MOST_NEPERS),
+    "log_indirect": Expected("G", most=MOST_NEPERS),
+}
+"""What the arrays of :class:`Parameters` must be: G groups, L lobes."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +36,9 @@ class Parameters:
         log_mirror: ln of the share of |Gamma|^2 that is reflected as by a mirror, shape ``(G,)``; 1 - S^2.
         log_indirect: ln of the indirect radiance [1/m^2], shape ``(G,)``; -inf where there is none.
         log_gain: ln of a gain common to all paths (an uncalibrated receiver).
+
+    Raises:
+        TypeError, ValueError: for arrays that do not fit each other, or are out of range.
     """
 
     log_weight: np.ndarray
@@ -33,6 +46,10 @@ class Parameters:
     log_mirror: np.ndarray
     log_indirect: np.ndarray
     log_gain: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_arrays(vars(self), ARRAYS)
+        check_number("log_gain", self.log_gain, -MOST_NEPERS, MOST_NEPERS)
 
     @property
     def weight(self) -> np.ndarray:

@@ -8,7 +8,7 @@ told apart at both scales.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
+from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components, smoothed_normals
@@ -33,6 +34,24 @@ LARGEST_FACE_M = 0.6  # longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
 SKIN_M = 0.02  # depth of a reconstructed surface's skin: shadow rays ignore it
 TRUE_SKIN_M = 1e-4
+_UNIT = Expected("F 3", -1.001, 1.001)
+ARRAYS = {
+    "normal": _UNIT,
+    "patch": index_to("P", "F", -1),
+    "plane_normal": replace(_UNIT, shape="P 3"),
+    "plane_offset": lengths("P"),
+    "group": index_to("G", "F"),
+    "material": index_to("G", "G"),
+    "colour": Expected("G 4", nan=True),
+    "patch_group": index_to("G", "P"),
+    "element": index_to("E", "F"),
+    "cell": index_to("X", "F"),
+    "cell_element": index_to("E", "X"),
+    "element_centre": lengths("E 3"),
+    "element_area": Expected("E", 0.0, LARGEST_M**2),
+    "element_group": index_to("G", "E"),
+}
+"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +76,9 @@ class Surface:
         skin_m: depth of the surface's skin.
         two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
             that photos saw.
+
+    Raises:
+        TypeError, ValueError: for arrays that do not fit each other, or indices and values out of range.
     """
 
     mesh: Mesh = field(repr=False)
@@ -78,6 +100,10 @@ class Surface:
     skin_m: float
     two_sided: bool = False
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
+
+    def __post_init__(self) -> None:
+        check_arrays(vars(self), ARRAYS, F=len(self.mesh.faces), G=len(self.group_names))
+        check_number("skin_m", self.skin_m, 0.0, 10.0)
 
     @cached_property
     def front_normal(self) -> np.ndarray:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from warprrf.checks import Expected, check_arrays, lengths
 from warprrf.rf.fields.bistatic.fit import NEPER
 from warprrf.rf.fields.bistatic.materials import Layout, Materials
 from warprrf.rf.fields.bistatic.render import Rendered
@@ -28,6 +29,15 @@ LEVEL_DB = (0.0, 0.02, 0.3, 3.0, 12.0, 30.0)
 ENOUGH = 60  # errors in a bin
 LEAST_DB = 0.01
 OUTLIERS = 0.05
+ARRAYS = {
+    "table": Expected(f"{len(LEVEL_DB)} {len(STEEPNESS_DB)}", 0.0, 1e4),
+    "growth": Expected("", 0.0, 1.0),
+    "middle_m": lengths("", 0.0),
+    "receivers": lengths("R 3"),
+    "covariance": Expected("C C", -1e12, 1e12),
+    "outlier_db": Expected("", 0.0, 1e4),
+}
+"""What the arrays of an :class:`ErrorModel` must be: R receivers, C parameters of materials."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,9 @@ class ErrorModel:
         receivers: training receivers [m], shape ``(R, 3)``.
         covariance: of the group parameters, shape ``(C, C)``.
         outlier_db: standard deviation of outliers [dB].
+
+    Raises:
+        TypeError, ValueError: for arrays of other shapes, or out of range.
     """
 
     table: np.ndarray
@@ -49,6 +62,9 @@ class ErrorModel:
     receivers: np.ndarray
     covariance: np.ndarray
     outlier_db: np.ndarray
+
+    def __post_init__(self) -> None:
+        check_arrays(vars(self), ARRAYS)
 
     def std_db(
         self, image_db: np.ndarray, receiver: np.ndarray, slopes: np.ndarray, index: np.ndarray

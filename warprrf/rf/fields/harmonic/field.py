@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,9 +26,8 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf import tensor_files
 from warprrf.cache import Cache
-from warprrf.checks import check_array, check_count
+from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_positive
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
@@ -51,6 +50,9 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
 from warprrf.steps import digest
 
+LAYERS = {"rf3dgs+": ("gain",), "rf3dgs": ("gain", "delay", "aod_x", "aod_y", "aod_z")}
+"""Layers that each model may have."""
+MOST_COEFFICIENT = 1e9
 CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that are nearly right
 CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
@@ -73,6 +75,7 @@ class HarmonicField(RadioField):
         delay_unit: seconds per unit of the delay layer.
         air: absorption over every path's length, that of the data set it was fitted to; None for none. ``rf3dgs`` has
             lengths for an explicit line of sight alone and learns it with the gain.
+        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
         report: how the fit went: seconds, pairs, losses, Gaussians seen.
     """
 
@@ -89,9 +92,22 @@ class HarmonicField(RadioField):
     gain_unit: float
     delay_unit: float
     air: Air | None = None
+    fitted_on: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _uploaded: Cache = field(init=False, repr=False, default_factory=lambda: Cache(8))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wanted = set(self.layers) - set(LAYERS[self.model])
+        if wanted:
+            raise ValueError(
+                f"layers: got {', '.join(sorted(wanted))}, expected {', '.join(LAYERS[self.model])}"
+            )
+        table = Expected(f"N {_kernels.COEFFICIENTS}", -MOST_COEFFICIENT, MOST_COEFFICIENT)
+        check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))
+        check_positive("gain_unit", self.gain_unit)
+        check_number("delay_unit", self.delay_unit, 0.0, 1.0)
 
     @property
     def model(self) -> str:
@@ -153,6 +169,7 @@ class HarmonicField(RadioField):
             gain_unit=1.0,
             delay_unit=1.0,
             air=getattr(ds, "air", None),
+            fitted_on=receivers.copy(),
             device=device,
         )
         seen = blank._seen_from(receivers, transport, progress)
@@ -241,51 +258,30 @@ class HarmonicField(RadioField):
         ]
         return found[0] if positions.ndim == 1 else Paths.stack(found)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one safetensors file, in one go: geometry, coefficients, options, report."""
+    def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         tensors = {f"layer/{name}": table for name, table in self.layers.items()}
-        for name in ("means", "quaternions", "scales", "opacities", "sh"):
-            tensors[f"gaussians/{name}"] = getattr(self.gaussians, name)
+        tensors |= {f"gaussians/{f.name}": getattr(self.gaussians, f.name) for f in fields(Gaussians)}
         if self.mesh is not None:
             tensors["mesh/vertices"], tensors["mesh/faces"] = self.mesh.vertices, self.mesh.faces
-        tensors["transmitter"] = self.transmitter
-        header = {name: getattr(self, name) for name in _PLAIN}
-        header |= {} if self.air is None else self.air.attributes
-        tensor_files.write(path, tensors, {**header, "options": asdict(self.options), "report": self.report})
+        header = {"gain_unit": self.gain_unit, "delay_unit": self.delay_unit, "options": asdict(self.options)}
+        return tensors, header
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], *, device: DeviceLike = None) -> HarmonicField:
-        """Read a field that :meth:`save` wrote.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if it is corrupt, or no radio field.
-        """
-        tensors, header = tensor_files.read(path)
-        try:
-            parts = {
-                n: tensors[f"gaussians/{n}"] for n in ("means", "quaternions", "scales", "opacities", "sh")
-            }
-            mesh = Mesh(tensors["mesh/vertices"], tensors["mesh/faces"]) if "mesh/faces" in tensors else None
-            layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
-            if "gain" not in layers or any(t.shape != (len(parts["means"]), 16) for t in layers.values()):
-                raise ValueError("its coefficients do not fit its Gaussians")
-            plain, options = {name: header[name] for name in _PLAIN}, header["options"]
-            return cls(
-                **{**plain, "shape": tuple(plain["shape"]), "range_db": tuple(plain["range_db"])},
-                gaussians=Gaussians(**parts),
-                mesh=mesh,
-                transmitter=tensors["transmitter"],
-                options=FieldOptions(**{**options, "rates": Rates(**options.get("rates", {}))}),
-                layers=layers,
-                air=Air.from_attributes(header),
-                report=header["report"],
-                device=device,
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{os.fspath(path)}: corrupt or no radio field of this version: {error}"
-            ) from error
+    def _put_together(cls, tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict[str, Any]:
+        options = dict(header["options"])
+        layers = {n.removeprefix("layer/"): t for n, t in tensors.items() if n.startswith("layer/")}
+        if "gain" not in layers:
+            raise ValueError("it has no layer of gain")
+        return {
+            "gaussians": Gaussians(**{f.name: tensors[f"gaussians/{f.name}"] for f in fields(Gaussians)}),
+            "mesh": Mesh(tensors["mesh/vertices"], tensors["mesh/faces"])
+            if "mesh/faces" in tensors
+            else None,
+            "options": FieldOptions(**options | {"rates": Rates(**options.get("rates", {}))}),
+            "layers": layers,
+            "gain_unit": header["gain_unit"],
+            "delay_unit": header["delay_unit"],
+        }
 
     @property
     def law(self) -> SingleBounce:
@@ -374,9 +370,6 @@ class HarmonicField(RadioField):
         delay = np.maximum(self._blend("delay", seen), 0.0) * self.delay_unit
         departure = np.stack([self._blend(f"aod_{axis}", seen) for axis in "xyz"], axis=-1)
         return np.where(empty, np.nan, delay), np.where(empty[..., None], np.nan, departure)
-
-
-_PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad", "gain_unit", "delay_unit")
 
 
 def _geometry(geometry: GeometryLike | Gaussians) -> tuple[Gaussians, Mesh | None]:

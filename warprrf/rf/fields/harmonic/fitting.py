@@ -100,9 +100,10 @@ class Checkpoint:
             raise ValueError(
                 f"checkpoint: {self.path} belongs to a fit with other data or options; delete it or name another file"
             )
-        for name, losses in header["losses"].items():
-            own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
-            self.states[name] = State(**own, losses=losses)
+        with tensor_files.named(self.path, "checkpoint: corrupt"):
+            for name, losses in header["losses"].items():
+                own = {k.removeprefix(f"{name}/"): t for k, t in tensors.items() if k.startswith(f"{name}/")}
+                self.states[name] = State(**own, losses=losses)
 
     def save(self, name: str, state: State) -> None:
         """Keep the state of layer ``name``."""

@@ -1,0 +1,87 @@
+"""A field knows which receivers it was fitted on, and scoring says so when they are among those scored."""
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_room import small_room
+
+import warprrf as wr
+from warprrf import cli
+from warprrf.rf.spectra import lookups
+
+QUICK = {"bistatic": {"quick": True}, "rf3dgs+": {"iterations": 2}, "rf3dgs": {"iterations": 2}}
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small_room(tmp_path_factory.mktemp("room"))
+
+
+@pytest.mark.parametrize("model", QUICK)
+def test_a_field_and_its_file_know_what_it_was_fitted_on(model: str, room: Path, tmp_path: Path) -> None:
+    ds = wr.SpectrumDataset.load(room / "spectra.nc")
+    mixed = ds.subset([0, 1, 2, 11])  # the last one is for test
+    field = wr.RadioField.fit(
+        wr.Reconstruction.load(room / "reconstruction"), mixed, model, device="cpu", **QUICK[model]
+    )
+    field.save(tmp_path / "field.safetensors")
+    for one in (field, wr.RadioField.load(tmp_path / "field.safetensors", device="cpu")):
+        np.testing.assert_array_equal(one.fitted_on, mixed.receivers)
+        np.testing.assert_array_equal(np.flatnonzero(one.was_fitted_on(ds)), [0, 1, 2, 11])
+    test = ds.split(3)[1]
+    with pytest.warns(
+        UserWarning, match="1 of its 4 receivers are among those that the predictor was fitted on"
+    ):
+        scored = wr.evaluate(test, field.spectrum)
+    assert scored["receivers_fitted_on"] == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert wr.evaluate(ds.subset([10, 12]), field.spectrum)["receivers_fitted_on"] == 0
+        assert wr.evaluate(ds.subset([10, 12]), lambda rx: field.spectrum(rx))["receivers_fitted_on"] is None
+
+    figures = tmp_path / "figures.json"
+    words = [str(tmp_path / "field.safetensors"), str(room / "spectra.nc"), "-o", str(figures)]
+    assert cli.main(["evaluate", *words, "--quiet", "--device", "cpu"]) == 2
+    assert not figures.exists()
+
+
+def test_the_command_line_scores_what_it_fitted_without_the_test_receivers(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Lookups see as many receivers as the field did, of the same order."""
+    field, figures = str(tmp_path / "field.safetensors"), tmp_path / "figures.json"
+    spectra, common = str(room / "spectra.nc"), ["--quiet", "--device", "cpu"]
+    fit = ["fit", str(room / "reconstruction"), spectra, "-o", field, "--train", "3", "--quick", *common]
+    assert cli.main(fit) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cli.main(["evaluate", field, spectra, "-o", str(figures), *common]) == 0
+    held = json.loads(figures.read_text())
+    assert {row["receivers_fitted_on"] for row in held.values()} == {0}
+    train, test = wr.SpectrumDataset.load(spectra).split(3)
+    expected = wr.evaluate(test, lookups.nearest(train))
+    assert held["nearest"]["psnr_db"] == pytest.approx(expected["psnr_db"], rel=1e-9)
+    other = wr.SpectrumDataset.load(spectra)
+    moved = wr.RadioField.load(field).was_fitted_on(
+        type(other)(**{**vars(other), "transmitter": other.transmitter + 0.1})
+    )
+    assert not moved.any()  # under another transmitter these are other spectra
+    capsys.readouterr()
+
+
+def test_a_lookup_knows_what_it_was_built_from(room: Path) -> None:
+    ds = wr.SpectrumDataset.load(room / "spectra.nc")
+    for build in (lookups.nearest, lookups.idw, lookups.constant, lookups.mean):
+        with pytest.warns(UserWarning, match="fitted on"):
+            assert wr.evaluate(ds.subset([0, 12]), build(ds.subset([0, 1])))["receivers_fitted_on"] == 1
+
+
+def test_a_field_of_no_measurement_was_fitted_on_nothing(room: Path) -> None:
+    ds = wr.SpectrumDataset.load(room / "spectra.nc")
+    from warprrf.rf.fields.bistatic.field import BistaticField
+
+    prior = BistaticField.prior(wr.Reconstruction.load(room / "reconstruction"), ds)
+    assert prior.fitted_on.shape == (0, 3) and not prior.was_fitted_on(ds).any()
