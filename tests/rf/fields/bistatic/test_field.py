@@ -78,9 +78,7 @@ def test_every_long_stage_of_a_fit_tells_how_far_it_is(scene: RadioScene, data: 
         done = [d for stage, d, _ in told if stage == name]
         total = {t for stage, _, t in told if stage == name}
         assert done == sorted(done) and total == {done[-1]}
-    assert (
-        len([d for stage, d, _ in told if stage == "fit"]) > 4 + 6
-    )  # receivers, and fits that choose terms
+    assert len([d for stage, d, _ in told if stage == "fit"]) > 4 + 6  # receivers, and fits that choose terms
 
 
 def test_spectra_that_would_not_fit_into_memory_are_refused(
