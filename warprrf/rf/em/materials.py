@@ -162,7 +162,6 @@ class Material:
         pattern: str = "lambertian",
         alpha_r: int = 4,
         reciprocal: bool = False,
-        xpd: float = 0.0,
     ) -> Material:
         """A material with the same permittivity and conductivity [S/m] at every frequency up to 10 THz.
 
@@ -171,7 +170,7 @@ class Material:
         """
         check_number("relative_permittivity", relative_permittivity, 1.0)
         check_number("conductivity", conductivity, 0.0)
-        band = Band(1e6, 1e13, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
+        band = Band(*WIDEST_HZ, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
         return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, reciprocal=reciprocal)
 
     @classmethod
@@ -335,6 +334,7 @@ def _material(entry: object, where: str) -> Material:
             itu=entry.get("itu"),
             sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
             reciprocal=reciprocal,
+            xpd=_number(parts["xpd"], "value", where) if "xpd" in parts else 0.0,
         )
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
