@@ -241,7 +241,7 @@ def _base_colour(header: Mapping[str, Any], index: int, buffers: list[bytes], fo
         raise ValueError(f"material {index} has the colour {factor}, expected four numbers")
     name, entry = material.get("name"), _texture(material)
     picture = None
-    if entry:
+    if entry and folder.colours:
         texture = _row(header, "textures", entry["index"])
         webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
         image = _row(header, "images", texture.get("source", webp))

@@ -66,10 +66,12 @@ class Folder:
     Attributes:
         path: of the model.
         allow_outside: whether it may name files elsewhere too.
+        colours: whether materials and textures are asked for.
     """
 
     path: Path
     allow_outside: bool = False
+    colours: bool = True
 
     def read(self, name: str) -> bytes:
         """The file that the model names.

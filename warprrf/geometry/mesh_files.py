@@ -91,12 +91,15 @@ def load_mesh(path: str | os.PathLike[str], options: MeshOptions) -> MeshContent
     return content.with_faces(*_simplified(vertices, faces, options.simplify))
 
 
-def read_mesh(path: str | os.PathLike[str], *, allow_outside: bool = False) -> MeshContent:
+def read_mesh(
+    path: str | os.PathLike[str], *, allow_outside: bool = False, colours: bool = True
+) -> MeshContent:
     """Read a mesh file as it stands, in its own unit and axes; polygons become fans of triangles.
 
     Args:
         path: PLY, OBJ, STL, glTF or GLB, by the suffix.
         allow_outside: whether it may name materials, textures and buffers outside its folder.
+        colours: whether the files of materials and textures that it names are read.
 
     Raises:
         OSError: naming the file, if it cannot be read.
@@ -110,7 +113,7 @@ def read_mesh(path: str | os.PathLike[str], *, allow_outside: bool = False) -> M
         raise FileNotFoundError(f"path: there is no mesh file {path}")
     if path.stat().st_size > LARGEST_BYTES:
         raise ValueError(f"path: {path} has {path.stat().st_size} bytes, expected at most {LARGEST_BYTES}")
-    content = reader(Folder(path, allow_outside))
+    content = reader(Folder(path, allow_outside, colours))
     vertices, faces = content.vertices, content.faces
     if len(faces) == 0:
         raise ValueError(f"path: {path} holds no triangles")

@@ -103,7 +103,7 @@ def read_obj(folder: Folder) -> MeshContent:
     starts = [0, *(start for start, _, _ in lines.runs), len(faces)]
     counts = np.diff(starts)
     known: dict[str, _Material] = {}
-    for library in lines.libraries:
+    for library in lines.libraries if folder.colours else ():
         try:
             known |= _read_materials(folder, library)
         except FileNotFoundError as error:
