@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from warprrf import device as _device
-
 from warprrf.checks import checked
 
 MIN_LLVM = 17
