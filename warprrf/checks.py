@@ -70,6 +70,8 @@ def check_array(
 def check_alike(**arrays: ArrayLike) -> None:
     """Raise ValueError, naming the arguments, unless their shapes can be broadcast to one."""
     shapes = [np.shape(array) for array in arrays.values()]
+    if len({shape for shape in shapes if shape}) < 2:
+        return
     try:
         np.broadcast_shapes(*shapes)
     except ValueError as error:
@@ -233,7 +235,7 @@ def checked(public: Public) -> Public:
 
 def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[..., Any]:
     parameters = inspect.signature(function).parameters
-    defaults = {name: one.default for name, one in parameters.items()}
+    names = tuple(parameters)
 
     @functools.cache
     def converters() -> dict[str, Callable[[Any], object]]:
@@ -244,21 +246,23 @@ def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[...,
                 kinds |= typing.get_type_hints(typing.get_args(kinds[one.name])[0])
         return {name: _converter(kind) for name, kind in kinds.items()}
 
-    def taken(name: str, value: object) -> object:
-        convert = converters().get(name)
-        if convert is None or value is defaults.get(name, _OTHER):
+    def refused(name: str, value: object) -> object:
+        if name in parameters and value is parameters[name].default:
             return value
-        found = convert(value)
-        if found is _OTHER:
-            expected = function.__annotations__.get(name, "another type")
-            raise TypeError(f"{name}: got {_shown(value)}, expected {expected}")
-        return found
+        expected = function.__annotations__.get(name, "another type")
+        raise TypeError(f"{name}: got {_shown(value)}, expected {expected}")
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        given = [taken(name, value) for name, value in zip(parameters, args, strict=False)]
-        named = {name: taken(name, value) for name, value in kwargs.items()}
-        return function(*given, *args[len(given) :], **named)
+        known = converters()
+        given = list(args)
+        for k, name in enumerate(names[: len(args)]):
+            if name in known and (found := known[name](args[k])) is not args[k]:
+                given[k] = refused(name, args[k]) if found is _OTHER else found
+        for name, value in kwargs.items():
+            if name in known and (found := known[name](value)) is not value:
+                kwargs[name] = refused(name, value) if found is _OTHER else found
+        return function(*given, **kwargs)
 
     return call
 
@@ -279,9 +283,10 @@ def _converter(kind: Any) -> Callable[[Any], object]:
     if origin in (typing.Union, types.UnionType):
         if bytes in inside:  # ArrayLike, whose numbers are arrays too
             inside = tuple(one for one in inside if one not in _NUMBERS and one not in (bool, str, bytes))
-        # What need not become an array comes first.
-        every = [_converter(one) for one in sorted(inside, key=_is_of_numpy)]
-        return lambda value: next((found for one in every if (found := one(value)) is not _OTHER), _OTHER)
+        # What need not become an array comes before what must, None, which is rarely given, last.
+        order = sorted(inside, key=lambda one: (one is types.NoneType, _is_of_numpy(one)))
+        every = [_converter(one) for one in order]
+        return functools.partial(_as_one_of, every)
     if kind is bool:
         return _as_bool
     if kind in _NUMBERS:
@@ -296,6 +301,13 @@ def _converter(kind: Any) -> Callable[[Any], object]:
     if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
         return lambda value: value
     return functools.partial(_as_object, origin)
+
+
+def _as_one_of(every: list[Callable[[Any], object]], value: object) -> object:
+    for convert in every:
+        if (found := convert(value)) is not _OTHER:
+            return found
+    return _OTHER
 
 
 def _is_of_numpy(kind: Any) -> bool:

@@ -220,10 +220,25 @@ class PathArrays:
         transmitter = check_array("transmitter", transmitter, (3,))
         receiver = check_array("receiver", receiver, (3,))
         vertices = check_array("vertices", vertices, (None, None, 3), finite=False)
-        count, depth = vertices.shape[:2]
+        count = len(vertices)
         amplitude = check_array("amplitude", amplitude, (count,), complex)
         if jones is not None:
             jones = check_array("jones", jones, (count, 2, 2), complex)
+        return cls._from_points(transmitter, receiver, vertices, amplitude, kind, frequency_hz, jones)
+
+    @classmethod
+    def _from_points(
+        cls,
+        transmitter: np.ndarray,
+        receiver: np.ndarray,
+        vertices: np.ndarray,
+        amplitude: np.ndarray,
+        kind: NDArray[np.str_],
+        frequency_hz: float,
+        jones: np.ndarray | None = None,
+    ) -> Self:
+        """:meth:`from_points` of arrays that fit each other."""
+        count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)
         each = np.arange(count)

@@ -134,7 +134,7 @@ class MirrorTracer:
             own = own[np.lexsort((found.length_m[own], found.order[own]))]
             kind = np.where(found.order[own] == 0, "los", "mirror").astype("<U7")
             result.append(
-                Paths.from_points(
+                Paths._from_points(
                     self.transmitter, point, found.point[own], amplitude[own], kind, self.frequency_hz,
                     None if jones is None else jones[own],
                 )
