@@ -43,18 +43,6 @@ def test_files_of_older_versions_are_checked_by_what_they_hold(make, tmp_path: P
     assert not any(damage.startswith("cut") for damage, _ in found.changed)
 
 
-def test_reconstructions_of_the_version_before_are_read(tmp_path: Path) -> None:
-    """They said which faces of patches repeat no other, not which face a repeated one repeats."""
-    path = reconstruction(tmp_path)
-    tensors, header = tensor_files.read(path, None)
-    first = tensors.pop("patch_first")
-    tensors["patch_once"] = (first == np.arange(len(first))) & (tensors["patch_face_patch"] >= 0)
-    tensor_files.write(path, tensors, header, None)
-    read = wr.Reconstruction.load(path.parent).patches
-    np.testing.assert_array_equal(read.first, first)
-    np.testing.assert_array_equal(read.face_patch, tensors["patch_face_patch"])
-
-
 def spoilt(path: Path, **changes: object) -> Path:
     """A file with parts of its header, or tensors, replaced, and the checksum of that."""
     tensors, header = tensor_files.read(path)
