@@ -189,7 +189,7 @@ def without_elements(field: BistaticField, dropped: np.ndarray) -> BistaticField
         group=np.where(dropped[s.element], none, s.group).astype(np.int32),
         element_group=np.where(dropped, none, s.element_group).astype(np.int32),
         material=np.append(s.material, s.material.max() + 1),
-        colour=np.vstack([s.colour, np.full(s.colour.shape[1], np.nan)]),
+        look=np.vstack([s.look, np.full(s.look.shape[1], np.nan)]),
         group_names=(*s.group_names, "unseen"),
     )
     parameters = replace(

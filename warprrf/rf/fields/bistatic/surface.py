@@ -1,7 +1,7 @@
 """Surfaces as radio sees them: planar patches, material groups, small elements, and images of a transmitter.
 
 A group holds faces that look alike and so share radio parameters: a Scene's materials where they are known, else
-patches of a reconstruction gathered by the colour that photos gave them. An element is a piece of one group, about half
+patches gathered by the colour that photos gave them, or by shape. An element is a piece of one group, about half
 a metre wide, at which scale surfaces light each other; a cell is a piece of an element: what differs within a group is
 told apart at both scales.
 """
@@ -21,10 +21,12 @@ from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, inde
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components, smoothed_normals
+from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.radio import bounce
 from warprrf.rf.fields.bistatic.colours import colour_groups
+from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
 
 ELEMENT_M = 0.5  # width of an element
 CELLS = 3  # along an element
@@ -42,7 +44,7 @@ ARRAYS = {
     "plane_offset": lengths("P"),
     "group": index_to("G", "F"),
     "material": index_to("G", "G"),
-    "colour": Expected("G 4", nan=True),
+    "look": Expected("G K", nan=True),
     "patch_group": index_to("G", "P"),
     "element": index_to("E", "F"),
     "cell": index_to("X", "F"),
@@ -51,7 +53,7 @@ ARRAYS = {
     "element_area": Expected("E", 0.0, LARGEST_M**2),
     "element_group": index_to("G", "E"),
 }
-"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells."""
+"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells, K looks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +67,9 @@ class Surface:
         plane_normal, plane_offset: planes of the patches, ``normal . x = offset`` [m], shapes ``(P, 3)``, ``(P,)``.
         group: group of each face, the smallest unit that may be of a material of its own, shape ``(F,)`` int32.
         material: which groups are taken for the same material before any measurement, shape ``(G,)`` int32.
-        colour: of each group as photos show it: log chromaticities and log luminance, scaled so that 1 tells materials
-            apart, shape ``(G, 4)``; NaN where unknown.
+        look: what tells groups apart before any measurement, scaled so that 1 tells materials apart: log chromaticities
+            and log luminance as photos show them, else place and extents, shape ``(G, 4)`` or ``(G, 6)``; NaN where names
+            tell it.
         patch_group: group of each patch, shape ``(P,)`` int32.
         element: surface element of each face, shape ``(F,)`` int32.
         cell: cell of each face, shape ``(F,)`` int32.
@@ -88,7 +91,7 @@ class Surface:
     plane_offset: np.ndarray
     group: np.ndarray
     material: np.ndarray
-    colour: np.ndarray
+    look: np.ndarray
     patch_group: np.ndarray
     element: np.ndarray
     cell: np.ndarray
@@ -139,6 +142,11 @@ class Surface:
         return len(self.group_names)
 
     @property
+    def by_shape(self) -> bool:
+        """Whether only shapes tell its groups apart."""
+        return self.look.shape[1] == SHAPES
+
+    @property
     def cells(self) -> int:
         """Number of cells."""
         return len(self.cell_element)
@@ -159,11 +167,15 @@ class Surface:
         material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
         gaussians = getattr(geometry, "gaussians", None)
         found = getattr(geometry, "patches", None)
-        if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
+        if material is None and not isinstance(found, PlanarPatches) and is_scan(mesh):
+            found = scanned_patches(mesh)
+            mesh = found.mesh
+        if material is None and isinstance(found, PlanarPatches):
             patches = found
             patch, planes = found.face_patch, (found.normal, found.offset)
             normal = _on_patches(found, smoothed_normals(found.mesh, 3))
-            group, sort, colour = colour_groups(mesh, patch, gaussians)
+            seen = isinstance(gaussians, Gaussians)
+            group, sort, look = colour_groups(mesh, patch, gaussians) if seen else shape_groups(mesh, patch)
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
             patches = planar_patches(mesh, material)
@@ -171,17 +183,17 @@ class Surface:
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
             normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
             if material is None:
-                group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
+                group, sort, look = shape_groups(mesh, patches.face_patch)
+                names = tuple(f"group_{k}" for k in range(len(sort)))
             else:
-                group = np.asarray(material, np.int32)
-                names = tuple(m.name for m in materials)
-            sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
+                group, names = np.asarray(material, np.int32), tuple(m.name for m in materials)
+                sort, look = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once))
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
-            group=group, material=sort, colour=colour, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
+            group=group, material=sort, look=look, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
             group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group),
         )  # fmt: skip
 
