@@ -26,10 +26,11 @@ from warprrf.rf.channel.band_plan import thz_channel
 from warprrf.rf.em.fresnel import slab_reflection
 from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
-from warprrf.rf.interop.sionna_engine import load_sionna_scene, sionna_rt
+from warprrf.rf.interop.sionna_engine import load_sionna_scene
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import MirrorTracer, trace_paths
 from warprrf.rf.scene import Scene
+from warprrf.rf.sionna_package import sionna_rt
 
 FREQUENCY_HZ = 300e9
 TRANSMITTER = (13.6, 11.2, 2.5)

@@ -53,7 +53,7 @@ LINKS = {links.scene: links for links in (CITY, STREET, *TOYS)}
 
 def open_scene(name: str) -> Any:
     """One of Sionna RT's built-in scenes, with isotropic antennas."""
-    from warprrf.rf.interop.sionna_engine import sionna_rt
+    from warprrf.rf.sionna_package import sionna_rt
 
     rt = sionna_rt()
     scene = rt.load_scene(getattr(rt.scene, name), merge_shapes=False)
@@ -78,7 +78,7 @@ def mesh_of(scene: Any) -> Mesh:
 def solved(scene: Any, links: Links, order: int = 2) -> tuple[list[tuple[int, float, np.ndarray]], float]:
     """Paths of PathSolver, diffraction, refraction and scattering off: receiver, length [m] and mirror points; and
     seconds of a second call."""
-    from warprrf.rf.interop.sionna_engine import sionna_rt
+    from warprrf.rf.sionna_package import sionna_rt
 
     rt = sionna_rt()
     scene.add(rt.Transmitter("tx", position=list(links.transmitter)))

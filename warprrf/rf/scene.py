@@ -1,17 +1,15 @@
-"""A scene for radio propagation: one mesh, a material for each face, and the XML it came from.
+"""A scene for radio propagation: one mesh, a material for each face, and where transmitters and receivers stand.
 
-The XML is the subset of Mitsuba's scene format that Sionna RT reads: ``bsdf`` elements whose identifiers name radio
-materials (``mat-itu_concrete``, ``itu_concrete`` or ``concrete``), and ``shape`` elements that load a PLY or OBJ file
-each. Neither Mitsuba nor Sionna is needed to read it. The values of the materials stand in a table beside the XML.
+Scenes come from files in Mitsuba's XML, as Sionna RT has them (neither of the two is needed), from live scenes of
+Sionna RT, and from arrays.
 """
 
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,8 +17,10 @@ from numpy.typing import ArrayLike
 from warprrf.checks import check_array, check_number, check_type
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.materials import Material, load_materials
+from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart
+from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
+from warprrf.rf.scene_xml import read_scene_xml
 
 T = TypeVar("T")
 
@@ -35,6 +35,7 @@ class Scene:
         face_object: index into ``object_names`` of each face, shape ``(F,)``, int32.
         object_names: names of the objects.
         xml_path: the file it was loaded from, or None.
+        transmitters, receivers: positions [m] by name, each ``(3,)``; may be empty.
     """
 
     def __init__(
@@ -46,6 +47,8 @@ class Scene:
         face_object: ArrayLike | None = None,
         object_names: Sequence[str] = ("object",),
         xml_path: str | os.PathLike[str] | None = None,
+        transmitters: Mapping[str, ArrayLike] | None = None,
+        receivers: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         check_type("mesh", mesh, Mesh)
         faces = len(mesh.faces)
@@ -57,6 +60,8 @@ class Scene:
         self.face_object = check_array("face_object", face_object, (faces,), dtype=np.int32)
         self.object_names = _named_list("object_names", object_names, str)
         self.xml_path = None if xml_path is None else Path(xml_path)
+        self.transmitters = _positions("transmitters", transmitters)
+        self.receivers = _positions("receivers", receivers)
         if len(set(self.object_names)) < len(self.object_names):
             raise ValueError("object_names: got a name twice, expected each once")
         for name, index, table in (
@@ -77,63 +82,119 @@ class Scene:
     @classmethod
     def load(
         cls,
-        xml: str | os.PathLike[str],
+        path: str | os.PathLike[str],
         *,
-        materials: str | os.PathLike[str] | None = None,
+        materials: Materials | None = None,
+        extrapolate: bool = False,
         allow_outside: bool = False,
     ) -> Scene:
-        """Read a scene.
+        """Read a scene file: any that Sionna RT 2 opens, such as ``sionna.rt.scene.munich``.
+
+        Materials named after those of ITU-R P.2040 are known; a table ``materials.json`` beside the file goes before
+        what the file says, and ``materials`` goes before both. What scatters nothing in the file has a scattering
+        coefficient of 0, as in Sionna.
 
         Args:
-            xml: the scene file.
-            materials: table of materials; ``materials.json`` beside ``xml`` by default.
-            allow_outside: read meshes outside the folder of ``xml`` too. A scene from elsewhere may name any file.
+            path: the scene file (Mitsuba's XML).
+            materials: materials by the name of those that they replace, or a table's file (:func:`load_materials`).
+            extrapolate: let materials hold outside the bands in which they are known; see
+                :meth:`Material.extrapolated`.
+            allow_outside: read files outside the folder of ``path`` too. A scene from elsewhere may name any file.
 
         Raises:
-            FileNotFoundError: if the XML, a mesh or the table is missing.
-            ValueError: if the XML cannot be parsed, uses what we don't read, names a material without an entry, or a
-                mesh outside its folder.
+            FileNotFoundError: if the file, a mesh or the table is missing.
+            TypeError: if ``materials`` is neither a mapping nor a file.
+            ValueError: if the file cannot be parsed, uses what we don't read, has a material that nobody knows, or a
+                file outside its folder; if ``materials`` has a name of which nothing is made.
+
+        Example::
+
+            import sionna.rt
+            scene = wr.Scene.load(sionna.rt.scene.munich, materials={"brick": wr.em.itu_material("concrete")})
         """
-        xml = Path(xml)
-        if not xml.is_file():
-            raise FileNotFoundError(f"xml: there is no scene file {xml}")
-        table = load_materials(xml.parent / "materials.json" if materials is None else materials)
-        try:
-            root = ElementTree.parse(xml).getroot()
-        except (ElementTree.ParseError, LookupError, ValueError) as error:  # the latter two: of its encoding
-            raise ValueError(f"xml: {xml} is not well-formed: {error}") from error
-        shapes = root.findall("shape")
-        if not shapes:
-            raise ValueError(f"xml: {xml} holds no shapes")
-        vertices: list[np.ndarray] = []
-        faces: list[np.ndarray] = []
-        names: list[str] = []
-        used: list[str] = []
-        start = 0
-        for shape in shapes:
-            name = shape.get("id") or f"shape_{len(names)}"
-            material = _material_name(shape, name, xml)
-            if material not in table:
-                raise ValueError(
-                    f"xml: object {name!r} of {xml} is made of {material!r}, which the table of materials lacks; "
-                    f"it has {', '.join(sorted(table))}"
-                )
-            part = read_mesh(_mesh_path(shape, name, xml, allow_outside))
-            vertices.append(part.vertices)
-            faces.append(part.faces + start)
-            start += len(part.vertices)
-            names.append(name)
-            used.append(material)
-        order = list(dict.fromkeys(used))
-        counts = [len(f) for f in faces]
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"path: there is no scene file {path}")
+        beside = path.parent / "materials.json"
+        table = load_materials(beside) if beside.is_file() else None
+        choice = MaterialChoice(materials, table, extrapolate)
+        parts = read_scene_xml(path, choice, allow_outside=allow_outside)
+        choice.check_used()
+        return cls._of_parts(parts, xml_path=path)
+
+    @classmethod
+    def from_sionna(
+        cls, rt_scene: Any, *, materials: Materials | None = None, extrapolate: bool = False
+    ) -> Scene:
+        """The surfaces, materials, transmitters and receivers of a live ``sionna.rt.Scene``.
+
+        Load it with ``merge_shapes=False`` to keep its objects apart. A radio material with a law of its own in Python
+        is known for the scene's frequency alone; antennas and orientations are not taken over.
+
+        Args:
+            rt_scene: the scene.
+            materials, extrapolate: as of :meth:`load`.
+
+        Raises:
+            ImportError: if Sionna RT is missing.
+            TypeError: for what is no such scene.
+            ValueError: for a scene without objects, or a material with a pattern that we don't have.
+        """
+        choice = MaterialChoice(materials, None, extrapolate)
+        parts, transmitters, receivers = parts_of(rt_scene, choice)
+        choice.check_used()
+        return cls._of_parts(parts, transmitters=transmitters, receivers=receivers)
+
+    @classmethod
+    def _of_parts(cls, parts: Sequence[ScenePart], **options: Any) -> Scene:
+        counts = [len(part.faces) for part in parts]
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        materials = list({id(part.material): part.material for part in parts}.values())
+        index = {id(material): k for k, material in enumerate(materials)}
         return cls(
-            Mesh(np.concatenate(vertices), np.concatenate(faces)),
-            [table[name] for name in order],
-            np.repeat([order.index(name) for name in used], counts),
-            face_object=np.repeat(np.arange(len(names)), counts),
-            object_names=names,
-            xml_path=xml,
+            Mesh(
+                np.concatenate([part.vertices for part in parts]),
+                np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
+            ),
+            materials,
+            np.repeat([index[id(part.material)] for part in parts], counts),
+            face_object=np.repeat(np.arange(len(parts)), counts),
+            object_names=[part.name for part in parts],
+            **options,
         )
+
+    def to_sionna(self, *, frequency_hz: float = SIONNA_FREQUENCY_HZ) -> Any:
+        """The scene as a ``sionna.rt.Scene``, with scattering patterns, transmitters and receivers.
+
+        Objects keep their names (with ``_`` for ``.``) and are not merged; one of several materials becomes one object
+        for each. Materials follow ``frequency`` of what comes back.
+
+        Args:
+            frequency_hz: carrier frequency [Hz]; Sionna RT's own default if none is given.
+
+        Raises:
+            ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
+            ValueError: if a material is not known at this frequency, is infinitely thick, or scatters in a lobe that
+                is too narrow for Sionna's single precision.
+        """
+        return to_sionna_scene(self._parts(), self.transmitters, self.receivers, frequency_hz)
+
+    def _parts(self) -> list[ScenePart]:
+        """One part for each object and material."""
+        order = np.lexsort((self.face_material, self.face_object))
+        key = np.stack([self.face_object[order], self.face_material[order]], axis=1)
+        starts = np.flatnonzero(np.r_[True, (np.diff(key, axis=0) != 0).any(axis=1)])
+        several = np.bincount(key[starts, 0], minlength=len(self.object_names)) > 1
+        found = []
+        for (thing, material), faces in zip(key[starts], np.split(order, starts[1:]), strict=True):
+            used, own = np.unique(self.mesh.faces[faces], return_inverse=True)
+            name = self.object_names[thing]
+            if several[thing]:
+                name = f"{name}-{self.materials[material].name}"
+            found.append(
+                ScenePart(name, self.mesh.vertices[used], own.reshape(-1, 3), self.materials[material])
+            )
+        return found
 
     def with_materials(self, materials: Sequence[Material]) -> Scene:
         """The same surfaces made of other materials, one for each of :attr:`materials`.
@@ -151,6 +212,8 @@ class Scene:
             face_object=self.face_object,
             object_names=self.object_names,
             xml_path=self.xml_path,
+            transmitters=self.transmitters,
+            receivers=self.receivers,
         )
 
     @property
@@ -190,16 +253,17 @@ class Scene:
         return free
 
 
-def _material_name(shape: ElementTree.Element, name: str, xml: Path) -> str:
-    """The radio material of a shape: its bsdf's identifier without ``mat-`` and ``itu_``."""
-    element = next((r for r in shape.findall("ref")), None)
-    if element is None:
-        element = shape.find("bsdf")
-    identifier = None if element is None else element.get("id")
-    if identifier is None:
-        raise ValueError(f"xml: object {name!r} of {xml} names no material (a <ref id=...> to a bsdf)")
-    identifier = identifier.removeprefix("mat-")
-    return identifier[4:] if identifier.startswith(("itu_", "itu-")) else identifier
+def _positions(name: str, values: Mapping[str, ArrayLike] | None) -> dict[str, np.ndarray]:
+    """Positions by name [m], each ``(3,)``."""
+    if values is None:
+        return {}
+    if not isinstance(values, Mapping):
+        raise TypeError(f"{name}: got {type(values).__name__}, expected a mapping of names to positions")
+    found = {}
+    for key, position in values.items():
+        check_type(f"{name}: the name {key!r}", key, str)
+        found[key] = check_array(f"{name}[{key!r}]", position, (3,))
+    return found
 
 
 def _named_list(name: str, values: Iterable[T], kind: type[T]) -> list[T]:
@@ -210,24 +274,3 @@ def _named_list(name: str, values: Iterable[T], kind: type[T]) -> list[T]:
     for k, value in enumerate(found):
         check_type(f"{name}[{k}]", value, kind)
     return found
-
-
-def _mesh_path(shape: ElementTree.Element, name: str, xml: Path, allow_outside: bool) -> Path:
-    if shape.get("type") not in ("ply", "obj"):
-        raise ValueError(
-            f"xml: object {name!r} of {xml} is a {shape.get('type')!r}, expected 'ply' or 'obj'; export it as a mesh"
-        )
-    if shape.find("transform") is not None:
-        raise ValueError(f"xml: object {name!r} of {xml} has a transform; apply it to the mesh before")
-    filename = next((s.get("value") for s in shape.findall("string") if s.get("name") == "filename"), None)
-    if filename is None:
-        raise ValueError(f"xml: object {name!r} of {xml} names no mesh file")
-    path = xml.parent / filename
-    if not allow_outside and not path.resolve().is_relative_to(xml.parent.resolve()):
-        raise ValueError(
-            f"xml: object {name!r} of {xml} names the mesh {filename}, which lies outside the scene's folder; move it "
-            "there, or trust the scene and load it with allow_outside=True"
-        )
-    if not path.is_file():
-        raise FileNotFoundError(f"xml: object {name!r} of {xml} needs the mesh {path}, which is missing")
-    return path

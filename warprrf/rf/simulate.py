@@ -111,11 +111,13 @@ def simulate(
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver = (sampling, _versions(engine, solver_only=True)) if engine == "sionna" else None
     inputs = digest(engine, common, air, surfaces, solver)
-    results = []
+    results: list[ReceivedPaths] = []
     for k, point in enumerate(points):
-        results.append(receive(point) if workspace is None else _kept(workspace, inputs, point, receive))
         if progress is not None:
-            progress("simulate", k + 1, len(points))
+            progress("simulate", k, len(points))
+        results.append(receive(point) if workspace is None else _kept(workspace, inputs, point, receive))
+    if progress is not None:
+        progress("simulate", len(points), len(points))
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
     if engine == "exact":
         settings = {"depth": 1, "sub_pixels": SUB_PIXELS}

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from sionna_room import sionna_or_skip, write_scene
 
+from warprrf.rf import sionna_package
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.interop import llvm
 from warprrf.rf.interop.sionna_engine import Sampling
 from warprrf.rf.paths.sionna import repeated
 from warprrf.rf.scene import Scene
@@ -121,11 +121,13 @@ def test_a_mirror_found_twice_counts_once():
     assert repeated(tau[:0], arrival[:0], aod[:0], bounces[:0]).shape == (0,)
 
 
-def test_a_scene_without_a_file_is_refused(scene):
-    sionna = sionna_or_skip()
-    bare = Scene(scene.mesh, scene.materials, scene.face_material)
-    with pytest.raises(ValueError, match="xml|XML"):
-        sionna(bare, transmitter=TX, frequency_hz=F, shape=SHAPE)
+def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, scene):
+    bare = Scene(
+        scene.mesh, scene.materials, scene.face_material, transmitters={"tx": TX + 1}, receivers={"rx": SEES}
+    )
+    engine = type(engines[1])(bare, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=1))
+    found, usual = (e.solve(SEES)["power"].sum() for e in (engine, engines[1]))
+    assert found == pytest.approx(usual, rel=2e-3)
 
 
 def test_reciprocal_materials_are_refused(scene):
@@ -146,12 +148,12 @@ def test_reciprocal_materials_are_refused(scene):
 def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(
-        llvm, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
+        sionna_package, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
     )
-    assert llvm.select_llvm() == Path("c")
+    assert sionna_package.select_llvm() == Path("c")
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH")
-    monkeypatch.setattr(llvm, "installed_llvm", lambda: {15: Path("b")})
+    monkeypatch.setattr(sionna_package, "installed_llvm", lambda: {15: Path("b")})
     with pytest.raises(ImportError, match="15.*libllvm19"):
-        llvm.select_llvm()
+        sionna_package.select_llvm()
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/mine.so")
-    assert llvm.select_llvm() == Path("/mine.so")
+    assert sionna_package.select_llvm() == Path("/mine.so")

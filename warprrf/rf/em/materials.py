@@ -2,7 +2,8 @@ r"""Radio materials: permittivity by band, slab thickness, and scattering from s
 
 The relative permittivity is a f^b and the conductivity c f^d [S/m] with f in GHz, as in ITU-R P.2040-4, section 2.1.4;
 the complex relative permittivity is then eps_r - j sigma / (2 pi f eps_0). A row holds in its own band only: outside
-all bands of a material every question about it is an error, never an extrapolation. The scattering coefficient comes
+all bands of a material every question about it is an error, unless it was extrapolated on request
+(:meth:`Material.extrapolated`), which its rows then say. The scattering coefficient comes
 from the roughness: S^2 = 1 - rho^2, rho = exp(-8 (pi sigma_h / lambda)^2), the Rayleigh roughness factor at normal
 incidence (Ament 1953; Degli-Esposti et al. 2007, eq. (2), for the power that leaves the mirror direction).
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,9 @@ PATTERNS = ("lambertian", "directive")
 NARROWEST_LOBE = 1000
 """Largest exponent of a scattering lobe: half its power lies within 3 degrees of the mirror direction. From 1023 on
 the sums of binomials that normalise it leave double precision; what is narrower is a mirror reflection."""
+
+WIDEST_HZ = (1e6, 1e13)
+"""Where a material whose permittivity does not depend on frequency is known [Hz]."""
 
 ROUGHEST_M = 1.0  # rms height; from a few wavelengths on nothing is reflected as by a mirror
 
@@ -66,6 +70,22 @@ class Band:
             )
             check_number("conductivity (c f^d) [S/m]" + what, self.conductivity(frequency_hz), 0.0)
 
+    def __str__(self) -> str:
+        return f"{self.low_hz / 1e9:g} to {self.high_hz / 1e9:g} GHz"
+
+    def widened(self, low_hz: float, high_hz: float) -> Band | None:
+        """This law from ``low_hz`` to ``high_hz`` beside its own band, as far as its relative permittivity is 1 or
+        more; None where nothing is left."""
+        if self.b != 0:  # a f^b = 1
+            with np.errstate(over="ignore"):
+                end = 1e9 * float(np.float64(self.a) ** (-1.0 / self.b)) * (1 + np.sign(self.b) * 1e-12)
+            low_hz, high_hz = (max(low_hz, end), high_hz) if self.b > 0 else (low_hz, min(high_hz, end))
+        if not low_hz < high_hz:
+            return None
+        return replace(
+            self, low_hz=low_hz, high_hz=high_hz, source=f"extrapolated from {self}: {self.source}"
+        )
+
     def relative_permittivity(self, frequency_hz: float) -> float:
         """a f^b, f in GHz."""
         with np.errstate(over="ignore"):
@@ -93,6 +113,8 @@ class Material:
         sources: where thickness, roughness and pattern come from.
         reciprocal: whether it scatters alike when transmitter and receiver change places. Degli-Esposti's lobes, the
             default and Sionna RT's, do not; see :func:`warprrf.rf.em.fresnel.lobe`. ``engine="exact"`` takes either.
+        xpd: share K_x of scattered power in the other polarisation, in [0, 1]. Path gains sum over both received
+            polarisations, so ours do not depend on it; Sionna RT is given it.
 
     Raises:
         TypeError, ValueError: naming what is no such number, and the material.
@@ -108,6 +130,7 @@ class Material:
     itu: str | None = None
     sources: Mapping[str, str] | None = None
     reciprocal: bool = False
+    xpd: float = 0.0
 
     def __post_init__(self) -> None:
         check_type("name", self.name, str)
@@ -125,6 +148,7 @@ class Material:
             raise ValueError(f"pattern{of}: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}")
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
         check_type("reciprocal" + of, self.reciprocal, bool)
+        check_number("xpd" + of, self.xpd, 0.0, 1.0)
 
     @classmethod
     def custom(
@@ -146,7 +170,7 @@ class Material:
         """
         check_number("relative_permittivity", relative_permittivity, 1.0)
         check_number("conductivity", conductivity, 0.0)
-        band = Band(1e6, 1e13, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
+        band = Band(*WIDEST_HZ, relative_permittivity, 0.0, conductivity, 0.0, "given by the caller")
         return cls(name, (band,), thickness_m, 0.0, scattering, pattern, alpha_r, reciprocal=reciprocal)
 
     @classmethod
@@ -171,11 +195,31 @@ class Material:
         for band in self.bands:
             if band.low_hz <= frequency_hz <= band.high_hz:
                 return band
-        known = ", ".join(f"{b.low_hz / 1e9:g} to {b.high_hz / 1e9:g} GHz" for b in self.bands)
+        known = ", ".join(str(b) for b in self.bands)
+        nearest = min(self.bands, key=lambda b: max(b.low_hz / frequency_hz, frequency_hz / b.high_hz))
         raise ValueError(
-            f"frequency_hz: got {frequency_hz / 1e9:g} GHz, but material {self.name!r} is known for {known} only; "
-            "choose a frequency inside, or add a row for this band to its table"
+            f"frequency_hz: got {frequency_hz / 1e9:g} GHz, but material {self.name!r} is known for {known} only, "
+            f"nearest {nearest}; choose a frequency inside, add a row for this band to its table, or load the scene "
+            "with extrapolate=True (Material.extrapolated)"
         )
+
+    def extrapolated(self) -> Material:
+        """The same material with the law of the nearest band at every frequency from 1 MHz to 10 THz.
+
+        The rows that are added say so in their ``source``; nobody measured there. Between two bands each holds up to
+        the geometric mean of their ends. Where a law's relative permittivity would fall below 1 it ends.
+        """
+        ends = sorted(self.bands, key=lambda band: (band.low_hz, band.high_hz))
+        added, below, reach = [], ends[0], ends[0].high_hz
+        added.append(ends[0].widened(WIDEST_HZ[0], ends[0].low_hz))
+        for band in ends[1:]:
+            if band.low_hz > reach:
+                middle = float(np.sqrt(reach * band.low_hz))
+                added += [below.widened(reach, middle), band.widened(middle, band.low_hz)]
+            if band.high_hz > reach:
+                below, reach = band, band.high_hz
+        added.append(below.widened(reach, WIDEST_HZ[1]))
+        return replace(self, bands=self.bands + tuple(band for band in added if band is not None))
 
     def permittivity(self, frequency_hz: float) -> complex:
         """Complex relative permittivity eps_r - j sigma / (2 pi f eps_0); ValueError outside the bands."""
@@ -209,7 +253,7 @@ def roughness_scattering(roughness_m: float, frequency_hz: float) -> float:
     return float(np.sqrt(-np.expm1(-2 * exponent)))
 
 
-_PARTS = ("thickness_m", "roughness_m", "scattering", "pattern")
+_PARTS = ("thickness_m", "roughness_m", "scattering", "pattern", "xpd")
 """Parts of a table's entry with a value and a source each."""
 
 
@@ -221,6 +265,8 @@ def table_entry(material: Material) -> dict[str, Any]:
         values["roughness_m"] = material.roughness_m
     else:
         values["scattering"] = material.scattering
+    if material.xpd:
+        values["xpd"] = material.xpd
     rows = [
         {"low_ghz": b.low_hz / 1e9, "high_ghz": b.high_hz / 1e9, "a": b.a, "b": b.b, "c": b.c, "d": b.d,
          "source": b.source}
@@ -288,6 +334,7 @@ def _material(entry: object, where: str) -> Material:
             itu=entry.get("itu"),
             sources={key: str(part.get("source", "assumed")) for key, part in parts.items()},
             reciprocal=reciprocal,
+            xpd=_number(parts["xpd"], "value", where) if "xpd" in parts else 0.0,
         )
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error

@@ -12,7 +12,7 @@ from warprrf.rf.interop.twin import Twin as Twin
 from warprrf.rf.paths.sionna import SionnaPaths as SionnaPaths
 
 # choose an LLVM that Dr.Jit can use
-from warprrf.rf.interop.llvm import select_llvm as select_llvm
+from warprrf.rf.sionna_package import select_llvm as select_llvm
 
 # == files ==
 # paths as a DeepMIMO scenario

@@ -1,7 +1,6 @@
 """Spectra from Sionna RT's PathSolver: line of sight, specular and diffuse paths of any depth, by ray sampling.
 
-The scene's own material table is set in Python (an XML can't carry scattering patterns, and Sionna has no metal at
-300 GHz). Both transmit and both receive polarisations are solved at once: path gain is the mean over the former and
+Both transmit and both receive polarisations are solved at once: path gain is the mean over the former and
 the sum over the latter. One solve per receiver, because Sionna shares its cap on paths between all of them. Sionna has
 no absorption by the air; where asked for, every path is given that of its own length.
 """
@@ -19,16 +18,12 @@ from warprrf import device as _device
 from warprrf.checks import check_array, check_count
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Gas, air_of
-from warprrf.rf.em.materials import Material
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import ReceivedPaths
-from warprrf.rf.interop.llvm import select_llvm
 from warprrf.rf.paths.sionna import DIFFUSE, repeated
 from warprrf.rf.scene import Scene
+from warprrf.rf.sionna_package import select_variant, sionna_rt
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
-
-NARROWEST_SIONNA_LOBE = 127
-"""Largest exponent that Sionna RT can normalise: it divides by 2^alpha_r in single precision."""
 
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.
 _RECEIVERS_PER_FLUSH = 20
@@ -40,90 +35,18 @@ def load_sionna_scene(scene: Scene | str | os.PathLike[str], *, frequency_hz: fl
     Sionna's own ``load_scene`` knows no patterns (every material is Lambertian) and takes what it can from the XML.
 
     Args:
-        scene: Path of an XML with ``materials.json`` beside it (a digital twin, the lobby), or a loaded :class:`Scene`.
+        scene: Path of a scene file, or a :class:`Scene`.
         frequency_hz: Carrier frequency [Hz]; materials are those of this frequency.
 
     Returns:
-        The ``sionna.rt.Scene``, objects kept apart and named as in the XML. Materials that the XML gives by their ITU
-        name alone are replaced by ``warprrf-<name>``.
+        The ``sionna.rt.Scene``; see :meth:`Scene.to_sionna`.
 
     Raises:
-        ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
-        FileNotFoundError: if the XML, a mesh or the table is missing.
-        ValueError: if the scene was not loaded from a file, a material is not known at this frequency or is infinitely
-            thick, or an object has more than one.
+        ImportError, ValueError: as :meth:`Scene.to_sionna`; for a path also what :meth:`Scene.load` raises.
     """
     if isinstance(scene, str | os.PathLike):
         scene = Scene.load(scene)
-    frequency = check_frequency(frequency_hz)
-    if scene.xml_path is None:
-        raise ValueError(
-            "scene: got one without an XML file, which Sionna needs; use Scene.load or engine='exact'"
-        )
-    rt = sionna_rt()
-    loaded = rt.load_scene(str(scene.xml_path), merge_shapes=False)
-    before = list(loaded.radio_materials)
-    materials = [_radio_material(loaded, rt, material, frequency) for material in scene.materials]
-    objects = dict(loaded.objects)
-    for index, name in enumerate(scene.object_names):
-        if name not in objects:
-            raise ValueError(f"scene: object {name!r} is not in {scene.xml_path} as Sionna reads it")
-        used = np.unique(np.asarray(scene.face_material)[np.asarray(scene.face_object) == index])
-        if len(used) != 1:
-            raise ValueError(f"scene: object {name!r} has {len(used)} materials, Sionna allows one an object")
-        objects[name].radio_material = materials[int(used[0])]
-    for name in before:
-        if not loaded.radio_materials[name].is_used:
-            loaded.remove(name)
-    loaded.frequency = frequency
-    return loaded
-
-
-def _radio_material(loaded: Any, rt: Any, material: Material, frequency: float) -> Any:
-    """The material of this name in Sionna's scene, added if it has none that can be set, with our values."""
-    directive = material.pattern == "directive"
-    if directive and material.alpha_r > NARROWEST_SIONNA_LOBE:
-        raise ValueError(
-            f"material {material.name!r}: alpha_r is {material.alpha_r}, but in Sionna's single precision a lobe of more "
-            f'than {NARROWEST_SIONNA_LOBE} scatters nothing; take engine="exact" or a wider lobe'
-        )
-    if not np.isfinite(material.thickness_m):
-        raise ValueError(
-            f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
-        )
-    if material.reciprocal and material.scattering_coefficient(frequency) > 0:
-        raise ValueError(
-            f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
-            'take its lobe of the same width, or use engine="exact"'
-        )
-    radio = loaded.radio_materials.get(material.name)
-    if type(radio) is not rt.RadioMaterial:  # an ITU material keeps its own permittivity
-        radio = rt.RadioMaterial(f"warprrf-{material.name}")  # objects and materials share one set of names
-        loaded.add(radio)
-    radio.relative_permittivity = material.relative_permittivity(frequency)
-    radio.conductivity = material.conductivity(frequency)
-    radio.thickness = float(material.thickness_m)
-    radio.scattering_coefficient = float(material.scattering_coefficient(frequency))
-    radio.xpd_coefficient = 0.0
-    radio.scattering_pattern = (
-        rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
-    )
-    return radio
-
-
-def sionna_rt() -> Any:
-    """Sionna RT, on a variant of Mitsuba and an LLVM that it can use."""
-    select_llvm()
-    select_variant()
-    return _device.require("sionna.rt", extra="sionna")
-
-
-def select_variant() -> Any:
-    """Mitsuba, on a variant for radio: it may be on another, for photos, and Sionna needs the one of its import."""
-    mitsuba = _device.require("mitsuba", extra="sionna")
-    if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
-        mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
-    return mitsuba
+    return scene.to_sionna(frequency_hz=frequency_hz)
 
 
 @dataclass(frozen=True)
@@ -152,7 +75,7 @@ class SionnaEngine:
     """Sionna RT for one transmitter.
 
     Args:
-        scene: Scene loaded from an XML file.
+        scene: Scene with materials; its own transmitters and receivers play no part.
         transmitter: Position [m], shape ``(3,)``.
         frequency_hz: Carrier frequency [Hz].
         shape: Rows and columns of the spectrum.
@@ -163,7 +86,7 @@ class SionnaEngine:
 
     Raises:
         ImportError: if Sionna RT is missing, or only an LLVM that aborts it is installed.
-        ValueError: if the scene was not loaded from a file.
+        ValueError: as :meth:`Scene.to_sionna`.
     """
 
     def __init__(
@@ -187,6 +110,8 @@ class SionnaEngine:
         self.device = device
         self._rt = sionna_rt()
         self._scene = load_sionna_scene(scene, frequency_hz=self.frequency_hz)
+        for name in (*scene.transmitters, *scene.receivers):
+            self._scene.remove(name)
         both = {"num_rows": 1, "num_cols": 1, "pattern": "iso", "polarization": "VH"}
         self._scene.tx_array = self._rt.PlanarArray(**both)
         self._scene.rx_array = self._rt.PlanarArray(**both)

@@ -8,8 +8,9 @@ try all pairs. Nothing that could be a path is left out, to rounding. Source: J.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,20 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.device import DeviceLike
+from warprrf.checks import check_positive
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.kernels.radio import mirrors as kernels
 
 ALL_SPACE = 2.0  # a sine that stands for no cone
 MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all chains are found once and kept
 BLOCK = 500_000  # chains that are unfolded at once
+MOST_CHAINS = 20_000_000
+"""More chains of mirrors than this are not tried unless asked for: a minute on two cores in a room, twenty in a city."""
+
+_SAMPLE = 1000  # chains from which the number of longer ones is estimated
+_FIRST, _LAUNCH_S = 4096, 0.1  # chains in the first launch; later ones take about so long
+_PARTS = 1000  # of a search, in which its progress is told
 
 
 @dataclass(frozen=True)
@@ -45,7 +53,8 @@ class Chains:
     def __len__(self) -> int:
         return len(self.sine)
 
-    def __getitem__(self, rows: slice) -> Chains:
+    def take(self, rows: slice | np.ndarray) -> Chains:
+        """The chains ``rows``."""
         return Chains(self.patch[rows], self.image[rows], self.axis[rows], self.sine[rows])
 
 
@@ -56,7 +65,11 @@ class MirrorImages:
         patches: What mirrors.
         transmitter: Position [m], shape ``(3,)``.
         slack_m: Boxes of patches are widened by it [m]: their tolerance by default.
+        max_chains: Searches that would try more chains are refused.
         device: Where chains are tried.
+
+    Raises:
+        ValueError: if ``max_chains`` is not positive.
     """
 
     def __init__(
@@ -65,9 +78,11 @@ class MirrorImages:
         transmitter: ArrayLike,
         *,
         slack_m: float | None = None,
+        max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
         self.patches = patches
+        self.max_chains = check_positive("max_chains", max_chains)
         self.transmitter = np.asarray(transmitter, float)
         self.device = _device.resolve(device)
         self._on_device = _patches_on_device(
@@ -78,12 +93,39 @@ class MirrorImages:
         )
         self._kept = [root]
 
-    def candidates(self, points: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def search(
+        self, points: np.ndarray, order: int, progress: Progress | None = None
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """:meth:`candidates` of 1, 2 ... ``order`` reflections.
+
+        Args:
+            points: Where the chains end [m], shape ``(N, 3)``.
+            order: Most reflections.
+            progress: Called with the stage ``"mirrors"``.
+
+        Raises:
+            ValueError: before anything is traced, if more than ``max_chains`` chains would be tried.
+        """
+        ends = np.cumsum([0.0, *self._work(np.asarray(points, float).reshape(-1, 3), order)])
+
+        def tick(share: float) -> None:
+            if progress is not None:
+                behind = ends[k - 1] + share * (ends[k] - ends[k - 1])
+                progress("mirrors", round(_PARTS * behind / max(ends[-1], 1.0)), _PARTS)
+
+        for k in range(1, order + 1):
+            yield self.candidates(points, k, tick)
+            tick(1.0)
+
+    def candidates(
+        self, points: np.ndarray, order: int, tick: Callable[[float], None] = lambda share: None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Chains of ``order`` reflections whose points lie in the boxes of their patches; nothing is cast.
 
         Args:
             points: Where the chains end [m], shape ``(N, 3)``.
             order: Reflections, at least 1.
+            tick: Called now and then with the share of the search that is behind.
 
         Returns:
             Index of the point ``(L,)``, patches ``(L, order)`` and mirror points [m] ``(L, order, 3)``, both from the
@@ -92,50 +134,105 @@ class MirrorImages:
         points = np.asarray(points, float).reshape(-1, 3)
         parts = [(np.zeros(0, int), np.zeros((0, order), np.int32), np.zeros((0, order, 3)))]
         if len(points) and len(self.patches):
-            ends = _Ends(points, self.device)
-            for chains in self._blocks(order, ends.middle, ends.radius):
-                parts.append(self._unfolded(chains, ends))
+            ends, kept = _Ends(points, self.device), self._keep(order)
+            known = min(order, len(kept) - 1)
+            for chains, share in self._descendants(kept[known], order - known, ends.middle, ends.radius):
+                if len(chains):
+                    parts.append(self._unfolded(chains, ends))
+                tick(share)
         row, patch, found = (np.concatenate(p) for p in zip(*parts, strict=True))
         by_row = np.argsort(row, kind="stable")
         return row[by_row], patch[by_row], found[by_row]
 
-    def _blocks(self, order: int, middle: np.ndarray, reach: float) -> Iterator[Chains]:
-        """All chains of ``order`` reflections; only those that may reach the ball of the points if they are many."""
-        while len(self._kept) <= order and len(self._kept[-1]) * len(self.patches) <= MOST_KEPT:
-            one = list(self._extended(self._kept[-1], np.zeros(3), -1.0, 2**31 - 1))
-            empty = Chains(
-                np.zeros((0, len(self._kept)), np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    def _keep(self, order: int) -> list[Chains]:
+        """All chains of 0, 1 ... reflections, up to ``order`` or as far as they are few; found once."""
+        kept = self._kept
+        while len(kept) <= order and len(kept[-1]) * len(self.patches) <= MOST_KEPT:
+            blocks = [block for block, _ in self._extended(kept[-1], np.zeros(3), -1.0, BLOCK)]
+            kept = [*kept, _joined(blocks, len(kept))]
+        self._kept = kept
+        return kept
+
+    def _work(self, points: np.ndarray, order: int) -> list[float]:
+        """Number of chains that each search of 1, 2 ... ``order`` reflections tries: estimated if they are many.
+
+        Raises:
+            ValueError: if it is more than ``max_chains``.
+        """
+        if len(points) == 0 or len(self.patches) == 0:
+            return [0.0] * order
+        kept, rng, ends = self._keep(order), np.random.default_rng(0), _Ends(points, self.device)
+        work = [float(len(chains)) for chains in kept[1 : order + 1]]
+        sample, many, shorter, seconds = kept[-1], float(len(kept[-1])), 0.0, 0.0
+        for k in range(len(kept), order + 1):
+            sample = sample.take(np.sort(rng.permutation(len(sample))[:_SAMPLE]))
+            each = many / max(len(sample), 1)
+            begin = time.perf_counter()
+            last = sum(len(block) for block, _ in self._extended(sample, ends.middle, ends.radius, BLOCK))
+            work.append(shorter + each * last)
+            seconds += each * (time.perf_counter() - begin)
+            if k < order:  # later searches go on from all of them
+                begin = time.perf_counter()
+                sample, whole = self._some_longer(sample, rng)
+                many, shorter = each * whole, shorter + each * whole
+                seconds += (order - k) * each * (time.perf_counter() - begin)
+        if sum(work) > self.max_chains:
+            raise ValueError(
+                f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
+                f"planar patches, some {_spoken(seconds)}; expected at most {self.max_chains:.3g}: lower mirror_order, "
+                "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
             )
-            self._kept.append(one[0] if one else empty)
-        known = min(order, len(self._kept) - 1)
-        yield from self._descendants(self._kept[known], order - known, middle, reach)
+        return work
 
-    def _descendants(self, chains: Chains, steps: int, middle: np.ndarray, reach: float) -> Iterator[Chains]:
+    def _some_longer(self, chains: Chains, rng: np.random.Generator) -> tuple[Chains, int]:
+        """About ``_SAMPLE`` of the chains of one reflection more that follow ``chains``, and how many these are."""
+        parts = []
+        for block, _ in self._extended(chains, np.zeros(3), -1.0, BLOCK):
+            parts.append((block.take(rng.permutation(len(block))[:_SAMPLE]), len(block)))
+        whole = sum(size for _, size in parts)
+        share = min(1.0, _SAMPLE / max(whole, 1))
+        some = [part.take(slice(int(np.ceil(share * size)))) for part, size in parts]
+        return _joined(some, chains.patch.shape[1] + 1), whole
+
+    def _descendants(
+        self, chains: Chains, steps: int, middle: np.ndarray, reach: float
+    ) -> Iterator[tuple[Chains, float]]:
+        """Chains of ``steps`` reflections more, at the end those that may reach the ball, and the share that is done."""
         if steps == 0:
-            yield from (chains[k : k + BLOCK] for k in range(0, len(chains), BLOCK))
+            for k in range(0, len(chains), BLOCK):
+                yield chains.take(slice(k, k + BLOCK)), min((k + BLOCK) / len(chains), 1.0)
             return
-        for block in self._extended(chains, middle, reach if steps == 1 else -1.0, BLOCK):
-            yield from self._descendants(block, steps - 1, middle, reach)
+        before = 0.0
+        for block, share in self._extended(chains, middle, reach if steps == 1 else -1.0, BLOCK):
+            for some, within in self._descendants(block, steps - 1, middle, reach):
+                yield some, before + within * (share - before)
+            before = share
 
-    def _extended(self, chains: Chains, middle: np.ndarray, reach: float, most: int) -> Iterator[Chains]:
-        """Chains of one reflection more, about ``most`` at a time."""
-        if len(chains) == 0:
-            return
+    def _extended(
+        self, chains: Chains, middle: np.ndarray, reach: float, most: int
+    ) -> Iterator[tuple[Chains, float]]:
+        """Chains of one reflection more, about ``most`` at a time, and the share of ``chains`` that is done."""
         last = chains.patch[:, -1] if chains.patch.shape[1] else np.full(len(chains), -1)
-        count = self._extend(chains, last, middle, reach, None)[0]
-        ends = np.cumsum(count, dtype=np.int64)
-        first = 0
+        first, size = 0, _FIRST
         while first < len(chains):
-            before = ends[first - 1] if first else 0
-            stop = max(first + 1, int(np.searchsorted(ends, before + most, side="right")))
-            some = slice(first, stop)
-            if ends[stop - 1] > before:
+            begin = time.perf_counter()
+            stretch = slice(first, first + size)
+            count = self._extend(chains.take(stretch), last[stretch], middle, reach, None)[0]
+            took = time.perf_counter() - begin
+            ends, done = np.cumsum(count, dtype=np.int64), 0
+            while done < len(count):
+                before = ends[done - 1] if done else 0
+                stop = max(done + 1, int(np.searchsorted(ends, before + most, side="right")))
+                some = slice(first + done, first + stop)
+                parents = chains.take(some)
                 _, parent, patch, image, axis, sine = self._extend(
-                    chains[some], last[some], middle, reach, count[some]
+                    parents, last[some], middle, reach, count[done:stop]
                 )
-                longer = np.column_stack([chains.patch[some][parent], patch])
-                yield Chains(longer.astype(np.int32, copy=False), image, axis, sine)
-            first = stop
+                longer = np.column_stack([parents.patch[parent], patch]).astype(np.int32, copy=False)
+                yield Chains(longer, image, axis, sine), (first + stop) / len(chains)
+                done = stop
+            first += len(count)
+            size = int(np.clip(size * _LAUNCH_S / max(took, 1e-9), size // 4 + 1, 4 * size))
 
     def _extend(
         self, chains: Chains, last: np.ndarray, middle: np.ndarray, reach: float, count: np.ndarray | None
@@ -204,6 +301,20 @@ class _Ends:
         )
         low, high = low.min(axis=0), high.max(axis=0)
         self.middle, self.radius = 0.5 * (low + high), 1e-6 + 0.5 * float(np.linalg.norm(high - low))
+
+
+def _joined(parts: list[Chains], order: int) -> Chains:
+    """``parts`` of chains of ``order`` reflections, one after another."""
+    none = Chains(np.zeros((0, order), np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    return Chains(*(np.concatenate([getattr(p, f.name) for p in (none, *parts)]) for f in fields(Chains)))
+
+
+def _spoken(seconds: float) -> str:
+    """A duration as people say it."""
+    for unit, length in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
+        if seconds >= 1.5 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} seconds"
 
 
 def _cones(chains: Chains, where: wp.Device) -> Any:

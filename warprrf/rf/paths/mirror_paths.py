@@ -10,10 +10,11 @@ approximation of a partly covered zone), so that power falls with its square.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import chain
 
 import numpy as np
 
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import ENDPOINT_CLEARANCE, vectors_across
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.paths.images import MirrorImages
@@ -68,20 +69,21 @@ class MirrorPaths:
         return self.share * wavelength_m / (4.0 * np.pi * self.length_m) * np.exp(-2j * np.pi * cycles)
 
 
-def exact_paths(images: MirrorImages, receivers: np.ndarray, order: int) -> MirrorPaths:
+def exact_paths(
+    images: MirrorImages, receivers: np.ndarray, order: int, progress: Progress | None = None
+) -> MirrorPaths:
     """All unobstructed paths to ``receivers`` (R, 3) with at most ``order`` reflections, by receiver, then by order.
 
     A mirror point lies in its patch's faces. Paths through one place on two patches (faces that overlap, or the seam
     between them) count once.
+
+    Raises:
+        ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
     patches, source = images.patches, images.transmitter
-    parts = []
-    for k in range(order + 1):
-        if k == 0:
-            row, none = np.arange(len(receivers)), np.zeros((len(receivers), 0))
-            patch, point = none.astype(np.int32), none[..., None].repeat(3, axis=2)
-        else:
-            row, patch, point = images.candidates(receivers, k)
+    parts, none = [], np.zeros((len(receivers), 0))
+    direct = np.arange(len(receivers)), none.astype(np.int32), none[..., None].repeat(3, axis=2)
+    for k, (row, patch, point) in enumerate(chain([direct], images.search(receivers, order, progress))):
         for j in range(k):
             own = patches.contains(patch[:, j], point[:, j])
             row, patch, point = row[own], patch[own], point[own]
@@ -99,7 +101,12 @@ def exact_paths(images: MirrorImages, receivers: np.ndarray, order: int) -> Mirr
 
 
 def zone_paths(
-    images: MirrorImages, receivers: np.ndarray, order: int, wavelength_m: float, skin_m: float
+    images: MirrorImages,
+    receivers: np.ndarray,
+    order: int,
+    wavelength_m: float,
+    skin_m: float,
+    progress: Progress | None = None,
 ) -> MirrorPaths:
     """Paths to ``receivers`` (R, 3) with at most ``order`` reflections, and what share of their Fresnel zones is free.
 
@@ -112,15 +119,18 @@ def zone_paths(
         order: Most reflections.
         wavelength_m: Wavelength [m].
         skin_m: Depth of the surface's skin, its position error: zones are wider, and rays end that much before it [m].
+        progress: Called with the stage ``"mirrors"``.
 
     Returns:
         Rows by order. Those with less than :data:`LEAST_SHARE` of their field are left out.
+
+    Raises:
+        ValueError: before anything is traced, if more chains would be tried than ``images`` allow.
     """
     zone = ZoneRays(images.patches, images.transmitter, wavelength_m, skin_m, images.device)
     parts = [_described(images.patches, images.transmitter, receivers, zone.line_of_sight(receivers), order)]
-    for k in range(1, order + 1):
-        row, patch, point = images.candidates(receivers, k)
-        if k > 1:
+    for row, patch, point in images.search(receivers, order, progress):
+        if patch.shape[1] > 1:
             free = zone.reached(receivers[row], patch, point)
             row, patch, point = row[free], patch[free], point[free]
         share = zone.mirror_share(receivers[row], patch, point)

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.paths.images import MirrorImages
+from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
@@ -31,6 +31,7 @@ def trace_paths(
     frequency_hz: float,
     mirror_order: int = 1,
     gas: Gas = False,
+    progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> Paths:
     """Line of sight and mirror reflections by the image method, in float64.
@@ -48,6 +49,8 @@ def trace_paths(
         frequency_hz: Carrier frequency [Hz].
         mirror_order: Most reflections on one path: 0 and up.
         gas: Absorption of the air in every gain: see :meth:`Paths.with_gas`.
+        progress: Called with the stages ``"patches"``, in which the mesh's planes are found, and ``"mirrors"``.
+        device: Where chains are tried and rays cast.
 
     Returns:
         Arrays ``(L,)`` for one receiver, ``(R, L)`` for several; line of sight first, then by order, then by delay.
@@ -55,23 +58,27 @@ def trace_paths(
     Raises:
         ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near
             field of the transmitter; on a frequency that is not positive or outside a material's band, or
-            another order.
+            another order; if more than :data:`~warprrf.rf.paths.images.MOST_CHAINS` chains of mirrors would be tried
+            (:class:`MirrorTracer` takes another limit).
     """
     points = check_receivers("receivers", receivers)
     source, frequency = check_array("transmitter", transmitter, (3,)), check_frequency(frequency_hz)
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
     check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
+    order = check_count("mirror_order", mirror_order, 0)
+    tell: Progress = progress or (lambda stage, done, total: None)
+    tell("patches", 0, 1)
     tracer = MirrorTracer(mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device)
-    if points.ndim == 1:
-        return tracer.trace(points, mirror_order).with_gas(gas)
-    return Paths.stack(tracer.trace_each(points, mirror_order)).with_gas(gas)
+    tell("patches", 1, 1)
+    found = tracer.trace_each(points.reshape(-1, 3), order, progress)
+    return (found[0] if points.ndim == 1 else Paths.stack(found)).with_gas(gas)
 
 
 class MirrorTracer:
     """Image method for one transmitter: patches and images are found once, then any receiver is traced.
 
-    Args: as of :func:`trace_paths`.
+    Args: as of :func:`trace_paths`, and ``max_chains``: searches that would try more chains of mirrors are refused.
 
     Attributes:
         mesh: The mesh.
@@ -88,6 +95,7 @@ class MirrorTracer:
         *,
         transmitter: ArrayLike,
         frequency_hz: float,
+        max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
         self.mesh = as_mesh(mesh_or_scene)
@@ -100,7 +108,7 @@ class MirrorTracer:
             self.table = surface_table(materials, frequency_hz)
             groups = getattr(mesh_or_scene, "face_material", None)
         self.patches = planar_patches(self.mesh, groups)
-        self.images = MirrorImages(self.patches, self.transmitter, device=device)
+        self.images = MirrorImages(self.patches, self.transmitter, max_chains=max_chains, device=device)
 
     @property
     def wavelength_m(self) -> float:
@@ -111,9 +119,11 @@ class MirrorTracer:
         """Paths of one receiver (3,); see :func:`trace_paths`."""
         return self.trace_each(check_array("receiver", receiver, (3,))[None], mirror_order)[0]
 
-    def trace_each(self, receivers: ArrayLike, mirror_order: int = 1) -> list[Paths]:
+    def trace_each(
+        self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None
+    ) -> list[Paths]:
         """Paths of each of ``receivers`` (R, 3), one after the other."""
-        found = self.find(receivers, mirror_order)
+        found = self.find(receivers, mirror_order, progress)
         points = np.asarray(receivers, float)
         jones, amplitude = self._reflected(found, points)
         ends = np.searchsorted(found.receiver, np.arange(len(points) + 1))
@@ -130,17 +140,20 @@ class MirrorTracer:
             )  # fmt: skip
         return result
 
-    def find(self, receivers: ArrayLike, mirror_order: int = 1) -> MirrorPaths:
+    def find(
+        self, receivers: ArrayLike, mirror_order: int = 1, progress: Progress | None = None
+    ) -> MirrorPaths:
         """Geometry of all paths to ``receivers`` (R, 3), sorted by receiver.
 
         Raises:
-            ValueError: on another order or shape, NaN, or a receiver at the transmitter's place.
+            ValueError: on another order or shape, NaN, a receiver at the transmitter's place, or a search that would
+                try too many chains.
         """
         order = check_count("mirror_order", mirror_order, 0)
         points = check_array("receivers", receivers, (None, 3))
         if (points == self.transmitter).all(axis=1).any():
             raise ValueError("receivers: got a receiver at the transmitter's place, expected them apart")
-        return exact_paths(self.images, points, order)
+        return exact_paths(self.images, points, order, progress)
 
     def _reflected(self, found: MirrorPaths, receivers: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
         """Jones matrices ``(L, 2, 2)``, None for a bare mesh, and amplitudes ``(L,)``, both without the delay's phase."""

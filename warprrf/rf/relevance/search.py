@@ -23,12 +23,13 @@ import numpy as np
 from warprrf.checks import check_array, check_positive
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
-from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.rf.em.waves import check_frequency
+from warprrf.geometry.mesh import as_mesh
+from warprrf.geometry.splats.gaussians import Gaussians, gaussians_of
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.positions import check_positions, check_receivers
+from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.relevance.choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
 from warprrf.rf.relevance.model import FullModel, full_field, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
@@ -298,10 +299,12 @@ def relevances(
     for tolerance in tolerances_db:
         check_positive("tolerance_db", tolerance, "number of decibels")
     asked = Setting(**setting).of(geometry)
+    frequency_hz = check_frequency(asked.frequency_hz)
+    question_unit(as_mesh(geometry, "geometry"), SPEED_OF_LIGHT / frequency_hz)
     full, walls, source = full_field(
         geometry,
         transmitter=check_array("transmitter", asked.transmitter, (3,)),
-        frequency_hz=check_frequency(asked.frequency_hz),
+        frequency_hz=frequency_hz,
         shape=check_shape(asked.shape),
         beam_sigma_rad=asked.beam_sigma_rad,
         device=device,
@@ -311,7 +314,7 @@ def relevances(
     check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
     tick: Progress = progress or (lambda stage, done, total: None)
     model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
-    gaussians = getattr(geometry, "gaussians", None)
+    gaussians = gaussians_of(geometry)
     found = []
     for tolerance in tolerances_db:
         one = _choose(model, source, float(tolerance))

@@ -13,6 +13,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
+from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
 from warprrf.rf.fields.bistatic.rays import RayGrid
@@ -66,6 +67,27 @@ def field(scene: RadioScene, data: SpectrumDataset) -> BistaticField:
 
 def psnr(field: RadioField, ds: SpectrumDataset, transmitter: np.ndarray | None = None) -> float:
     return evaluate(ds, lambda rx: field.spectrum(rx, transmitter))["psnr_db"]
+
+
+def test_every_long_stage_of_a_fit_tells_how_far_it_is(scene: RadioScene, data: SpectrumDataset) -> None:
+    told: list[tuple[str, int, int]] = []
+    RadioField.fit(scene, data.subset(np.arange(4)), sub_pixels=1, progress=lambda *words: told.append(words))
+    stages = list(dict.fromkeys(stage for stage, _, _ in told))
+    assert stages == ["patches", "mirrors", "transport", "fit"]
+    for name in stages:
+        done = [d for stage, d, _ in told if stage == name]
+        total = {t for stage, _, t in told if stage == name}
+        assert done == sorted(done) and total == {done[-1]}
+    assert len([d for stage, d, _ in told if stage == "fit"]) > 4 + 6  # receivers, and fits that choose terms
+
+
+def test_spectra_that_would_not_fit_into_memory_are_refused(
+    scene: RadioScene, data: SpectrumDataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "MOST_RAYS", 10 * 24 * 48 * 4 - 1)
+    with pytest.raises(ValueError, match="ds: 10 spectra of 24 x 48 pixels take 4.6e.04 rays"):
+        trace(scene, data, sub_pixels=2)
+    assert len(trace(scene, data.subset(np.arange(9)), sub_pixels=2).views) == 9
 
 
 def test_ten_times_better_than_the_nearest_measurement(field: BistaticField, data: SpectrumDataset) -> None:

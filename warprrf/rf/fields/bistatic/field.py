@@ -145,7 +145,7 @@ class BistaticField(RadioField):
             options: what is modelled and how it is fitted.
             transport: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
             device: where rays are cast.
-            progress: called with the stages ``"transport"`` and ``"fit"``.
+            progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
             settings: attributes of :class:`warprrf.rf.fields.bistatic.training.FitOptions`, in place of those of
                 ``options``: ``quick=True``, ``mirror_order=2``, ``relevance=found``, ...
 

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_topology import components, edge_pairs
 
-
 SHAPES = 6  # numbers that tell shapes apart
 
 

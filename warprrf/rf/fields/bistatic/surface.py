@@ -23,9 +23,9 @@ from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components, smoothed_normals
 from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.kernels.radio import bounce
-from warprrf.rf.fields.bistatic.colours import colour_groups
+from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
 from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
 
 ELEMENT_M = 0.5  # width of an element
@@ -153,8 +153,10 @@ class Surface:
 
     @classmethod
     def of(cls, geometry: GeometryLike) -> Surface:
-        """Patches, groups and elements of a Reconstruction, a Scene (its materials become groups) or a bare Mesh; a
-        Surface is returned as it is.
+        """Patches, groups and elements of a Reconstruction, a Scene or a Mesh; a Surface is returned as it is.
+
+        Materials of a Scene become groups, and those that a Mesh has names of; else pieces of one colour, or of one shape
+        where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it.
 
         Raises:
             TypeError: if it has no mesh.
@@ -164,30 +166,24 @@ class Surface:
             return geometry
         mesh = as_mesh(geometry, "geometry")
         _check_size(mesh)
-        material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
-        gaussians = getattr(geometry, "gaussians", None)
-        found = getattr(geometry, "patches", None)
-        if material is None and not isinstance(found, PlanarPatches) and is_scan(mesh):
-            found = scanned_patches(mesh)
-            mesh = found.mesh
-        if material is None and isinstance(found, PlanarPatches):
-            patches = found
-            patch, planes = found.face_patch, (found.normal, found.offset)
-            normal = _on_patches(found, smoothed_normals(found.mesh, 3))
-            seen = isinstance(gaussians, Gaussians)
-            group, sort, look = colour_groups(mesh, patch, gaussians) if seen else shape_groups(mesh, patch)
-            names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
+        material, names = _named_faces(geometry, mesh)
+        found, colours = _patches_and_colours(geometry, mesh) if material is None else (None, None)
+        if found is not None:
+            patches, mesh, patch = found, found.mesh, found.face_patch
+            planes, skin = (found.normal, found.offset), SKIN_M
+            normal = _on_patches(found, smoothed_normals(mesh, 3))
         else:
             patches = planar_patches(mesh, material)
             patch, planes = _mirrors(patches)
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
             normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
-            if material is None:
-                group, sort, look = shape_groups(mesh, patches.face_patch)
-                names = tuple(f"group_{k}" for k in range(len(sort)))
-            else:
-                group, names = np.asarray(material, np.int32), tuple(m.name for m in materials)
-                sort, look = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
+        if material is not None:
+            group, sort = material, np.arange(len(names), dtype=np.int32)
+            look = np.full((len(names), 4), np.nan)
+        else:
+            pieces = mesh, patches.face_patch
+            group, sort, look = shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
+            names = tuple(f"group_{k}" for k in range(len(sort)))
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once))
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
@@ -221,6 +217,38 @@ class Surface:
         """Image of ``transmitter`` (3,) in every patch's plane, ``(P, 3)``, and its height over it, ``(P,)`` [m]."""
         height = self.plane_normal @ transmitter - self.plane_offset
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
+
+
+def _patches_and_colours(geometry: GeometryLike, mesh: Mesh) -> tuple[PlanarPatches | None, Colours | None]:
+    """Patches that photos gave, or of a scan, with their mesh; None for a mesh without noise. And colours on it, None
+    where there are none."""
+    found, gaussians = getattr(geometry, "patches", None), gaussians_of(geometry)
+    if isinstance(found, PlanarPatches) and gaussians is not None:
+        return found, Colours.of_gaussians(mesh, gaussians)
+    colours = Colours.of_faces(mesh)
+    if not is_scan(mesh):
+        return None, colours
+    flat = scanned_patches(mesh)
+    if colours is not None:
+        places = mesh.triangles[colours.face].mean(axis=1)
+        colours = replace(colours, face=flat.mesh.closest(places).face)
+    return flat, colours
+
+
+def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
+    Scene's materials, else of the mesh's, the last for faces of none."""
+    known = getattr(geometry, "face_material", None)
+    if known is not None and not isinstance(geometry, Mesh):
+        return np.asarray(known, np.int32), tuple(m.name for m in getattr(geometry, "materials", ()))
+    if mesh.face_material is None:
+        return None, ()
+    names = mesh.material_names
+    own = np.where(mesh.face_material < 0, len(names), mesh.face_material)
+    used, group = np.unique(own, return_inverse=True)
+    if len(used) < 2:
+        return None, ()
+    return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 
 def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray) -> dict[str, np.ndarray]:

@@ -46,6 +46,9 @@ QUICK: dict[str, Any] = {
 """What a quick fit takes for given: light of more than one bounce is even but for the residual, one ray a pixel."""
 TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "indirect", "residual")
 """Terms that a fit decides on where they are None."""
+MOST_RAYS = 500_000_000
+"""Spectra with more rays than this are refused: what rays meet is kept during a fit."""
+RAY_BYTES = 40  # kept of each ray
 
 
 class TermChoice(Protocol):
@@ -250,17 +253,21 @@ def trace(
         mirror_order: most mirror reflections on a path; 3 by default.
         sub_pixels: square root of the rays per pixel; 3 by default.
         device: where rays are cast.
-        progress: called as ``progress("transport", done, total)``.
+        progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
 
     Raises:
-        ValueError: for receivers on a surface or outside the scene, or numbers out of range.
+        ValueError: for receivers on a surface or outside the scene, numbers out of range, or more rays or chains of
+            mirrors than :data:`MOST_RAYS` and :data:`~warprrf.rf.paths.images.MOST_CHAINS`.
         TypeError: for a geometry without a mesh.
     """
-    started = time.perf_counter()
+    started, tell = time.perf_counter(), progress or _silent
     receivers, transmitter = check_dataset(as_mesh(geometry, "geometry"), ds, device=device)
-    surface = Surface.of(geometry)
     order = 3 if mirror_order is None else mirror_order
     terms = Terms(mirror_order=order, sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels)
+    _check_rays(ds.path_gain.shape, terms.sub_pixels)
+    tell("patches", 0, 1)
+    surface = Surface.of(geometry)
+    tell("patches", 1, 1)
     frequency_hz, air = float(ds.frequency_hz), getattr(ds, "air", None)
     transport = Transport.of(
         surface, transmitter, frequency_hz,
@@ -268,14 +275,27 @@ def trace(
         beam_sigma_rad=float(ds.beam_sigma_rad), loss_per_m=0.0 if air is None else air.loss_per_m(frequency_hz),
         device=device,
     )  # fmt: skip
-    found = transport.paths(receivers, order)
+    found = transport.paths(receivers, order, progress)
     views = []
     for r, receiver in enumerate(receivers):
         own = found.subset(np.flatnonzero(found.receiver == r))
         views.append(transport.view(receiver, terms, paths=own))
-        if progress is not None:
-            progress("transport", r + 1, len(receivers))
+        tell("transport", r + 1, len(receivers))
     return TrainingViews(transport, views, frequency_hz, air, time.perf_counter() - started)
+
+
+def _check_rays(shape: tuple[int, ...], sub_pixels: int) -> None:
+    """Refuse spectra of ``shape`` (R, H, W) whose rays would not fit into memory."""
+    rays = int(np.prod(shape, dtype=np.int64)) * sub_pixels**2
+    if rays > MOST_RAYS:
+        raise ValueError(
+            f"ds: {shape[0]} spectra of {shape[1]} x {shape[2]} pixels take {rays:.2g} rays, {rays * RAY_BYTES / 1e9:.0f} "
+            f"GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, ds.subset) or sub_pixels=1"
+        )
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    """No progress is asked for."""
 
 
 @dataclass(frozen=True)
@@ -347,7 +367,8 @@ class _Training:
             held = min(int(self.count * self.choose.held_out), self.choose.most_held_out)
             self.held = np.sort(rng.permutation(self.count)[:held])
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
-        self.progress: Progress = progress or (lambda stage, done, total: None)
+        self.progress: Progress = progress or _silent
+        self.behind, self.steps = 0, self._planned() if len(self.held) else 1
         pixels = self.target[0].size
         most = min(pixels, max(200, self.choose.readings // self.count))
         self.measured, self.readings = [], []
@@ -357,7 +378,7 @@ class _Training:
             self.measured.append(SpectrumPixels(self.beam, chosen))
             response = respond(self.views[r], self.measured[r], terms, self.floor)
             self.readings.append(Reading(response, self.target[r].ravel()[chosen]))
-            self.progress("fit", r, 2 * self.count)
+            self.progress("fit", r, (1 + self.steps) * self.count)
         self.log: list[dict[str, Any]] = []
 
     def run(self) -> Trained:
@@ -381,8 +402,23 @@ class _Training:
             materials = replace(materials, residual=self._residual(materials, everyone))
         if errors is not None:
             errors = replace(errors, covariance=fit.covariance)
-        self.progress("fit", 2 * self.count, 2 * self.count)
+        total = (1 + self.steps) * self.count
+        self.progress("fit", total, total)
         return Trained(self.surface, materials, self.material, errors, self._report(fit))
+
+    def _planned(self) -> int:
+        """Most fits of groups and residuals, each of which is a step of the progress that is told."""
+        o, folds = self.options, len(self._folds()) - 1
+        free = [name for name, _ in MORE if getattr(o, name) is None]
+        residual = int(o.residual is not False)
+        return (
+            3 + len(free) + self.choose.regrouped + int(o.indirect is None) + folds + (folds + 2) * residual
+        )
+
+    def _stepped(self) -> None:
+        """Tell that one more fit is behind."""
+        self.behind += 1
+        self.progress("fit", (1 + min(self.behind, self.steps)) * self.count, (1 + self.steps) * self.count)
 
     def _report(self, fit: Fitted) -> dict[str, Any]:
         report = {
@@ -504,10 +540,7 @@ class _Training:
         """Learned from the receivers held out; where they are few, from all, held out in turn."""
         receivers = np.asarray(self.ds.receivers, float)
         images, errors, gaps = [], [], []
-        folds = [self.held]
-        if self.count <= self.choose.few_receivers:
-            folds += np.array_split(self.kept, max(len(self.kept) // max(len(self.held), 2), 2))
-        for held in folds:
+        for held in self._folds():
             kept = np.setdiff1d(np.arange(self.count), held)
             if held is self.held:
                 materials = self._materials(terms, fit, residual)
@@ -522,6 +555,13 @@ class _Training:
                 errors.append(images[-1] - self.target[r])
                 gaps.append(np.linalg.norm(receivers[kept] - receivers[r], axis=1).min())
         return learn_errors(images, errors, np.array(gaps), receivers, fit.covariance)
+
+    def _folds(self) -> list[np.ndarray]:
+        """Receivers that are held out in turn to learn errors."""
+        folds = [self.held]
+        if self.count <= self.choose.few_receivers:
+            folds += np.array_split(self.kept, max(len(self.kept) // max(len(self.held), 2), 2))
+        return folds
 
     # ------------------------------------------------------------------------------------------ fitting
 
@@ -546,7 +586,9 @@ class _Training:
             self.options.groups, indirect=terms.indirect, gain=self.options.gain_offset, steps=steps
         )
         tied = [r.tied(self.material) for r in readings]
-        return fit_groups(tied, start, np.bincount(self.material, self.area), options)
+        fit = fit_groups(tied, start, np.bincount(self.material, self.area), options)
+        self._stepped()
+        return fit
 
     def _readings(self, terms: Terms, fit: Fitted, chosen: np.ndarray, *, follow: bool) -> list[Reading]:
         """Readings of the receivers ``chosen`` by groups, under ``terms``; light that reaches surfaces from others held
@@ -587,7 +629,9 @@ class _Training:
             shares_of(self._view(r, materials.terms), materials, sent, self.beam, self.floor, self.target[r])
             for r in chosen
         ]
-        return fit_residual(shares, self.beam, self.surface, self.options.residuals)
+        found = fit_residual(shares, self.beam, self.surface, self.options.residuals)
+        self._stepped()
+        return found
 
     def _materials(self, terms: Terms, fit: Fitted, residual: np.ndarray | None = None) -> Materials:
         """What ``fit`` found, by groups."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from warprrf.cache import Cache
-from warprrf.device import DeviceLike
+from warprrf.device import DeviceLike, Progress
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.elements import LIFT_M, ElementLinks
 from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M, MirrorIllumination, MirrorLight
@@ -184,9 +184,9 @@ class Transport:
 
         return self._made.get("images", make)
 
-    def paths(self, receivers: np.ndarray, order: int) -> MirrorPaths:
+    def paths(self, receivers: np.ndarray, order: int, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) with at most ``order`` reflections."""
-        return zone_paths(self.images, receivers, order, self.wavelength_m, self.surface.skin_m)
+        return zone_paths(self.images, receivers, order, self.wavelength_m, self.surface.skin_m, progress)
 
     def view(self, receivers: np.ndarray, terms: Terms, *, paths: MirrorPaths | None = None) -> ReceiverView:
         """What ``receivers``, (3,) or (R, 3) [m], see, as far as ``terms`` want it.

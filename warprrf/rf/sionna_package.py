@@ -1,4 +1,7 @@
-"""Which LLVM Dr.Jit gets on a CPU: 15 and 16 abort the process, 14 is too old, so the choice isn't left to it."""
+"""Sionna RT and Mitsuba, on an LLVM and a variant that they can use.
+
+Dr.Jit takes any LLVM on a CPU: 15 and 16 abort the process, 14 is too old, so the choice isn't left to it.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,9 @@ import glob
 import os
 import re
 from pathlib import Path
+from typing import Any
+
+from warprrf import device as _device
 
 MIN_LLVM = 17
 """Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)."""
@@ -56,3 +62,18 @@ def select_llvm() -> Path | None:
             "apt-get install libllvm19 (Debian, Ubuntu), or set DRJIT_LIBLLVM_PATH"
         )
     return None
+
+
+def sionna_rt() -> Any:
+    """Sionna RT, on a variant of Mitsuba and an LLVM that it can use."""
+    select_llvm()
+    select_variant()
+    return _device.require("sionna.rt", extra="sionna")
+
+
+def select_variant() -> Any:
+    """Mitsuba, on a variant for radio: it may be on another, for photos, and Sionna needs the one of its import."""
+    mitsuba = _device.require("mitsuba", extra="sionna")
+    if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
+        mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
+    return mitsuba

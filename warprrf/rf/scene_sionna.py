@@ -1,0 +1,201 @@
+"""Scenes of Sionna RT 2 in memory, from and to: objects, materials, transmitters and receivers.
+
+Sionna RT holds one radio material an object, in single precision, for one frequency. Materials of ITU-R P.2040 and
+constant ones are read for all frequencies; one with a law of its own in Python for the frequency that the scene has.
+Radio devices are read as positions; antennas and orientations stay with Sionna.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from warprrf.rf.em.itu import itu_material
+from warprrf.rf.em.materials import Band, Material
+from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.scene_parts import MaterialChoice, ScenePart
+from warprrf.rf.sionna_package import select_variant, sionna_rt
+
+SIONNA_FREQUENCY_HZ = 3.5e9  # that a scene of Sionna RT has before it is set
+
+NARROWEST_SIONNA_LOBE = 127
+"""Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision."""
+
+Positions = dict[str, np.ndarray]
+
+
+def parts_of(rt_scene: Any, choice: MaterialChoice) -> tuple[list[ScenePart], Positions, Positions]:
+    """Objects, transmitters and receivers of a ``sionna.rt.Scene``.
+
+    Raises:
+        TypeError: for what is no such scene.
+        ValueError: for a scene without objects, or a material that cannot be read, naming it.
+    """
+    rt = sionna_rt()
+    if not isinstance(rt_scene, rt.Scene):
+        raise TypeError(
+            f"rt_scene: got {type(rt_scene).__name__}, expected a sionna.rt.Scene (a path goes to Scene.load)"
+        )
+    if not rt_scene.objects:
+        raise ValueError("rt_scene: got a scene without objects, expected surfaces")
+    frequency = float(np.asarray(rt_scene.frequency).reshape(-1)[0])
+    found = []
+    for name, thing in rt_scene.objects.items():
+        radio = thing.radio_material
+        label = str(radio.name)
+        label = label[4:] if label.startswith(("itu_", "itu-")) else label
+        material = choice.choose(label, partial(_read, rt, radio, label, frequency))
+        mesh = thing.mi_mesh
+        vertices = np.array(mesh.vertex_positions_buffer(), dtype=np.float64).reshape(-1, 3)
+        faces = np.array(mesh.faces_buffer(), dtype=np.int32).reshape(-1, 3)
+        found.append(ScenePart(str(name), vertices, faces, material))
+    devices = (rt_scene.transmitters, rt_scene.receivers)
+    transmitters, receivers = (
+        {str(name): _shortest(np.array(device.position)) for name, device in group.items()}
+        for group in devices
+    )
+    return found, transmitters, receivers
+
+
+def _shortest(values: Any) -> np.ndarray:
+    """Single-precision values as the decimal numbers that they were most likely given as."""
+    plain = np.asarray(values, dtype=np.float32).reshape(-1)
+    return np.array([float(str(value)) for value in plain])
+
+
+def _read(rt: Any, radio: Any, name: str, frequency: float) -> Material:
+    """Our material of a radio material of Sionna's."""
+    if isinstance(radio, rt.AbsorberRadioMaterial):
+        return Material.custom(name, relative_permittivity=1.0)
+    if not isinstance(radio, rt.RadioMaterial):
+        raise ValueError(
+            f"rt_scene: material {name!r} is a {type(radio).__name__}, expected a RadioMaterial; give its values by "
+            f"materials={{{name!r}: ...}}"
+        )
+
+    def value(attribute: str) -> float:
+        return float(_shortest(getattr(radio, attribute))[0])
+
+    pattern, lobe = radio.scattering_pattern, {}
+    if isinstance(pattern, rt.DirectivePattern) or (
+        isinstance(pattern, rt.BackscatteringPattern) and float(_shortest(pattern.lambda_)[0]) == 1.0
+    ):
+        lobe = {"pattern": "directive", "alpha_r": int(pattern.alpha_r)}
+    elif not isinstance(pattern, rt.LambertianPattern) and value("scattering_coefficient") > 0:
+        raise ValueError(
+            f"rt_scene: material {name!r} scatters by {type(pattern).__name__}, expected LambertianPattern or "
+            f"DirectivePattern; give what it shall be by materials={{{name!r}: ...}}"
+        )
+    common: dict[str, Any] = {
+        "thickness_m": value("thickness"),
+        "scattering": value("scattering_coefficient"),
+        "xpd": value("xpd_coefficient"),
+        **lobe,
+    }
+    if isinstance(radio, rt.ITURadioMaterial):
+        return itu_material(radio.itu_type, name=name, **common)
+    permittivity, conductivity = value("relative_permittivity"), value("conductivity")
+    if radio.frequency_update_callback is None:
+        constant = Material.custom(name, relative_permittivity=permittivity, conductivity=conductivity)
+        return replace(constant, **common)
+    ends = frequency * (1 - 1e-6), frequency * (1 + 1e-6)
+    source = f"a law in Python of Sionna RT's material, at {frequency / 1e9:g} GHz"
+    return Material(name, (Band(*ends, permittivity, 0.0, conductivity, 0.0, source),), **common)
+
+
+def to_sionna_scene(
+    parts: Sequence[ScenePart],
+    transmitters: Mapping[str, np.ndarray],
+    receivers: Mapping[str, np.ndarray],
+    frequency_hz: float,
+) -> Any:
+    """A ``sionna.rt.Scene`` of these objects and devices; see :meth:`Scene.to_sionna`."""
+    frequency = check_frequency(frequency_hz)
+    rt = sionna_rt()
+    mi = select_variant()
+    taken = set(transmitters) | set(receivers)
+    names = []
+    for part in parts:
+        name = part.name.replace(".", "_")  # Mitsuba parts its paths by it
+        while name in taken:
+            name += "_"
+        taken.add(name)
+        names.append(name)
+    radio: dict[int, Any] = {}
+    for part in parts:
+        material = part.material
+        if id(material) not in radio:
+            name = material.name
+            while name in taken:  # Sionna's objects, materials and devices share one set of names
+                name = f"{name}-material"
+            taken.add(name)
+            radio[id(material)] = _radio_material(rt, material, name, frequency)
+    shapes: dict[str, Any] = {"type": "scene"}
+    for part, name in zip(parts, names, strict=True):
+        properties = mi.Properties()
+        properties.set_id(name)
+        properties["face_normals"] = True
+        mesh = mi.Mesh(name, len(part.vertices), len(part.faces), props=properties)
+        values = mi.traverse(mesh)
+        values["vertex_positions"] = np.ravel(part.vertices).astype(np.float32)
+        values["faces"] = np.ravel(part.faces).astype(np.uint32)
+        values.update()
+        mesh.set_bsdf(radio[id(part.material)])
+        shapes[name] = mesh
+    scene = rt.Scene(mi.load_dict(shapes, optimize=False))
+    scene.frequency = frequency
+    for material in {id(part.material): part.material for part in parts}.values():
+        _follow_frequency(
+            radio[id(material)], material
+        )  # not before: a new scene has Sionna's default frequency
+    for name, position in transmitters.items():
+        scene.add(rt.Transmitter(name, position=np.asarray(position, float).tolist()))
+    for name, position in receivers.items():
+        scene.add(rt.Receiver(name, position=np.asarray(position, float).tolist()))
+    return scene
+
+
+def _radio_material(rt: Any, material: Material, name: str, frequency: float) -> Any:
+    """Sionna's material of ours at this frequency."""
+    directive = material.pattern == "directive"
+    if directive and material.alpha_r > NARROWEST_SIONNA_LOBE:
+        raise ValueError(
+            f"material {material.name!r}: alpha_r is {material.alpha_r}, but in Sionna's single precision a lobe of more "
+            f'than {NARROWEST_SIONNA_LOBE} scatters nothing; take engine="exact" or a wider lobe'
+        )
+    if not np.isfinite(material.thickness_m):
+        raise ValueError(
+            f"material {material.name!r}: an infinite slab is unknown to Sionna; give a thickness"
+        )
+    if material.reciprocal and material.scattering_coefficient(frequency) > 0:
+        raise ValueError(
+            f"material {material.name!r}: it scatters reciprocally, Sionna RT's patterns do not; set reciprocal=False to "
+            'take its lobe of the same width, or use engine="exact"'
+        )
+    radio = rt.RadioMaterial(
+        name,
+        thickness=float(material.thickness_m),
+        relative_permittivity=material.relative_permittivity(frequency),
+        conductivity=material.conductivity(frequency),
+        scattering_coefficient=material.scattering_coefficient(frequency),
+        xpd_coefficient=float(material.xpd),
+    )
+    radio.scattering_pattern = (
+        rt.DirectivePattern(alpha_r=int(material.alpha_r)) if directive else rt.LambertianPattern()
+    )
+    return radio
+
+
+def _follow_frequency(radio: Any, material: Material) -> None:
+    """Let Sionna's material take our values whenever its scene's frequency is set."""
+
+    def law(frequency: Any) -> tuple[float, float]:
+        hertz = float(np.asarray(frequency).reshape(-1)[0])
+        radio.scattering_coefficient = material.scattering_coefficient(hertz)
+        return material.relative_permittivity(hertz), material.conductivity(hertz)
+
+    radio.frequency_update_callback = law

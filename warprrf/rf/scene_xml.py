@@ -1,0 +1,456 @@
+"""Scenes in Mitsuba's XML, as Sionna RT 2 reads them; neither of the two is needed.
+
+Read are shapes (meshes in PLY and OBJ files, Mitsuba's primitives, ``merge``) with their transforms, materials
+(``itu-radio-material``, ``radio-material``, and any other ``bsdf`` that is named after a material of ITU-R P.2040 or
+holds or refers to such a one), ``default`` values and ``$names``, ``include`` and ``alias``. Cameras, lights, textures
+and integrators are passed over. Who wrote the file is not trusted: it declares no document type (entities), is not
+nested without end, and names no file outside its folder.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+
+import numpy as np
+
+from warprrf.geometry.mesh_files import read_mesh
+from warprrf.rf.em.itu import DEFAULT_THICKNESS_M, ITU_BANDS, itu_material, itu_name
+from warprrf.rf.em.materials import Material
+from warprrf.rf.scene_parts import MaterialChoice, ScenePart
+
+MOST_BYTES = 200_000_000  # of an XML file; that of 4735 objects has a million
+MOST_NESTED = 50  # elements within each other; expat and Python take thousands
+MOST_INCLUDED = 8
+MOST_LETTERS = 10_000  # of a value after $names are replaced
+ROUND = 64  # facets around a primitive that is round
+
+Element = ElementTree.Element
+
+
+def read_scene_xml(path: Path, choice: MaterialChoice, *, allow_outside: bool = False) -> list[ScenePart]:
+    """The objects of a scene file.
+
+    Args:
+        path: the file.
+        choice: which material a name stands for.
+        allow_outside: read files outside the folder of ``path`` too.
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        ValueError: naming the file and the object, for what cannot be read.
+    """
+    return _SceneFile(path, choice, allow_outside).parts()
+
+
+class _SceneFile:
+    """One scene file, with what it includes, being read."""
+
+    def __init__(self, path: Path, choice: MaterialChoice, allow_outside: bool) -> None:
+        self.path, self.choice, self.allow_outside = path, choice, allow_outside
+        self.top = list(self._included(path, 0))
+        self._replace_names()
+        self.bsdfs = {e.get("id"): e for e in self.top if e.tag == "bsdf" and e.get("id") is not None}
+        for element in self.top:
+            if element.tag == "alias" and element.get("id") in self.bsdfs:
+                self.bsdfs[element.get("as")] = self.bsdfs[element.get("id")]
+
+    def parts(self) -> list[ScenePart]:
+        shapes = [shape for element in self.top for shape in _single_shapes(element)]
+        if not shapes:
+            raise ValueError(f"path: {self.path} holds no shapes")
+        ids = [shape.get("id") or f"shape_{k}" for k, shape in enumerate(shapes)]
+        plain = [identifier.removeprefix("mesh-") for identifier in ids]  # as Sionna RT names its objects
+        names = plain if len(set(plain)) == len(plain) else ids
+        found = []
+        for shape, name in zip(shapes, names, strict=True):
+            material = self._material(shape, name)
+            vertices, faces = self._surface(shape, name)
+            found.append(ScenePart(name, vertices, faces, material))
+        return found
+
+    def wrong(self, name: str, what: str) -> ValueError:
+        return ValueError(f"path: object {name!r} of {self.path} {what}")
+
+    # files
+
+    def _included(self, path: Path, depth: int) -> list[Element]:
+        if depth > MOST_INCLUDED:
+            raise ValueError(f"path: {self.path} includes files within files more than {MOST_INCLUDED} deep")
+        found: list[Element] = []
+        for element in read_xml(path):
+            if element.tag == "include":
+                inner = self._file(element.get("filename"), "the included file")
+                found += self._included(inner, depth + 1)
+            else:
+                found.append(element)
+        return found
+
+    def _file(self, filename: str | None, what: str) -> Path:
+        """The file of this name, relative to the scene's folder."""
+        if not filename or "\0" in filename:
+            raise ValueError(f"path: {self.path} gives no name of {what}")
+        folder = self.path.parent
+        found = folder / filename
+        if not self.allow_outside and not found.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(
+                f"path: {self.path}: {what} is {filename}, which lies outside the scene's folder; move it there, or "
+                "trust the scene and load it with allow_outside=True"
+            )
+        if not found.is_file():
+            raise FileNotFoundError(f"path: {self.path}: {what} is {found}, which is missing")
+        return found
+
+    def _replace_names(self) -> None:
+        """Put the values of ``default`` elements where attributes hold their ``$names``."""
+        values: dict[str, str] = {}
+
+        def put(text: str) -> str:
+            def value(found: re.Match[str]) -> str:
+                if found[1] not in values:
+                    raise ValueError(f"path: {self.path} uses ${found[1]}, which no <default> element gives")
+                return values[found[1]]
+
+            text = re.sub(r"\$(\w+)", value, text)
+            if len(text) > MOST_LETTERS:
+                raise ValueError(f"path: {self.path} holds a value of more than {MOST_LETTERS} characters")
+            return text
+
+        for element in self.top:
+            if element.tag == "default":
+                values.setdefault(element.get("name", ""), put(element.get("value", "")))
+        for element in self.top:
+            for part in element.iter():
+                for key, text in part.attrib.items():
+                    if "$" in text:
+                        part.set(key, put(text))
+
+    # materials
+
+    def _material(self, shape: Element, name: str) -> Material:
+        """What a shape is made of: its own ``bsdf``, or the one that it refers to."""
+        element = shape.find("bsdf")
+        if element is None:
+            links = shape.findall("ref")
+            known = [link for link in links if link.get("id") in self.bsdfs]
+            link = next(iter(known or [link for link in links if link.get("name", "bsdf") == "bsdf"]), None)
+            if link is None or link.get("id") is None:
+                raise self.wrong(name, "names no material (a <ref id=...> to a bsdf)")
+            element = self.bsdfs.get(link.get("id"), link)
+        itu = element.get("id") or _text(element, "type") or ""
+        label = itu.removeprefix("mat-")
+        label = label[4:] if label.startswith(("itu_", "itu-")) else label
+        if not label:
+            raise self.wrong(name, "has a material without an id")
+        return self.choice.choose(label, lambda: self._declared(element, label, name))
+
+    def _declared(self, element: Element, label: str, name: str) -> Material:
+        """The material that the file itself gives for the name ``label``."""
+        for candidate in self._within(element, 0):
+            try:
+                found = _radio_material(candidate, label)
+            except ValueError as error:
+                raise self.wrong(name, f"is made of {label!r}: {error}") from error
+            if found is not None:
+                return found
+        tables = f"; the table of materials has {', '.join(self.choice.names)}" if self.choice.names else ""
+        raise self.wrong(
+            name,
+            f"is made of {label!r}, which is neither a radio material nor one of ITU-R P.2040 "
+            f"({', '.join(sorted(ITU_BANDS))}){tables}; give it by materials={{{label!r}: ...}}",
+        )
+
+    def _within(self, element: Element, depth: int) -> list[Element]:
+        """``element``, then the materials that it holds or refers to (as ``twosided`` does)."""
+        if depth > MOST_NESTED:
+            raise ValueError(f"path: {self.path} holds materials that refer to each other in a circle")
+        found = [element]
+        for part in element:
+            if part.tag == "bsdf":
+                found += self._within(part, depth + 1)
+            elif part.tag == "ref" and part.get("id") in self.bsdfs:
+                found += self._within(self.bsdfs[part.get("id")], depth + 1)
+        return found
+
+    # surfaces
+
+    def _surface(self, shape: Element, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices [m] and faces of a shape where it stands."""
+        kind = shape.get("type", "")
+        try:
+            if kind in ("ply", "obj"):
+                file = self._file(_text(shape, "filename"), f"the mesh of object {name!r}")
+                mesh = read_mesh(file, colours=False)
+                vertices, faces = mesh.vertices, mesh.faces
+            elif kind in _PRIMITIVES:
+                vertices, faces = _PRIMITIVES[kind](shape)
+            else:
+                raise self.wrong(
+                    name,
+                    f"is a {kind!r}, expected one of ply, obj, {', '.join(_PRIMITIVES)}; export it as a mesh",
+                )
+            place = next((t for t in shape.findall("transform") if t.get("name") == "to_world"), None)
+            matrix = np.eye(4) if place is None else to_world(place)
+        except ValueError as error:
+            if str(error).startswith("path: "):
+                raise
+            raise self.wrong(name, str(error)) from error
+        if place is not None:
+            vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+            if not np.isfinite(vertices).all():
+                raise self.wrong(name, "is transformed to places that are NaN or infinite")
+        flipped = (_text(shape, "flip_normals", "boolean") or "").strip().lower() == "true"
+        if flipped != (np.linalg.det(matrix[:3, :3]) < 0):  # a mirrored solid keeps its outer side
+            faces = faces[:, ::-1]
+        return vertices, faces
+
+
+def read_xml(path: Path) -> Element:
+    """The root element of an XML file.
+
+    Raises:
+        ValueError: naming the file, if it is not well-formed, too large or too deep, or declares a document type.
+    """
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"path: {path} has {path.stat().st_size} bytes, expected at most {MOST_BYTES}")
+    builder, depth = ElementTree.TreeBuilder(), 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > MOST_NESTED:
+            raise ValueError(f"path: {path} is nested more than {MOST_NESTED} deep")
+        builder.start(tag, attributes)
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    def document_type(*_: object) -> None:
+        raise ValueError(f"path: {path} declares a document type, which a scene has no use for")
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartDoctypeDeclHandler = document_type
+    try:
+        parser.Parse(path.read_bytes(), True)
+    except (expat.ExpatError, LookupError) as error:  # the latter: of its encoding
+        raise ValueError(f"path: {path} is not well-formed: {error}") from error
+    return builder.close()
+
+
+def _single_shapes(element: Element) -> list[Element]:
+    """``element`` if it is a shape; those within if it is a ``merge`` of shapes."""
+    if element.tag != "shape":
+        return []
+    if element.get("type") != "merge":
+        return [element]
+    return [shape for part in element for shape in _single_shapes(part)]
+
+
+def _text(element: Element, name: str, tag: str = "string") -> str | None:
+    return next((part.get("value") for part in element.findall(tag) if part.get("name") == name), None)
+
+
+def _value(element: Element, name: str, default: float) -> float:
+    """A number's property ``name``."""
+    for tag in ("float", "integer"):
+        text = _text(element, name, tag)
+        if text is not None:
+            return _numbers(text, f"{name!r}", 1)[0]
+    return default
+
+
+def _numbers(text: str, what: str, *counts: int) -> list[float]:
+    """The numbers of ``text``, between which stand commas or blanks."""
+    try:
+        found = [float(word) for word in re.split(r"[\s,]+", text.strip())]
+    except ValueError as error:
+        raise ValueError(f"has {what} {text!r:.60}, expected numbers") from error
+    if len(found) not in counts or not np.isfinite(found).all():
+        wanted = " or ".join(str(n) for n in counts)
+        raise ValueError(f"has {what} {text!r:.60}, expected {wanted} finite numbers")
+    return found
+
+
+def _radio_material(element: Element, label: str) -> Material | None:
+    """The radio material that ``element`` itself gives, called ``label``; None for one of looks alone.
+
+    Sionna RT takes every ``bsdf`` whose id begins with ``itu_`` for that material of P.2040, whatever its type.
+    """
+    kind, identifier = element.get("type"), element.get("id") or ""
+    common: dict[str, Any] = {
+        "thickness_m": _value(element, "thickness", DEFAULT_THICKNESS_M),
+        "scattering": _value(element, "scattering_coefficient", 0.0),
+        "xpd": _value(element, "xpd_coefficient", 0.0),
+        "pattern": _text(element, "scattering_pattern") or "lambertian",
+        "alpha_r": int(_value(element, "alpha_r", 4)),
+    }
+    prefixed = identifier.removeprefix("mat-").startswith(("itu_", "itu-"))
+    if kind == "itu-radio-material" or prefixed:
+        itu = _text(element, "type") or identifier
+        return itu_material(itu, name=label, **common)
+    if kind == "absorber-radio-material":  # nothing comes back
+        return Material.custom(label, relative_permittivity=1.0)
+    if kind == "radio-material":
+        constant = Material.custom(
+            label,
+            relative_permittivity=_value(element, "relative_permittivity", 1.0),
+            conductivity=_value(element, "conductivity", 0.0),
+        )
+        return replace(constant, **common)
+    return itu_material(identifier, name=label, **common) if itu_name(identifier) else None
+
+
+def to_world(transform: Element) -> np.ndarray:
+    """The matrix of a ``transform`` element, shape ``(4, 4)``: its parts apply one after the other, first to last.
+
+    Raises:
+        ValueError: for parts that are unknown or hold no such numbers.
+    """
+    matrix = np.eye(4)
+    for part in transform:
+        if part.tag not in _TRANSFORMS:
+            raise ValueError(
+                f"has the transform {part.tag!r}, expected one of {', '.join(_TRANSFORMS)}; apply it to the mesh"
+            )
+        matrix = _TRANSFORMS[part.tag](part) @ matrix
+    return matrix
+
+
+def _vector(part: Element, name: str, default: float | None) -> np.ndarray:
+    """``x``, ``y`` and ``z``, or ``value`` with three numbers or one, or ``name`` with three."""
+    for key, counts in (("value", (1, 3)), (name, (3,))):
+        text = part.get(key)
+        if text is not None:
+            return np.broadcast_to(_numbers(text, f"the {part.tag} {key}", *counts), 3).astype(float)
+    if default is None:
+        raise ValueError(f"has a {part.tag} without {name!r}")
+    return np.array([_numbers(part.get(k, str(default)), f"the {part.tag} {k}", 1)[0] for k in "xyz"])
+
+
+def _affine(linear: np.ndarray, offset: np.ndarray | None = None) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    if offset is not None:
+        matrix[:3, 3] = offset
+    return matrix
+
+
+def _unit(vector: np.ndarray, what: str) -> np.ndarray:
+    length = np.linalg.norm(vector)
+    if not length > 0:
+        raise ValueError(f"has {what} of no length")
+    return vector / length
+
+
+def _rotate(part: Element) -> np.ndarray:
+    axis = _vector(part, "axis", 0.0)
+    if not np.isclose(np.linalg.norm(axis), 1.0, rtol=1e-4):  # Mitsuba takes it as it is, and bends the shape
+        raise ValueError(f"has a rotation about {axis.tolist()}, expected an axis of length 1")
+    angle = np.deg2rad(_numbers(part.get("angle", "0"), "the rotation angle", 1)[0])
+    cross = np.cross(np.eye(3), axis)  # cross @ v is axis x v; Rodrigues' formula
+    return _affine(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+
+
+def _look_at(part: Element) -> np.ndarray:
+    origin, target, up = (_vector_of(part, name) for name in ("origin", "target", "up"))
+    forward = _unit(target - origin, "a lookat from origin to target")
+    left = _unit(np.cross(up, forward), "a lookat whose 'up' lies along it,")
+    return _affine(np.column_stack([left, np.cross(forward, left), forward]), origin)
+
+
+def _vector_of(part: Element, name: str) -> np.ndarray:
+    text = part.get(name, "0, 0, 1" if name == "up" else None)
+    if text is None:
+        raise ValueError(f"has a lookat without {name!r}")
+    return np.array(_numbers(text, f"the lookat {name}", 3))
+
+
+def _matrix(part: Element) -> np.ndarray:
+    values = np.array(_numbers(part.get("value", ""), "the matrix", 9, 16))
+    if len(values) == 9:
+        return _affine(values.reshape(3, 3))
+    matrix = values.reshape(4, 4)
+    if not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise ValueError(f"has a matrix whose last row is {matrix[3].tolist()}, expected 0, 0, 0, 1")
+    return matrix
+
+
+_TRANSFORMS: dict[str, Callable[[Element], np.ndarray]] = {
+    "translate": lambda part: _affine(np.eye(3), _vector(part, "offset", 0.0)),
+    "scale": lambda part: _affine(np.diag(_vector(part, "factors", 1.0))),
+    "rotate": _rotate,
+    "lookat": _look_at,
+    "look_at": _look_at,
+    "matrix": _matrix,
+}
+
+
+def _revolved(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The surface that (radius, z) points ``(N, 2)`` sweep about the z axis, normals to the left of their course."""
+    turn = np.arange(ROUND) * 2 * np.pi / ROUND
+    radius, z = profile.T
+    vertices = np.stack(
+        [
+            np.outer(radius, np.cos(turn)),
+            np.outer(radius, np.sin(turn)),
+            np.repeat(z[:, None], ROUND, axis=1),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    ring, along = np.meshgrid(np.arange(len(profile) - 1) * ROUND, np.arange(ROUND), indexing="ij")
+    a, b = ring + along, ring + (along + 1) % ROUND
+    c, d = b + ROUND, a + ROUND
+    first, second = np.stack([a, d, c], axis=-1), np.stack([a, c, b], axis=-1)
+    poles = radius == 0
+    kept = [first[~poles[1:]], second[~poles[:-1]]]  # at a pole one of the two has no area
+    return vertices, np.concatenate([faces.reshape(-1, 3) for faces in kept]).astype(np.int32)
+
+
+def _sphere(shape: Element) -> tuple[np.ndarray, np.ndarray]:
+    polar = np.linspace(0.0, np.pi, ROUND // 2 + 1)
+    sine = np.sin(polar)
+    sine[[0, -1]] = 0.0
+    vertices, faces = _revolved(np.column_stack([sine, np.cos(polar)]))
+    return _value(shape, "radius", 1.0) * vertices + _point(shape, "center", (0.0, 0.0, 0.0)), faces
+
+
+def _cylinder(shape: Element) -> tuple[np.ndarray, np.ndarray]:
+    radius, start = _value(shape, "radius", 1.0), _point(shape, "p0", (0.0, 0.0, 0.0))
+    along = _point(shape, "p1", (0.0, 0.0, 1.0)) - start
+    vertices, faces = _revolved(np.array([[radius, np.linalg.norm(along)], [radius, 0.0]]))
+    up = _unit(along, "an axis")
+    side = _unit(np.cross(np.eye(3)[np.abs(up).argmin()], up), "an axis")
+    return vertices @ np.stack([side, np.cross(up, side), up]) + start, faces
+
+
+def _point(shape: Element, name: str, default: tuple[float, float, float]) -> np.ndarray:
+    part = next((p for p in shape.findall("point") if p.get("name") == name), None)
+    return np.array(default) if part is None else _vector(part, name, 0.0)
+
+
+def _cube(_: Element) -> tuple[np.ndarray, np.ndarray]:
+    vertices = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    return vertices, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).astype(np.int32)
+
+
+def _rectangle(_: Element) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+
+
+_PRIMITIVES: dict[str, Callable[[Element], tuple[np.ndarray, np.ndarray]]] = {
+    "rectangle": _rectangle,
+    "cube": _cube,
+    "sphere": _sphere,
+    "disk": lambda _: _revolved(np.array([[0.0, 0.0], [1.0, 0.0]])),
+    "cylinder": _cylinder,
+}
