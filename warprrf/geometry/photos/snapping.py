@@ -22,7 +22,6 @@ LONGEST_MOVE_M = 0.15  # of a vertex to its plane
 FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
 DRAWN = 100_000  # faces are enough to find planes among
 SCAN_NOISE_M = 2e-3  # vertices whose errors are larger are a scanner's
-SCAN_BEND_RAD = 1.2  # and bend neighbours by so much at most
 SMOOTHED = 5  # rounds of smoothing a scan
 SHRINK, GROW = 0.5, -0.53  # Taubin (1995): noise goes, nothing shrinks
 
@@ -66,7 +65,7 @@ def find_patches(
 def is_scan(mesh: Mesh) -> bool:
     """Whether the vertices of ``mesh`` have errors like a scanner's: more than :data:`SCAN_NOISE_M`."""
     pairs = edge_pairs(mesh.welded_faces, np.flatnonzero(mesh.areas > 0))
-    return vertex_noise(mesh, pairs, mesh.rounding_m, SCAN_BEND_RAD) > SCAN_NOISE_M
+    return vertex_noise(mesh, pairs, mesh.rounding_m) > SCAN_NOISE_M
 
 
 def scanned_patches(mesh: Mesh, config: SurfaceConfig | None = None) -> PlanarPatches:

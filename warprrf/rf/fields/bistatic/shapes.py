@@ -65,7 +65,7 @@ def shape_groups(
     group = _without_crumbs(mesh, _pieces(mesh, patch, pairs, o), part, o)
     _, first = np.unique(group, return_index=True)
     through = _extents(mesh, part) >= o.through * _extents(mesh, np.zeros(len(part), np.int64))
-    lone = through.all(axis=1)[part[first]]
+    lone = np.asarray(through.all(axis=1))[part[first]]
     body = np.unique(np.where(lone, np.arange(len(first)), len(first) + part[first]), return_inverse=True)[1]
     shape, area = _shape(mesh, body[group], o), np.bincount(body[group], mesh.areas)
     large = np.flatnonzero(area >= min(o.body_m2, float(area.max())))
