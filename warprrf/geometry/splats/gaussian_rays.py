@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.rays import check_rows
 from warprrf.geometry.splats.blending import RADIO, Blending
@@ -72,6 +72,7 @@ class Traced:
         return self.t, self.alpha, self.weight, self.left
 
 
+@checked
 class GaussianRays:
     """Gaussians in a hierarchy, asked along arbitrary rays.
 

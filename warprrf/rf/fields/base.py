@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import LARGEST_M, check_array, check_number, check_positive, check_type
+from warprrf.checks import LARGEST_M, check_array, check_number, check_positive, check_type, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
@@ -32,6 +32,7 @@ CARRIERS_HZ = (1e3, 1e16)
 NARROWEST_BEAM_RAD = 1e-4
 
 
+@checked
 class RadioField(ABC):
     """A fitted radio field; build it with :meth:`fit` or :meth:`load`.
 

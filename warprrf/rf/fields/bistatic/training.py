@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.checks import check_array, check_count, check_seed
+from warprrf.checks import check_array, check_count, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.em.absorption import Air
@@ -96,6 +96,7 @@ class Selection:
     regrouping: Regrouping = Regrouping()
 
 
+@checked
 @dataclass(frozen=True)
 class FitOptions:
     """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
