@@ -118,7 +118,7 @@ def full_field(
             "fit",
         )
     surface = Surface.of(geometry)
-    known = hasattr(geometry, "face_material")
+    known = hasattr(geometry, "materials")
     if known:
         parameters, lobes = material_parameters(geometry.materials, frequency_hz)
         table = surface_table(list(geometry.materials), frequency_hz)
