@@ -82,7 +82,7 @@ def simulate(
             unknown engine.
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
     """
-    if not hasattr(scene, "face_material"):
+    if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
