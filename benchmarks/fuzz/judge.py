@@ -72,9 +72,20 @@ def complaint(error: BaseException, names: Collection[str]) -> str:
 
 
 def wrong(answer: Leaves, usual: Leaves) -> str:
-    """Where ``answer`` holds NaN that the ``usual`` answer does not have there."""
+    """Where ``answer`` holds NaN that the ``usual`` answer does not have there.
+
+    A pixel of a spectrum from which nothing comes has no delay and no direction: these are NaN there.
+    """
     for where, array in answer.items():
         if array.dtype.kind in "fc" and np.isnan(array).any():
+            gain = answer.get(where.rpartition(".")[0] + ".path_gain")
+            if (
+                gain is not None
+                and where.endswith((".delay_s", ".aod"))
+                and gain.shape == array.shape[: gain.ndim]
+            ):
+                if not np.isnan(array[gain > 0]).any():
+                    continue
             known = usual.get(where)
             if known is None or not (known.dtype.kind in "fc" and np.isnan(known).any()):
                 return f"NaN in answer{where}"

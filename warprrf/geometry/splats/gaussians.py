@@ -146,7 +146,7 @@ class Gaussians:
             ValueError: if it is no PLY, is cut short, or lacks a property of the layout.
         """
         if not Path(path).is_file():
-            raise FileNotFoundError(f"{os.fspath(path)}: no such file")
+            raise FileNotFoundError(f"path: there is no file {os.fspath(path)!r}")
         table = read_ply(path).get("vertex", {})
 
         def columns(*names: str) -> np.ndarray:

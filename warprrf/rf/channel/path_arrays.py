@@ -112,9 +112,12 @@ class PathArrays:
 
         Raises:
             TypeError: for paths of one receiver.
+            ValueError: if there is no such receiver.
         """
         if not self.batched:
             raise TypeError("paths of one receiver cannot be indexed by receiver; expected paths of several")
+        if not -len(self.gain) <= receiver < len(self.gain):
+            raise ValueError(f"receiver: got {receiver}, expected one of {len(self.gain)}")
         point = None if self.receiver is None else self.receiver[receiver]
         return replace(self._taken(receiver), receiver=point)
 
@@ -294,6 +297,8 @@ def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.nda
 
 def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
     """The arrays of all parts by name, equally deep; without ``jones`` if no part has it, NaN for those that lack it."""
+    if not len(parts):
+        raise ValueError("parts: got none, expected at least one")
     columns = {name: [getattr(p, name) for p in parts] for name in _PADDING}
     depth = max((v.shape[1] for v in columns["vertices"]), default=1)
     columns["vertices"] = [_padded(v, 1, depth, np.nan) for v in columns["vertices"]]

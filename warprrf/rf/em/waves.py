@@ -25,6 +25,7 @@ def check_frequency(frequency_hz: ArrayLike | None) -> float:
 @checked
 def carrier_phase(frequency_hz: ArrayLike, tau: ArrayLike) -> np.ndarray:
     """exp(-j 2 pi f tau); whole turns are dropped before the exponential, since f tau reaches 1e4 and more."""
-    frequency, delay = np.asarray(frequency_hz), np.asarray(tau)
+    frequency = check_array("frequency_hz", frequency_hz, finite=False)
+    delay = check_array("tau", tau, finite=False)
     check_alike(frequency_hz=frequency, tau=delay)
     return np.exp(-2j * np.pi * np.mod(frequency * delay, 1.0))

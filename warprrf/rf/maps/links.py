@@ -20,7 +20,13 @@ from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, directions_from_angles, pixel_of, pixel_solid_angles
+from warprrf.rf.spectra.spectrum import (
+    BEAM_SIGMA_RAD,
+    check_shape,
+    directions_from_angles,
+    pixel_of,
+    pixel_solid_angles,
+)
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,8 @@ class LinkOptions:
     progress: Progress | None = None
 
     def __post_init__(self) -> None:
+        if self.shape is not None:
+            object.__setattr__(self, "shape", check_shape(self.shape))
         sigma = self.beam_sigma_rad
         check_positive("beam_sigma_rad", sigma, "beam width in radians")
         if self.mirror_order not in (None, 0, 1, 2, 3):

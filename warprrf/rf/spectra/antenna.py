@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_positive
+from warprrf.checks import check_array, check_count, check_number, check_positive
 from warprrf.device import DeviceLike
 from warprrf.rf.spectra.spectrum import (
     check_shape,
@@ -79,8 +79,7 @@ class Scan:
     device: DeviceLike = None
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.noise) and self.noise >= 0):
-            raise ValueError(f"noise: got {self.noise!r}, expected a linear power of at least 0")
+        check_number("noise", self.noise, 0.0)
         for name in ("iterations", "snapshots"):
             check_count(name, getattr(self, name))
         check_positive("tolerance", self.tolerance)
