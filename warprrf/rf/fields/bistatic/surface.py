@@ -217,12 +217,12 @@ def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None,
     """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
     Scene's materials, else of the mesh's, the last for faces of none."""
     known = getattr(geometry, "face_material", None)
-    if known is not None and not isinstance(geometry, Mesh):
+    if known is not None:
         return np.asarray(known, np.int32), tuple(m.name for m in getattr(geometry, "materials", ()))
-    if mesh.face_material is None:
+    if mesh.face_label is None:
         return None, ("surface",)
-    names = mesh.material_names
-    own = np.where(mesh.face_material < 0, len(names), mesh.face_material)
+    names = mesh.labels
+    own = np.where(mesh.face_label < 0, len(names), mesh.face_label)
     used, group = np.unique(own, return_inverse=True)
     if len(used) < 2:
         return None, ("surface",)
