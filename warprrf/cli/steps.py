@@ -65,7 +65,11 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
 def add_simulate(add: Add) -> None:
     """Define `simulate`."""
     sim = add("simulate", _simulate)
-    sim.add_argument("scene", help="scene XML (Mitsuba/Sionna RT), with materials.json beside it")
+    sim.add_argument("scene", help="scene (Mitsuba/Sionna RT's XML) or mesh file")
+    sim.add_argument(
+        "--materials", metavar="FILE", help="table of materials (default: materials.json beside it)"
+    )
+    add_mesh_options(sim)
     add_out(sim, "NetCDF file")
     add_point(sim, "--transmitter", "metres", required=True)
     sim.add_argument(
@@ -87,6 +91,13 @@ def add_simulate(add: Add) -> None:
     sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
 
 
+def _load_scene(args: argparse.Namespace) -> wr.Scene:
+    table = None if args.materials is None else existing(args.materials)
+    return wr.Scene.load(
+        existing(args.scene), materials=table, unit=args.unit, up=args.up, simplify=args.simplify
+    )
+
+
 def _simulate(args: argparse.Namespace, bars: Bars) -> None:
     """Radio spectra of a scene at given receivers.
 
@@ -97,11 +108,12 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
 
     examples:
       warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,5,1.5
+      warprrf simulate room.glb -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 --materials materials.json
       warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
     """
     unfinished = Path(f"{args.out}.receivers")
     dataset = wr.simulate(
-        wr.Scene.load(existing(args.scene)),
+        _load_scene(args),
         transmitter=np.array(args.transmitter, dtype=np.float64),
         receivers=read_receivers(args.receivers),
         frequency_hz=args.frequency,

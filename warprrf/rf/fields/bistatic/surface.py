@@ -216,9 +216,9 @@ class Surface:
 def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
     Scene's materials, else of the mesh's, the last for faces of none."""
-    known = getattr(geometry, "face_material", None)
-    if known is not None:
-        return np.asarray(known, np.int32), tuple(m.name for m in getattr(geometry, "materials", ()))
+    known, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
+    if known is not None and (len(materials) > 1 or all(m.bands for m in materials)):
+        return np.asarray(known, np.int32), tuple(m.name for m in materials)
     if mesh.face_label is None:
         return None, ("surface",)
     names = mesh.labels
