@@ -95,6 +95,14 @@ def add_mesh_options(parser: argparse.ArgumentParser) -> None:
         help="axis of a mesh file that points up (default: y for glTF, else z)",
     )
     parser.add_argument("--simplify", type=int, metavar="N", help="most triangles of a mesh file")
+    add_allow_outside(parser)
+
+
+def add_allow_outside(parser: argparse.ArgumentParser) -> None:
+    """Define that a scene may name any file."""
+    parser.add_argument(
+        "--allow-outside", action="store_true", help="read meshes outside the scene's folder too"
+    )
 
 
 def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> Any:
@@ -103,7 +111,7 @@ def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> A
     if source.is_dir():
         return wr.Reconstruction.load(source)
     if source.suffix == ".xml":
-        return wr.Scene.load(source)
+        return wr.Scene.load(source, allow_outside=options.allow_outside)
     if not is_mesh_file(source):
         raise ValueError(
             f"{source}: expected a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh "
@@ -118,4 +126,10 @@ def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> A
 
 
 def _load_mesh(path: str | Path, options: argparse.Namespace) -> wr.Mesh:
-    return wr.Mesh.load(existing(path), options.unit, options.up, simplify=options.simplify)
+    return wr.Mesh.load(
+        existing(path),
+        options.unit,
+        options.up,
+        simplify=options.simplify,
+        allow_outside=options.allow_outside,
+    )

@@ -15,6 +15,7 @@ from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import (
     Add,
+    add_allow_outside,
     add_mesh_options,
     add_out,
     add_point,
@@ -89,12 +90,18 @@ def add_simulate(add: Add) -> None:
     sim.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receiver beam (default 2 degrees)")
     sim.add_argument("--refraction", action="store_true", help="transmission through walls (sionna)")
     sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
+    add_allow_outside(sim)
 
 
 def _load_scene(args: argparse.Namespace) -> wr.Scene:
     table = None if args.materials is None else existing(args.materials)
     return wr.Scene.load(
-        existing(args.scene), materials=table, unit=args.unit, up=args.up, simplify=args.simplify
+        existing(args.scene),
+        materials=table,
+        allow_outside=args.allow_outside,
+        unit=args.unit,
+        up=args.up,
+        simplify=args.simplify,
     )
 
 

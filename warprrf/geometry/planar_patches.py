@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
 from warprrf.geometry.mesh import Mesh, vectors_across
-from warprrf.geometry.mesh_topology import components
+from warprrf.geometry.mesh_topology import components, edge_pairs
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
@@ -167,7 +167,7 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
     longest = np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, 1, axis=1), axis=2).max(axis=1)
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
     once &= ~_is_sliver(corner, height, rounding)
-    pairs = _neighbours(corner, np.flatnonzero(once))
+    pairs = edge_pairs(corner, np.flatnonzero(once))
     noise = vertex_noise(mesh, pairs, rounding)
     faces = _Faces(mesh, group, height, FLAT_M + 6.0 * noise, 3.0 * noise)
     piece = _pieces(faces, once, pairs)
@@ -240,20 +240,6 @@ def _is_sliver(corner: np.ndarray, height: np.ndarray, rounding: float) -> np.nd
     """Faces without a plane of their own: corners that fall together, or a height that rounding alone makes."""
     a, b, c = corner.T
     return (a == b) | (b == c) | (c == a) | (height <= 4.0 * rounding)
-
-
-def _neighbours(corner: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Pairs of the faces ``face`` that share an edge, shape ``(N, 2)``."""
-    edge = np.sort(corner[face][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    owner = np.repeat(face, 3)
-    order = np.lexsort((owner, edge[:, 1], edge[:, 0]))
-    edge, owner = edge[order], owner[order]
-    # Where more than two faces share an edge, neighbours in sorted order are not all pairs: look three ahead.
-    pairs = [np.zeros((0, 2), int)]
-    for step in (1, 2, 3):
-        same = (edge[step:] == edge[:-step]).all(axis=1)
-        pairs.append(np.column_stack([owner[:-step][same], owner[step:][same]]))
-    return np.concatenate(pairs)
 
 
 def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:

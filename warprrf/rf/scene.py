@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_number, check_type
+from warprrf.checks import check_array, check_number, check_type, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
@@ -27,6 +27,7 @@ from warprrf.rf.scene_xml import read_scene_xml
 T = TypeVar("T")
 
 
+@checked
 class Scene:
     """Surfaces and what they are made of.
 
