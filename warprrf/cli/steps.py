@@ -15,7 +15,6 @@ from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import (
     Add,
-    add_allow_outside,
     add_mesh_options,
     add_out,
     add_point,
@@ -90,7 +89,6 @@ def add_simulate(add: Add) -> None:
     sim.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receiver beam (default 2 degrees)")
     sim.add_argument("--refraction", action="store_true", help="transmission through walls (sionna)")
     sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
-    add_allow_outside(sim)
 
 
 def _load_scene(args: argparse.Namespace) -> wr.Scene:

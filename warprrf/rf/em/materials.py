@@ -248,13 +248,18 @@ class Material:
         return roughness_scattering(self.roughness_m, frequency_hz)
 
 
+def is_name_alone(material: object) -> bool:
+    """Whether nothing is known of a material but its name."""
+    return isinstance(material, Material) and not material.bands
+
+
 def check_known(materials: Iterable[Material]) -> None:
     """Refuse materials that are names alone.
 
     Raises:
         ValueError: naming them all.
     """
-    unknown = sorted({material.name for material in materials if not material.bands})
+    unknown = sorted({material.name for material in materials if is_name_alone(material)})
     if unknown:
         raise ValueError(
             f"materials: nothing is known of {', '.join(map(repr, unknown))} but the name, expected radio materials: "

@@ -25,6 +25,7 @@ from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.kernels.radio import bounce
+from warprrf.rf.em.materials import is_name_alone
 from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
 from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
 
@@ -239,7 +240,7 @@ def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None,
     """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
     Scene's materials, else of the mesh's, the last for faces of none."""
     known, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
-    if known is not None and (len(materials) > 1 or all(m.bands for m in materials)):
+    if known is not None and (len(materials) > 1 or not any(map(is_name_alone, materials))):
         return np.asarray(known, np.int32), tuple(m.name for m in materials)
     if mesh.face_label is None:
         return None, ()
