@@ -309,8 +309,8 @@ def test_wheel_works_in_a_fresh_environment_without_extras(wheel: Path, tmp_path
     )
     assert done.returncode != 0
     assert 'ImportError: pycolmap is not installed: pip install "warprrf[photos]"' in done.stderr
-    scene = str(ROOT / "data" / "lobby" / "scene.xml")
-    done = python(f"import warprrf as wr; wr.Scene.load({scene!r})", interpreter, cwd=tmp_path)
+    (tmp_path / "room.glb").write_bytes(b"glTF")
+    done = python("import warprrf as wr; wr.Mesh.load('room.glb')", interpreter, cwd=tmp_path)
     assert 'ImportError: trimesh is not installed: pip install "warprrf[mesh]"' in done.stderr
     done = subprocess.run(
         [str(fresh / "bin" / "warprrf"), "--version"],

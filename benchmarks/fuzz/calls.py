@@ -196,6 +196,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Mesh.closest": _on(lambda p: p.mesh, points=POINTS, device="cpu"),
     "Mesh.cross_section": _on(lambda p: p.mesh, height=1.0),
     "Mesh.distance": _on(lambda p: p.mesh, points=POINTS, device="cpu"),
+    "Mesh.load": lambda p: {"path": p.folder / "meshes/mesh.ply", "unit": "m", "up": "z", "simplify": 20},
     "Mesh.look_around": _on(lambda p: p.mesh, points=POINTS, directions=TOWARDS, device="cpu"),
     "Mesh.on_device": _on(lambda p: p.mesh, device="cpu"),
     "Mesh.visible": _on(lambda p: p.mesh, a=POINTS, b=POINTS[::-1].copy(), device="cpu"),

@@ -161,6 +161,8 @@ FORMATS: dict[str, Format] = {
     "JPEG": Format(_copy("photos/1.jpg"), _photo),
     "PLY mesh": Format(_copy("meshes/mesh.ply"), _mesh, "words"),
     "OBJ mesh": Format(_copy("meshes/mesh.obj"), _mesh, "words"),
+    "STL mesh": Format(_copy("meshes/mesh.stl"), _mesh),
+    "GLB mesh": Format(_copy("meshes/mesh.glb"), _mesh),
     **{
         f"COLMAP {name}": Format(_copy(f"colmap/{name}.bin"), lambda p: read_colmap(p.parent))
         for name in ("cameras", "images", "points3D")

@@ -96,6 +96,7 @@ class Place:
     def _make_foreign(self) -> None:
         """What other software writes: NeWRF's rays, a COLMAP model, meshes."""
         import pycolmap
+        import trimesh
 
         rng = np.random.default_rng(0)
         newrf, model, meshes = (self.folder / name for name in ("newrf", "colmap", "meshes"))
@@ -106,8 +107,12 @@ class Place:
             last_point=rng.uniform(0.5, 3.0, (10, 4, 3)), gain=rng.normal(size=(10, 4)) * (1e-3 + 1e-3j),
             rays=np.full(10, 3), csi=rng.normal(size=10) * (1e-3 + 1e-3j), line_of_sight=np.ones(10, bool),
         )  # fmt: skip
-        for suffix in ("ply", "obj", "stl"):
+        for suffix in ("ply", "obj"):
             write_mesh(meshes / f"mesh.{suffix}", self.mesh.vertices, self.mesh.faces)
+        for suffix in ("stl", "glb"):
+            trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False).export(
+                meshes / f"mesh.{suffix}"
+            )
         (newrf / "conferenceroom.stl").write_bytes((meshes / "mesh.stl").read_bytes())
         options = pycolmap.SyntheticDatasetOptions(
             num_points3D=20, num_frames_per_rig=3, camera_model_id=pycolmap.CameraModelId.PINHOLE,

@@ -14,6 +14,8 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_array
 from warprrf.files import read_json
+from warprrf.geometry.mesh_files import METRES, READERS, is_mesh_file
+from warprrf.geometry.ply_files import ply_columns
 
 Add = Callable[..., argparse.ArgumentParser]
 """Defines one command: name and what runs it, whose docstring is its help (or a line and a text of help)."""
@@ -84,13 +86,36 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
     return rows
 
 
-def load_geometry(path: str, mesh: str | None) -> Any:
-    """A saved reconstruction (folder), splats (PLY, optionally with a mesh), or a scene (XML: its true mesh)."""
+def add_mesh_options(parser: argparse.ArgumentParser) -> None:
+    """Define how a mesh file is read."""
+    parser.add_argument("--unit", choices=tuple(METRES), help="of a mesh file (default m)")
+    parser.add_argument(
+        "--up",
+        choices=("x", "y", "z"),
+        help="axis of a mesh file that points up (default: y for glTF, else z)",
+    )
+    parser.add_argument("--simplify", type=int, metavar="N", help="most triangles of a mesh file")
+
+
+def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> Any:
+    """A saved reconstruction (folder), splats (PLY, optionally with a mesh), a scene (XML) or a mesh file."""
     source = existing(path)
     if source.is_dir():
         return wr.Reconstruction.load(source)
     if source.suffix == ".xml":
         return wr.Scene.load(source)
-    if source.suffix == ".ply":
-        return wr.Reconstruction.from_files(source, mesh=existing(mesh) if mesh else None)
-    raise ValueError(f"{source}: expected a reconstruction's folder, splats (.ply) or a scene (.xml)")
+    if not is_mesh_file(source):
+        raise ValueError(
+            f"{source}: expected a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh "
+            f"({', '.join(READERS)})"
+        )
+    if source.suffix.lower() == ".ply" and "scale_0" in ply_columns(source).get("vertex", ()):
+        own = None if mesh is None else _load_mesh(mesh, options)
+        return wr.Reconstruction.from_files(source, mesh=own)
+    if mesh is not None:
+        raise ValueError(f"--mesh: {source} is a mesh itself, expected splats (.ply) where --mesh is given")
+    return _load_mesh(source, options)
+
+
+def _load_mesh(path: str | Path, options: argparse.Namespace) -> wr.Mesh:
+    return wr.Mesh.load(existing(path), options.unit, options.up, simplify=options.simplify)

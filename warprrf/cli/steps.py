@@ -15,6 +15,7 @@ from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import (
     Add,
+    add_mesh_options,
     add_out,
     add_point,
     existing,
@@ -124,7 +125,9 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
 def add_fit(add: Add) -> None:
     """Define `fit`."""
     fit = add("fit", _fit)
-    fit.add_argument("geometry", help="a reconstruction's folder, splats (.ply) or a scene (.xml)")
+    fit.add_argument(
+        "geometry", help="a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh file"
+    )
     fit.add_argument("spectra", help="NetCDF file of spectra")
     add_out(fit, "field file (.safetensors)")
     fit.add_argument(
@@ -136,7 +139,8 @@ def add_fit(add: Add) -> None:
         metavar="N",
         help="receivers of the nested training subset (default: all for training)",
     )
-    fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is a .ply")
+    fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is splats")
+    add_mesh_options(fit)
     fit.add_argument(
         "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: terms ruled out are off"
     )
@@ -164,9 +168,11 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
 
     examples:
       warprrf fit room spectra.nc -o field.safetensors
+      warprrf fit room.glb spectra.nc -o field.safetensors
+      warprrf fit scan.stl spectra.nc -o field.safetensors --unit mm --simplify 200000
       warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
     """
-    geometry = load_geometry(args.geometry, args.mesh)
+    geometry = load_geometry(args.geometry, args.mesh, args)
     dataset = wr.SpectrumDataset.load(existing(args.spectra))
     training = dataset.role == "train"
     if args.train is not None:
@@ -254,7 +260,8 @@ def add_relevance(add: Add) -> None:
     """Define `relevance`."""
     rel = add("relevance", _relevance)
     rel.add_argument(
-        "source", help="scene (.xml), reconstruction's folder, splats (.ply) or field (.safetensors)"
+        "source",
+        help="scene (.xml), mesh file, reconstruction's folder, splats (.ply) or field (.safetensors)",
     )
     add_out(rel, "JSON file; the table goes beside it as Markdown", required=False)
     rel.add_argument("--spectra", help="NetCDF file whose transmitter, carrier and receivers are used")
@@ -265,7 +272,8 @@ def add_relevance(add: Add) -> None:
     rel.add_argument(
         "--most", type=int, default=12, metavar="N", help="receivers used, drawn by --seed (default 12)"
     )
-    rel.add_argument("--mesh", help="mesh for line of sight, where SOURCE is a .ply")
+    rel.add_argument("--mesh", help="mesh for line of sight, where SOURCE is splats")
+    add_mesh_options(rel)
 
 
 def _relevance(args: argparse.Namespace, bars: Bars) -> None:
@@ -298,7 +306,7 @@ def _relevance(args: argparse.Namespace, bars: Bars) -> None:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
     fitted = source.suffix == ".safetensors"
     found = wr.relevance(
-        wr.RadioField.load(source) if fitted else load_geometry(args.source, args.mesh),
+        wr.RadioField.load(source) if fitted else load_geometry(args.source, args.mesh, args),
         receivers=receivers,
         tolerance_db=args.tolerance,
         progress=bars,

@@ -17,6 +17,7 @@ from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.gaussians import Gaussians
 
 GAUSSIANS = tuple(f.name for f in fields(Gaussians))
+MESH = ("vertices", "faces", "face_colours", "face_material")
 PATCHES = tuple(f.name for f in fields(PlanarPatches) if f.name != "mesh")
 PATCH_ARRAYS = {
     "patch_face_patch": index_to("P", "F", -1),
@@ -78,15 +79,27 @@ def to_planes(arrays: Arrays) -> list[Plane]:
     ]
 
 
+def of_mesh(mesh: Mesh) -> Arrays:
+    """Arrays of a mesh; its materials' names are left to the header."""
+    held = {name: getattr(mesh, name) for name in MESH}
+    return {name: array for name, array in held.items() if array is not None}
+
+
+def to_mesh(arrays: Arrays, material_names: Sequence[str] = ()) -> Mesh:
+    """What :func:`of_mesh` took apart."""
+    known = {name: arrays.get(name) for name in MESH[2:]}
+    return Mesh(arrays["vertices"], arrays["faces"], material_names=material_names, **known)
+
+
 def of_patches(patches: PlanarPatches) -> Arrays:
     """Arrays of a mesh and its planar patches."""
     own = {f"patch_{name}": np.asarray(getattr(patches, name)) for name in PATCHES}
-    return own | {"vertices": patches.mesh.vertices, "faces": patches.mesh.faces}
+    return own | of_mesh(patches.mesh)
 
 
-def to_patches(arrays: Arrays) -> PlanarPatches:
+def to_patches(arrays: Arrays, material_names: Sequence[str] = ()) -> PlanarPatches:
     """What :func:`of_patches` took apart."""
-    mesh = Mesh(arrays["vertices"], arrays["faces"])
+    mesh = to_mesh(arrays, material_names)
     check_arrays(arrays, PATCH_ARRAYS, F=len(mesh.faces))
     own: dict[str, Any] = {name: arrays[f"patch_{name}"] for name in PATCHES}
     own |= {name: own[name].item() for name in ("tolerance_m", "two_sided")}

@@ -8,8 +8,10 @@ query, which may come from several threads at once.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -23,11 +25,15 @@ from warprrf.brief import one_line
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import LARGEST_M, check_array, check_number
 from warprrf.device import DeviceLike
+from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
 from warprrf.kernels.rays.mesh import closest_faces, look_around
 
 ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
+
+
+_KEPT = ("vertices", "faces", "face_colours", "face_material", "material_names")
 
 
 @dataclass(frozen=True)
@@ -48,18 +54,29 @@ class Closest:
 
 
 class Mesh:
-    """A triangle mesh in metres.
+    """A triangle mesh in metres, and what is known of its faces: they tell a radio field which surfaces are alike.
 
     Args:
         vertices: Positions [m], shape ``(V, 3)``; kept in float64.
         faces: Vertex indices, shape ``(F, 3)``, counter-clockwise seen from outside.
+        face_colours: Colours as a photo has them (sRGB, 0 to 1), shape ``(F, 3)``, NaN where unknown.
+        face_material: Index into ``material_names`` of each face, -1 for none, shape ``(F,)``.
+        material_names: What the materials are called.
 
     Raises:
         TypeError: if the arguments don't read as arrays, or faces are not whole numbers.
         ValueError: on a wrong shape, no faces, an index out of range, or vertices that are not finite.
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        *,
+        face_colours: ArrayLike | None = None,
+        face_material: ArrayLike | None = None,
+        material_names: Sequence[str] = (),
+    ) -> None:
         self.vertices: np.ndarray = check_array("vertices", vertices, (None, 3)).copy()
         if np.abs(self.vertices).max(initial=0.0) > LARGEST_M:
             raise ValueError(
@@ -76,15 +93,84 @@ class Mesh:
             )
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
+        self.face_colours = self._checked_colours(face_colours)
+        self.face_material, self.material_names = self._checked_materials(face_material, material_names)
+
+    def _checked_colours(self, colours: ArrayLike | None) -> np.ndarray | None:
+        if colours is None:
+            return None
+        found = check_array(
+            "face_colours", colours, (len(self.faces), 3), dtype=np.float32, finite=False
+        ).copy()
+        if not ((found >= 0) & (found <= 1) | np.isnan(found)).all():
+            raise ValueError("face_colours: got values outside 0 to 1, expected sRGB, NaN where unknown")
+        found.setflags(write=False)
+        return found
+
+    def _checked_materials(
+        self, material: ArrayLike | None, names: Sequence[str]
+    ) -> tuple[np.ndarray | None, tuple[str, ...]]:
+        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            raise TypeError(f"material_names: got {names!r:.60}, expected a list of names")
+        if material is None:
+            if len(names):
+                raise ValueError("face_material: got none, expected one index a face to material_names")
+            return None, ()
+        found = check_array("face_material", material, (len(self.faces),), dtype=np.int32).copy()
+        if found.min() < -1 or found.max() >= len(names):
+            raise ValueError(
+                f"face_material: got indices from {found.min()} to {found.max()}, expected -1 (none) to {len(names) - 1}"
+            )
+        found.setflags(write=False)
+        return found, tuple(names)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        unit: str | None = None,
+        up: str | None = None,
+        *,
+        simplify: int | None = None,
+        allow_outside: bool = False,
+    ) -> Mesh:
+        """Read a mesh file: PLY, OBJ, STL, glTF or GLB, by the suffix.
+
+        Instances stand in their places. Vertices at one place become one. Colours come from textures (sampled in each
+        face), vertices or materials. Names are those of materials; numbered pages of a scan's texture are none.
+
+        Args:
+            path: The file.
+            unit: Its unit of length, ``"mm"``, ``"cm"``, ``"m"``, ``"in"`` or ``"ft"``; metres by default, as glTF has it.
+            up: Its axis that points up, ``"x"``, ``"y"`` or ``"z"``. By default ``"y"`` for glTF, which says so, and
+                ``"z"`` for the others, which don't say: OBJ files are often y-up. Of a y-up file x stays, y becomes z.
+            simplify: Most triangles (about); by default all stay. Colours and names are those of the nearest face.
+            allow_outside: Whether the file may name materials, textures and buffers outside its folder.
+
+        Raises:
+            OSError: naming the file, if it cannot be read.
+            ValueError: naming it, if it is damaged or holds no triangles; for an unknown unit or axis.
+            ImportError: if the package that the format or ``simplify`` needs is not installed.
+
+        Warns:
+            UserWarning: if no unit is given and the size is no room's or city's in metres, or a texture is missing.
+
+        Example:
+            >>> mesh = Mesh.load("room.stl", unit="mm")  # doctest: +SKIP
+        """
+        content = load_mesh(path, MeshOptions(unit, up, simplify, allow_outside))
+        return cls(content.vertices, content.faces, **content.known)
 
     def __repr__(self) -> str:
-        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+        known = f", materials {', '.join(self.material_names)}" if self.material_names else ""
+        colours = ", colours" if self.face_colours is not None else ""
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces{known}{colours})"
 
-    def __getstate__(self) -> dict[str, np.ndarray]:
-        return {"vertices": self.vertices, "faces": self.faces}
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in _KEPT}
 
-    def __setstate__(self, state: dict[str, np.ndarray]) -> None:
-        self.__init__(state["vertices"], state["faces"])  # type: ignore[misc]
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
 
     @cached_property
     def triangles(self) -> np.ndarray:

@@ -1,81 +1,174 @@
-"""Triangle meshes to and from files: PLY, and OBJ by trimesh, which no other module touches.
+"""Triangle meshes to and from files: PLY, OBJ, STL, glTF and GLB, with the colours and names that they hold.
 
-Vertices are metres, faces are counter-clockwise seen from outside. Texture coordinates are those of Mitsuba: one pair
-per vertex, so a vertex on a texture seam is stored once per side.
+Faces are counter-clockwise seen from outside. Texture coordinates are those of Mitsuba: one pair per vertex, so a vertex
+on a texture seam is stored once per side.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import LARGEST_M, check_array
-from warprrf.device import require
+from warprrf.checks import LARGEST_M, check_array, check_count
 from warprrf.files import write_bytes
+from warprrf.geometry import o3d
+from warprrf.geometry.gltf_files import read_gltf
+from warprrf.geometry.mesh_colours import to_linear, to_srgb
+from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent
+from warprrf.geometry.obj_files import obj_bytes, read_obj
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
 
-LARGEST_BYTES = 4 << 30
-_CHECKSUM = b"# warprrf sha256 "  # the comment that begins an OBJ file of ours: a letter there may be a face
-_OBJ = {
-    "v": (3, 8), "vt": (1, 3), "vn": (3, 3), "vp": (1, 3), "f": (3, 4096), "l": (2, 4096), "p": (1, 4096), "o": (0, 99),
-    "g": (0, 99), "s": (1, 1), "usemtl": (1, 99), "mtllib": (1, 99),
-}  # fmt: skip
-"""Statements of an OBJ file, and how many words may follow each."""
+METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
+"""Units of length [m]."""
+UP = {
+    "x": ([1, 2, 0], [1.0, 1.0, 1.0]),
+    "y": ([0, 2, 1], [1.0, -1.0, 1.0]),
+    "z": ([0, 1, 2], [1.0, 1.0, 1.0]),
+}
+"""The file's axes that become x, y, z, and their signs, by the name of that which points up. Of y-up files x stays, as
+modelling programs have it that write z-up scenes so."""
+USUAL_SIZE_M = (0.2, 5000.0)  # of what is in metres when nobody said so
 
 
 @dataclass(frozen=True)
-class MeshFile:
-    """What a mesh file holds.
+class MeshOptions:
+    """How a mesh file is read.
 
     Attributes:
-        vertices: positions [m], shape ``(V, 3)``, float64.
-        faces: vertex indices, shape ``(F, 3)``, int32.
-        uv: texture coordinates, shape ``(V, 2)``, or None.
+        unit: one of :data:`METRES`; the format's by default: metres.
+        up: the file's axis that points up, ``"x"``, ``"y"`` or ``"z"``; the format's by default: ``"y"`` for glTF, else
+            ``"z"``.
+        simplify: most triangles: more are merged where the surface is flattest.
+        allow_outside: whether the file may name materials, textures and buffers outside its folder.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    uv: np.ndarray | None = None
+    unit: str | None = None
+    up: str | None = None
+    simplify: int | None = None
+    allow_outside: bool = False
+
+    def __post_init__(self) -> None:
+        for name, value, known in (("unit", self.unit, METRES), ("up", self.up, UP)):
+            if value is not None and value not in (*known,):
+                raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(known)}")
+        if self.simplify is not None:
+            check_count("simplify", self.simplify, 4)
 
 
-def _trimesh() -> Any:
-    return require("trimesh", extra="mesh")
+def load_mesh(path: str | os.PathLike[str], options: MeshOptions) -> MeshContent:
+    """Read a mesh file into metres, z up; vertices at one place become one.
+
+    Raises:
+        OSError, ValueError: as :func:`read_mesh`.
+        ImportError: if a package that the format or ``simplify`` needs is not installed.
+
+    Warns:
+        UserWarning: if no unit is given and the mesh is very large or small for one in metres.
+    """
+    content = read_mesh(path, allow_outside=options.allow_outside)
+    up = options.up or ("y" if Path(path).suffix.lower() in GLTF else "z")
+    axes, signs = UP[up]
+    turned = content.vertices[:, axes] * np.array(signs) * METRES[options.unit or "m"]
+    vertices, faces = _merged(turned, content.faces)
+    if not (np.abs(vertices) < LARGEST_M).all():
+        raise ValueError(f"unit: in {options.unit!r} {path} holds vertices beyond {LARGEST_M:g} m")
+    size = float(np.ptp(vertices, axis=0).max())
+    if options.unit is None and not USUAL_SIZE_M[0] <= size <= USUAL_SIZE_M[1]:
+        warnings.warn(
+            f"path: {path} is {size:.3g} m in size if its unit is the metre; give unit= ({', '.join(METRES)})",
+            UserWarning,
+            stacklevel=3,
+        )
+    content = replace(content, vertices=vertices, faces=faces, uv=None)
+    if options.simplify is None or len(faces) <= options.simplify:
+        return content
+    return content.with_faces(*_simplified(vertices, faces, options.simplify))
 
 
-def read_mesh(path: str | os.PathLike[str]) -> MeshFile:
-    """Read a PLY or OBJ file, vertices and faces in the file's own order; polygons become fans of triangles.
+def read_mesh(
+    path: str | os.PathLike[str], *, allow_outside: bool = False, colours: bool = True
+) -> MeshContent:
+    """Read a mesh file as it stands, in its own unit and axes; polygons become fans of triangles.
+
+    Args:
+        path: PLY, OBJ, STL, glTF or GLB, by the suffix.
+        allow_outside: whether it may name materials, textures and buffers outside its folder.
+        colours: whether the files of materials and textures that it names are read.
 
     Raises:
         OSError: naming the file, if it cannot be read.
         ValueError: naming it, if it is damaged, holds no triangles, or holds NaN or out-of-range indices.
     """
     path = Path(path)
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ValueError(f"path: got {path}, expected a mesh file: {', '.join(READERS)}")
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no mesh file {path}")
     if path.stat().st_size > LARGEST_BYTES:
         raise ValueError(f"path: {path} has {path.stat().st_size} bytes, expected at most {LARGEST_BYTES}")
-    content = _from_ply(path) if path.suffix.lower() == ".ply" else _from_obj(path)
-    vertices, faces, uv = content.vertices, content.faces, content.uv
+    content = reader(Folder(path, allow_outside, colours))
+    vertices, faces = content.vertices, content.faces
     if len(faces) == 0:
         raise ValueError(f"path: {path} holds no triangles")
-    for name, values in (("vertices", vertices), ("texture coordinates", uv)):
+    for name, values in (("vertices", vertices), ("texture coordinates", content.uv)):
         if values is not None and not (np.abs(values) < LARGEST_M).all():
             raise ValueError(f"path: {path} holds {name} that are NaN, infinite or above {LARGEST_M:g}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(
             f"path: {path} names vertices from {faces.min()} to {faces.max()} but holds {len(vertices)}"
         )
-    return MeshFile(vertices, faces.astype(np.int32), uv)
+    return content
 
 
-def _from_ply(path: Path) -> MeshFile:
+def _merged(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of the same coordinates as one, in the order in which they come, and faces of those."""
+    bits = np.ascontiguousarray(vertices + 0.0).view(np.uint64)  # -0 and 0 are one place
+    mixed = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(
+        axis=1
+    )
+    first, index = np.unique(mixed ^ (mixed >> np.uint64(29)), return_index=True, return_inverse=True)[1:]
+    if not np.array_equal(vertices[first][index], vertices):  # two places of one number: compare them in full
+        first, index = np.unique(vertices, axis=0, return_index=True, return_inverse=True)[1:]
+    order = np.argsort(first)
+    place = np.empty(len(first), np.int64)
+    place[order] = np.arange(len(first))
+    return vertices[first[order]], place[index.reshape(-1)][faces].astype(np.int32)
+
+
+def _simplified(
+    vertices: np.ndarray, faces: np.ndarray, target: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """At most about ``target`` triangles by quadric decimation, and for each the face that it lies nearest to.
+
+    Source: Garland and Heckbert, "Surface simplification using quadric error metrics", SIGGRAPH 1997, in Open3D.
+    """
+    open3d = o3d.load()
+    middle = vertices.mean(axis=0)
+    mesh = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(vertices - middle), open3d.utility.Vector3iVector(faces)
+    )
+    fewer = mesh.simplify_quadric_decimation(target)
+    points, triangles = np.asarray(fewer.vertices), np.asarray(fewer.triangles, dtype=np.int32)
+    if len(triangles) == 0:
+        raise ValueError(
+            f"simplify: got {target}, but nothing is left of {len(faces)} triangles; ask for more"
+        )
+    rays = open3d.t.geometry.RaycastingScene()
+    rays.add_triangles((vertices - middle).astype(np.float32), faces.astype(np.uint32))
+    centre = points[triangles].mean(axis=1).astype(np.float32)
+    parent = rays.compute_closest_points(open3d.core.Tensor(centre))["primitive_ids"].numpy()
+    return points + middle, triangles, parent.astype(np.int64)
+
+
+def _from_ply(folder: Folder) -> MeshContent:
+    path = folder.path
     held = read_ply(path)
     vertex, face = held.get("vertex", {}), held.get("face", {})
     corners = face.get("vertex_indices", face.get("vertex_index"))
@@ -89,68 +182,103 @@ def _from_ply(path: Path) -> MeshFile:
         raise ValueError(
             f"path: {path} holds one of the texture coordinates {' and '.join(uv)}, expected both"
         )
-    return MeshFile(
-        _columns(vertex, "xyz"), _fans(corners, path), None if uv is None else _columns(vertex, uv)
-    )  # fmt: skip
+    vertices, (faces, polygon) = _columns(vertex, "xyz"), _fans(corners, path)
+    own, seen = _ply_colours(face, path), _ply_colours(vertex, path)
+    colours = None
+    if own is not None:
+        colours = own[polygon]
+    elif seen is not None and faces.min(initial=0) >= 0 and faces.max(initial=0) < len(vertices):
+        colours = to_srgb(to_linear(seen)[faces].mean(axis=1)).astype(np.float32)
+    return MeshContent(vertices, faces, None if uv is None else _columns(vertex, uv), colours)
+
+
+def _ply_colours(element: Element, path: Path) -> np.ndarray | None:
+    """Red, green and blue in [0, 1] of an element that has them, ``(N, 3)``."""
+    columns = [element.get(name) for name in ("red", "green", "blue")]
+    if any(column is None or isinstance(column, Lists) for column in columns):
+        return None
+    kind = np.asarray(columns[0]).dtype
+    found = _columns(element, ("red", "green", "blue")) / (np.iinfo(kind).max if kind.kind in "iu" else 1.0)
+    if not ((found >= 0) & (found <= 1)).all():
+        raise ValueError(f"path: {path} holds colours outside 0 to 1 (whole numbers: 0 to 255)")
+    return found.astype(np.float32)
 
 
 def _columns(element: Element, names: Sequence[str]) -> np.ndarray:
     return np.column_stack([np.asarray(element[name], dtype=np.float64) for name in names])
 
 
-def _fans(polygons: Lists, path: Path) -> np.ndarray:
-    """Triangles ``(F, 3)`` around the first corner of each polygon."""
+def _fans(polygons: Lists, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles ``(F, 3)`` around the first corner of each polygon, and the polygon of each, ``(F,)``."""
     n = polygons.lengths
     if (n < 3).any():
         raise ValueError(f"path: {path} holds {int((n < 3).sum())} faces of fewer than three corners")
     first = np.repeat(np.cumsum(n) - n, n - 2)
     place = np.arange(len(first)) - np.repeat(np.cumsum(n - 2) - (n - 2), n - 2)
     index = np.stack([first, first + place + 1, first + place + 2], axis=1)
-    return np.asarray(polygons.values, dtype=np.int64)[index]
+    corners = np.asarray(polygons.values)[index]
+    if not (np.abs(corners) < 2**31).all():
+        raise ValueError(f"path: {path} names vertices beyond {2**31}")
+    return corners.astype(np.int32), np.repeat(np.arange(len(n)), n - 2)
 
 
-def _from_obj(path: Path) -> MeshFile:
-    """By trimesh, once a checksum of ours holds and every line has as many words as the format gives it."""
+def _from_stl(folder: Folder) -> MeshContent:
+    """Binary or ASCII; three vertices a face, as they stand."""
+    path = folder.path
     data = path.read_bytes()
-    first, _, content = data.partition(b"\n")
-    if first.startswith(_CHECKSUM) and first != _CHECKSUM + hashlib.sha256(content).hexdigest().encode():
+    count = int(np.frombuffer(data[80:84], "<u4")[0]) if len(data) >= 84 else -1
+    if len(data) == 84 + 50 * count:
+        rows = np.frombuffer(data, np.uint8, offset=84).reshape(count, 50)[:, 12:48]
+        corners = np.ascontiguousarray(rows).view("<f4").astype(np.float64)
+    else:
+        corners = _ascii_stl(data, path)
+    return MeshContent(corners.reshape(-1, 3), np.arange(corners.size // 3, dtype=np.int32).reshape(-1, 3))
+
+
+def _ascii_stl(data: bytes, path: Path) -> np.ndarray:
+    """Corners of facets, shape ``(3 F, 3)``."""
+    words = data.split()
+    if data[:5].lower() != b"solid" or b"endsolid" not in words:
         raise ValueError(
-            f"path: {path} is damaged: its sha256 does not fit; take that line out if the file was edited"
+            f"path: {path} has {len(data)} bytes, expected a binary STL file (84 bytes and 50 a triangle) or text from "
+            "'solid' to 'endsolid'"
         )
+    lines = [line.split() for line in data.splitlines()]
+    corners = [line[1:] for line in lines if line[:1] == [b"vertex"]]
+    facets = sum(line[:1] == [b"facet"] for line in lines)
     try:
-        lines = data.decode("utf-8").replace("\\\n", " ").splitlines()
-    except UnicodeDecodeError as error:
+        found = np.array(corners, dtype=np.float64).reshape(-1, 3)
+    except ValueError as error:
         raise ValueError(f"path: {path} is not a readable mesh: {error}") from error
-    triangles = 0
-    for number, line in enumerate(lines, 1):
-        words = line.split("#")[0].split()
-        least, most = _OBJ.get(words[0], (0, -1)) if words else (0, 0)
-        if words and not least <= len(words) - 1 <= most:
-            raise ValueError(f"path: {path} is not a readable mesh: line {number} is {line[:60]!r}")
-        triangles += len(words) - 3 if words[:1] == ["f"] else 0
-    try:
-        mesh = _trimesh().load(path, process=False, force="mesh")
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        faces = np.asarray(mesh.faces, dtype=np.int64).reshape(-1, 3)
-    except ImportError:
-        raise
-    except Exception as error:  # trimesh raises whatever its parsers trip over
-        raise ValueError(f"path: {path} is not a readable mesh: {error}") from error
-    if len(faces) != triangles:
-        raise ValueError(f"path: {path} states {triangles} triangles, of which {len(faces)} can be read")
-    uv = getattr(mesh.visual, "uv", None)
-    return MeshFile(vertices, faces, None if uv is None else np.asarray(uv, dtype=np.float64))
+    if len(found) != 3 * facets:
+        raise ValueError(f"path: {path} states {facets} facets, but {len(found)} corners")
+    return found
+
+
+READERS: dict[str, Callable[[Folder], MeshContent]] = {
+    ".ply": _from_ply, ".obj": read_obj, ".stl": _from_stl, ".glb": read_gltf, ".gltf": read_gltf,
+}  # fmt: skip
+"""What reads each format, by its suffix."""
+GLTF = (".glb", ".gltf")
+
+
+def is_mesh_file(path: str | os.PathLike[str]) -> bool:
+    """Whether the name of a file says that it is a mesh."""
+    return Path(path).suffix.lower() in READERS
 
 
 def write_mesh(
     path: str | os.PathLike[str], vertices: ArrayLike, faces: ArrayLike, *, uv: ArrayLike | None = None
 ) -> None:
-    """Write a mesh (the suffix of ``path`` picks the format), whole or not at all.
+    """Write a mesh as PLY or OBJ (the suffix of ``path`` says which), whole or not at all.
 
     Args:
         vertices: positions [m], shape ``(V, 3)``.
         faces: vertex indices, shape ``(F, 3)``.
         uv: texture coordinates, shape ``(V, 2)``, for PLY.
+
+    Raises:
+        ValueError: for another suffix, or arrays of another shape.
     """
     path = Path(path)
     vertices = check_array("vertices", vertices, (None, 3))
@@ -160,9 +288,7 @@ def write_mesh(
         columns = dict(zip("xyz", vertices.T, strict=True))
         columns |= {} if coordinates is None else dict(zip("st", coordinates.T, strict=True))
         write_ply(path, columns, triangles)
-        return
-    data = _trimesh().Trimesh(vertices, triangles, process=False).export(file_type=path.suffix.lstrip("."))
-    data = data.encode() if isinstance(data, str) else data
-    if path.suffix == ".obj":
-        data = _CHECKSUM + hashlib.sha256(data).hexdigest().encode() + b"\n" + data
-    write_bytes(path, data)
+    elif path.suffix == ".obj":
+        write_bytes(path, obj_bytes(vertices, triangles))
+    else:
+        raise ValueError(f"path: got {path}, expected a name that ends in .ply or .obj")

@@ -23,6 +23,7 @@ _TYPES = {
 }  # fmt: skip
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _END = b"end_header"
+_LONGEST_HEADER = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,25 @@ def read_ply(path: str | os.PathLike[str]) -> dict[str, Element]:
         raise ValueError(f"{os.fspath(path)}: {error}") from error
 
 
+def ply_columns(path: str | os.PathLike[str]) -> dict[str, list[str]]:
+    """Names of the columns of each element that the header of a PLY file states.
+
+    Raises:
+        OSError: naming the file, if it cannot be read.
+        ValueError: naming it, if it is no PLY file.
+    """
+    with Path(path).open("rb") as file:
+        data = file.read(_LONGEST_HEADER)
+    end = data.find(b"\n" + _END)
+    try:
+        if not data.startswith(b"ply") or end < 0:
+            raise ValueError("not a PLY file (no 'ply' ... 'end_header')")
+        stated = _header(data[:end].decode("ascii", "replace"))[1]
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {error}") from error
+    return {element.name: [name for name, _, _ in element.columns] for element in stated}
+
+
 def write_ply(
     path: str | os.PathLike[str], columns: Mapping[str, np.ndarray], faces: np.ndarray | None
 ) -> None:
@@ -100,9 +120,23 @@ def _elements(data: bytes) -> dict[str, Element]:
         if element.count * least > len(rest):
             raise ValueError(f"cut short: {element.count} rows of {element.name!r} are not there")
         found[element.name], rest = _rows(element, order, rest)
+        if not order:
+            _set_types(element, found[element.name])
     if len(rest) and (not order or bytes(rest).strip()):
         raise ValueError(f"holds more than its header states, {len(rest)} bytes")
     return found
+
+
+def _set_types(stated: _Stated, element: Element) -> None:
+    """Give the words of ASCII the types that the header states."""
+    for name, kind, _ in stated.columns:
+        column = element[name]
+        words = column.values if isinstance(column, Lists) else column
+        with np.errstate(invalid="ignore", over="ignore"):
+            values = words.astype(kind)
+        if values.dtype.kind in "iu" and not np.array_equal(values, words):
+            raise ValueError(f"{name} of {stated.name!r} holds numbers that are not of type {kind}")
+        element[name] = Lists(column.lengths, values) if isinstance(column, Lists) else values
 
 
 def _header(text: str) -> tuple[str, list[_Stated]]:

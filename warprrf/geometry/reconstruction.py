@@ -13,7 +13,6 @@ from warprrf.checks import check_number, check_type
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.sfm import read_colmap
@@ -30,7 +29,7 @@ class Reconstruction:
     """Geometry of a place, frozen.
 
     Attributes:
-        gaussians: the Gaussians.
+        gaussians: the Gaussians; an error where there are none, as in what a mesh alone gave.
         cameras: photo name to :class:`Camera`; empty for splats without poses.
         patches: planar patches of the mesh, largest first; None without a mesh.
         scale_rms_m: rms distance left between surveyed and reconstructed camera positions [m]; NaN without survey.
@@ -41,7 +40,7 @@ class Reconstruction:
 
     def __init__(
         self,
-        gaussians: Gaussians,
+        gaussians: Gaussians | None = None,
         mesh: Mesh | None = None,
         cameras: Mapping[str, Camera] | None = None,
         *,
@@ -51,7 +50,9 @@ class Reconstruction:
         unposed: Sequence[str] = (),
         held_out: Sequence[str] = (),
     ) -> None:
-        self.gaussians = gaussians
+        if gaussians is None and mesh is None:
+            raise ValueError("gaussians, mesh: got neither, expected Gaussians, a mesh or both")
+        self._gaussians = gaussians
         self._mesh = mesh
         self.cameras = dict(cameras or {})
         self.patches = patches
@@ -62,7 +63,27 @@ class Reconstruction:
 
     def __repr__(self) -> str:
         faces = f"{len(self._mesh.faces)} triangles" if self._mesh is not None else "no mesh"
-        return f"Reconstruction({len(self.gaussians)} Gaussians, {faces}, {len(self.cameras)} cameras)"
+        splats = f"{len(self._gaussians)} Gaussians" if self._gaussians is not None else "no Gaussians"
+        return f"Reconstruction({splats}, {faces}, {len(self.cameras)} cameras)"
+
+    @property
+    def has_gaussians(self) -> bool:
+        """Whether there are Gaussians."""
+        return self._gaussians is not None
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians.
+
+        Raises:
+            ValueError: if this reconstruction has none.
+        """
+        if self._gaussians is None:
+            raise ValueError(
+                "this reconstruction is a mesh alone and has no Gaussians, which pictures need: give "
+                "Reconstruction.from_files a ply=, or make it from photos (reconstruct)"
+            )
+        return self._gaussians
 
     @property
     def has_mesh(self) -> bool:
@@ -96,12 +117,13 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
+            "material_names": () if self._mesh is None else self._mesh.material_names,
         }  # fmt: skip
-        arrays = files.of_gaussians(self.gaussians)
+        arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
         if self.patches is not None:
             arrays |= files.of_patches(self.patches)
         elif self._mesh is not None:
-            arrays |= {"vertices": self._mesh.vertices, "faces": self._mesh.faces}
+            arrays |= files.of_mesh(self._mesh)
         files.write(Path(folder) / FILE, arrays, header)
 
     @classmethod
@@ -123,16 +145,18 @@ class Reconstruction:
                 "its photos (reconstruct)"
             )
         with named(path, "damaged or incomplete"):
-            patches = files.to_patches(arrays) if "patch_face_patch" in arrays else None
+            names = header.get("material_names", ())
+            patches = files.to_patches(arrays, names) if "patch_face_patch" in arrays else None
             mesh = None if patches is None else patches.mesh
             if mesh is None and "faces" in arrays:
-                mesh = Mesh(arrays["vertices"], arrays["faces"])
+                mesh = files.to_mesh(arrays, names)
+            splats = None if mesh is not None and "means" not in arrays else files.to_gaussians(arrays)
             rms = header["scale_rms_m"]
             check_type("metric", header["metric"], bool)
             for name in (*header["unposed"], *header["held_out"]):
                 check_type("unposed, held_out", name, str)
             return cls(
-                files.to_gaussians(arrays),
+                splats,
                 mesh,
                 {name: _camera(camera) for name, camera in header["cameras"].items()},
                 patches=patches,
@@ -145,7 +169,7 @@ class Reconstruction:
     @classmethod
     def from_files(
         cls,
-        ply: str | os.PathLike[str],
+        ply: str | os.PathLike[str] | None = None,
         mesh: Mesh | str | os.PathLike[str] | None = None,
         colmap: str | os.PathLike[str] | None = None,
         *,
@@ -153,24 +177,29 @@ class Reconstruction:
         progress: Progress | None = None,
         device: DeviceLike = None,
     ) -> Reconstruction:
-        """Your own splats: skips stage 1. Splats, mesh and poses must share one metric, z-up frame.
+        """Your own geometry: skips stage 1. Splats, mesh and poses must share one metric, z-up frame.
+
+        A mesh alone is enough for line of sight, mirrors and ``bistatic`` fields.
 
         Args:
             ply: splats in the INRIA PLY layout.
-            mesh: a :class:`Mesh` or a mesh file (PLY, OBJ).
+            mesh: a :class:`Mesh` or a mesh file, which is read by :meth:`Mesh.load` (call that for another unit or axis).
             colmap: a COLMAP model folder (``.bin`` or ``.txt``) with the camera poses. Without ``mesh``, one is fused
-                from depth maps rendered at these poses. With neither, :attr:`mesh` raises when it is needed.
+                from depth maps of ``ply`` rendered at these poses. With neither, :attr:`mesh` raises when it is needed.
 
         Raises:
-            FileNotFoundError, ValueError: if a file is missing, damaged, or no surface can be fused.
+            FileNotFoundError, ValueError: if a file is missing, damaged, or no surface can be fused; if there is
+                neither ``ply`` nor ``mesh``.
         """
-        gaussians = Gaussians.load_ply(ply)
+        if ply is None and mesh is None:
+            raise ValueError("ply, mesh: got neither, expected a file of splats, a mesh or both")
+        gaussians = None if ply is None else Gaussians.load_ply(ply)
         cameras = read_colmap(colmap).cameras if colmap is not None else {}
         patches: PlanarPatches | None = None
         if mesh is not None:
-            mesh = mesh if isinstance(mesh, Mesh) else _mesh_from_file(mesh)
+            mesh = mesh if isinstance(mesh, Mesh) else Mesh.load(mesh)
             patches = planar_patches(mesh)
-        elif cameras:
+        elif cameras and gaussians is not None:
             patches = fuse_gaussians(
                 gaussians, list(cameras.values()), config=config, progress=progress, device=device
             )
@@ -182,8 +211,3 @@ def _camera(stored: Mapping[str, Any]) -> Camera:
     width, height = stored["size"]
     lens = dict(zip(("fx", "fy", "cx", "cy"), stored["lens"], strict=True))
     return Camera(stored["kind"], width, height, np.array(stored["world_to_camera"]), **lens)
-
-
-def _mesh_from_file(path: str | os.PathLike[str]) -> Mesh:
-    content = read_mesh(path)
-    return Mesh(content.vertices, content.faces)

@@ -184,7 +184,8 @@ class _SceneFile:
         kind = shape.get("type", "")
         try:
             if kind in ("ply", "obj"):
-                mesh = read_mesh(self._file(_text(shape, "filename"), f"the mesh of object {name!r}"))
+                file = self._file(_text(shape, "filename"), f"the mesh of object {name!r}")
+                mesh = read_mesh(file, colours=False)
                 vertices, faces = mesh.vertices, mesh.faces
             elif kind in _PRIMITIVES:
                 vertices, faces = _PRIMITIVES[kind](shape)

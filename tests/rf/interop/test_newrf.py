@@ -11,7 +11,8 @@ from radio_scenes import box_mesh, joined
 import warprrf as wr
 from benchmarks import newrf as bench
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.interop.newrf import load_newrf, read_stl
+from warprrf.geometry.mesh_files import read_mesh
+from warprrf.rf.interop.newrf import load_newrf
 from warprrf.rf.paths.reflections import fit_reflections, mesh_parts
 from warprrf.rf.paths.trace import MirrorTracer
 
@@ -92,7 +93,7 @@ def test_what_does_not_read_is_refused(tmp_path):
     with pytest.raises(ValueError, match="npz"):
         load_newrf(tmp_path)
     with pytest.raises(ValueError, match="binary STL"):
-        read_stl(tmp_path / "conferenceroom.stl")
+        read_mesh(tmp_path / "conferenceroom.stl")
     content = dict(
         transmitter=np.zeros(3),
         receivers=np.ones((2, 3)),
@@ -248,4 +249,6 @@ def test_an_empty_room_reads_back_from_stl(tmp_path):
     )
     path = tmp_path / "box.stl"
     path.write_bytes(bytes(80) + np.uint32(len(faces)).tobytes() + record.tobytes())
-    np.testing.assert_allclose(read_stl(path).triangles, Mesh(vertices, faces).triangles, atol=1e-6)
+    found = read_mesh(path)
+    triangles = Mesh(found.vertices, found.faces).triangles
+    np.testing.assert_allclose(triangles, Mesh(vertices, faces).triangles, atol=1e-6)

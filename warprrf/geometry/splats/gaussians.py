@@ -184,3 +184,8 @@ def rotations_of(quaternions: np.ndarray) -> np.ndarray:
 def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     """Quaternions wxyz ``(N, 4)`` of rotation matrices ``(N, 3, 3)``."""
     return Rotation.from_matrix(np.asarray(rotations, np.float64)).as_quat()[:, [3, 0, 1, 2]]
+
+
+def gaussians_of(geometry: object) -> Gaussians | None:
+    """What a geometry has as its ``gaussians``; None for a mesh, a scene, or a reconstruction of a mesh alone."""
+    return getattr(geometry, "gaussians", None) if getattr(geometry, "has_gaussians", True) else None

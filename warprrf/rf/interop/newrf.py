@@ -17,6 +17,7 @@ from numpy.typing import DTypeLike
 from warprrf.checks import check_array
 from warprrf.files import read_arrays
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
 RAYS_FILE = "newrf_conference.npz"
@@ -134,7 +135,7 @@ def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
         valid=valid,
         line_of_sight=_array(data, "line_of_sight", (count,), bool),
         csi=check_array("csi", _array(data, "csi", (count,), complex), (count,), dtype=complex),
-        mesh=read_stl(base / MESH_FILE),
+        mesh=_room(base / MESH_FILE),
     )
 
 
@@ -158,23 +159,6 @@ def _array(data: dict[str, np.ndarray], name: str, shape: tuple[int, ...], dtype
     return check_array(name, data[name], shape, dtype=dtype, finite=False)
 
 
-def read_stl(path: str | os.PathLike[str]) -> Mesh:
-    """A binary STL file as a mesh with three vertices a face.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a whole binary STL file.
-    """
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"path: there is no {file}")
-    content = np.fromfile(file, dtype=np.uint8)
-    count = int(content[80:84].view("<u4")[0]) if len(content) >= 84 else -1
-    if count < 1 or len(content) != 84 + 50 * count:
-        raise ValueError(
-            f"path: {file} has {len(content)} bytes, expected a binary STL file: 84 bytes and 50 a triangle"
-        )
-    floats = content[84:].reshape(count, 50)[:, :48].copy().view("<f4").reshape(count, 4, 3)
-    if not np.isfinite(floats[:, 1:]).all():
-        raise ValueError(f"path: {file} holds vertices that are NaN or infinite")
-    return Mesh(floats[:, 1:].reshape(-1, 3).astype(np.float64), np.arange(3 * count).reshape(-1, 3))
+def _room(path: Path) -> Mesh:
+    content = read_mesh(path)
+    return Mesh(content.vertices, content.faces)

@@ -24,7 +24,7 @@ from warprrf.checks import check_array, check_positive
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import Gaussians, gaussians_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -314,7 +314,7 @@ def relevances(
     check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
     tick: Progress = progress or (lambda stage, done, total: None)
     model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
-    gaussians = getattr(geometry, "gaussians", None)
+    gaussians = gaussians_of(geometry)
     found = []
     for tolerance in tolerances_db:
         one = _choose(model, source, float(tolerance))

@@ -1,4 +1,4 @@
-"""Groups of a reconstruction's faces by planar patch and by the colour that photos gave them."""
+"""Groups of faces by planar patch and colour: of the Gaussians before them, or that their mesh's file gives them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from warprrf.geometry.mesh_topology import connected_pieces
 from warprrf.geometry.splats.gaussians import Gaussians
 
 Y00 = 0.28209479177387814  # harmonic of degree 0
+TOLD_APART = 0.02  # faces whose colours differ by less are of one colour: what exporters write by default
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,39 @@ class ColourGrouping:
     rest: float = 4.0
 
 
+@dataclass(frozen=True)
+class Colours:
+    """Colours on a mesh.
+
+    Attributes:
+        face: where each is, shape ``(N,)``.
+        weight: of each, shape ``(N,)``.
+        rgb: as a photo has them, 0 to 1, shape ``(N, 3)``.
+    """
+
+    face: np.ndarray
+    weight: np.ndarray
+    rgb: np.ndarray
+
+    @classmethod
+    def of_gaussians(cls, mesh: Mesh, gaussians: Gaussians) -> Colours:
+        """Of Gaussians, on the faces that are nearest to them."""
+        weight = gaussians.opacities * np.sort(gaussians.scales, axis=1)[:, 1:].prod(axis=1)
+        rgb = gaussians.sh[:, 0, :].astype(np.float64) * Y00 + 0.5
+        return cls(mesh.closest(gaussians.means).face, weight, rgb)
+
+    @classmethod
+    def of_faces(cls, mesh: Mesh) -> Colours | None:
+        """Of the mesh's own faces; None where they tell nothing apart."""
+        rgb = mesh.face_colours
+        known = np.zeros(0, np.int64) if rgb is None else np.flatnonzero(~np.isnan(rgb).any(axis=1))
+        if rgb is None or len(known) == 0 or np.ptp(rgb[known], axis=0).max() < TOLD_APART:
+            return None
+        return cls(known, mesh.areas[known], rgb[known].astype(np.float64))
+
+
 def colour_groups(
-    mesh: Mesh, patch: np.ndarray, gaussians: Gaussians, options: ColourGrouping | None = None
+    mesh: Mesh, patch: np.ndarray, colours: Colours, options: ColourGrouping | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Groups of faces by patch and photo colour.
 
@@ -59,7 +91,7 @@ def colour_groups(
     Args:
         mesh: F faces.
         patch: planar patch of each, -1 for none, shape ``(F,)``.
-        gaussians: of the same reconstruction.
+        colours: on its faces.
         options: what is told apart.
 
     Returns:
@@ -73,7 +105,7 @@ def colour_groups(
     owner = np.full(int(unit.max()) + 1, -1)
     owner[unit] = sheet
     size = np.bincount(unit, mesh.areas) + 1e-9
-    feature = _colours(unit[mesh.closest(gaussians.means).face], owner, size, gaussians, o)
+    feature = _colours(unit[colours.face], owner, size, colours, o)
     piece = np.zeros(len(owner), np.int64)
     for s in np.unique(owner):
         own = np.flatnonzero(owner == s)
@@ -98,13 +130,12 @@ def _sheets(mesh: Mesh, patch: np.ndarray, o: ColourGrouping) -> np.ndarray:
 
 
 def _colours(
-    unit: np.ndarray, owner: np.ndarray, size: np.ndarray, gaussians: Gaussians, o: ColourGrouping
+    unit: np.ndarray, owner: np.ndarray, size: np.ndarray, colours: Colours, o: ColourGrouping
 ) -> np.ndarray:
-    """Colour of each unit in steps, shape ``(U, 4)``: the mean of its Gaussians', who stand at ``unit``; of one without
+    """Colour of each unit in steps, shape ``(U, 4)``: the mean of ``colours``, which stand at ``unit``; of one without
     any that of its sheet, or of all."""
     count = len(owner)
-    weight = gaussians.opacities * np.sort(gaussians.scales, axis=1)[:, 1:].prod(axis=1)
-    log = np.log(np.clip(gaussians.sh[:, 0, :].astype(np.float64) * Y00 + 0.5, 0.01, 1.0))
+    weight, log = colours.weight, np.log(np.clip(colours.rgb, 0.01, 1.0))
     total = np.bincount(unit, weight, minlength=count)
     known = total > 1e-9
     mean = np.stack([np.bincount(unit, weight * channel, minlength=count) for channel in log.T], axis=1)

@@ -22,9 +22,9 @@ from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components, smoothed_normals
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import Gaussians, gaussians_of
 from warprrf.kernels.radio import bounce
-from warprrf.rf.fields.bistatic.colours import colour_groups
+from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
 
 ELEMENT_M = 0.5  # width of an element
 CELLS = 3  # along an element
@@ -145,8 +145,9 @@ class Surface:
 
     @classmethod
     def of(cls, geometry: GeometryLike) -> Surface:
-        """Patches, groups and elements of a Reconstruction, a Scene (its materials become groups) or a bare Mesh; a
-        Surface is returned as it is.
+        """Patches, groups and elements of a Reconstruction, a Scene or a Mesh; a Surface is returned as it is.
+
+        Materials of a Scene become groups, and those that a Mesh has names of; else pieces of one colour.
 
         Raises:
             TypeError: if it has no mesh.
@@ -156,26 +157,27 @@ class Surface:
             return geometry
         mesh = as_mesh(geometry, "geometry")
         _check_size(mesh)
-        material, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
-        gaussians = getattr(geometry, "gaussians", None)
+        material, names = _named_faces(geometry, mesh)
+        gaussians = gaussians_of(geometry)
         found = getattr(geometry, "patches", None)
         if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
             patches = found
             patch, planes = found.face_patch, (found.normal, found.offset)
             normal = _on_patches(found, smoothed_normals(found.mesh, 3))
-            group, sort, colour = colour_groups(mesh, patch, gaussians)
+            group, sort, colour = colour_groups(mesh, patch, Colours.of_gaussians(mesh, gaussians))
             names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
         else:
             patches = planar_patches(mesh, material)
             patch, planes = _mirrors(patches)
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
             normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
-            if material is None:
-                group, names = np.zeros(len(mesh.faces), np.int32), ("surface",)
+            colours = Colours.of_faces(mesh)
+            if material is None and colours is not None:
+                group, sort, colour = colour_groups(mesh, patches.face_patch, colours)
+                names = tuple(f"group_{k}" for k in range(len(sort)))
             else:
-                group = np.asarray(material, np.int32)
-                names = tuple(m.name for m in materials)
-            sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
+                group = np.zeros(len(mesh.faces), np.int32) if material is None else material
+                sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once))
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
@@ -209,6 +211,22 @@ class Surface:
         """Image of ``transmitter`` (3,) in every patch's plane, ``(P, 3)``, and its height over it, ``(P,)`` [m]."""
         height = self.plane_normal @ transmitter - self.plane_offset
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
+
+
+def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
+    Scene's materials, else of the mesh's, the last for faces of none."""
+    known = getattr(geometry, "face_material", None)
+    if known is not None and not isinstance(geometry, Mesh):
+        return np.asarray(known, np.int32), tuple(m.name for m in getattr(geometry, "materials", ()))
+    if mesh.face_material is None:
+        return None, ("surface",)
+    names = mesh.material_names
+    own = np.where(mesh.face_material < 0, len(names), mesh.face_material)
+    used, group = np.unique(own, return_inverse=True)
+    if len(used) < 2:
+        return None, ("surface",)
+    return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 
 def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray) -> dict[str, np.ndarray]:

@@ -31,7 +31,7 @@ from warprrf.checks import Expected, check_array, check_arrays, check_count, che
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import Gaussians, gaussians_of
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -375,7 +375,7 @@ class HarmonicField(RadioField):
 def _geometry(geometry: GeometryLike | Gaussians) -> tuple[Gaussians, Mesh | None]:
     if isinstance(geometry, Gaussians):
         return geometry, None
-    gaussians = getattr(geometry, "gaussians", None)
+    gaussians = gaussians_of(geometry)
     mesh = geometry if isinstance(geometry, Mesh) else getattr(geometry, "mesh", None)
     if gaussians is None and mesh is not None:
         gaussians = discs_on_mesh(mesh)

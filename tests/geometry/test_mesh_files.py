@@ -1,0 +1,236 @@
+"""Mesh files of other software: units, axes, instances, colours, names; what they may name; damage."""
+
+import os
+import pickle
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from damage import survey
+from model_files import BLUE, RED, changed_glb, obj_with_materials, room_glb, room_gltf
+from places import ROOT
+
+import warprrf as wr
+from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh
+
+BLUE_SRGB = np.array(BLUE) / 255.0
+
+
+@pytest.mark.parametrize("make", [room_glb, room_gltf])
+def test_instances_of_a_gltf_scene_stand_in_their_places_z_up(make, tmp_path: Path) -> None:
+    mesh = wr.Mesh.load(make(tmp_path))
+    # y-up 4 x 3 x 5 becomes 4 wide, 5 deep, 3 high
+    np.testing.assert_allclose(mesh.bounds, [[-2, -2.5, -1.5], [2, 2.5, 1.5]], atol=1e-6)
+    assert set(mesh.material_names) == {"itu_concrete", "Wood_01"}
+    wood = np.flatnonzero(mesh.face_material == mesh.material_names.index("Wood_01"))
+    assert len(wood) == 4
+    lowest = mesh.triangles[wood].reshape(2, -1, 3).min(axis=1)
+    placed = [[0.2, -0.4, 0.3], [-1.0, 0.0, 0.0]]  # (x, y, z) of the file is (x, -z, y)
+    np.testing.assert_allclose(lowest[np.argsort(lowest[:, 0])], np.array(placed)[::-1], atol=1e-6)
+    # a mirror turns corners about, and winding with them: both face the file's z
+    np.testing.assert_allclose(mesh.face_normals[wood], [[0.0, -1.0, 0.0]] * 4, atol=1e-6)
+    np.testing.assert_allclose(mesh.face_colours[wood], [BLUE_SRGB] * 4, atol=1e-3)
+
+
+def test_the_factor_of_a_gltf_material_is_linear_light(tmp_path: Path) -> None:
+    mesh = wr.Mesh.load(room_glb(tmp_path))
+    walls = mesh.face_material == mesh.material_names.index("itu_concrete")
+    linear = 128 / 255
+    np.testing.assert_allclose(mesh.face_colours[walls], 1.055 * linear ** (1 / 2.4) - 0.055, atol=1e-3)
+
+
+def test_an_axis_that_is_asked_for_is_taken(tmp_path: Path) -> None:
+    path = room_glb(tmp_path)
+    as_it_stands = wr.Mesh.load(path, up="z").vertices
+    np.testing.assert_allclose(np.ptp(as_it_stands, axis=0), [4, 3, 5], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(wr.Mesh.load(path, up="x").vertices, axis=0), [3, 5, 4], atol=1e-6)
+    for up in "xyz":
+        axes = wr.Mesh.load(path, up=up)
+        assert np.linalg.det(np.linalg.lstsq(as_it_stands, axes.vertices, rcond=None)[0]) == pytest.approx(1)
+
+
+def test_objects_of_an_obj_file_keep_material_and_texture(tmp_path: Path) -> None:
+    content = read_mesh(obj_with_materials(tmp_path))
+    np.testing.assert_array_equal(content.faces, [[0, 1, 2], [0, 2, 3], [0, 1, 3]])
+    assert content.material_names == ("Wood_01", "Paint") and content.object_names == ("floor", "wall")
+    np.testing.assert_array_equal(content.face_material, [0, 0, 1])
+    np.testing.assert_allclose(content.face_colours, [BLUE_SRGB, BLUE_SRGB, [0.9, 0.1, 0.2]], atol=1e-3)
+
+
+def test_names_of_an_obj_file_stay_where_its_materials_are_missing(tmp_path: Path) -> None:
+    path = obj_with_materials(tmp_path)
+    (tmp_path / "square.mtl").unlink()
+    with pytest.warns(UserWarning, match=r"square\.obj needs the file 'square\.mtl'"):
+        mesh = wr.Mesh.load(path)
+    assert mesh.material_names == ("Wood_01", "Paint") and mesh.face_colours is None
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("mm", 0.001), ("cm", 0.01), ("m", 1), ("in", 0.0254), ("ft", 0.3048)]
+)
+@pytest.mark.parametrize("encoding", ["stl", "stl_ascii"])
+def test_units_are_metres_afterwards(unit, metres, encoding, tmp_path: Path) -> None:
+    trimesh.creation.box((40.0, 30.0, 25.0)).export(tmp_path / "box.stl", file_type=encoding)
+    mesh = wr.Mesh.load(tmp_path / "box.stl", unit=unit)
+    np.testing.assert_allclose(np.ptp(mesh.bounds, axis=0), np.array([40, 30, 25]) * metres)
+    assert len(mesh.vertices) == 8 and mesh.is_closed  # STL stores 36
+
+
+def test_a_room_in_millimetres_taken_for_metres_is_said(tmp_path: Path) -> None:
+    trimesh.creation.box((9000.0, 5000.0, 2500.0)).export(tmp_path / "box.stl")
+    with pytest.warns(UserWarning, match=r"box\.stl is 9e\+03 m in size.*unit="):
+        wr.Mesh.load(tmp_path / "box.stl")
+    with pytest.raises(ValueError, match="unit: got 'yard', expected one of mm, cm, m, in, ft"):
+        wr.Mesh.load(tmp_path / "box.stl", unit="yard")
+
+
+@pytest.mark.parametrize("encoding", ["binary", "ascii"])
+def test_colours_of_ply_vertices_are_those_of_faces(encoding, tmp_path: Path) -> None:
+    box = trimesh.creation.box((4.0, 3.0, 2.5))
+    box.visual.vertex_colors = np.tile([*RED, 255], (8, 1))
+    (tmp_path / "box.ply").write_bytes(box.export(file_type="ply", encoding=encoding))
+    mesh = wr.Mesh.load(tmp_path / "box.ply")
+    np.testing.assert_allclose(mesh.face_colours, [np.array(RED) / 255.0] * 12, atol=1e-5)
+
+
+def test_colours_and_names_travel_with_a_mesh(tmp_path: Path) -> None:
+    mesh = wr.Mesh.load(room_glb(tmp_path))
+    wr.Reconstruction.from_files(mesh=mesh).save(tmp_path / "kept")
+    for other in (pickle.loads(pickle.dumps(mesh)), wr.Reconstruction.load(tmp_path / "kept").mesh):
+        np.testing.assert_array_equal(other.face_colours, mesh.face_colours)
+        np.testing.assert_array_equal(other.face_material, mesh.face_material)
+        assert other.material_names == mesh.material_names
+
+
+def test_a_simplified_mesh_keeps_its_shape_colours_and_names(tmp_path: Path) -> None:
+    pytest.importorskip("open3d", reason="Open3D is an extra")
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
+    upper = ball.triangles_center[:, 2] > 0
+    ball.visual.face_colors = np.where(upper[:, None], [*RED, 255], [*BLUE, 255])
+    ball.export(tmp_path / "ball.ply")
+    mesh = wr.Mesh.load(tmp_path / "ball.ply", simplify=500)
+    assert 450 <= len(mesh.faces) <= 500
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 2.0, atol=0.03)
+    height = mesh.triangles.mean(axis=1)[:, 2]
+    expected = np.where(height[:, None] > 0, np.array(RED), np.array(BLUE)) / 255.0
+    clear = np.abs(height) > 0.3
+    np.testing.assert_allclose(mesh.face_colours[clear], expected[clear], atol=1e-5)
+    with pytest.raises(ValueError, match="simplify: got 0"):
+        wr.Mesh.load(tmp_path / "ball.ply", simplify=0)
+
+
+def test_numbered_pages_of_a_scan_are_no_materials(tmp_path: Path) -> None:
+    path = obj_with_materials(tmp_path)
+    for name in ("square.obj", "square.mtl"):
+        text = (tmp_path / name).read_text()
+        (tmp_path / name).write_text(text.replace("Wood_01", "material_0"))
+    mesh = wr.Mesh.load(path)
+    assert mesh.material_names == ("Paint",)
+    np.testing.assert_array_equal(mesh.face_material, [-1, -1, 0])
+
+
+def outside_obj(folder: Path) -> Path:
+    path = obj_with_materials(folder)
+    path.write_text(path.read_text().replace("square.mtl", "../square.mtl"))
+    (folder.parent / "square.mtl").write_text("newmtl Paint\nKd 0 0 1\n")
+    return path
+
+
+def outside_texture(folder: Path) -> Path:
+    path = obj_with_materials(folder)
+    text = (folder / "square.mtl").read_text()
+    (folder / "square.mtl").write_text(text.replace("pages/wood.png", str(folder.parent / "wood.png")))
+    (folder / "pages" / "wood.png").rename(folder.parent / "wood.png")
+    return path
+
+
+def outside_buffer(folder: Path) -> Path:
+    path = room_gltf(folder)
+    path.write_text(path.read_text().replace('"gltf_buffer_0.bin"', '"..%2Fgltf_buffer_0.bin"'))
+    (folder / "gltf_buffer_0.bin").rename(folder.parent / "gltf_buffer_0.bin")
+    return path
+
+
+@pytest.mark.parametrize("make", [outside_obj, outside_texture, outside_buffer])
+def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, tmp_path: Path) -> None:
+    (tmp_path / "model").mkdir()
+    path = make(tmp_path / "model")
+    with pytest.raises(ValueError, match=rf"{path.name}.*outside its folder.*allow_outside=True"):
+        wr.Mesh.load(path)
+    assert wr.Mesh.load(path, allow_outside=True).face_colours is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda h: h["accessors"][0].update(count=10**9), "accessor 0 states"),
+        (lambda h: h["accessors"][0].update(sparse={}), "accessor 0 is sparse"),
+        (lambda h: h["bufferViews"][0].update(byteLength=10**9), "buffer view 0 states"),
+        (lambda h: h["nodes"][0].update(children=[0]), "two parents"),
+        (lambda h: h["nodes"][1].update(mesh=99), "meshes 99 of 2"),
+        (
+            lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+            "KHR_draco.*without compression",
+        ),
+        (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
+        (lambda h: h["meshes"][0]["primitives"][0].update(mode=1), "no triangles|lines"),
+        (lambda h: h["asset"].update(version="1.0"), "version 2"),
+        (lambda h: h["accessors"][0].update(componentType=1), "KeyError"),
+    ],
+)
+def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told: str, tmp_path: Path) -> None:
+    path = changed_glb(room_glb(tmp_path), change)
+    if told.startswith("no triangles"):
+        assert (wr.Mesh.load(path).face_material is not None) and len(wr.Mesh.load(path).faces) < 16
+        return
+    with pytest.raises(ValueError, match=rf"room\.glb.*({told})"):
+        wr.Mesh.load(path)
+
+
+@pytest.mark.parametrize("make", [room_glb, room_gltf, obj_with_materials])
+def test_damage_is_refused_by_the_file_s_name_or_gives_numbers(make, tmp_path: Path) -> None:
+    found = survey(make(tmp_path), "file_formats:read_mesh_file", flips=60, cuts=20)
+    # a name that is damaged is that of no material, whose colour is unknown
+    assert [outcome for _, outcome in found.wrong if outcome != "NaN in face_colours"] == []
+    if make is room_glb:  # text may end early and be whole; a binary file states its length
+        assert not any(damage.startswith("cut") for damage, _ in found.changed)
+
+
+def test_a_binary_stl_that_is_cut_short_is_refused(tmp_path: Path) -> None:
+    trimesh.creation.box().export(tmp_path / "box.stl")
+    whole = (tmp_path / "box.stl").read_bytes()
+    for damaged in (whole[:-1], whole[:80] + struct.pack("<I", 10**9) + whole[84:], b""):
+        (tmp_path / "box.stl").write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"box\.stl"):
+            wr.Mesh.load(tmp_path / "box.stl")
+
+
+def test_files_of_other_kinds_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "room.fbx").write_bytes(b"Kaydara")
+    with pytest.raises(
+        ValueError, match=r"room\.fbx, expected a mesh file: \.ply, \.obj, \.stl, \.glb, \.gltf"
+    ):
+        wr.Mesh.load(tmp_path / "room.fbx")
+    with pytest.raises(FileNotFoundError, match=r"none\.glb"):
+        wr.Mesh.load(tmp_path / "none.glb")
+
+
+def test_the_conference_room_is_as_its_publishers_have_it() -> None:
+    root = Path(os.environ.get("WARPRRF_EXTERNAL", ROOT.parent / "shared" / "external"))
+    path = root / "newrf" / "conferenceroom.stl"
+    if not path.is_file():
+        pytest.skip("NeWRF's conference room is not on this machine")
+    mesh = wr.Mesh.load(path)
+    np.testing.assert_allclose(mesh.bounds, [[-1.5, -1.5, 0.0], [1.5, 1.5, 2.5]], atol=1e-6)
+    assert len(mesh.faces) == 39392
+
+
+def test_vertices_at_one_place_become_one_in_the_file_s_order(tmp_path: Path) -> None:
+    (tmp_path / "two.obj").write_text(
+        "v 1 0 0\nv -0 0 0\nv 0 1 0\nv 0 -0 0\nv 1 0 0\nv 0 0 1\nf 1 2 3\nf 4 5 6\n"
+    )
+    content = load_mesh(tmp_path / "two.obj", MeshOptions())
+    np.testing.assert_array_equal(content.vertices, [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 1]])
+    np.testing.assert_array_equal(content.faces, [[0, 1, 2], [1, 0, 3]])

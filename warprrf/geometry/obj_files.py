@@ -1,0 +1,220 @@
+"""OBJ files with their materials: vertices and faces in the file's own order, names of materials and objects, colours.
+
+What a line states is held against what the format gives it: a damaged line is an error, never a face less.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from array import array
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from warprrf.geometry.mesh_colours import read_picture, sampled, to_linear, to_srgb
+from warprrf.geometry.mesh_content import Folder, MeshContent, material_name, numbered
+
+_CHECKSUM = b"# warprrf sha256 "  # the comment that begins an OBJ file of ours: a letter there may be a face
+_STATEMENTS = {
+    "v": (3, 8), "vt": (1, 3), "vn": (3, 3), "vp": (1, 3), "f": (3, 4096), "l": (2, 4096), "p": (1, 4096), "o": (0, 99),
+    "g": (0, 99), "s": (1, 1), "usemtl": (1, 99), "mtllib": (1, 99),
+}  # fmt: skip
+"""Statements of an OBJ file, and how many words may follow each."""
+
+
+@dataclass
+class _Lines:
+    """What the lines of an OBJ file say: numbers one after the other, and where names begin to hold."""
+
+    positions: array[float] = field(default_factory=lambda: array("d"))
+    colours: array[float] = field(default_factory=lambda: array("d"))
+    textures: array[float] = field(default_factory=lambda: array("d"))
+    corners: array[int] = field(default_factory=lambda: array("q"))
+    corner_textures: array[int] = field(default_factory=lambda: array("q"))
+    libraries: list[str] = field(default_factory=list)
+    material: str | None = None
+    object: str | None = None
+    group: str | None = None
+    runs: list[tuple[int, str | None, str | None]] = field(default_factory=list)
+
+    def add(self, words: list[str]) -> None:
+        """One statement."""
+        match words:
+            case ["v", *numbers]:
+                self.positions.extend(map(float, numbers[:3]))
+                if len(numbers) in (6, 7):
+                    self.colours.extend(map(float, numbers[-3:]))
+            case ["vt", *numbers]:
+                self.textures.extend(map(float, (numbers + ["0"])[:2]))
+            case ["f", *corners]:
+                self._add_face(corners)
+            case ["usemtl", *name]:
+                self.material = " ".join(name)
+                self._begin()
+            case ["o", *name]:
+                self.object = " ".join(name)
+                self._begin()
+            case ["g", *name]:
+                self.group = " ".join(name)
+                self._begin()
+            case ["mtllib", *name]:
+                self.libraries.append(" ".join(name))
+
+    def _begin(self) -> None:
+        self.runs.append((len(self.corners) // 3, self.material, self.object or self.group))
+
+    def _add_face(self, corners: list[str]) -> None:
+        """A fan of triangles around the first corner."""
+        vertex, texture = [], []
+        for corner in corners:
+            parts = corner.split("/")
+            vertex.append(_index(parts[0], len(self.positions) // 3))
+            has = len(parts) > 1 and parts[1] != ""
+            texture.append(_index(parts[1], len(self.textures) // 2) if has else -1)
+        for k in range(1, len(corners) - 1):
+            self.corners.extend((vertex[0], vertex[k], vertex[k + 1]))
+            self.corner_textures.extend((texture[0], texture[k], texture[k + 1]))
+
+
+@dataclass(frozen=True)
+class _Material:
+    """Of an MTL file: linear colour (3,), and the picture that stands for it."""
+
+    colour: np.ndarray
+    picture: np.ndarray | None = None
+
+
+def read_obj(folder: Folder) -> MeshContent:
+    """Read the OBJ file of ``folder``; polygons become fans of triangles.
+
+    Raises:
+        ValueError: naming the file and the line, if it is damaged or names files outside its folder.
+
+    Warns:
+        UserWarning: if a file of materials or a texture is missing: those colours stay unknown.
+    """
+    lines = _lines(folder)
+    vertices = np.array(lines.positions, dtype=np.float64).reshape(-1, 3)
+    if not np.isfinite(lines.textures).all() or not np.isfinite(lines.colours).all():
+        raise ValueError(f"path: {folder.path} holds texture coordinates or colours that are not finite")
+    faces = np.array(lines.corners, dtype=np.int64).reshape(-1, 3)
+    starts = [0, *(start for start, _, _ in lines.runs), len(faces)]
+    counts = np.diff(starts)
+    known: dict[str, _Material] = {}
+    for library in lines.libraries if folder.colours else ():
+        try:
+            known |= _read_materials(folder, library)
+        except FileNotFoundError as error:
+            warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=4)
+    material = [None, *(name for _, name, _ in lines.runs)]
+    pages = {name for name, found in known.items() if found.picture is not None}
+    names = numbered([material_name(name, name in pages) for name in material], counts.tolist())
+    objects = numbered([None, *(name or None for _, _, name in lines.runs)], counts.tolist())
+    return MeshContent(
+        vertices, faces.astype(np.int32), face_colours=_colours(lines, faces, material, counts, known),
+        face_material=names[0], material_names=names[1], face_object=objects[0], object_names=objects[1],
+    )  # fmt: skip
+
+
+def obj_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+    """An OBJ file that begins with its checksum."""
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    data = "\n".join([*lines, ""]).encode()
+    return _CHECKSUM + hashlib.sha256(data).hexdigest().encode() + b"\n" + data
+
+
+def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
+    """Number and words of each line that says something."""
+    for number, line in enumerate(text.replace("\\\n", " ").splitlines(), 1):
+        words = line.split("#", 1)[0].split()
+        if words:
+            yield number, words
+
+
+def _lines(folder: Folder) -> _Lines:
+    data = folder.path.read_bytes()
+    first, _, content = data.partition(b"\n")
+    if first.startswith(_CHECKSUM) and first != _CHECKSUM + hashlib.sha256(content).hexdigest().encode():
+        raise ValueError(
+            f"path: {folder.path} is damaged: its sha256 does not fit; take that line out if the file was edited"
+        )
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"path: {folder.path} is not a readable mesh: {error}") from error
+    found = _Lines()
+    for number, words in _statements(text):
+        least, most = _STATEMENTS.get(words[0], (0, -1))
+        try:
+            if not least <= len(words) - 1 <= most:
+                raise ValueError(f"it is no statement of an OBJ file, or has {len(words) - 1} words after it")
+            found.add(words)
+        except (ValueError, OverflowError) as error:
+            raise ValueError(
+                f"path: {folder.path} is not a readable mesh: line {number} is {' '.join(words)[:60]!r}: {error}"
+            ) from error
+    return found
+
+
+def _index(word: str, count: int) -> int:
+    """From 0, of ``count`` rows so far, of a number from 1 or from -1 backward."""
+    number = int(word)
+    index = number - 1 if number > 0 else count + number
+    if number == 0 or not 0 <= index < 2**31:
+        raise ValueError(f"index {number} of {count}")
+    return index
+
+
+def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
+    """The materials of an MTL file by name."""
+    known: dict[str, _Material] = {}
+    name: str | None = None
+    for number, words in _statements(folder.read(library).decode("utf-8", "replace")):
+        try:
+            match words:
+                case ["newmtl", *parts]:
+                    name = " ".join(parts)
+                    known[name] = _Material(np.full(3, np.nan))
+                case ["Kd", red, green, blue] if name is not None:
+                    colour = to_linear(np.array([float(red), float(green), float(blue)]))
+                    known[name] = _Material(colour, known[name].picture)
+                case ["map_Kd", *parts] if name is not None and parts:
+                    file = parts[-1] if parts[0].startswith("-") else " ".join(parts)
+                    picture = read_picture(folder.read(file), f"path: {folder.path}, texture {file}")
+                    known[name] = _Material(known[name].colour, picture)
+        except FileNotFoundError as error:
+            warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=5)
+        except ValueError as error:
+            raise ValueError(f"{error} (line {number} of {library}, which {folder.path} names)") from error
+    return known
+
+
+def _colours(
+    lines: _Lines,
+    faces: np.ndarray,
+    material: list[str | None],
+    counts: np.ndarray,
+    known: Mapping[str, _Material],
+) -> np.ndarray | None:
+    """sRGB of faces: of the texture, else of the vertices, else of the material; None without any."""
+    colour = np.full((len(faces), 3), np.nan)
+    if len(lines.colours) == len(lines.positions):
+        vertex = to_linear(np.array(lines.colours).reshape(-1, 3))
+        own = (faces < len(vertex)).all(axis=1)  # the others are refused by whoever reads them
+        colour[own] = vertex[faces[own]].mean(axis=1)
+    uv = np.array(lines.textures, dtype=np.float64).reshape(-1, 2)
+    corner = np.array(lines.corner_textures, dtype=np.int64).reshape(-1, 3)
+    start = np.concatenate([[0], np.cumsum(counts)])
+    for name, low, high in zip(material, start[:-1], start[1:], strict=True):
+        found = known.get(name) if name is not None else None
+        if found is None or low == high:
+            continue
+        part, at = colour[low:high], corner[low:high]
+        part[np.isnan(part[:, 0])] = found.colour
+        mapped = (at >= 0).all(axis=1) & (at < len(uv)).all(axis=1)
+        if found.picture is not None and mapped.any():
+            part[mapped] = sampled(found.picture, uv[at[mapped]])
+    return None if np.isnan(colour).all() else to_srgb(colour).astype(np.float32)
