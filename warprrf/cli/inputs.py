@@ -97,13 +97,29 @@ def add_mesh_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--simplify", type=int, metavar="N", help="most triangles of a mesh file")
 
 
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """Define what of a scene file's materials is taken."""
+    parser.add_argument("--materials", metavar="FILE", help="table that replaces a scene's materials by name")
+    parser.add_argument(
+        "--extrapolate",
+        action="store_true",
+        help="let a scene's materials hold outside their bands, by the nearest band's law",
+    )
+
+
+def load_scene(path: str | Path, options: argparse.Namespace) -> wr.Scene:
+    """A scene file that Sionna RT opens."""
+    materials = None if options.materials is None else existing(options.materials)
+    return wr.Scene.load(existing(path), materials=materials, extrapolate=options.extrapolate)
+
+
 def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> Any:
     """A saved reconstruction (folder), splats (PLY, optionally with a mesh), a scene (XML) or a mesh file."""
     source = existing(path)
     if source.is_dir():
         return wr.Reconstruction.load(source)
     if source.suffix == ".xml":
-        return wr.Scene.load(source)
+        return load_scene(source, options)
     if not is_mesh_file(source):
         raise ValueError(
             f"{source}: expected a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh "
