@@ -53,6 +53,7 @@ class _SceneFile:
 
     def __init__(self, path: Path, choice: MaterialChoice, allow_outside: bool) -> None:
         self.path, self.choice, self.allow_outside = path, choice, allow_outside
+        self.folder = path.parent.resolve()
         self.top = list(self._included(path, 0))
         self._replace_names()
         self.bsdfs = {e.get("id"): e for e in self.top if e.tag == "bsdf" and e.get("id") is not None}
@@ -95,9 +96,8 @@ class _SceneFile:
         """The file of this name, relative to the scene's folder."""
         if not filename or "\0" in filename:
             raise ValueError(f"path: {self.path} gives no name of {what}")
-        folder = self.path.parent
-        found = folder / filename
-        if not self.allow_outside and not found.resolve().is_relative_to(folder.resolve()):
+        found = self.path.parent / filename
+        if not self.allow_outside and not found.resolve().is_relative_to(self.folder):
             raise ValueError(
                 f"path: {self.path}: {what} is {filename}, which lies outside the scene's folder; move it there, or "
                 "trust the scene and load it with allow_outside=True"
