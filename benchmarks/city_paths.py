@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.machine import machine
 from benchmarks.report import Report, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.geometry.mesh import Mesh
@@ -297,7 +298,11 @@ def run(options: Options, job: Job) -> Report:
         "sionna_all_receivers_s",
     )  # fmt: skip
     cells = [[f"{row[n]:.2g}" if isinstance(row[n], float) else str(row[n]) for n in shown] for row in rows]
-    return Report("city_paths", {"scenes": rows}, table([n.replace("_", " ") for n in shown], cells))
+    return Report(
+        "city_paths",
+        {"machine": machine(job.device), "scenes": rows},
+        table([n.replace("_", " ") for n in shown], cells),
+    )
 
 
 HELP = """\
