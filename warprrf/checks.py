@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import functools
+import inspect
+import numbers
+import types
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, is_dataclass
+from types import EllipsisType
+from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
@@ -13,14 +20,15 @@ from numpy.typing import ArrayLike, DTypeLike
 def check_array(
     name: str,
     value: ArrayLike | wp.array,
-    shape: tuple[int | None, ...] | None = None,
+    shape: tuple[int | EllipsisType | None, ...] | None = None,
     dtype: DTypeLike = np.float64,
     finite: bool = True,
 ) -> np.ndarray:
     """``value`` (NumPy, Warp, torch or nested lists) as a contiguous NumPy array of ``shape`` and ``dtype``.
 
     Args:
-        shape: expected shape, ``None`` for a free length; ``None`` altogether skips the check.
+        shape: expected shape, ``None`` for a free length, ``...`` at its beginning for any number of these; ``None``
+            altogether skips the check.
         dtype: of whole numbers: what is not whole, or too large for it, is refused.
         finite: refuse NaN and infinities.
 
@@ -42,11 +50,14 @@ def check_array(
         raise TypeError(f"{name}: got {what} of {given.dtype}, expected an array of {wanted}")
     with np.errstate(over="ignore", invalid="ignore"):  # both are found below
         array = np.asarray(given, dtype=wanted, order="C")
+    sizes = shape or ()
+    if sizes and sizes[0] is Ellipsis:
+        sizes = (*(None,) * (array.ndim + 1 - len(sizes)), *sizes[1:])
     if shape is not None and (
-        array.ndim != len(shape)
-        or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True))
+        array.ndim != len(sizes)
+        or any(s is not None and s != n for s, n in zip(sizes, array.shape, strict=True))
     ):
-        wished = ", ".join("any" if s is None else str(s) for s in shape)
+        wished = ", ".join("any" if s is None else "..." if s is Ellipsis else str(s) for s in shape)
         raise ValueError(f"{name}: got shape {array.shape}, expected ({wished})")
     if wanted.kind in "iu" and given.dtype != wanted and not np.array_equal(array, given):
         raise TypeError(f"{name}: got numbers that are not whole or too large, expected {wanted}")
@@ -54,6 +65,19 @@ def check_array(
         bad = int(np.count_nonzero(~np.isfinite(array)))
         raise ValueError(f"{name}: got {bad} values that are NaN or infinite, expected finite numbers")
     return array
+
+
+def check_alike(**arrays: ArrayLike) -> None:
+    """Raise ValueError, naming the arguments, unless their shapes can be broadcast to one."""
+    shapes = [np.shape(array) for array in arrays.values()]
+    if len({shape for shape in shapes if shape}) < 2:
+        return
+    try:
+        np.broadcast_shapes(*shapes)
+    except ValueError as error:
+        raise ValueError(
+            f"{', '.join(arrays)}: got shapes {', '.join(map(str, shapes))}, expected ones that go together"
+        ) from error
 
 
 def check_count(name: str, value: object, least: int = 1, most: int = 2**31 - 1) -> int:
@@ -184,3 +208,163 @@ def index_to(size: str, shape: str, least: int = 0) -> Expected:
 def lengths(shape: str, least: float = -LARGEST_M) -> Expected:
     """Coordinates or lengths [m]."""
     return Expected(shape, least, LARGEST_M)
+
+
+Public = TypeVar("Public", bound=Callable[..., Any])
+
+
+def checked(public: Public) -> Public:
+    """A function, or a class with its public methods, whose arguments come as their annotations say.
+
+    Numbers of other kinds become Python's, arrays of other kinds (Warp's, torch's, lists, Python objects) NumPy's. What
+    a sequence or a mapping holds is not looked at, and values are checked by the function itself.
+
+    Raises:
+        TypeError: when called with something else, naming the argument.
+    """
+    if not isinstance(public, type):
+        return _checked_call(public, public)  # type: ignore[return-value]
+    for name, member in list(vars(public).items()):
+        inner = getattr(member, "__func__", member)  # of a class method
+        if inspect.isfunction(inner) and (name == "__init__" or not name.startswith("_")):
+            # A field's annotation names what the module of its own class imports.
+            call = _checked_call(inner, public if name == "__init__" and is_dataclass(public) else inner)
+            setattr(public, name, call if member is inner else type(member)(call))
+    return public
+
+
+def _checked_call(function: Callable[..., Any], annotated: Any) -> Callable[..., Any]:
+    parameters = inspect.signature(function).parameters
+    names = tuple(parameters)
+
+    @functools.cache
+    def converters() -> dict[str, Callable[[Any], object]]:
+        """By argument, when first called: annotations name what modules import last."""
+        kinds = typing.get_type_hints(annotated)
+        for one in parameters.values():
+            if one.kind is one.VAR_KEYWORD and typing.get_origin(kinds[one.name]) is typing.Unpack:
+                kinds |= typing.get_type_hints(typing.get_args(kinds[one.name])[0])
+        return {name: _converter(kind) for name, kind in kinds.items()}
+
+    def refused(name: str, value: object) -> object:
+        if name in parameters and value is parameters[name].default:
+            return value
+        expected = function.__annotations__.get(name, "another type")
+        raise TypeError(f"{name}: got {_shown(value)}, expected {expected}")
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        known = converters()
+        given = list(args)
+        for k, name in enumerate(names[: len(args)]):
+            if name in known and (found := known[name](args[k])) is not args[k]:
+                given[k] = refused(name, args[k]) if found is _OTHER else found
+        for name, value in kwargs.items():
+            if name in known and (found := known[name](value)) is not value:
+                kwargs[name] = refused(name, value) if found is _OTHER else found
+        return function(*given, **kwargs)
+
+    return call
+
+
+_OTHER = object()  # what does not fit its annotation
+
+
+def _shown(value: object) -> str:
+    """A value by its type, and as it is written where that is short."""
+    written = f" {value!r}" if isinstance(value, (str, bytes, numbers.Number)) else ""
+    return type(value).__name__ + (written if len(written) < 60 else "")
+
+
+@functools.cache
+def _converter(kind: Any) -> Callable[[Any], object]:
+    """What turns a value into one of the annotation ``kind``, or into :data:`_OTHER`."""
+    origin, inside = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        if bytes in inside:  # ArrayLike, whose numbers are arrays too
+            inside = tuple(one for one in inside if one not in _NUMBERS and one not in (bool, str, bytes))
+        # What need not become an array comes before what must, None, which is rarely given, last.
+        order = sorted(inside, key=lambda one: (one is types.NoneType, _is_of_numpy(one)))
+        every = [_converter(one) for one in order]
+        return functools.partial(_as_one_of, every)
+    if kind is bool:
+        return _as_bool
+    if kind in _NUMBERS:
+        return functools.partial(_as_number, kind)
+    if _is_of_numpy(kind):
+        return functools.partial(_as_array, "U" if "str_" in repr(inside) else "biufc", origin is np.ndarray)
+    if origin is tuple:
+        length = None if Ellipsis in inside else len(inside)
+        return lambda value: value if _is_row(value) and length in (None, len(value)) else _OTHER
+    if origin is Callable:
+        return lambda value: value if callable(value) else _OTHER
+    if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+        return lambda value: value
+    return functools.partial(_as_object, origin)
+
+
+def _as_one_of(every: list[Callable[[Any], object]], value: object) -> object:
+    for convert in every:
+        if (found := convert(value)) is not _OTHER:
+            return found
+    return _OTHER
+
+
+def _is_of_numpy(kind: Any) -> bool:
+    return str(getattr(typing.get_origin(kind) or kind, "__module__", "")).startswith("numpy")
+
+
+def _is_row(value: object) -> bool:
+    return isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
+def _as_bool(value: object) -> object:
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    whole = isinstance(value, (int, np.integer)) and value in (0, 1)
+    return bool(value) if whole or isinstance(value, np.bool_) else _OTHER
+
+
+_NUMBERS: dict[type, type] = {int: numbers.Integral, float: numbers.Real, complex: numbers.Complex}
+
+
+def _as_number(kind: type, value: object) -> object:
+    if type(value) is kind and (kind is not int or abs(value) < 2**63):  # type: ignore[arg-type]
+        return value  # in a hurry
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, _NUMBERS[kind]):
+        return _OTHER
+    number = int(value) if isinstance(value, numbers.Integral) else kind(value)
+    return number if not isinstance(number, int) or abs(number) < 2**63 else _OTHER
+
+
+def _as_array(letters: str, of_axes: bool, value: Any) -> object:
+    """An array of one of the kinds ``letters``, a Python number where that is enough, or :data:`_OTHER`."""
+    if type(value) is np.ndarray and value.dtype.kind in letters and value.dtype.isnative:
+        return value  # in a hurry
+    if isinstance(value, wp.array):
+        value = value.numpy()
+    try:
+        array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
+        if array.dtype.kind == "O":
+            if not all(isinstance(one, numbers.Number) for one in array.flat):
+                return _OTHER
+            array = array.astype(complex)
+            array = array if array.imag.any() else array.real
+    except (TypeError, ValueError, OverflowError, RuntimeError):
+        return _OTHER
+    if array.dtype.kind not in letters:
+        return _OTHER
+    if isinstance(value, (numbers.Number, np.generic)) and not of_axes:
+        return array[()].item()
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
+
+
+def _as_object(kind: type, value: object) -> object:
+    if isinstance(value, str):
+        return value if kind is object or (kind is str and "\0" not in value) else _OTHER
+    # One's own class may stand for one of ours, as long as it is an object with attributes.
+    own = kind.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
+    fits = isinstance(value, kind) or (own and not isinstance(value, wp.array))
+    return value if fits and not isinstance(value, bytes) else _OTHER

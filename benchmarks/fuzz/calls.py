@@ -177,7 +177,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "fit_reflections": lambda p: {
         **TRACE, "mesh": p.mesh, "receivers": p.receivers[:4], "csi": np.full(4, 1e-6 + 1e-6j), "order": 1,
     },
-    "relevance": lambda p: {"geometry": p.field, "receivers": p.receivers[:2], "device": "cpu"},
+    "relevance": lambda p: {**TRACE, "geometry": p.field, "receivers": p.receivers[:2], "device": "cpu"},
     "evaluate": lambda p: {"test": p.test, "predict": wr.lookups.nearest(p.train)},
     # nouns
     "Camera": lambda p: {name: getattr(p.camera, name) for name in p.camera.__dataclass_fields__},

@@ -75,7 +75,10 @@ class Trial:
                 return Outcome("unfit", str(error))
         answer = _asked(lambda: calls.call(case.target, changed))
         if isinstance(answer, Exception):
-            return _refused(answer, given)
+            paths = [
+                str(changed[argument]) for argument, _ in case.edits if isinstance(changed[argument], str)
+            ]
+            return _refused(answer, [*given, *paths])
         values = {value for _, value in case.edits}
         bad = "" if values & NOT_FINITE else judge.wrong(answer, usual or {})
         if not bad and values <= SAME.keys() and usual:

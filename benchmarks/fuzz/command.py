@@ -101,6 +101,7 @@ def run(options: Options, job: Job) -> Report | None:
         while time.monotonic() < until:
             batch = list(itertools.islice(waiting, BATCH))
             for case, outcome in workers.run(batch, until):
+                state["done"] += 1
                 tried = state["tried"].setdefault(case.target, {})
                 tried[outcome.kind] = tried.get(outcome.kind, 0) + 1
                 if outcome.kind == "finding":
@@ -108,7 +109,6 @@ def run(options: Options, job: Job) -> Report | None:
                         stated(case)
                     )
                 job.progress(f"fuzz, {len(state['findings'])} findings", int(time.monotonic() - start), whole)
-            state["done"] += len(batch)
             state["seconds"] = before + time.monotonic() - start
             write_json(state_file, state)
     return _report(state)

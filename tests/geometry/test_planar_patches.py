@@ -91,6 +91,37 @@ def test_an_error_of_a_millimetre_leaves_the_area_in_eighteen_planes():
     assert patches.area[:18].sum() > 0.98 * true_areas().sum()
 
 
+@pytest.mark.parametrize("noise", [5e-3, 2e-2])
+def test_a_scan_with_errors_as_large_as_its_faces_are_high_keeps_its_walls(noise):
+    """Six walls of a room in faces of 9 to 20 cm; a tenth of the faces is missing."""
+    low, high = np.zeros(3), np.array([6.0, 5.0, 3.0])
+    v, f = box(low, high)
+    for _ in range(5):
+        v, f = subdivided(v, f)
+    rng = np.random.default_rng(6)
+    mesh = Mesh(v + noise * rng.normal(size=v.shape), f[rng.random(len(f)) > 0.1])
+    patches = planar_patches(mesh)
+    assert patches.area[:6].sum() > 0.95 * mesh.areas.sum()
+    axis = np.abs(patches.normal[:6]).argmax(axis=1)
+    assert sorted(axis) == [0, 0, 1, 1, 2, 2]
+    assert np.abs(patches.normal[np.arange(6), axis]).min() > np.cos(np.radians(0.2))
+    for p in range(6):
+        corners = mesh.triangles[patches.faces(p)].reshape(-1, 3)
+        here = corners.mean(axis=0)
+        here[axis[p]] = (low if here[axis[p]] < 1.0 else high)[axis[p]]
+        assert abs(here @ patches.normal[p] - patches.offset[p]) < 0.2 * noise
+
+
+def test_hills_are_no_noise():
+    x, y = np.meshgrid(np.arange(12.0), np.arange(12.0), indexing="ij")
+    z = 0.3 * np.random.default_rng(7).normal(size=x.shape)
+    k = np.arange(144).reshape(12, 12)
+    a, b, c, d = (q.ravel() for q in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    f = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    patches = planar_patches(Mesh(np.column_stack([q.ravel() for q in (x, y, z)]), f))
+    assert len(patches) == len(f) and patches.tolerance_m < 1e-4
+
+
 @pytest.mark.parametrize("times", [0, 2])
 def test_winding_order_repeats_and_float32_turns_change_nothing(times):
     rng = np.random.default_rng(3)

@@ -18,6 +18,7 @@ from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, Re
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
 from warprrf.geometry.photos.planes import Plane, plane_axes
 from warprrf.geometry.pipeline import reconstruct
+from warprrf.geometry.planar_patches import planar_patches
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.discs import discs_on_mesh
 
@@ -316,6 +317,18 @@ def splats(tmp_path_factory):
     (folder / "model").mkdir()
     model.write_binary(str(folder / "model"))
     return folder
+
+
+def test_patches_of_older_files_are_read():
+    """They hold which faces of patches repeat no other, in place of which ones these repeat."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [3, 3, 3], [3, 3, 4]], float)
+    mesh = wr.Mesh(corners, np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [0, 4, 5]]))
+    patches = planar_patches(mesh)
+    arrays = files.of_patches(patches)
+    del arrays["patch_first"]
+    found = files.to_patches(arrays | {"patch_once": patches.once & (patches.face_patch >= 0)})
+    np.testing.assert_array_equal(found.first, [0, 1, 0, 3])
+    np.testing.assert_array_equal(found.face_patch, patches.face_patch)
 
 
 def test_splats_with_poses_get_a_mesh_of_their_own(splats):

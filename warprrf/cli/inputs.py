@@ -98,19 +98,27 @@ def add_mesh_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """Define what of a scene file's materials is taken."""
+    """Define what of a scene file's materials is taken, and that it may name any file."""
     parser.add_argument("--materials", metavar="FILE", help="table that replaces a scene's materials by name")
     parser.add_argument(
         "--extrapolate",
         action="store_true",
         help="let a scene's materials hold outside their bands, by the nearest band's law",
     )
+    parser.add_argument(
+        "--allow-outside", action="store_true", help="read meshes outside the scene's folder too"
+    )
 
 
 def load_scene(path: str | Path, options: argparse.Namespace) -> wr.Scene:
     """A scene file that Sionna RT opens."""
     materials = None if options.materials is None else existing(options.materials)
-    return wr.Scene.load(existing(path), materials=materials, extrapolate=options.extrapolate)
+    return wr.Scene.load(
+        existing(path),
+        materials=materials,
+        extrapolate=options.extrapolate,
+        allow_outside=options.allow_outside,
+    )
 
 
 def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> Any:

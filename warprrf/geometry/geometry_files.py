@@ -100,6 +100,9 @@ def of_patches(patches: PlanarPatches) -> Arrays:
 def to_patches(arrays: Arrays, material_names: Sequence[str] = ()) -> PlanarPatches:
     """What :func:`of_patches` took apart."""
     mesh = to_mesh(arrays, material_names)
+    if "patch_once" in arrays:  # older files say which faces repeat none, not which ones others repeat
+        itself = arrays["patch_once"] | (arrays["patch_face_patch"] < 0)
+        arrays = arrays | {"patch_first": np.where(itself, np.arange(len(itself)), mesh.first_at_place)}
     check_arrays(arrays, PATCH_ARRAYS, F=len(mesh.faces))
     own: dict[str, Any] = {name: arrays[f"patch_{name}"] for name in PATCHES}
     own |= {name: own[name].item() for name in ("tolerance_m", "two_sided")}

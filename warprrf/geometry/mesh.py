@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from warprrf import device as _device
 from warprrf.brief import one_line
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import LARGEST_M, check_array, check_number
+from warprrf.checks import LARGEST_M, check_array, check_number, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
@@ -53,6 +53,7 @@ class Closest:
     face: np.ndarray
 
 
+@checked
 class Mesh:
     """A triangle mesh in metres, and what is known of its faces: they tell a radio field which surfaces are alike.
 

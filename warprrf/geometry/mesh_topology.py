@@ -16,6 +16,21 @@ def components(count: int, pairs: np.ndarray) -> np.ndarray:
     return found
 
 
+def edge_pairs(corner: np.ndarray, face: np.ndarray | None = None) -> np.ndarray:
+    """Pairs of the faces ``corner`` (F, 3), of ``face`` (K,) alone if given, that share an edge, shape ``(N, 2)``."""
+    face = np.arange(len(corner)) if face is None else face
+    edge = np.sort(corner[face][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    owner = np.repeat(face, 3)
+    order = np.lexsort((owner, edge[:, 1], edge[:, 0]))
+    edge, owner = edge[order], owner[order]
+    # Where more than two faces share an edge, neighbours in sorted order are not all pairs: look three ahead.
+    pairs = [np.zeros((0, 2), int)]
+    for step in (1, 2, 3):
+        same = (edge[step:] == edge[:-step]).all(axis=1)
+        pairs.append(np.column_stack([owner[:-step][same], owner[step:][same]]))
+    return np.concatenate(pairs)
+
+
 def face_neighbours(faces: np.ndarray) -> np.ndarray:
     """The face across each edge, -1 at a border (and at edges of more than two faces), shape ``(F, 3)`` int64."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)

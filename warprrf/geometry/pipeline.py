@@ -16,6 +16,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from warprrf.checks import checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.photos import sfm
@@ -34,6 +35,7 @@ VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 1, "surface": 1}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 
+@checked
 def reconstruct(
     photos: Photos,
     *,

@@ -16,12 +16,18 @@ from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
 from warprrf.geometry.mesh import Mesh, vectors_across
-from warprrf.geometry.mesh_topology import components
+from warprrf.geometry.mesh_topology import components, edge_pairs
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""
 FLAT_RAD = 1.4e-3
 """Faces may be turned this much against their patch [rad], and by three standard deviations over their heights more."""
+
+
+BENT_RAD = 0.8
+"""Neighbours that are bent this much may still be coplanar: errors of 2 cm bend faces of 10 cm by 0.3."""
+MOST_NOISE_M = 0.05
+"""Standard deviation of vertices' errors up to which unevenness is taken for a scanner's [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +167,7 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
     longest = np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, 1, axis=1), axis=2).max(axis=1)
     height = 2.0 * mesh.areas / np.maximum(longest, 1e-300)
     once &= ~_is_sliver(corner, height, rounding)
-    pairs = _neighbours(corner, np.flatnonzero(once))
+    pairs = edge_pairs(corner, np.flatnonzero(once))
     noise = vertex_noise(mesh, pairs, rounding)
     faces = _Faces(mesh, group, height, FLAT_M + 6.0 * noise, 3.0 * noise)
     piece = _pieces(faces, once, pairs)
@@ -169,17 +175,18 @@ def planar_patches(mesh: Mesh, groups: ArrayLike | None = None) -> PlanarPatches
 
 
 def vertex_noise(mesh: Mesh, pairs: np.ndarray, rounding_m: float) -> float:
-    """Standard deviation of vertices' errors [m], from neighbours that are nearly coplanar; at least ``rounding_m``.
+    """Standard deviation of vertices' errors [m], from neighbours that may be coplanar; at least ``rounding_m``.
 
     On a flat piece errors bend a face towards one neighbour and away from another; on a smooth curved one all bend the
-    same way. Only if most faces with three neighbours are bent both ways is that noise.
+    same way. Only if most faces with three neighbours are bent both ways is that noise, and only up to
+    :data:`MOST_NOISE_M`: hills are not.
 
     Args:
         pairs: Neighbouring faces, shape ``(N, 2)``.
     """
     a, b = np.concatenate([pairs, pairs[:, ::-1]]).T
     n, x = mesh.face_normals, mesh.triangles
-    flat = np.abs(np.einsum("ni,ni->n", n[a], n[b])) > np.cos(0.15)
+    flat = np.abs(np.einsum("ni,ni->n", n[a], n[b])) > np.cos(BENT_RAD)
     a, b = a[flat], b[flat]
     rise = np.einsum("nki,ni->nk", x[b] - x[a][:, :1], n[a])
     rise = rise[np.arange(len(a)), np.abs(rise).argmax(axis=1)] if len(a) else np.zeros(0)
@@ -193,7 +200,8 @@ def vertex_noise(mesh: Mesh, pairs: np.ndarray, rounding_m: float) -> float:
     if both.sum() <= 0.55 * whole.sum():
         return rounding_m
     # The corner across an edge lies off the neighbour's plane by twice a vertex's error (of a parallelogram).
-    return max(rounding_m, float(np.median(np.abs(rise)) / 0.6745 / 2.0))
+    noise = float(np.median(np.abs(rise)) / 0.6745 / 2.0)
+    return max(rounding_m, noise) if noise <= MOST_NOISE_M else rounding_m
 
 
 @dataclass(frozen=True)
@@ -234,20 +242,6 @@ def _is_sliver(corner: np.ndarray, height: np.ndarray, rounding: float) -> np.nd
     return (a == b) | (b == c) | (c == a) | (height <= 4.0 * rounding)
 
 
-def _neighbours(corner: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Pairs of the faces ``face`` that share an edge, shape ``(N, 2)``."""
-    edge = np.sort(corner[face][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    owner = np.repeat(face, 3)
-    order = np.lexsort((owner, edge[:, 1], edge[:, 0]))
-    edge, owner = edge[order], owner[order]
-    # Where more than two faces share an edge, neighbours in sorted order are not all pairs: look three ahead.
-    pairs = [np.zeros((0, 2), int)]
-    for step in (1, 2, 3):
-        same = (edge[step:] == edge[:-step]).all(axis=1)
-        pairs.append(np.column_stack([owner[:-step][same], owner[step:][same]]))
-    return np.concatenate(pairs)
-
-
 def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Piece of each face, -1 where not ``once``, shape ``(F,)``."""
     mesh, n = faces.mesh, faces.mesh.face_normals
@@ -269,10 +263,7 @@ def _pieces(faces: _Faces, once: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     bad = np.unique(piece[own][faces.gap(own, normal[piece[own]], offset[piece[own]]) > faces.distance_m])
     if len(bad):
         piece = _numbered(_grown(faces, piece, np.isin(piece, bad), pairs))
-    for _ in range(6):
-        joined = _joined(faces, piece, pairs)
-        if joined is None:
-            break
+    while (joined := _joined(faces, piece, pairs)) is not None:
         piece = joined
     return piece
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_number, check_type
+from warprrf.checks import check_number, check_type, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
@@ -25,6 +25,7 @@ FILE = "reconstruction.safetensors"
 FORMAT = 2  # 1 held a list of patches, each with its faces
 
 
+@checked
 class Reconstruction:
     """Geometry of a place, frozen.
 

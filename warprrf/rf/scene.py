@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_number, check_type
+from warprrf.checks import check_array, check_number, check_type, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material, load_materials
@@ -25,6 +25,7 @@ from warprrf.rf.scene_xml import read_scene_xml
 T = TypeVar("T")
 
 
+@checked
 class Scene:
     """Surfaces and what they are made of.
 

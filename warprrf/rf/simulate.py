@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from warprrf.checks import check_array, check_count, check_number, check_seed
+from warprrf.checks import check_array, check_count, check_number, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import as_mesh
 from warprrf.rf.em.absorption import Gas, air_of
@@ -31,6 +31,7 @@ _BATCH = 1000
 _TRIES = 200
 
 
+@checked
 def simulate(
     scene: Scene,
     *,
@@ -45,7 +46,7 @@ def simulate(
     refraction: bool = False,
     seed: int = 0,
     gas: Gas = False,
-    roles: Sequence[str] | np.ndarray | None = None,
+    roles: Sequence[str] | NDArray[np.str_] | None = None,
     floor: float | None = None,
     workspace: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
@@ -81,7 +82,7 @@ def simulate(
             unknown engine.
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
     """
-    if not hasattr(scene, "face_material"):
+    if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
@@ -140,6 +141,7 @@ def simulate(
     )
 
 
+@checked
 def sample_receivers(
     scene: Scene,
     n: int,

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from warprrf import device as _device
+from warprrf.checks import checked
 
 MIN_LLVM = 17
 """Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)."""
@@ -38,6 +39,7 @@ def installed_llvm() -> dict[int, Path]:
     return found
 
 
+@checked
 def select_llvm() -> Path | None:
     """Point Dr.Jit at the newest LLVM of at least 17 before it is first imported; returns it.
 

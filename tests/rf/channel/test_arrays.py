@@ -129,5 +129,5 @@ def test_spherical_response_is_the_field_of_a_point_source():
     ],
 )
 def test_bad_arrays_are_named(arguments, name):
-    with pytest.raises(ValueError, match=name):
+    with pytest.raises((ValueError, TypeError), match=name):
         PlanarArray(**arguments)

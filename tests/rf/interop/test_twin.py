@@ -289,7 +289,7 @@ def test_a_failed_write_leaves_the_earlier_twin(field, tmp_path, monkeypatch):
 
 
 def test_fields_without_materials_are_refused(field, tmp_path):
-    with pytest.raises(TypeError, match="field.*bistatic"):
+    with pytest.raises(TypeError, match="field.*RadioField"):
         wr.write_twin(object(), tmp_path / "twin")
     with pytest.raises(ValueError, match="line of sight alone"):
         wr.write_twin(replace(field, terms=Terms(lobes=LOBES, diffuse=False, mirror_order=0)), tmp_path / "x")

@@ -1,4 +1,4 @@
-"""A mesh fused from depth maps snapped to planes: faces find their plane, vertices move onto it, flat parts go coarse.
+"""A mesh fused from depth maps, or a scan, snapped to planes: faces find their plane, vertices move onto it, flat parts go coarse.
 
 Rooms are mostly planar, and a plane fitted to thousands of points is far better than any depth map. Sharp edges come
 out where two planes meet. Lengths in metres.
@@ -10,15 +10,20 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy import sparse
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_topology import connected_pieces, face_neighbours, smoothed_normals
+from warprrf.geometry.mesh_topology import connected_pieces, edge_pairs, face_neighbours, smoothed_normals
 from warprrf.geometry.photos.config import PlaneConfig, SurfaceConfig
-from warprrf.geometry.photos.planes import Plane, detect_planes
-from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.photos.planes import Plane, detect_planes, drawn_by_place
+from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 
 LONGEST_MOVE_M = 0.15  # of a vertex to its plane
 FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
+DRAWN = 100_000  # faces are enough to find planes among
+SCAN_NOISE_M = 2e-3  # vertices whose errors are larger are a scanner's
+SMOOTHED = 5  # rounds of smoothing a scan
+SHRINK, GROW = 0.5, -0.53  # Taubin (1995): noise goes, nothing shrinks
 
 
 def find_patches(
@@ -39,7 +44,11 @@ def find_patches(
             min_points=2 * config.min_patch_m2,
             max_planes=40,
         )
-        planes = detect_planes(centres, normals, weights=areas, config=among_faces)
+        drawn = (
+            drawn_by_place(centres, np.ones(len(centres)), DRAWN, 0) if len(centres) > DRAWN else slice(None)
+        )
+        weights = areas[drawn] * (areas.sum() / max(areas[drawn].sum(), 1e-30))
+        planes = detect_planes(centres[drawn], normals[drawn], weights=weights, config=among_faces)
     label = np.full(len(centres), -1, dtype=np.int64)
     best = np.full(len(centres), config.patch_distance_m)
     for k, plane in enumerate(planes):
@@ -51,6 +60,40 @@ def find_patches(
     return PlanarPatches.from_planes(
         mesh, label, [p.normal for p in planes], [p.offset for p in planes], tolerance_m=FLAT_M
     )
+
+
+def is_scan(mesh: Mesh) -> bool:
+    """Whether the vertices of ``mesh`` have errors like a scanner's: more than :data:`SCAN_NOISE_M`."""
+    pairs = edge_pairs(mesh.welded_faces, np.flatnonzero(mesh.areas > 0))
+    return vertex_noise(mesh, pairs, mesh.rounding_m) > SCAN_NOISE_M
+
+
+def scanned_patches(mesh: Mesh, config: SurfaceConfig | None = None) -> PlanarPatches:
+    """Planar patches of a scan, largest first, on a mesh without its noise: smoothed, snapped to planes, made coarse.
+
+    Args:
+        mesh: noisy, with holes, of any number of faces.
+        config: least size of a patch, and its distances.
+    """
+    config = config or SurfaceConfig()
+    patches = simplified(flattened(find_patches(_smoothed(mesh), config=config)), cell_m=config.simplify_m)
+    return replace(largest_first(patches, config.min_patch_m2), two_sided=True)
+
+
+def _smoothed(mesh: Mesh) -> Mesh:
+    """``mesh`` with its noise smoothed away (Taubin, "A signal processing approach to fair surface design", 1995)."""
+    faces, count = mesh.welded_faces, len(mesh.vertices)
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    link = sparse.coo_array((np.ones(len(ends)), ends.T), shape=(count, count)).tocsr()
+    link = ((link + link.T) > 0).astype(float)
+    degree = np.maximum(np.asarray(link.sum(axis=1)).reshape(-1, 1), 1.0)
+    first = np.unique(faces, return_index=True)
+    vertices = np.zeros((count, 3))
+    vertices[first[0]] = mesh.vertices[mesh.faces.reshape(-1)[first[1]]]
+    for _ in range(SMOOTHED):
+        for share in (SHRINK, GROW):
+            vertices = vertices + share * ((link @ vertices) / degree - vertices)
+    return Mesh(vertices, faces)
 
 
 def flattened(patches: PlanarPatches) -> PlanarPatches:

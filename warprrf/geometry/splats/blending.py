@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from warprrf.checks import checked
 from warprrf.kernels.raster import view as kernels
 
 RULES = {"product": kernels.PRODUCT, "exp": kernels.EXPONENTIAL}
 
 
+@checked
 @dataclass(frozen=True)
 class Blending:
     """How responses become an image; the defaults suit 8-bit photos.

@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_number, check_positive, check_type
+from warprrf.checks import check_array, check_count, check_number, check_positive, check_type, checked
 
 KINDS = ("pinhole", "spherical")
 
 
+@checked
 @dataclass(frozen=True)
 class Camera:
     """A camera; build it with :meth:`pinhole` or :meth:`spherical`.

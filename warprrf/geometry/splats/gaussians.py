@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warprrf.brief import one_line
-from warprrf.checks import LARGEST_M, check_array
+from warprrf.checks import LARGEST_M, check_array, checked
 from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
@@ -22,6 +22,7 @@ OPACITY_MARGIN = 1e-7
 LARGEST_SH = 1e6
 
 
+@checked
 @dataclass(frozen=True)
 class Gaussians:
     """N anisotropic Gaussians.

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from warprrf.checks import checked
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.splats.blending import RADIO as RADIO
 from warprrf.geometry.splats.blending import Blending as Blending
@@ -80,6 +81,7 @@ class Image:
         return self.features, self.alpha, self.depth
 
 
+@checked
 class Rasterizer:
     """Projects, bins and blends on one device in one precision.
 
@@ -131,7 +133,7 @@ class Rasterizer:
         opacities: wp.array,
         features: wp.array,
         cam: Camera,
-        background: ArrayLike | None = None,
+        background: ArrayLike | wp.array | None = None,
     ) -> Image:
         """Project and blend; differentiable on an active tape."""
         return self.blend(self.prepare(means, quaternions, scales, opacities, cam), features, background)
@@ -178,7 +180,9 @@ class Rasterizer:
         ids, starts = _listed(span, count, distance, view)
         return Prepared(cam, view, inputs, splats, ids, starts)
 
-    def blend(self, prepared: Prepared, features: wp.array, background: ArrayLike | None = None) -> Image:
+    def blend(
+        self, prepared: Prepared, features: wp.array, background: ArrayLike | wp.array | None = None
+    ) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
         tape = active_tape()
         behind = self._background(features, background)
@@ -194,7 +198,7 @@ class Rasterizer:
         self,
         prepared: Prepared,
         features: wp.array,
-        background: ArrayLike | None = None,
+        background: ArrayLike | wp.array | None = None,
         *,
         gradients: bool = True,
     ) -> tuple[Image, Callable[[], wp.array]]:
@@ -222,7 +226,7 @@ class Rasterizer:
         self._launch_tiles(kernel, prepared, [*self._scene(prepared), *out])
         return out
 
-    def _background(self, features: wp.array, background: ArrayLike | None) -> wp.array:
+    def _background(self, features: wp.array, background: ArrayLike | wp.array | None) -> wp.array:
         if isinstance(background, wp.array):
             return background
         values = np.zeros(features.shape[1]) if background is None else np.asarray(background)

@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf.brief import one_line
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, resolve
 from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.camera import Camera, check_camera
@@ -38,6 +38,7 @@ class Rendering:
     peak: np.ndarray = field(repr=False)
 
 
+@checked
 @dataclass(frozen=True)
 class BlendWeights:
     """The ``K`` largest blending weights of every pixel, front to back.
@@ -61,6 +62,7 @@ class BlendWeights:
     dropped: np.ndarray = field(repr=False)
 
 
+@checked
 def render(
     g: Gaussians,
     cam: Camera,
@@ -104,6 +106,7 @@ def render(
     return Rendering(image.features.numpy(), alpha, depth, dominant, peak)
 
 
+@checked
 def blend_weights(
     g: Gaussians, cam: Camera, *, top_k: int = 16, blending: Blending = RADIO, device: DeviceLike = None
 ) -> BlendWeights:

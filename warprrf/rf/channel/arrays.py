@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
-from warprrf.checks import check_array, check_count, check_positive
+from warprrf.checks import check_array, check_count, check_positive, checked
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import angles_from_directions, transverse_basis
@@ -38,6 +38,7 @@ SLANTS_RAD = {
 """Slant angle of each port of an element, by the name of its polarisation."""
 
 
+@checked
 @dataclass(frozen=True)
 class PlanarArray:
     """A planar array of equal elements.
@@ -116,7 +117,7 @@ class PlanarArray:
 
     def gain(self, directions: ArrayLike) -> np.ndarray:
         """Power gain of an element [linear] towards world ``directions`` (..., 3), shape ``(...)``."""
-        local = np.asarray(directions, dtype=np.float64) @ self.rotation
+        local = check_array("directions", directions, (..., 3), finite=False) @ self.rotation
         return _pattern_gain(self.pattern, local)
 
     def field(self, directions: ArrayLike) -> np.ndarray:
@@ -130,7 +131,7 @@ class PlanarArray:
         """
         if self.polarisation is None:
             raise ValueError("polarisation: got None, expected 'V', 'H', 'VH' or 'cross'")
-        world = np.asarray(directions, dtype=np.float64)
+        world = check_array("directions", directions, (..., 3), finite=False)
         local = world @ self.rotation
         size = np.sqrt(_pattern_gain(self.pattern, local))
         turn = np.einsum(
@@ -153,7 +154,7 @@ class PlanarArray:
         Returns:
             Shape ``(..., N)``, complex, of unit modulus, phase zero at the array's centre.
         """
-        reach = np.asarray(directions, dtype=np.float64) @ self.positions(wavelength_m).T
+        reach = check_array("directions", directions, (..., 3), finite=False) @ self.positions(wavelength_m).T
         number = 1.0 / wavelength_m if frequency_hz is None else frequency_hz / SPEED_OF_LIGHT
         return np.exp(2j * np.pi * number * reach)
 
@@ -165,7 +166,7 @@ class PlanarArray:
         Every element's own distance counts, in phase and (as its inverse) in amplitude: r / r_n exp(-j 2 pi f (r_n -
         r) / c). Shape ``(..., N)``, complex; other arguments as in :meth:`response`.
         """
-        source = np.asarray(points, dtype=np.float64)[..., None, :]
+        source = check_array("points", points, (..., 3), finite=False)[..., None, :]
         place = self.positions(wavelength_m)
         far = np.linalg.norm(source, axis=-1)
         each = np.linalg.norm(source - place, axis=-1)
@@ -187,6 +188,7 @@ def rotation_matrix(orientation: ArrayLike) -> np.ndarray:
     )
 
 
+@checked
 def orientation_towards(direction: ArrayLike) -> tuple[float, float, float]:
     """Yaw, pitch and roll [rad] that point an array's boresight along ``direction`` (3,), columns level.
 
@@ -199,6 +201,7 @@ def orientation_towards(direction: ArrayLike) -> tuple[float, float, float]:
     return float(np.arctan2(d[1], d[0])), float(-np.arctan2(d[2], np.hypot(d[0], d[1]))), 0.0
 
 
+@checked
 @dataclass(frozen=True)
 class PlaneWaveError:
     """What taking a spherical wave for a plane one costs an array.
@@ -215,6 +218,7 @@ class PlaneWaveError:
     entry_error: float
 
 
+@checked
 def plane_wave_error(
     array: PlanarArray, distance_m: float, wavelength_m: float, direction: ArrayLike = (1.0, 0.0, 0.0)
 ) -> PlaneWaveError:

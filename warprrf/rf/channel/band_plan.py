@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.checks import check_count
+from warprrf.checks import check_count, checked
 
 LOW_HZ, HIGH_HZ = 252.72e9, 321.84e9
 """Edges of the band [Hz]."""
@@ -22,6 +22,7 @@ UNIT_HZ = 2.16e9
 _UNITS = (1, 2, 4, 6, 8, 12, 24, 32)  # bandwidths, in units, in the order of the numbering
 
 
+@checked
 @dataclass(frozen=True)
 class ThzChannel:
     """A channel of IEEE Std 802.15.3d-2017.
@@ -71,6 +72,7 @@ THZ_CHANNELS: dict[int, ThzChannel] = _plan()
 """All channels by number."""
 
 
+@checked
 def thz_channel(number: int) -> ThzChannel:
     """The channel of CHNL_ID ``number``.
 

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_positive
+from warprrf.checks import check_array, check_count, check_positive, checked
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
@@ -34,6 +34,7 @@ MAX_ROUNDS = 20  # of the multi-user search, which ends by itself once no user g
 _TERMS = 1 << 18  # numbers held at once while paths are summed: what fits a cache
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class Codebook:
     """Beams of an array; make one with :func:`dft_codebook` or :func:`steering_codebook`.
@@ -78,7 +79,7 @@ class Codebook:
 
         Elements' patterns count: |amplitude|^2 is the beam's power gain.
         """
-        d = np.asarray(directions, dtype=np.float64)
+        d = check_array("directions", directions, (None, 3), finite=False)
         size = np.sqrt(self.array.gain(d))
         parts = self._waves(d)
         if len(parts) == 1:
@@ -91,15 +92,15 @@ class Codebook:
         Returns:
             Shape ``(..., B)``.
         """
-        values = np.asarray(gains, dtype=complex)
-        d = np.asarray(directions, dtype=np.float64)
+        d = check_array("directions", directions, (None, 3), finite=False)
+        values = check_array("gains", gains, (..., len(d)), complex, finite=False)
         size = np.sqrt(self.array.gain(d))
         return self._summed(d, values * size, lambda waves: waves)
 
     def power(self, directions: ArrayLike, powers: ArrayLike) -> np.ndarray:
         """Mean |w^T h|^2 of every beam for waves of ``powers`` (..., L) and independent phases, shape ``(..., B)``."""
-        values = np.asarray(powers, dtype=np.float64)
-        d = np.asarray(directions, dtype=np.float64)
+        d = check_array("directions", directions, (None, 3), finite=False)
+        values = check_array("powers", powers, (..., len(d)), finite=False)
         return self._summed(d, values * self.array.gain(d), squared)
 
     def _summed(
@@ -128,6 +129,7 @@ class Codebook:
         ]
 
 
+@checked
 def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
     """Beams at equally spaced spatial frequencies, across and down the array; orthonormal without oversampling.
 
@@ -143,6 +145,7 @@ def dft_codebook(array: PlanarArray, oversampling: int = 1) -> Codebook:
     return Codebook(array, (_dft(array.cols, times), _dft(array.rows, times)))
 
 
+@checked
 def steering_codebook(
     array: PlanarArray,
     directions: ArrayLike | None = None,
@@ -182,6 +185,7 @@ Ends = PlanarArray | Codebook | None
 """Beams of one end: those given, an array's DFT codebook, or a single isotropic element."""
 
 
+@checked
 @dataclass(frozen=True)
 class BeamChoice:
     """Pairs of beams, best first, of one receiver ``(K,)`` or several ``(R, K)``.
@@ -197,6 +201,7 @@ class BeamChoice:
     gain: np.ndarray
 
 
+@checked
 def beam_gains(source: Source, tx_array: Ends = None, rx_array: Ends = None) -> np.ndarray:
     """Predicted mean |w_r^T H w_t|^2 of every pair of beams; arguments and errors as for :func:`select_beams`.
 
@@ -208,6 +213,7 @@ def beam_gains(source: Source, tx_array: Ends = None, rx_array: Ends = None) -> 
     return np.stack(found) if isinstance(source, PathArrays) and source.batched else found[0]
 
 
+@checked
 def select_beams(
     source: Source, tx_array: Ends = None, rx_array: Ends = None, *, count: int = 1
 ) -> BeamChoice:
@@ -241,6 +247,7 @@ def select_beams(
     return BeamChoice(*(np.stack(column) for column in zip(*rows, strict=True)))
 
 
+@checked
 @dataclass(frozen=True)
 class MultiUserChoice:
     """One beam at each end for every user served at once.
@@ -261,6 +268,7 @@ class MultiUserChoice:
         return float(np.log2(1.0 + self.sinr).sum())
 
 
+@checked
 def select_beams_multiuser(
     sources: Source | Iterable[Source], tx_array: Ends = None, rx_array: Ends = None, *, noise: float
 ) -> MultiUserChoice:
@@ -289,6 +297,7 @@ def select_beams_multiuser(
     return MultiUserChoice(sent, received, signal_over_interference(gains, sent, received, noise))
 
 
+@checked
 def signal_over_interference(
     gains: Sequence[ArrayLike], tx: ArrayLike, rx: ArrayLike, noise: float
 ) -> np.ndarray:
@@ -299,7 +308,19 @@ def signal_over_interference(
         tx, rx: Beams of the users, shape ``(U,)``.
         noise: Noise power over the total transmitted power.
     """
-    heard = np.array([np.asarray(g)[r, np.asarray(tx)] for g, r in zip(gains, np.asarray(rx), strict=True)])
+    users = len(gains)
+    sent, received = (
+        check_array(name, value, (users,), np.int64) for name, value in (("tx", tx), ("rx", rx))
+    )
+    tables = [check_array("gains", g, (None, None)) for g in gains]
+    for name, index, axis in (("rx", received, 0), ("tx", sent, 1)):
+        fewest = min((table.shape[axis] for table in tables), default=0)
+        if users and not -fewest <= index.min() <= index.max() < fewest:
+            raise ValueError(f"{name}: got beams {index.min()} to {index.max()}, expected 0 to {fewest - 1}")
+    check_positive("noise", noise, "noise power")
+    heard = np.array([table[r, sent] for table, r in zip(tables, received, strict=True)]).reshape(
+        users, users
+    )
     signal = np.diag(heard)
     return signal / (heard.sum(axis=1) - signal + noise * len(heard))
 

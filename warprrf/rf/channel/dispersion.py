@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.rf.channel.path_arrays import PathArrays
 
 COHERENCE = 0.5
@@ -24,6 +24,7 @@ _STEPS = 16  # trials of the correlation over the shortest period that it can ha
 _MOST_PERIODS = 4096  # searched for the first crossing
 
 
+@checked
 @dataclass(frozen=True)
 class Dispersion:
     """Spreads of the paths of one receiver, arrays ``()``, or of several, ``(R,)``; NaN where there is no path.
@@ -76,24 +77,27 @@ def dispersion(paths: PathArrays) -> Dispersion:
     )
 
 
+@checked
 def delay_spread(power: ArrayLike, tau: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Mean delay and rms delay spread [s] of powers at delays ``tau`` (..., L) [s], each ``(...)``.
 
     Delays without power may be NaN; both are NaN where there is no power.
     """
-    weight, delay = _weights(power, tau)
+    weight, delay = _weights(power, tau, "tau")
     mean = (weight * delay).sum(axis=-1)
     return mean, np.sqrt((weight * (delay - mean[..., None]) ** 2).sum(axis=-1))
 
 
+@checked
 def angular_spread(power: ArrayLike, angle: ArrayLike) -> np.ndarray:
     """sqrt(-2 ln |sum P exp(j angle)| / sum P) [rad] over the last axis; 3GPP TR 38.901, eq. (A-1)."""
-    weight, angle = _weights(power, angle)
+    weight, angle = _weights(power, angle, "angle")
     resultant = np.abs((weight * np.exp(1j * angle)).sum(axis=-1))
     with np.errstate(divide="ignore"):
         return np.sqrt(np.maximum(-2.0 * np.log(np.minimum(resultant, 1.0)), 0.0))
 
 
+@checked
 def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = COHERENCE) -> np.ndarray:
     """Least frequency shift at which |sum P exp(-j 2 pi shift tau)| falls to ``level`` of sum P [Hz], shape ``(...)``.
 
@@ -104,7 +108,7 @@ def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = COHEREN
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"level: got {level!r}, expected a share between 0 and 1")
-    weight, delay = _weights(power, tau)
+    weight, delay = _weights(power, tau, "tau")
     shape = weight.shape[:-1]
     found = [
         _first_fall(w, t, level)
@@ -136,17 +140,17 @@ def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:
     return float("inf")
 
 
-def _weights(power: ArrayLike, values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def _weights(power: ArrayLike, values: ArrayLike, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Shares of power that sum to one over the last axis (NaN without power), and values with 0 where there is none."""
     p = check_array("power", power)
-    v = check_array("values", values, finite=False)
+    v = check_array(name, values, finite=False)
     if p.shape != v.shape or p.ndim == 0:
-        raise ValueError(f"power: got shape {p.shape} for values of shape {v.shape}, expected the same")
+        raise ValueError(f"power: got shape {p.shape} for {name} of shape {v.shape}, expected the same")
     if (p < 0).any():
         raise ValueError("power: got negative values, expected linear power")
     positive = p > 0
     if not np.isfinite(v[positive]).all():
-        raise ValueError("values: got NaN or infinite ones where there is power")
+        raise ValueError(f"{name}: got NaN or infinite ones where there is power")
     total = p.sum(axis=-1, keepdims=True)
     share = np.divide(p, total, out=np.full(p.shape, np.nan), where=total > 0)
     return share, np.where(positive, v, 0.0)

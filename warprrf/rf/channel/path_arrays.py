@@ -17,8 +17,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from warprrf.brief import one_line
+from warprrf.checks import check_array, checked
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -30,6 +32,7 @@ _PADDING: dict[str, Any] = {
 """Arrays with an entry for each path, and what they hold where there is none."""
 
 
+@checked
 @dataclass(frozen=True)
 class PathArrays:
     """Paths of one receiver, arrays ``(L,)``, or of several, arrays ``(R, L)`` padded where ``valid`` is False.
@@ -62,7 +65,7 @@ class PathArrays:
     theta_t: np.ndarray
     phi_t: np.ndarray
     vertices: np.ndarray
-    kind: np.ndarray
+    kind: NDArray[np.str_]
     valid: np.ndarray
     jones: np.ndarray | None = None
     frequency_hz: float | None = None
@@ -142,7 +145,19 @@ class PathArrays:
             raise TypeError(
                 "paths of several receivers cannot be selected from at once; index a receiver first"
             )
-        return self._taken(chosen)
+        index: Any = chosen
+        if not isinstance(chosen, slice):
+            index = np.asarray(chosen)
+            index = index if index.size else index.astype(int)
+        try:
+            found = np.arange(len(self.gain))[index]
+        except IndexError as error:
+            raise ValueError(
+                f"chosen: {error}; expected indices of {len(self.gain)} paths, or a mask"
+            ) from error
+        if found.ndim != 1:
+            raise ValueError(f"chosen: got shape {found.shape}, expected a list of paths")
+        return self._taken(index)
 
     def with_gas(self, gas: Gas = True) -> Self:
         """The same paths with the absorption of ``gas`` in their gains, in place of what was in them.
@@ -192,7 +207,7 @@ class PathArrays:
         receiver: np.ndarray,
         vertices: np.ndarray,
         amplitude: np.ndarray,
-        kind: np.ndarray,
+        kind: NDArray[np.str_],
         frequency_hz: float,
         jones: np.ndarray | None = None,
     ) -> Self:
@@ -202,6 +217,27 @@ class PathArrays:
             amplitude: Gain before exp(-j 2 pi f tau), complex, shape ``(L,)``; its modulus squared is the path gain.
             jones: Polarised gain before exp(-j 2 pi f tau), complex, shape ``(L, 2, 2)``.
         """
+        transmitter = check_array("transmitter", transmitter, (3,))
+        receiver = check_array("receiver", receiver, (3,))
+        vertices = check_array("vertices", vertices, (None, None, 3), finite=False)
+        count = len(vertices)
+        amplitude = check_array("amplitude", amplitude, (count,), complex)
+        if jones is not None:
+            jones = check_array("jones", jones, (count, 2, 2), complex)
+        return cls._from_points(transmitter, receiver, vertices, amplitude, kind, frequency_hz, jones)
+
+    @classmethod
+    def _from_points(
+        cls,
+        transmitter: np.ndarray,
+        receiver: np.ndarray,
+        vertices: np.ndarray,
+        amplitude: np.ndarray,
+        kind: NDArray[np.str_],
+        frequency_hz: float,
+        jones: np.ndarray | None = None,
+    ) -> Self:
+        """:meth:`from_points` of arrays that fit each other."""
         count, depth = vertices.shape[:2]
         bounces = np.isfinite(vertices[..., 0]).sum(axis=1)
         points = points_along(transmitter, vertices, receiver)

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
-from warprrf.checks import check_positive
+from warprrf.checks import check_positive, checked
 from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -39,6 +39,7 @@ LEAST_APART = 1e-9
 ROUNDING = 1e-13
 
 
+@checked
 def transmit_covariance(
     sources: Source | Iterable[Source], tx_array: Ends, rx_array: Ends = None, *, rx: ArrayLike | None = None
 ) -> np.ndarray:
@@ -81,6 +82,7 @@ def transmit_covariance(
     return found
 
 
+@checked
 def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.ndarray:
     """Weights that serve all users at once, unit norm each, shape ``(U, N)``, complex: user u is sent ``weights[u]``.
 
@@ -110,6 +112,7 @@ def precoders(channels: ArrayLike, method: str = "slnr", *, noise: float) -> np.
     return _apart(best) if method == "zf" else best
 
 
+@checked
 def precoded_sinr(channels: ArrayLike, weights: ArrayLike, *, noise: float) -> np.ndarray:
     """SINR of every user [linear], shape ``(U,)``, the power shared equally.
 

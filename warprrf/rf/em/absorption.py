@@ -15,7 +15,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_number
+from warprrf.checks import check_array, check_number, checked
 
 LOW_HZ, HIGH_HZ = 1e9, 1000e9
 """Where the recommendation's sum holds."""
@@ -25,6 +25,7 @@ WATER_VAPOUR_G_M3 = 7.5
 _PREFIX = "air_"
 
 
+@checked
 @dataclass(frozen=True)
 class Air:
     """A state of the air; the defaults are the standard atmosphere at sea level (ITU-R P.835).
@@ -106,6 +107,7 @@ def air_of(gas: Gas, frequency_hz: float | None = None) -> Air | None:
     return air
 
 
+@checked
 def gas_attenuation_db_per_m(
     frequency_hz: ArrayLike,
     *,

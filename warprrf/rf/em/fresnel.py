@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_count
+from warprrf.checks import check_alike, check_array, check_count, checked
 from warprrf.rf.em.materials import NARROWEST_LOBE, Material
 
 LAMBERTIAN = 0
@@ -62,8 +62,9 @@ def surface_table(materials: Sequence[Material], frequency_hz: float) -> Surface
     )
 
 
+@checked
 def slab_reflection(
-    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reflection of a slab (``inf`` thick: a half-space): field across (TE) and in (TM) the plane of incidence.
 
@@ -74,8 +75,9 @@ def slab_reflection(
     return te * (1.0 - echo) / (1.0 - te**2 * echo), tm * (1.0 - echo) / (1.0 - tm**2 * echo)  # eq. (43a)
 
 
+@checked
 def slab_transmission(
-    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmission of a slab: field across (TE) and in (TM) the plane of incidence; nothing leaves a half-space.
 
@@ -86,19 +88,32 @@ def slab_transmission(
 
 
 def _slab(
-    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: float
+    cos_incidence: ArrayLike, permittivity: ArrayLike, thickness_m: ArrayLike, wavelength_m: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Reflection of the first face, TE and TM, and what is left of a wave that goes once through; eqs. (37), (44)."""
-    cos = np.asarray(cos_incidence, dtype=np.float64)
-    eta = np.asarray(permittivity, dtype=np.complex128)
-    thickness = np.asarray(thickness_m, dtype=np.float64)
+    cos = check_array("cos_incidence", cos_incidence)
+    eta = check_array("permittivity", permittivity, dtype=np.complex128)
+    thickness = check_array("thickness_m", thickness_m, finite=False)
+    wavelength = check_array("wavelength_m", wavelength_m)
+    check_alike(cos_incidence=cos, permittivity=eta, thickness_m=thickness, wavelength_m=wavelength)
+    for name, values, fits in (
+        ("cos_incidence", cos, (cos >= 0) & (cos <= 1.0 + 1e-6)),
+        ("permittivity", eta, (eta.real > 0) & (eta.imag <= 0) & (abs(eta) < 1e30)),
+        ("thickness_m", thickness, thickness >= 0),
+        ("wavelength_m", wavelength, wavelength > 0),
+    ):
+        if not fits.all():
+            raise ValueError(
+                f"{name}: got {values[~fits].flat[0]!r}, expected a passive slab and a wave that meets it"
+            )
     root = np.sqrt(eta - (1.0 - cos**2))
     endless = np.isinf(thickness)
-    q = 2.0 * np.pi * np.where(endless, 0.0, thickness) / wavelength_m * root
+    q = 2.0 * np.pi * np.where(endless, 0.0, thickness) / wavelength * root
     once = np.where(endless, 0.0, np.exp(-1j * q))
     return (cos - root) / (cos + root), (eta * cos - root) / (eta * cos + root), once
 
 
+@checked
 def lobe(
     alpha_r: int,
     cos_incidence: ArrayLike,
@@ -118,6 +133,7 @@ def lobe(
         reciprocal: The reciprocal lobe: cos(theta_s) b(theta_i) b(theta_s) ((1 + cos psi) / 2)^alpha_r, with b of
             :func:`reciprocal_factor`.
     """
+    check_alike(cos_incidence=cos_incidence, cos_scatter=cos_scatter, cos_to_mirror=cos_to_mirror)
     if check_count("alpha_r", alpha_r, 0, NARROWEST_LOBE) == LAMBERTIAN:
         return np.asarray(cos_scatter) / np.pi
     shape = (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r

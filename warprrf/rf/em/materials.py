@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_count, check_number, check_positive, check_type
+from warprrf.checks import check_count, check_number, check_positive, check_type, checked
 from warprrf.files import read_json
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 
@@ -35,6 +35,7 @@ WIDEST_HZ = (1e6, 1e13)
 ROUGHEST_M = 1.0  # rms height; from a few wavelengths on nothing is reflected as by a mirror
 
 
+@checked
 @dataclass(frozen=True)
 class Band:
     """One row of permittivity coefficients and where it holds.
@@ -97,6 +98,7 @@ class Band:
             return float(self.c * np.float64(frequency_hz / 1e9) ** self.d)
 
 
+@checked
 @dataclass(frozen=True)
 class Material:
     """What a surface does to a radio wave.
@@ -133,7 +135,6 @@ class Material:
     xpd: float = 0.0
 
     def __post_init__(self) -> None:
-        check_type("name", self.name, str)
         if not self.bands:
             raise ValueError(f"bands: material {self.name!r} has none, expected at least one row")
         for k, band in enumerate(self.bands):
@@ -147,7 +148,6 @@ class Material:
         if self.pattern not in PATTERNS:
             raise ValueError(f"pattern{of}: got {self.pattern!r}, expected one of {', '.join(PATTERNS)}")
         check_count("alpha_r" + of, self.alpha_r, 1, NARROWEST_LOBE)
-        check_type("reciprocal" + of, self.reciprocal, bool)
         check_number("xpd" + of, self.xpd, 0.0, 1.0)
 
     @classmethod
@@ -246,6 +246,7 @@ class Material:
         return roughness_scattering(self.roughness_m, frequency_hz)
 
 
+@checked
 def roughness_scattering(roughness_m: float, frequency_hz: float) -> float:
     """Scattering coefficient of a surface of rms height ``roughness_m`` [m] at normal incidence, in [0, 1]."""
     height = check_number("roughness_m", roughness_m, 0.0, ROUGHEST_M)
@@ -340,6 +341,7 @@ def _material(entry: object, where: str) -> Material:
         raise ValueError(f"{where}: {error}") from error
 
 
+@checked
 def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     """Read a table of materials (see ``data/lobby/materials.json``), by name.
 

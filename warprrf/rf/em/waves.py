@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_alike, check_array, checked
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
 
@@ -22,6 +22,9 @@ def check_frequency(frequency_hz: ArrayLike | None) -> float:
     return value
 
 
+@checked
 def carrier_phase(frequency_hz: ArrayLike, tau: ArrayLike) -> np.ndarray:
     """exp(-j 2 pi f tau); whole turns are dropped before the exponential, since f tau reaches 1e4 and more."""
-    return np.exp(-2j * np.pi * np.mod(np.asarray(frequency_hz) * np.asarray(tau), 1.0))
+    frequency, delay = np.asarray(frequency_hz), np.asarray(tau)
+    check_alike(frequency_hz=frequency, tau=delay)
+    return np.exp(-2j * np.pi * np.mod(frequency * delay, 1.0))

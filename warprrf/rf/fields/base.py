@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import LARGEST_M, check_array, check_number, check_positive, check_type
+from warprrf.checks import LARGEST_M, check_array, check_number, check_positive, check_type, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
@@ -32,6 +32,7 @@ CARRIERS_HZ = (1e3, 1e16)
 NARROWEST_BEAM_RAD = 1e-4
 
 
+@checked
 class RadioField(ABC):
     """A fitted radio field; build it with :meth:`fit` or :meth:`load`.
 
@@ -248,6 +249,8 @@ class RadioField(ABC):
     def __post_init__(self) -> None:
         """Check what every model has; ValueError or TypeError names the attribute."""
         object.__setattr__(self, "transmitter", check_array("transmitter", self.transmitter, (3,)))
+        if self.device is not None:  # its name: a wp.Device cannot be pickled
+            object.__setattr__(self, "device", str(self.device))
         check_number("frequency_hz", self.frequency_hz, *CARRIERS_HZ)
         check_shape(self.shape)
         check_positive("floor", self.floor, "linear noise floor")

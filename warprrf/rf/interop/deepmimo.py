@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_count
+from warprrf.checks import check_count, checked
 from warprrf.files import write_arrays, write_text
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.scene import Scene
@@ -29,6 +29,7 @@ _VERSION = "4.0.5"  # of the format
 _FORBIDDEN = set('/\\:*?"<>|\n') | {"'"}
 
 
+@checked
 def write_deepmimo(
     paths: Paths,
     folder: str | os.PathLike[str],

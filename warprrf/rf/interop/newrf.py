@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.files import read_arrays
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
@@ -98,6 +98,7 @@ class NewrfRays:
         return np.arange(chosen), np.arange(count - int(count * 0.2), count)
 
 
+@checked
 def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
     """Read ``newrf_conference.npz`` and ``conferenceroom.stl`` from ``folder``.
 

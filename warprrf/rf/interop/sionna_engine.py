@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
@@ -29,6 +29,7 @@ from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_
 _RECEIVERS_PER_FLUSH = 20
 
 
+@checked
 def load_sionna_scene(scene: Scene | str | os.PathLike[str], *, frequency_hz: float) -> Any:
     """Open a scene in Sionna RT with its table of materials, scattering patterns included.
 

@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
+from warprrf.checks import checked
 from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import LAMBERTIAN, lobe, slab_reflection
@@ -99,6 +100,7 @@ class TwinGroup:
     lobe_error_db: float
 
 
+@checked
 @dataclass(frozen=True)
 class Twin:
     """A digital twin on disk; see :func:`write_twin`.
@@ -135,6 +137,7 @@ class Twin:
         return float(np.sqrt(np.average(squares, weights=[group.area_m2 for group in self.groups])))
 
 
+@checked
 def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     """Write the reconstructed mesh with a field's materials as ``scene.xml``, ``materials.json`` and ``meshes/``.
 

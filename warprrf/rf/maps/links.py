@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from warprrf.brief import one_line
-from warprrf.checks import check_positive
+from warprrf.checks import check_positive, checked
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
@@ -48,6 +48,7 @@ class Links:
         return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in cls.__dataclass_fields__})
 
 
+@checked
 @dataclass(frozen=True)
 class LinkOptions:
     """How links are found.

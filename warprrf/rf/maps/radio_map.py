@@ -18,7 +18,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf import netcdf_files
-from warprrf.checks import check_array, check_number, check_positive
+from warprrf.checks import check_array, check_number, check_positive, checked
 from warprrf.files import write_bytes
 from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
@@ -50,6 +50,7 @@ QUANTITIES = {
 """What :meth:`RadioMap.plot` draws, and how the picture calls it."""
 
 
+@checked
 @dataclass(frozen=True)
 class RadioMap:
     """What receivers at the centres of cells get; rows go along y, columns along x, NaN outside the air.
@@ -233,6 +234,7 @@ _VARIABLES = {
 }
 
 
+@checked
 @dataclass(frozen=True)
 class MapOptions(LinkOptions):
     """How a radio map is made: how links are found, and

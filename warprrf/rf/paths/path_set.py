@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.brief import one_line
+from warprrf.checks import checked
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.dispersion import Dispersion, dispersion
 from warprrf.rf.channel.path_arrays import PathArrays
@@ -26,6 +27,7 @@ from warprrf.rf.channel.response import (
 from warprrf.rf.paths import files, sionna
 
 
+@checked
 @dataclass(frozen=True)
 class Paths(PathArrays):
     """Paths of one receiver, arrays ``(L,)``, or of several, arrays ``(R, L)`` padded where ``valid`` is False.

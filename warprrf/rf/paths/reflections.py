@@ -8,12 +8,13 @@ complex Gauss-Newton steps (the channel is a polynomial in them); a prior holds 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components
@@ -72,6 +73,7 @@ class Reflections:
         return _Model(paths, self.patch_group, count, self._tracer.wavelength_m).channel(self.coefficient)
 
 
+@checked
 def fit_reflections(
     mesh: GeometryLike,
     transmitter: ArrayLike,
@@ -80,7 +82,7 @@ def fit_reflections(
     frequency_hz: float,
     order: int = 2,
     *,
-    groups: str | ArrayLike = "patch",
+    groups: str | Sequence[int] | np.ndarray = "patch",
     prior: complex = 1.0,
     regularisation: float = REGULARISATION,
     chains: MirrorPaths | None = None,
@@ -214,7 +216,9 @@ def _gauss_newton(
     return best
 
 
-def _patch_groups(mesh: Mesh, patches: PlanarPatches, groups: str | ArrayLike) -> tuple[np.ndarray, int]:
+def _patch_groups(
+    mesh: Mesh, patches: PlanarPatches, groups: str | Sequence[int] | np.ndarray
+) -> tuple[np.ndarray, int]:
     """Group of each patch, and how many groups there are."""
     if isinstance(groups, str):
         if groups == "patch":

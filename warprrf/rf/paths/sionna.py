@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array
+from warprrf.checks import check_array, checked
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
@@ -30,6 +30,7 @@ SAME_LENGTH_M = (
 SAME_DIRECTION_RAD = 1e-3
 
 
+@checked
 @dataclass(frozen=True)
 class SionnaPaths:
     """What ``sionna.rt.Paths`` holds for synthetic arrays and one transmitter, as NumPy arrays.
@@ -172,6 +173,8 @@ def from_sionna(
 ) -> list[dict[str, Any]]:
     """Arrays of the paths of ``sionna.rt.Paths`` from one transmitter, of each receiver; see ``Paths.from_sionna``."""
     carrier = check_frequency(frequency_hz)
+    if not hasattr(paths, "synthetic_array"):
+        raise TypeError(f"paths: got {type(paths).__name__}, expected what Sionna RT's PathSolver returned")
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
     if not paths.synthetic_array or real.shape[1] != 2 or real.shape[3] != 2:
         raise ValueError(

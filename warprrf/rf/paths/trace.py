@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.geometry.planar_patches import planar_patches
@@ -23,6 +23,7 @@ from warprrf.rf.paths.polarisation import jones_matrices
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 
 
+@checked
 def trace_paths(
     mesh_or_scene: GeometryLike,
     *,
@@ -133,7 +134,7 @@ class MirrorTracer:
             own = own[np.lexsort((found.length_m[own], found.order[own]))]
             kind = np.where(found.order[own] == 0, "los", "mirror").astype("<U7")
             result.append(
-                Paths.from_points(
+                Paths._from_points(
                     self.transmitter, point, found.point[own], amplitude[own], kind, self.frequency_hz,
                     None if jones is None else jones[own],
                 )

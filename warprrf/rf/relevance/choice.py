@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.checks import checked
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -25,6 +26,7 @@ COSTLY = (
 """From the costliest down, as measured on the lobby: fixed, so that a choice does not hang on the clock."""
 
 
+@checked
 @dataclass(frozen=True)
 class Effect:
     """One row of the table.

@@ -118,7 +118,7 @@ def full_field(
             "fit",
         )
     surface = Surface.of(geometry)
-    known = hasattr(geometry, "face_material")
+    known = hasattr(geometry, "materials")
     if known:
         parameters, lobes = material_parameters(geometry.materials, frequency_hz)
         table = surface_table(list(geometry.materials), frequency_hz)
@@ -189,7 +189,7 @@ def without_elements(field: BistaticField, dropped: np.ndarray) -> BistaticField
         group=np.where(dropped[s.element], none, s.group).astype(np.int32),
         element_group=np.where(dropped, none, s.element_group).astype(np.int32),
         material=np.append(s.material, s.material.max() + 1),
-        colour=np.vstack([s.colour, np.full(s.colour.shape[1], np.nan)]),
+        look=np.vstack([s.look, np.full(s.look.shape[1], np.nan)]),
         group_names=(*s.group_names, "unseen"),
     )
     parameters = replace(

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, checked
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
@@ -63,6 +63,7 @@ MATERIALS = {
 }
 
 
+@checked
 @dataclass(frozen=True)
 class Relevance:
     """What a scene needs; made by :func:`relevance`.
@@ -204,6 +205,7 @@ def title(name: str) -> str:
     return TITLES.get(name) or f"scattering lobe of exponent {name.removeprefix('lobe_')}"
 
 
+@checked
 @dataclass(frozen=True)
 class Setting:
     """What relevance is judged for.
@@ -254,6 +256,7 @@ class Setting:
         return found
 
 
+@checked
 def relevance(
     geometry: Any,
     *,

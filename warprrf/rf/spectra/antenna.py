@@ -10,7 +10,7 @@ does not turn and directions were told apart by other means; its pattern over ab
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, TypedDict, Unpack
 
@@ -43,7 +43,7 @@ _TOGETHER = 32  # receivers whose estimates are refined at once
 _FLAT_DB = 0.1  # a pattern that varies less cannot tell directions apart
 
 
-Pattern: TypeAlias = Callable[[np.ndarray], ArrayLike] | ArrayLike
+Pattern: TypeAlias = Callable[[np.ndarray], ArrayLike] | Sequence[float] | np.ndarray
 """Power gain [linear]: a function of the angle off boresight [rad], or samples of it from 0 to pi."""
 
 

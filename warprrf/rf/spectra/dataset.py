@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_positive, check_seed, check_type
+from warprrf.checks import check_array, check_count, check_positive, check_seed, checked
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files, exr
@@ -33,6 +33,7 @@ SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
 _MOST_ATTRIBUTE_BYTES = 60_000  # HDF5 takes 64 kB
 
 
+@checked
 @dataclass(frozen=True, repr=False)
 class SpectrumDataset:
     """Spectra at R receivers.
@@ -68,7 +69,7 @@ class SpectrumDataset:
     engine: str
     polarisation: str
     seed: int
-    role: np.ndarray
+    role: NDArray[np.str_]
     line_of_sight: np.ndarray
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -93,8 +94,6 @@ class SpectrumDataset:
             "line_of_sight": _check_flags("line_of_sight", self.line_of_sight, count),
             "attributes": _check_attributes(self.attributes),
         }
-        for name in ("engine", "polarisation"):
-            check_type(name, getattr(self, name), str)
         check_pixels(gain, fields["delay_s"], fields["aod"])
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -122,7 +121,7 @@ class SpectrumDataset:
         beam_sigma_rad: float,
         engine: str,
         seed: int = 0,
-        role: Sequence[str] | np.ndarray | None = None,
+        role: Sequence[str] | NDArray[np.str_] | None = None,
         floor: float | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> SpectrumDataset:
@@ -379,7 +378,6 @@ def _check_flags(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 def _check_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """What a file can hold beside the fields, under names of its own."""
-    check_type("attributes", attributes, Mapping)
     for name, value in attributes.items():
         if not isinstance(name, str) or not name or name.startswith("_") or {"/", "\0"} & set(name):
             raise ValueError(

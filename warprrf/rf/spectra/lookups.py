@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_positive
+from warprrf.checks import check_array, check_positive, checked
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import Spectrum, to_db
@@ -21,6 +21,7 @@ from warprrf.rf.spectra.spectrum import Spectrum, to_db
 SAME_PLACE_M = 1e-9  # a receiver nearer than this to a training one is that one
 
 
+@checked
 @dataclass(frozen=True)
 class Lookup:
     """A baseline's prediction.
@@ -51,6 +52,7 @@ class Lookup:
         return measured_at(ds, self.train.receivers, self.train.transmitter)
 
 
+@checked
 def nearest(train: SpectrumDataset) -> Lookup:
     """The spectrum of the nearest training receiver, with its delays and angles of departure."""
     receivers = _receivers(train)
@@ -68,6 +70,7 @@ def nearest(train: SpectrumDataset) -> Lookup:
     return Lookup("nearest", "", train, predict)
 
 
+@checked
 def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> Lookup:
     """Inverse-distance weighting of all training spectra.
 
@@ -113,6 +116,7 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
     return Lookup("idw", note, train, lambda receiver: _bare(gain(receiver, all_of_them, domain), train))
 
 
+@checked
 def constant(train: SpectrumDataset) -> Lookup:
     """One number for every pixel and receiver: the mean of the training dB images."""
     _receivers(train)
@@ -121,6 +125,7 @@ def constant(train: SpectrumDataset) -> Lookup:
     return Lookup("constant", f"{level:.2f} dB", train, lambda receiver: _bare(gain, train))
 
 
+@checked
 def mean(train: SpectrumDataset) -> Lookup:
     """The mean of the training dB images, wherever the receiver is."""
     _receivers(train)

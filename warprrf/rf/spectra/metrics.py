@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
+from warprrf.checks import check_alike, check_array, checked
 from warprrf.device import Progress
 from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -36,6 +37,7 @@ SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with 
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
+@checked
 def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float]) -> np.ndarray:
     """The dB image of a spectrum mapped to [0, 1] by the data set's range, shape of ``path_gain``, float64."""
     low, high = (float(v) for v in range_db)
@@ -43,22 +45,26 @@ def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float
         raise ValueError(
             f"range_db: got ({low}, {high}), expected (lowest, highest) with highest above lowest"
         )
+    path_gain = check_array("path_gain", path_gain, finite=False)
     return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
 
 
+@checked
 def psnr(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Peak signal-to-noise ratio [dB] of two images in [0, 1]; equal images score :data:`PSNR_CEILING_DB`."""
-    error = float(np.mean((np.asarray(prediction, np.float64) - truth) ** 2))
+    a, b = _pair(prediction=prediction, truth=truth)
+    error = float(np.mean((a - b) ** 2))
     return PSNR_CEILING_DB if error <= 10 ** (-PSNR_CEILING_DB / 10) else -10.0 * np.log10(error)
 
 
+@checked
 def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
     """Structural similarity of two images in [0, 1], shape ``(height, width)`` of at least 7 x 7 pixels.
 
     Wang et al. 2004 with a uniform 7 x 7 window, sample covariance and the border left out: the defaults of
     ``skimage.metrics.structural_similarity(..., data_range=1)``, without needing scikit-image.
     """
-    a, b = np.asarray(prediction, np.float64), np.asarray(truth, np.float64)
+    a, b = _pair(prediction=prediction, truth=truth)
     if a.shape != b.shape or a.ndim != 2 or min(a.shape) < SSIM_WINDOW:
         raise ValueError(
             f"prediction, truth: got shapes {a.shape} and {b.shape}, expected two equal (height, width) images of at "
@@ -80,28 +86,36 @@ def ssim(prediction: np.ndarray, truth: np.ndarray) -> float:
     return float(np.mean(score / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))))
 
 
+@checked
 def rmse_db(prediction_db: np.ndarray, truth_db: np.ndarray) -> float:
     """Root mean square difference [dB] of two dB images ``(height, width)``, weighted by solid angle."""
+    predicted, truth_db = _pair(prediction_db=prediction_db, truth_db=_image("truth_db", truth_db))
     weight = pixel_solid_angles(truth_db.shape)[:, None]
-    error = (np.asarray(prediction_db, np.float64) - truth_db) ** 2
+    error = (predicted - truth_db) ** 2
     return float(np.sqrt(np.sum(weight * error) / (np.sum(weight) * truth_db.shape[1])))
 
 
+@checked
 def strongest_direction(path_gain: np.ndarray) -> np.ndarray:
     """Unit direction ``(3,)`` of the pixel with the most path gain per solid angle.
 
     Of equal pixels the first is taken (an empty or constant density has no direction: this is the first row's).
     """
-    density = np.asarray(path_gain, np.float64) / pixel_solid_angles(path_gain.shape)[:, None]
+    path_gain = _image("path_gain", path_gain)
+    density = path_gain / pixel_solid_angles(path_gain.shape)[:, None]
     row, column = np.unravel_index(np.argmax(density), density.shape)
     return pixel_directions(path_gain.shape)[row, column]
 
 
+@checked
 def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Angle [degrees] between unit vectors ``(..., 3)``; accurate for small angles too."""
+    a, b = check_array("a", a, (..., 3), finite=False), check_array("b", b, (..., 3), finite=False)
+    check_alike(a=a, b=b)
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
+@checked
 def beam_kappa(width_rad: float) -> float:
     """Concentration of the von Mises-Fisher beam whose power falls to half at ``width_rad / 2`` off its axis."""
     if not 0 < width_rad < 2 * np.pi:
@@ -109,12 +123,14 @@ def beam_kappa(width_rad: float) -> float:
     return float(np.log(2.0) / (1.0 - np.cos(width_rad / 2)))
 
 
+@checked
 def beam_response(path_gain: np.ndarray, width_rad: float) -> np.ndarray:
     """Power a beam collects when steered to each pixel centre, shape ``(height, width)``.
 
     The beam's power pattern is ``exp(kappa (cos(angle) - 1))``, one on its axis, with :func:`beam_kappa`. The sum over
     the sphere is exact on the grid: rows are convolved in azimuth by FFT.
     """
+    path_gain = _image("path_gain", path_gain)
     return respond(path_gain, _beam_kernel(path_gain.shape, beam_kappa(width_rad)))
 
 
@@ -123,23 +139,26 @@ def _beam_kernel(shape: tuple[int, int], kappa: float) -> np.ndarray:
     return scanned_kernel(lambda angle: np.exp(-2.0 * kappa * np.sin(0.5 * angle) ** 2), shape)
 
 
+@checked
 def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: float) -> float:
     """Loss [dB] of a beam steered to ``direction`` (3,) on the spectrum ``path_gain`` against its best steering.
 
     The best is sought over pixel centres, so steering between them can score slightly below zero.
     """
-    power = np.asarray(path_gain, np.float64)
+    power = path_gain = _image("path_gain", path_gain)
+    toward = check_array("direction", direction, (3,))
     best = float(np.max(beam_response(power, width_rad)))
     if best <= 0:
         return 0.0
-    cosine = pixel_directions(path_gain.shape) @ np.asarray(direction, np.float64)
+    cosine = pixel_directions(path_gain.shape) @ toward
     got = float(np.sum(power * np.exp(beam_kappa(width_rad) * (cosine - 1.0))))
     return float(10.0 * np.log10(best / max(got, best * 1e-30)))
 
 
+@checked
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     """Smallest value at which the cumulated weight reaches one half; NaN when no weight is positive."""
-    values, weights = np.ravel(values), np.ravel(weights)
+    values, weights = (np.ravel(one) for one in _pair(values=values, weights=weights))
     if not np.any(weights > 0):
         return float("nan")
     order = np.argsort(values, kind="stable")
@@ -147,6 +166,7 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(values[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
 
 
+@checked
 def evaluate(
     test: SpectrumDataset,
     predict: Callable[[np.ndarray], Any],
@@ -245,6 +265,21 @@ def evaluate(
         per_receiver={**rows, "line_of_sight": line_of_sight, "seconds": seconds},
     )
     return report
+
+
+def _pair(**given: np.ndarray) -> list[np.ndarray]:
+    """Two arrays of one shape, float64."""
+    (name, one), (other, two) = given.items()
+    found = check_array(name, one, finite=False)
+    return [found, check_array(other, two, found.shape, finite=False)]
+
+
+def _image(name: str, value: np.ndarray) -> np.ndarray:
+    """An image of at least 2 x 2 pixels, float64."""
+    image = check_array(name, value, (None, None), finite=False)
+    if min(image.shape) < 2:
+        raise ValueError(f"{name}: got shape {image.shape}, expected at least 2 x 2 pixels")
+    return image
 
 
 def _predicts(values: np.ndarray | None) -> bool:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.brief import one_line
-from warprrf.checks import check_array, check_number, check_positive
+from warprrf.checks import check_array, check_number, check_positive, checked
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -393,6 +393,7 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     )
 
 
+@checked
 @dataclass(frozen=True)
 class Spectrum:
     """The spatial spectrum of one receiver.

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, index_to
+from warprrf.checks import Expected, check_array, check_arrays, check_count, checked, index_to
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
@@ -45,6 +45,7 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class BistaticField(RadioField):
     """A fitted bistatic field; build it with :meth:`RadioField.fit` or :meth:`RadioField.load`.

@@ -18,8 +18,8 @@ from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 _SURFACE = {
     name: name
     for name in ("normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element",
-                 "element_centre", "element_area", "element_group")
-} | {"colour": "look", "cell": "texel", "cell_element": "texel_element"}  # fmt: skip
+                 "element_centre", "element_area", "element_group", "look")
+} | {"cell": "texel", "cell_element": "texel_element"}  # fmt: skip
 """Arrays of a surface, and what files call them."""
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")
 

@@ -1,6 +1,6 @@
-"""Which surfaces are of one material: decided by colour first, then by what the spectra say.
+"""Which surfaces are of one material: decided by their look first, then by what the spectra say.
 
-Photos tell materials apart only so far. Once materials have parameters, each group of faces is tried as every other
+Colours or shapes tell materials apart only so far. Once materials have parameters, each group of faces is tried as every other
 material: what the objective would rise or fall by is known without a new fit, because a spectrum is linear in what its
 groups scatter. Materials that are as well described by another one join it, and a group that another material describes
 better goes over. Fewer parameters, and purer materials, are learned better from the same spectra.
@@ -24,23 +24,27 @@ class Regrouping:
     """What it takes to be of one material, in units of the fit's objective.
 
     Attributes:
-        colour_cost: of one unit of difference in colour, squared.
-        most_colour: largest squared difference that counts: colours that differ more tell no more.
+        look_cost: of one unit of difference in look, squared.
+        most_look: largest squared difference that counts: looks that differ more tell no more.
         join: rise that a material of its own must be worth.
         move: fall that a group must bring to go over.
     """
 
-    colour_cost: float = 3.0
-    most_colour: float = 9.0
+    look_cost: float = 3.0
+    most_look: float = 9.0
     join: float = 30.0
     move: float = 4.0
+
+
+BY_SHAPE = Regrouping(look_cost=1.0, join=15.0, move=30.0)
+"""For groups that only shapes tell apart: place and extent say less of a material than colour, a thing's parts more."""
 
 
 def regroup(
     readings: Sequence[Reading],
     p: Parameters,
     material: np.ndarray,
-    colour: np.ndarray,
+    look: np.ndarray,
     area: np.ndarray,
     options: Regrouping | None = None,
 ) -> tuple[np.ndarray, Parameters]:
@@ -50,16 +54,16 @@ def regroup(
         readings: of the training receivers, by groups.
         p: parameters of the materials.
         material: of each group now.
-        colour: of each group, shape ``(G, 4)``; see :class:`warprrf.rf.fields.bistatic.surface.Surface`.
+        look: of each group, shape ``(G, K)``; see :class:`warprrf.rf.fields.bistatic.surface.Surface`.
         area: of each group [m^2].
         options: what it takes.
     """
     o, count = options or Regrouping(), len(p.log_excess)
-    typical = _mean_colour(colour, material, area, count)
+    typical = _mean_look(look, material, area, count)
 
     # whole materials first, small ones before large ones
     cost = _costs([r.tied(material) for r in readings], p, np.arange(count))
-    cost += _colour_cost(typical, typical, o)
+    cost += _look_cost(typical, typical, o)
     np.fill_diagonal(cost, np.inf)
     size = np.bincount(material, area, minlength=count)
     target = np.arange(count)
@@ -74,9 +78,9 @@ def regroup(
     material = target[material]
 
     # then single groups
-    typical = _mean_colour(colour, material, area, count)
+    typical = _mean_look(look, material, area, count)
     alive = np.unique(material)
-    cost = _costs(readings, p, material) + _colour_cost(colour, typical, o)
+    cost = _costs(readings, p, material) + _look_cost(look, typical, o)
     rows = np.arange(len(material))
     change = cost - cost[rows, material][:, None]
     change[:, np.setdiff1d(np.arange(count), alive)] = np.inf
@@ -87,16 +91,16 @@ def regroup(
     return material.reshape(-1), p.take(left)
 
 
-def _mean_colour(colour: np.ndarray, material: np.ndarray, area: np.ndarray, count: int) -> np.ndarray:
-    """Mean colour of each material, shape ``(count, 4)``."""
+def _mean_look(look: np.ndarray, material: np.ndarray, area: np.ndarray, count: int) -> np.ndarray:
+    """Mean look of each material, shape ``(count, K)``."""
     size = np.maximum(np.bincount(material, area, minlength=count), 1e-12)
-    sums = [np.bincount(material, area * channel, minlength=count) for channel in colour.T]
+    sums = [np.bincount(material, area * channel, minlength=count) for channel in look.T]
     return np.stack(sums, axis=1) / size[:, None]
 
 
-def _colour_cost(colour: np.ndarray, typical: np.ndarray, o: Regrouping) -> np.ndarray:
-    gap = ((colour[:, None] - typical[None]) ** 2).sum(axis=2)
-    return o.colour_cost * np.minimum(np.nan_to_num(gap, nan=o.most_colour), o.most_colour)
+def _look_cost(look: np.ndarray, typical: np.ndarray, o: Regrouping) -> np.ndarray:
+    gap = ((look[:, None] - typical[None]) ** 2).sum(axis=2)
+    return o.look_cost * np.minimum(np.nan_to_num(gap, nan=o.most_look), o.most_look)
 
 
 def _costs(readings: Sequence[Reading], p: Parameters, owner: np.ndarray) -> np.ndarray:

@@ -45,7 +45,7 @@ def paths_of(
     over[:, 0] = point[kept]
     whole = np.isfinite(over[:, 0]).all(axis=1)
     power, over = power[whole] * (power.sum() / max(power[whole].sum(), 1e-300)), over[whole]
-    paths = Paths.from_points(
+    paths = Paths._from_points(
         view.transport.transmitter,
         view.receivers[0],
         np.concatenate([vertices, over]),

@@ -1,7 +1,7 @@
 """Surfaces as radio sees them: planar patches, material groups, small elements, and images of a transmitter.
 
 A group holds faces that look alike and so share radio parameters: a Scene's materials where they are known, else
-patches of a reconstruction gathered by the colour that photos gave them. An element is a piece of one group, about half
+patches gathered by the colour that photos gave them, or by shape. An element is a piece of one group, about half
 a metre wide, at which scale surfaces light each other; a cell is a piece of an element: what differs within a group is
 told apart at both scales.
 """
@@ -21,10 +21,12 @@ from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, inde
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
 from warprrf.geometry.mesh_topology import components, smoothed_normals
+from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
-from warprrf.geometry.splats.gaussians import Gaussians, gaussians_of
+from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.kernels.radio import bounce
 from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
+from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
 
 ELEMENT_M = 0.5  # width of an element
 CELLS = 3  # along an element
@@ -42,7 +44,7 @@ ARRAYS = {
     "plane_offset": lengths("P"),
     "group": index_to("G", "F"),
     "material": index_to("G", "G"),
-    "colour": Expected("G 4", nan=True),
+    "look": Expected("G K", nan=True),
     "patch_group": index_to("G", "P"),
     "element": index_to("E", "F"),
     "cell": index_to("X", "F"),
@@ -51,7 +53,7 @@ ARRAYS = {
     "element_area": Expected("E", 0.0, LARGEST_M**2),
     "element_group": index_to("G", "E"),
 }
-"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells."""
+"""What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells, K looks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +67,9 @@ class Surface:
         plane_normal, plane_offset: planes of the patches, ``normal . x = offset`` [m], shapes ``(P, 3)``, ``(P,)``.
         group: group of each face, the smallest unit that may be of a material of its own, shape ``(F,)`` int32.
         material: which groups are taken for the same material before any measurement, shape ``(G,)`` int32.
-        colour: of each group as photos show it: log chromaticities and log luminance, scaled so that 1 tells materials
-            apart, shape ``(G, 4)``; NaN where unknown.
+        look: what tells groups apart before any measurement, scaled so that 1 tells materials apart: log chromaticities
+            and log luminance as photos show them, else place and extents, shape ``(G, 4)`` or ``(G, 6)``; NaN where names
+            tell it.
         patch_group: group of each patch, shape ``(P,)`` int32.
         element: surface element of each face, shape ``(F,)`` int32.
         cell: cell of each face, shape ``(F,)`` int32.
@@ -88,7 +91,7 @@ class Surface:
     plane_offset: np.ndarray
     group: np.ndarray
     material: np.ndarray
-    colour: np.ndarray
+    look: np.ndarray
     patch_group: np.ndarray
     element: np.ndarray
     cell: np.ndarray
@@ -139,6 +142,11 @@ class Surface:
         return len(self.group_names)
 
     @property
+    def by_shape(self) -> bool:
+        """Whether only shapes tell its groups apart."""
+        return self.look.shape[1] == SHAPES
+
+    @property
     def cells(self) -> int:
         """Number of cells."""
         return len(self.cell_element)
@@ -147,7 +155,8 @@ class Surface:
     def of(cls, geometry: GeometryLike) -> Surface:
         """Patches, groups and elements of a Reconstruction, a Scene or a Mesh; a Surface is returned as it is.
 
-        Materials of a Scene become groups, and those that a Mesh has names of; else pieces of one colour.
+        Materials of a Scene become groups, and those that a Mesh has names of; else pieces of one colour, or of one shape
+        where there are no colours. A mesh with the noise of a scan is flattened where planes are found in it.
 
         Raises:
             TypeError: if it has no mesh.
@@ -158,32 +167,29 @@ class Surface:
         mesh = as_mesh(geometry, "geometry")
         _check_size(mesh)
         material, names = _named_faces(geometry, mesh)
-        gaussians = gaussians_of(geometry)
-        found = getattr(geometry, "patches", None)
-        if material is None and isinstance(found, PlanarPatches) and isinstance(gaussians, Gaussians):
-            patches = found
-            patch, planes = found.face_patch, (found.normal, found.offset)
-            normal = _on_patches(found, smoothed_normals(found.mesh, 3))
-            group, sort, colour = colour_groups(mesh, patch, Colours.of_gaussians(mesh, gaussians))
-            names, skin = tuple(f"group_{k}" for k in range(len(sort))), SKIN_M
+        found, colours = _patches_and_colours(geometry, mesh) if material is None else (None, None)
+        if found is not None:
+            patches, mesh, patch = found, found.mesh, found.face_patch
+            planes, skin = (found.normal, found.offset), SKIN_M
+            normal = _on_patches(found, smoothed_normals(mesh, 3))
         else:
             patches = planar_patches(mesh, material)
             patch, planes = _mirrors(patches)
             # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
             normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
-            colours = Colours.of_faces(mesh)
-            if material is None and colours is not None:
-                group, sort, colour = colour_groups(mesh, patches.face_patch, colours)
-                names = tuple(f"group_{k}" for k in range(len(sort)))
-            else:
-                group = np.zeros(len(mesh.faces), np.int32) if material is None else material
-                sort, colour = np.arange(len(names), dtype=np.int32), np.full((len(names), 4), np.nan)
+        if material is not None:
+            group, sort = material, np.arange(len(names), dtype=np.int32)
+            look = np.full((len(names), 4), np.nan)
+        else:
+            pieces = mesh, patches.face_patch
+            group, sort, look = shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
+            names = tuple(f"group_{k}" for k in range(len(sort)))
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once))
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
-            group=group, material=sort, colour=colour, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
+            group=group, material=sort, look=look, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
             group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group),
         )  # fmt: skip
 
@@ -213,6 +219,22 @@ class Surface:
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
 
 
+def _patches_and_colours(geometry: GeometryLike, mesh: Mesh) -> tuple[PlanarPatches | None, Colours | None]:
+    """Patches that photos gave, or of a scan, with their mesh; None for a mesh without noise. And colours on it, None
+    where there are none."""
+    found, gaussians = getattr(geometry, "patches", None), gaussians_of(geometry)
+    if isinstance(found, PlanarPatches) and gaussians is not None:
+        return found, Colours.of_gaussians(mesh, gaussians)
+    colours = Colours.of_faces(mesh)
+    if not is_scan(mesh):
+        return None, colours
+    flat = scanned_patches(mesh)
+    if colours is not None:
+        places = mesh.triangles[colours.face].mean(axis=1)
+        colours = replace(colours, face=flat.mesh.closest(places).face)
+    return flat, colours
+
+
 def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
     Scene's materials, else of the mesh's, the last for faces of none."""
@@ -220,12 +242,12 @@ def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None,
     if known is not None and not isinstance(geometry, Mesh):
         return np.asarray(known, np.int32), tuple(m.name for m in getattr(geometry, "materials", ()))
     if mesh.face_material is None:
-        return None, ("surface",)
+        return None, ()
     names = mesh.material_names
     own = np.where(mesh.face_material < 0, len(names), mesh.face_material)
     used, group = np.unique(own, return_inverse=True)
     if len(used) < 2:
-        return None, ("surface",)
+        return None, ()
     return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.checks import check_array, check_count, check_type
+from warprrf.checks import check_array, check_count, checked
 from warprrf.rf.em.materials import NARROWEST_LOBE
 
 LOBES = (0, 2, 5, 12, 30)
 """Exponents of the lobe mix; 0 is Lambertian."""
 
 
+@checked
 @dataclass(frozen=True)
 class Terms:
     """What a bistatic field models; see :class:`warprrf.rf.fields.bistatic.training.FitOptions`.
@@ -47,7 +48,6 @@ class Terms:
         whole = {"mirror_order": (0, 3), "diffuse_order": (1, 3), "sub_pixels": (1, 16)}
         for name, (least, most) in whole.items():
             check_count(name, getattr(self, name), least, most)
-        check_type("reciprocal", self.reciprocal, bool)
         lobes = check_array("lobes", self.lobes, (None,), dtype=np.int64).tolist()
         if not lobes or len(set(lobes)) < len(lobes) or not 0 <= min(lobes) <= max(lobes) <= NARROWEST_LOBE:
             raise ValueError(

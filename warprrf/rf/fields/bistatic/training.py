@@ -10,12 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.checks import check_array, check_count, check_seed
+from warprrf.checks import check_array, check_count, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
-from warprrf.rf.fields.bistatic.grouping import Regrouping, regroup
+from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.render import render, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
@@ -77,7 +77,7 @@ class Selection:
         regrouped: rounds of deciding what is of one material, and fitting.
         rounds: of further bounces and groups in turn, where no choice came before.
         readings: pixels that groups are fitted to, spread over the training receivers.
-        regrouping: what it takes to be of one material.
+        regrouping: what it takes to be of one material; None for :data:`BY_SHAPE` where only shapes tell groups apart.
     """
 
     least_receivers: int = 4
@@ -93,9 +93,10 @@ class Selection:
     regrouped: int = 3
     rounds: int = 2
     readings: int = 12_000
-    regrouping: Regrouping = Regrouping()
+    regrouping: Regrouping | None = None
 
 
+@checked
 @dataclass(frozen=True)
 class FitOptions:
     """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
@@ -461,7 +462,7 @@ class _Training:
             if name == "scatter_mirror" and not (terms.further or terms.mirror_scatter):
                 continue  # the same bounces the other way round
             best = self._tried(name, value, best)
-        if np.isfinite(self.surface.colour).all() and self.material.max() > 0:
+        if np.isfinite(self.surface.look).all() and self.material.max() > 0:
             best = self._regroup(best)
         # Last, because it would stand in for whatever a wrong material leaves dark.
         if "indirect" in free and best.terms.diffuse:
@@ -491,15 +492,16 @@ class _Training:
     def _regroup(self, best: _Candidate) -> _Candidate:
         """Materials by what the spectra say, if that lowers the held-out error."""
         before, terms, trial = self.material, best.terms, best.fit
+        options = self.choose.regrouping or (BY_SHAPE if self.surface.by_shape else Regrouping())
         for _ in range(self.choose.regrouped):
             readings = self._readings(terms, trial, self._few(2), follow=True)
             self.material, start = regroup(
                 readings,
                 trial.parameters,
                 self.material,
-                self.surface.colour,
+                self.surface.look,
                 self.area,
-                self.choose.regrouping,
+                options,
             )
             # What surfaces get of each other changes little with who is of which material: the same readings serve.
             trial = self._fitted(readings, terms, start, self.choose.short_steps)

@@ -27,7 +27,15 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, check_positive
+from warprrf.checks import (
+    Expected,
+    check_array,
+    check_arrays,
+    check_count,
+    check_number,
+    check_positive,
+    checked,
+)
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
@@ -57,6 +65,7 @@ CHANNEL_STEPS = 100  # of each delay and AoD channel: they start at means that a
 CHANNEL_RATES = Rates(constant=0.1, directional=0.05, ridge=0.02, ridge_directional=0.1)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class HarmonicField(RadioField):
     """A radio field of spherical harmonics per Gaussian; build it with :meth:`fit` or :meth:`load`.

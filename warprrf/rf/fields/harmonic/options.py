@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from warprrf.checks import check_count, check_seed
+from warprrf.checks import check_count, check_seed, checked
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.interaction import INTERACTION_POINTS
 from warprrf.rf.fields.harmonic.transport import TOP_K, TRANSMITTANCE
@@ -34,6 +34,7 @@ class Rates:
     ridge_directional: float = 0.2
 
 
+@checked
 @dataclass(frozen=True)
 class FieldOptions:
     """What a field computes, and how :meth:`HarmonicField.fit` learns it.
