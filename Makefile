@@ -74,7 +74,7 @@ docs: $(VENV)/.test
 	$(BIN)/sphinx-build -q -W --keep-going -b html -d build/doctrees docs build/site
 
 test: lint docs
-	$(RUN) -m pytest $(ARGS)
+	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
 
 gpu: $(VENV)/.test
 	@$(RUN) -m benchmarks gpu $(ARGS)
