@@ -11,6 +11,7 @@ import pytest
 from places import LOBBY
 from radio_scenes import enclosed_volume, is_wound_alike
 
+from warprrf import cli
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh, write_mesh
 from warprrf.rf.em.materials import Material
@@ -155,6 +156,10 @@ def test_meshes_outside_the_scenes_folder_are_read_on_request_alone(
     with pytest.raises(ValueError, match=r"'desk'.*outside.*allow_outside=True"):
         Scene.load(copy / "scene.xml")
     assert "desk" in Scene.load(copy / "scene.xml", allow_outside=True).object_names
+    words = [str(copy / "scene.xml"), "-o", str(away / "one.nc"), "--transmitter", "2", "3", "3.2", "--quiet"]
+    words += ["--receivers", "7,4,1.5", "--shape", "6", "12"]
+    assert cli.main(["simulate", *words]) == 2
+    assert cli.main(["simulate", *words, "--allow-outside"]) == 0
 
 
 def test_a_scene_whose_folder_is_a_link_is_read(copy: Path, tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -15,6 +15,7 @@ from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import (
     Add,
+    add_allow_outside,
     add_mesh_options,
     add_out,
     add_point,
@@ -85,6 +86,7 @@ def add_simulate(add: Add) -> None:
     sim.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receiver beam (default 2 degrees)")
     sim.add_argument("--refraction", action="store_true", help="transmission through walls (sionna)")
     sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
+    add_allow_outside(sim)
 
 
 def _simulate(args: argparse.Namespace, bars: Bars) -> None:
@@ -101,7 +103,7 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
     """
     unfinished = Path(f"{args.out}.receivers")
     dataset = wr.simulate(
-        wr.Scene.load(existing(args.scene)),
+        wr.Scene.load(existing(args.scene), allow_outside=args.allow_outside),
         transmitter=np.array(args.transmitter, dtype=np.float64),
         receivers=read_receivers(args.receivers),
         frequency_hz=args.frequency,

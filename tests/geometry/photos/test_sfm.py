@@ -9,7 +9,7 @@ import pytest
 from places import LOBBY
 
 from warprrf.geometry.photos import sfm
-from warprrf.geometry.photos.photo_files import find_photos, match_names
+from warprrf.geometry.photos.photo_files import find_photos, match_names, read_photo
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, fit_similarity
 from warprrf.geometry.splats.camera import Camera
 
@@ -218,6 +218,16 @@ def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
         sfm.read_colmap(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["rigs", "cameras", "frames", "images", "points3D"])
+def test_colmap_files_that_end_too_early_are_refused(name, posed, tmp_path):
+    folder = shutil.copytree(posed[0] / "sfm" / "model", tmp_path / "model")
+    whole = (folder / f"{name}.bin").read_bytes()
+    for damaged in (whole[:4], whole[: len(whole) // 2], b"\xff" * 5 + whole[5:]):
+        (folder / f"{name}.bin").write_bytes(damaged)
+        with pytest.raises(ValueError, match=rf"{name}\.bin is cut short or damaged"):
+            sfm.read_colmap(folder)
+
+
 # ------------------------------------------------------------------------------------------- bad input
 
 
@@ -251,6 +261,14 @@ def test_unreadable_and_odd_photos_are_named(tmp_path, lobby):
     save(tmp_path / "small.jpg", np.zeros((24, 32, 3)))
     with pytest.raises(ValueError, match=r"not 640 x 480.*small\.jpg \(32 x 24\)"):
         sfm.structure_from_motion(tmp_path, workspace=tmp_path / "w")
+
+
+def test_photos_that_unfold_to_too_many_pixels_are_named(tmp_path, lobby, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 640 * 480 // 3)
+    with pytest.raises(ValueError, match="3 of 3 files do not read as images: .*decompression bomb"):
+        sfm.structure_from_motion(lobby[0][:3], workspace=tmp_path)
+    with pytest.raises(ValueError, match="does not read as an image: .*decompression bomb"):
+        read_photo(lobby[0][0])
 
 
 def test_photos_without_anything_in_common_are_refused(tmp_path):

@@ -64,7 +64,7 @@ def check_photos(named: Mapping[str, Path]) -> None:
             with image.open(path) as photo:
                 photo.load()
                 sizes[name] = photo.size
-        except (OSError, SyntaxError, ValueError) as error:
+        except (OSError, SyntaxError, ValueError, image.DecompressionBombError) as error:
             bad.append(f"{name} ({error})")
     if bad:
         raise ValueError(f"photos: {len(bad)} of {len(named)} files do not read as images: {some(bad)}")
@@ -118,7 +118,7 @@ def read_photo(path: str | os.PathLike[str]) -> np.ndarray:
     try:
         with image.open(path) as photo:
             return np.asarray(photo.convert("RGB"), dtype=np.float32) / 255
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, image.DecompressionBombError) as error:
         raise ValueError(f"photos: {path} does not read as an image: {error}") from error
 
 

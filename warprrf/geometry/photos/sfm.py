@@ -12,7 +12,7 @@ import itertools
 import os
 import shutil
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -127,10 +127,39 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
         )
     with _quiet(colmap):
         try:
+            for name, walk in _RECORDS.items():
+                if (root / name).is_file():
+                    _check_whole(root / name, walk)
             model = colmap.Reconstruction(str(root))
         except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
             raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
         return replace(_sparse_model(model, sorted(i.name for i in model.images.values())), metric=True)
+
+
+_RECORDS: dict[str, Callable[[bytes, int], int]] = {
+    "rigs.bin": lambda data, at: at + 8,
+    "cameras.bin": lambda data, at: at + 48,
+    "frames.bin": lambda data, at: at + 68,
+    "images.bin": lambda data, at: _after(data, data.find(b"\0", at + 64) + 1 or len(data), 24),
+    "points3D.bin": lambda data, at: _after(data, at + 43, 8),
+}
+"""Where a record ends that begins at a byte of a COLMAP file; of the first three, the least that it can take."""
+
+
+def _after(data: bytes, at: int, size: int) -> int:
+    """Where a list ends that begins with its length; its entries have ``size`` bytes."""
+    return at + 8 + size * int.from_bytes(data[at : at + 8], "little")
+
+
+def _check_whole(path: Path, walk: Callable[[bytes, int], int]) -> None:
+    """COLMAP reads on behind the end of a file, for ever if need be: refuse one that holds less than it counts."""
+    data, at = path.read_bytes(), 8
+    for _ in range(int.from_bytes(data[:8], "little")):
+        at = walk(data, at)
+        if at > len(data):
+            break
+    if at > len(data):
+        raise ValueError(f"{path.name} is cut short or damaged: its {len(data)} bytes end within a record")
 
 
 @contextmanager

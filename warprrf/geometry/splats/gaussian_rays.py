@@ -118,6 +118,9 @@ class GaussianRays:
     def __len__(self) -> int:
         return len(self.inputs[0])
 
+    def __reduce__(self) -> tuple[Callable[..., GaussianRays], tuple[Any, ...]]:
+        return _rebuilt, (tuple(a.numpy() for a in self.inputs), self.blending, str(self.device))
+
     def _build(self) -> None:
         n, on = len(self), self.device
         scene = kernels.Scene()
@@ -278,3 +281,15 @@ def _pairs(
 
 def _rows(one: np.ndarray, other: np.ndarray) -> int:
     return max(len(one), len(other)) if min(len(one), len(other)) else 0
+
+
+def _rebuilt(arrays: tuple[np.ndarray, ...], blending: Blending, device: str) -> GaussianRays:
+    """What was pickled or copied, with a hierarchy of its own."""
+    vec3, vec4, real = (
+        (wp.vec3d, wp.vec4d, wp.float64) if arrays[3].dtype == np.float64 else (wp.vec3, wp.vec4, wp.float32)
+    )
+    means, quaternions, scales, opacities = (
+        wp.array(a, dtype=kind, device=device)
+        for a, kind in zip(arrays, (vec3, vec4, vec3, real), strict=True)
+    )
+    return GaussianRays((means, quaternions, scales, opacities), blending=blending)

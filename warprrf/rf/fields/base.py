@@ -249,6 +249,8 @@ class RadioField(ABC):
     def __post_init__(self) -> None:
         """Check what every model has; ValueError or TypeError names the attribute."""
         object.__setattr__(self, "transmitter", check_array("transmitter", self.transmitter, (3,)))
+        if self.device is not None:  # its name: a wp.Device cannot be pickled
+            object.__setattr__(self, "device", str(self.device))
         check_number("frequency_hz", self.frequency_hz, *CARRIERS_HZ)
         check_shape(self.shape)
         check_positive("floor", self.floor, "linear noise floor")
