@@ -16,6 +16,7 @@ from warprrf.checks import check_array
 from warprrf.files import read_json
 from warprrf.geometry.mesh_files import METRES, READERS, is_mesh_file
 from warprrf.geometry.ply_files import ply_columns
+from warprrf.tensor_files import named
 
 Add = Callable[..., argparse.ArgumentParser]
 """Defines one command: name and what runs it, whose docstring is its help (or a line and a text of help)."""
@@ -67,14 +68,12 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
     """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
     if len(values) == 1 and "," not in values[0]:
         path = existing(values[0])
-        try:
+        with named(path, "expected rows x,y,z in metres"):
             if path.suffix == ".npy":
-                found = np.load(path, allow_pickle=False)
+                found = np.load(path, mmap_mode="r", allow_pickle=False)
             else:
                 found = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "x"))
-        except ValueError as error:
-            raise ValueError(f"{path}: expected rows x,y,z in metres ({error})") from error
-        return check_array(f"{path}: rows x,y,z in metres", found, (None, 3))
+            return check_array("rows x,y,z in metres", found, (None, 3))
     try:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)
     except ValueError as error:
