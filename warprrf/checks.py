@@ -16,6 +16,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, DTypeLike
 
+LARGEST = 1e100
+"""Beyond it a number counts as infinite, its inverse as zero: products of a few would leave double precision."""
+
 
 def check_array(
     name: str,
@@ -61,9 +64,15 @@ def check_array(
         raise ValueError(f"{name}: got shape {array.shape}, expected ({wished})")
     if wanted.kind in "iu" and given.dtype != wanted and not np.array_equal(array, given):
         raise TypeError(f"{name}: got numbers that are not whole or too large, expected {wanted}")
-    if finite and wanted.kind in "fc" and not np.isfinite(array).all():
-        bad = int(np.count_nonzero(~np.isfinite(array)))
-        raise ValueError(f"{name}: got {bad} values that are NaN or infinite, expected finite numbers")
+    if wanted.kind in "fc" and array.size:
+        size = np.abs(array)
+        most = min(LARGEST, float(np.finfo(wanted).max))
+        bad = ~(size <= most) if finite else (size > most) & (size < np.inf)
+        if bad.any():
+            number, kinds = int(np.count_nonzero(bad)), "NaN, infinite or " if finite else ""
+            raise ValueError(
+                f"{name}: got {number} values that are {kinds}above {most:g}, expected finite numbers"
+            )
     return array
 
 
@@ -109,7 +118,7 @@ def check_number(name: str, value: object, least: float = -np.inf, most: float =
         ValueError: otherwise, naming the argument.
     """
     number = _number(value)
-    if not (np.isfinite(number) and least <= number <= most):
+    if not (abs(number) <= LARGEST and least <= number <= most):
         limits = [f"at least {least:g}"] * (least > -np.inf) + [f"at most {most:g}"] * (most < np.inf)
         raise ValueError(
             f"{name}: got {value!r}, expected a finite number{' of ' * any(limits)}{', '.join(limits)}"
@@ -124,7 +133,7 @@ def check_positive(name: str, value: object, what: str = "number") -> float:
         ValueError: otherwise, naming the argument.
     """
     number = _number(value)
-    if not (np.isfinite(number) and number > 0):
+    if not 1 / LARGEST <= number <= LARGEST:
         raise ValueError(f"{name}: got {value!r}, expected a positive {what}")
     return number
 

@@ -159,6 +159,13 @@ def write_arrays(
     write_bytes(path, data.getbuffer(), seal=True)
 
 
+UNREADABLE = (
+    zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, EOFError, ValueError, TypeError, KeyError,
+    SyntaxError, RuntimeError, OverflowError, AttributeError,
+)  # fmt: skip
+"""What readers raise on damaged files, NumPy's among them."""
+
+
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """All arrays of an NPZ file of anybody's, whose checksums hold; Python objects are not unpacked.
 
@@ -171,10 +178,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(content) as archive:
             return {i.filename.removesuffix(".npy"): _member(archive, i) for i in archive.infolist()}
-    except (
-        zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, EOFError, ValueError, TypeError, KeyError,
-        SyntaxError, RuntimeError, OverflowError,
-    ) as error:  # fmt: skip
+    except UNREADABLE as error:
         raise ValueError(f"{os.fspath(path)}: damaged, or no NPZ file: {error}") from error
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.files import write_atomically
+from warprrf.files import UNREADABLE, write_atomically
 
 FORMAT = "warprrf field 1"
 """Of radio fields."""
@@ -84,7 +84,7 @@ def named(path: str | os.PathLike[str], what: str) -> Iterator[None]:
         yield
     except KeyError as error:
         raise ValueError(f"{os.fspath(path)}: {what}: it lacks {error}") from error
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+    except UNREADABLE as error:
         raise ValueError(f"{os.fspath(path)}: {what}: {error}") from error
 
 

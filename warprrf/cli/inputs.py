@@ -16,6 +16,7 @@ from warprrf.checks import check_array
 from warprrf.files import read_json
 from warprrf.geometry.mesh_files import METRES, READERS, is_mesh_file
 from warprrf.geometry.ply_files import ply_columns
+from warprrf.tensor_files import named
 
 Add = Callable[..., argparse.ArgumentParser]
 """Defines one command: name and what runs it, whose docstring is its help (or a line and a text of help)."""
@@ -67,14 +68,12 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
     """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
     if len(values) == 1 and "," not in values[0]:
         path = existing(values[0])
-        try:
+        with named(path, "expected rows x,y,z in metres"):
             if path.suffix == ".npy":
-                found = np.load(path, allow_pickle=False)
+                found = np.load(path, mmap_mode="r", allow_pickle=False)
             else:
                 found = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "x"))
-        except ValueError as error:
-            raise ValueError(f"{path}: expected rows x,y,z in metres ({error})") from error
-        return check_array(f"{path}: rows x,y,z in metres", found, (None, 3))
+            return check_array("rows x,y,z in metres", found, (None, 3))
     try:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)
     except ValueError as error:
@@ -95,13 +94,34 @@ def add_mesh_options(parser: argparse.ArgumentParser) -> None:
         help="axis of a mesh file that points up (default: y for glTF, else z)",
     )
     parser.add_argument("--simplify", type=int, metavar="N", help="most triangles of a mesh file")
-    add_allow_outside(parser)
 
 
-def add_allow_outside(parser: argparse.ArgumentParser) -> None:
-    """Define that a scene may name any file."""
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """Define what of a scene file's materials is taken, and that it may name any file."""
+    parser.add_argument("--materials", metavar="FILE", help="table that replaces a scene's materials by name")
     parser.add_argument(
-        "--allow-outside", action="store_true", help="read meshes outside the scene's folder too"
+        "--extrapolate",
+        action="store_true",
+        help="let a scene's materials hold outside their bands, by the nearest band's law",
+    )
+    parser.add_argument(
+        "--allow-outside",
+        action="store_true",
+        help="read files outside the folder of a scene or mesh file too",
+    )
+
+
+def load_scene(path: str | Path, options: argparse.Namespace) -> wr.Scene:
+    """A scene file that Sionna RT opens, or a mesh file."""
+    materials = None if options.materials is None else existing(options.materials)
+    return wr.Scene.load(
+        existing(path),
+        materials=materials,
+        extrapolate=options.extrapolate,
+        allow_outside=options.allow_outside,
+        unit=options.unit,
+        up=options.up,
+        simplify=options.simplify,
     )
 
 
@@ -111,7 +131,7 @@ def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> A
     if source.is_dir():
         return wr.Reconstruction.load(source)
     if source.suffix == ".xml":
-        return wr.Scene.load(source, allow_outside=options.allow_outside)
+        return load_scene(source, options)
     if not is_mesh_file(source):
         raise ValueError(
             f"{source}: expected a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh "

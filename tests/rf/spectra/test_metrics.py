@@ -104,7 +104,8 @@ def test_steering_half_a_beamwidth_off_a_lone_path_loses_three_decibels() -> Non
 
 def test_weighted_median_ignores_what_has_no_weight() -> None:
     assert metrics.weighted_median(np.array([5.0, 1.0, 3.0, 100.0]), np.array([1.0, 1.0, 1.5, 0.0])) == 3.0
-    assert np.isnan(metrics.weighted_median(np.array([1.0]), np.array([0.0])))
+    with pytest.raises(ValueError, match="weights"):
+        metrics.weighted_median(np.array([1.0]), np.array([0.0]))
 
 
 def test_a_perfect_prediction_has_no_error() -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.checks import checked
+from warprrf.checks import check_array, check_count, checked
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.splats.blending import RADIO as RADIO
 from warprrf.geometry.splats.blending import Blending as Blending
@@ -30,6 +30,7 @@ from warprrf.kernels.raster.view import PINHOLE, SPHERICAL, View
 PARTS = (
     8  # partial sums of gradients on a CPU, one writer each: the result does not depend on the thread count
 )
+MOST_WEIGHTS = 1 << 16  # of a pixel that can be asked for
 GRAIN = 32  # a tile is work enough for few of them to be worth a thread
 PIXEL_TILE = 16  # pixels: side of a tile where each pixel has a thread of its own
 
@@ -141,6 +142,7 @@ class Rasterizer:
     def colors(self, means: wp.array, sh: wp.array, cam: Camera) -> wp.array:
         """Colours ``max(0, SH + 0.5)`` towards the camera, shape ``(N, C)``; differentiable on an active tape."""
         tape = active_tape()
+        self._fits("sh", sh, self.real, (None, None, None))
         shape = (len(means), sh.shape[2])
         out = wp.zeros(shape, dtype=self.real, device=self.device, requires_grad=tape is not None)
         origin = self.colors_into(means, sh, cam, out)
@@ -150,12 +152,15 @@ class Rasterizer:
 
     def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
         """Write the colours to ``out``; returns the ray origin that :meth:`colors_adjoint` wants. Records nothing."""
+        self._check_colors(means, sh, out)
         origin = wp.array([cam.position], dtype=self.vector(3), device=self.device)
         launch(harmonics.build(self.real).colors, len(means), [means, sh, origin, out], device=self.device)
         return origin
 
     def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
         """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
+        self._check_colors(means, sh, out)
+        self._fits("origin", origin, self.vector(3), (1,))
         kernel = harmonics.build(self.real).colors
         launch(kernel, len(means), [means, sh, origin, out], device=self.device, adjoint=True)
 
@@ -165,9 +170,14 @@ class Rasterizer:
         """Project every Gaussian and list those that each tile may see, near to far.
 
         Raises:
-            ValueError: if the Gaussians cover more than 2^30 tiles in all.
+            ValueError: if the Gaussians cover more than 2^30 tiles in all, or an array is not of this device and
+                precision.
         """
         n, device = len(means), self.device
+        self._fits("means", means, self.vector(3), (n,))
+        self._fits("quaternions", quaternions, self.vector(4), (n,))
+        self._fits("scales", scales, self.vector(3), (n,))
+        self._fits("opacities", opacities, self.real, (n,))
         view = _view(cam, self.tile)
         inputs = (means, quaternions, scales, opacities)
         span = wp.empty(n, dtype=wp.vec4i, device=device)
@@ -185,7 +195,7 @@ class Rasterizer:
     ) -> Image:
         """Blend ``features`` (N, C) front to back; differentiable on an active tape."""
         tape = active_tape()
-        behind = self._background(features, background)
+        behind = self._background(prepared, features, background)
         image = self._blend(prepared, features, behind, requires_grad=tape is not None)
         if tape is not None:
             inputs = (*prepared.inputs, features, behind)
@@ -208,14 +218,18 @@ class Rasterizer:
         With ``gradients`` the image gets gradients of zero to write to; without, assign those that there are (they are
         only read). An input without a gradient is left out.
         """
-        behind = self._background(features, background)
+        behind = self._background(prepared, features, background)
         image = self._blend(prepared, features, behind, requires_grad=gradients)
         return image, lambda: self._adjoint(prepared, features, image, behind)
 
     def strongest(self, prepared: Prepared, top_k: int) -> tuple[wp.array, wp.array, wp.array, wp.array]:
         """The ``top_k`` largest blending weights of every pixel, front to back: Gaussian (-1 where fewer), weight and
         range of the peak [m], shape ``(H, W, K)`` each, and the sum of all weights ``(H, W)``."""
-        shape = (prepared.camera.height, prepared.camera.width, top_k)
+        shape = (
+            prepared.camera.height,
+            prepared.camera.width,
+            check_count("top_k", top_k, most=MOST_WEIGHTS),
+        )
         out = (
             wp.full(shape, -1, dtype=int, device=self.device),
             wp.zeros(shape, dtype=self.real, device=self.device),
@@ -226,11 +240,40 @@ class Rasterizer:
         self._launch_tiles(kernel, prepared, [*self._scene(prepared), *out])
         return out
 
-    def _background(self, features: wp.array, background: ArrayLike | wp.array | None) -> wp.array:
+    def _background(
+        self, prepared: Prepared, features: wp.array, background: ArrayLike | wp.array | None
+    ) -> wp.array:
+        """What lies behind ``features``, which are checked with it."""
+        self._fits("features", features, self.real, (len(prepared.splats), None))
+        channels = features.shape[1]
         if isinstance(background, wp.array):
+            self._fits("background", background, self.real, (channels,))
             return background
-        values = np.zeros(features.shape[1]) if background is None else np.asarray(background)
+        values = (
+            np.zeros(channels) if background is None else check_array("background", background, (channels,))
+        )
         return wp.array(values, dtype=self.real, device=self.device)
+
+    def _check_colors(self, means: wp.array, sh: wp.array, out: wp.array) -> None:
+        self._fits("means", means, self.vector(3), (None,))
+        self._fits("sh", sh, self.real, (len(means), None, None))
+        if sh.shape[1] not in harmonics.COEFFICIENTS.values():
+            raise ValueError(
+                f"sh: got {sh.shape[1]} coefficients, expected {[*harmonics.COEFFICIENTS.values()]}"
+            )
+        self._fits("out", out, self.real, (len(means), sh.shape[2]))
+
+    def _fits(self, name: str, array: wp.array, kind: type, shape: tuple[int | None, ...]) -> None:
+        """Raise ValueError unless an array is of this device, ``kind`` and ``shape``, None for any length."""
+        fits = array.ndim == len(shape) and all(
+            n in (None, own) for n, own in zip(shape, array.shape, strict=True)
+        )
+        if not fits or not wp.types.types_equal(array.dtype, kind) or array.device != self.device:
+            told = tuple("any" if n is None else n for n in shape)
+            raise ValueError(
+                f"{name}: got {array.shape} of {array.dtype.__name__} on {array.device}, expected {told} of "
+                f"{kind.__name__} on {self.device}"
+            )
 
     def _scene(self, prepared: Prepared) -> list[Any]:
         """What kernels that walk the lists take first."""

@@ -103,7 +103,8 @@ class PlanarArray:
 
     def positions(self, wavelength_m: float) -> np.ndarray:
         """Elements about the array's centre in world axes [m], shape ``(N, 3)``; ``wavelength_m`` is the carrier's."""
-        down, across = np.broadcast_to(np.asarray(self.spacing, dtype=np.float64), (2,)) * wavelength_m
+        wavelength = check_positive("wavelength_m", wavelength_m, "number of metres")
+        down, across = np.broadcast_to(np.asarray(self.spacing, dtype=np.float64), (2,)) * wavelength
         column, row = np.divmod(np.arange(self.elements), self.rows)
         local = np.zeros((self.elements, 3))
         local[:, 1] = (column - 0.5 * (self.cols - 1)) * across
@@ -233,6 +234,8 @@ def plane_wave_error(
     for name, value in (("distance_m", distance_m), ("wavelength_m", wavelength_m)):
         check_positive(name, value, "number of metres")
     d = check_array("direction", direction, (3,))
+    if not np.linalg.norm(d) > 0:
+        raise ValueError("direction: got (0, 0, 0), expected a direction")
     unit = d / np.linalg.norm(d)
     plane = array.response(unit, wavelength_m)
     true = array.spherical_response(distance_m * unit, wavelength_m)

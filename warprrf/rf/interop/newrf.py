@@ -19,6 +19,7 @@ from warprrf.files import read_arrays
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.tensor_files import named
 
 RAYS_FILE = "newrf_conference.npz"
 MESH_FILE = "conferenceroom.stl"
@@ -112,6 +113,11 @@ def load_newrf(folder: str | os.PathLike[str]) -> NewrfRays:
             raise FileNotFoundError(
                 f"folder: there is no {base / name}, expected {RAYS_FILE} and {MESH_FILE}"
             )
+    with named(base / RAYS_FILE, "damaged or of another kind"):
+        return _rays(base)
+
+
+def _rays(base: Path) -> NewrfRays:
     data = _read_npz(base / RAYS_FILE)
     count, most = _shape(data, base / RAYS_FILE)
     last = _array(data, "last_point", (count, most, 3), float)

@@ -200,7 +200,7 @@ def without_elements(field: BistaticField, dropped: np.ndarray) -> BistaticField
         log_indirect=np.append(p.log_indirect, -np.inf),
     )
     material = np.append(field.material, field.material.max() + 1)
-    return replace(field, surface=surface, parameters=parameters, material=material)
+    return replace(field, surface=surface, parameters=parameters, material=material, errors=None)
 
 
 class FullModel:

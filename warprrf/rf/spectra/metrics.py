@@ -157,10 +157,14 @@ def beam_gain_loss_db(path_gain: np.ndarray, direction: np.ndarray, width_rad: f
 
 @checked
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    """Smallest value at which the cumulated weight reaches one half; NaN when no weight is positive."""
+    """Smallest value at which the cumulated weight reaches one half.
+
+    Raises:
+        ValueError: if no weight is positive, or one negative.
+    """
     values, weights = (np.ravel(one) for one in _pair(values=values, weights=weights))
-    if not np.any(weights > 0):
-        return float("nan")
+    if not np.any(weights > 0) or not np.all(weights >= 0):
+        raise ValueError("weights: got none above zero, or one below, expected some above zero")
     order = np.argsort(values, kind="stable")
     cumulated = np.cumsum(weights[order], dtype=np.float64)
     return float(values[order][np.searchsorted(cumulated, 0.5 * cumulated[-1])])
@@ -243,10 +247,10 @@ def evaluate(
             rows["beam_gain_loss_db"][i] = beam_gain_loss_db(truth, peak, beam_width_rad)
         if isinstance(prediction, Spectrum):
             weight = np.where((truth > floor) & np.isfinite(test.delay_s[i]), truth, 0.0)
-            if _predicts(prediction.delay_s):
+            if weight.any() and _predicts(prediction.delay_s):
                 error = np.abs(np.asarray(prediction.delay_s, np.float64) - test.delay_s[i]) * 1e9
                 rows["tof_error_ns"][i] = weighted_median(np.where(np.isnan(error), np.inf, error), weight)
-            if _predicts(prediction.aod):
+            if weight.any() and _predicts(prediction.aod):
                 error = angle_deg(_unit(prediction.aod), _unit(test.aod[i]))
                 rows["aod_error_deg"][i] = weighted_median(np.where(np.isnan(error), np.inf, error), weight)
         if progress is not None:
