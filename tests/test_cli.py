@@ -42,6 +42,21 @@ def test_help_shows_an_example_that_the_parser_takes(
         cli._parser().parse_args(words)  # exits where an example is wrong
 
 
+def test_scenes_that_name_itu_materials_alone_go_in(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "room.xml").write_text(
+        '<scene version="3.0.0"><bsdf type="itu-radio-material" id="it"><string name="type" value="metal"/></bsdf>'
+        '<shape type="cube"><ref id="it"/><boolean name="flip_normals" value="true"/></shape></scene>'
+    )
+    words = ["simulate", tmp_path / "room.xml", "-o", tmp_path / "x.nc", "--shape", 8, 16, "--quiet"]
+    words += ["--transmitter", 0.5, 0, 0, "--receivers", "0,0.5,0.1"]
+    assert cli.main([str(word) for word in words]) == 2
+    assert "1 to 100 GHz" in capsys.readouterr().err  # metal, at 300 GHz
+    assert cli.main([str(word) for word in [*words, "--extrapolate"]]) == 0
+    assert cli.main([str(word) for word in [*words, "--frequency", 60e9]]) == 0
+
+
 @pytest.mark.parametrize("command", ["simulate", "relevance"])
 def test_examples_that_need_the_repository_alone_run(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

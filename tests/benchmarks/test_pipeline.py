@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A lobby of four photos of 64 x 48 pixels and ten spectra of 12 x 24."""
     images = pytest.importorskip("PIL.Image")
     folder = tmp_path_factory.mktemp("lobby")
-    for name in ("scene.xml", "meshes", "textures", "materials.json"):
-        (folder / name).symlink_to(LOBBY / name)
+    for name in ("scene.xml", "materials.json"):
+        shutil.copy(LOBBY / name, folder)
+    for name in ("meshes", "textures"):
+        shutil.copytree(LOBBY / name, folder / name)
     scene = wr.Scene.load(folder / "scene.xml")
     lens = {"fx": 40.0, "fy": 40.0, "cx": 32.0, "cy": 24.0}
     views, rng = {}, np.random.default_rng(0)

@@ -23,8 +23,8 @@ def test_instances_of_a_gltf_scene_stand_in_their_places_z_up(make, tmp_path: Pa
     mesh = wr.Mesh.load(make(tmp_path))
     # y-up 4 x 3 x 5 becomes 4 wide, 5 deep, 3 high
     np.testing.assert_allclose(mesh.bounds, [[-2, -2.5, -1.5], [2, 2.5, 1.5]], atol=1e-6)
-    assert set(mesh.material_names) == {"itu_concrete", "Wood_01"}
-    wood = np.flatnonzero(mesh.face_material == mesh.material_names.index("Wood_01"))
+    assert set(mesh.labels) == {"itu_concrete", "Wood_01"}
+    wood = np.flatnonzero(mesh.face_label == mesh.labels.index("Wood_01"))
     assert len(wood) == 4
     lowest = mesh.triangles[wood].reshape(2, -1, 3).min(axis=1)
     placed = [[0.2, -0.4, 0.3], [-1.0, 0.0, 0.0]]  # (x, y, z) of the file is (x, -z, y)
@@ -36,7 +36,7 @@ def test_instances_of_a_gltf_scene_stand_in_their_places_z_up(make, tmp_path: Pa
 
 def test_the_factor_of_a_gltf_material_is_linear_light(tmp_path: Path) -> None:
     mesh = wr.Mesh.load(room_glb(tmp_path))
-    walls = mesh.face_material == mesh.material_names.index("itu_concrete")
+    walls = mesh.face_label == mesh.labels.index("itu_concrete")
     linear = 128 / 255
     np.testing.assert_allclose(mesh.face_colours[walls], 1.055 * linear ** (1 / 2.4) - 0.055, atol=1e-3)
 
@@ -64,7 +64,7 @@ def test_names_of_an_obj_file_stay_where_its_materials_are_missing(tmp_path: Pat
     (tmp_path / "square.mtl").unlink()
     with pytest.warns(UserWarning, match=r"square\.obj needs the file 'square\.mtl'"):
         mesh = wr.Mesh.load(path)
-    assert mesh.material_names == ("Wood_01", "Paint") and mesh.face_colours is None
+    assert mesh.labels == ("Wood_01", "Paint") and mesh.face_colours is None
 
 
 @pytest.mark.parametrize(
@@ -100,8 +100,8 @@ def test_colours_and_names_travel_with_a_mesh(tmp_path: Path) -> None:
     wr.Reconstruction.from_files(mesh=mesh).save(tmp_path / "kept")
     for other in (pickle.loads(pickle.dumps(mesh)), wr.Reconstruction.load(tmp_path / "kept").mesh):
         np.testing.assert_array_equal(other.face_colours, mesh.face_colours)
-        np.testing.assert_array_equal(other.face_material, mesh.face_material)
-        assert other.material_names == mesh.material_names
+        np.testing.assert_array_equal(other.face_label, mesh.face_label)
+        assert other.labels == mesh.labels
 
 
 def test_a_simplified_mesh_keeps_its_shape_colours_and_names(tmp_path: Path) -> None:
@@ -127,8 +127,8 @@ def test_numbered_pages_of_a_scan_are_no_materials(tmp_path: Path) -> None:
         text = (tmp_path / name).read_text()
         (tmp_path / name).write_text(text.replace("Wood_01", "material_0"))
     mesh = wr.Mesh.load(path)
-    assert mesh.material_names == ("Paint",)
-    np.testing.assert_array_equal(mesh.face_material, [-1, -1, 0])
+    assert mesh.labels == ("Paint",)
+    np.testing.assert_array_equal(mesh.face_label, [-1, -1, 0])
 
 
 def outside_obj(folder: Path) -> Path:
@@ -183,7 +183,7 @@ def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, tmp_p
 def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told: str, tmp_path: Path) -> None:
     path = changed_glb(room_glb(tmp_path), change)
     if told.startswith("no triangles"):
-        assert (wr.Mesh.load(path).face_material is not None) and len(wr.Mesh.load(path).faces) < 16
+        assert (wr.Mesh.load(path).face_label is not None) and len(wr.Mesh.load(path).faces) < 16
         return
     with pytest.raises(ValueError, match=rf"room\.glb.*({told})"):
         wr.Mesh.load(path)

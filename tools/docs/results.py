@@ -577,6 +577,29 @@ def _beams_users() -> str:
     return markdown(("sum, bit/s/Hz", "spectra", *(words.get(c, c) for c in choices)), lines)
 
 
+@entry("city-paths")
+def _city_paths() -> str:
+    found = measured("city_paths")
+    if found is None or "machine" not in found:
+        return missing("python -m benchmarks city-paths")
+    head = (
+        "scene", "triangles", "receivers", "of PathSolver's paths", "delay error [s]", "gain error [dB]", "only ours",
+        "load [s]", "one receiver [s]", "all [s]", "PathSolver, one [s]", "all [s]",
+    )  # fmt: skip
+    lines = []
+    for r in found["scenes"]:
+        gain = f"{r['gain_error_db']:.4f}"
+        if r["gain_apart"]:
+            gain += f" ({r['gain_apart_near_origin_db']:.4f})"
+        times = (r["load_s"], r["patches_s"] + r["one_receiver_s"], r["patches_s"] + r["all_receivers_s"])
+        times += (r["sionna_one_receiver_s"], r["sionna_all_receivers_s"])
+        lines.append(
+            [r["scene"], str(r["faces"]), str(r["receivers"]), f"{r['found']} of {r['paths_of_sionna']}"]
+            + [f"{r['delay_error_s']:.0e}", gain, str(r["only_ours"]), *(f"{t:.2g}" for t in times)]
+        )
+    return markdown(head, lines)
+
+
 @entry("map")
 def _map() -> str:
     found = read("map")

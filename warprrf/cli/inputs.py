@@ -94,13 +94,34 @@ def add_mesh_options(parser: argparse.ArgumentParser) -> None:
         help="axis of a mesh file that points up (default: y for glTF, else z)",
     )
     parser.add_argument("--simplify", type=int, metavar="N", help="most triangles of a mesh file")
-    add_allow_outside(parser)
 
 
-def add_allow_outside(parser: argparse.ArgumentParser) -> None:
-    """Define that a scene may name any file."""
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """Define what of a scene file's materials is taken, and that it may name any file."""
+    parser.add_argument("--materials", metavar="FILE", help="table that replaces a scene's materials by name")
     parser.add_argument(
-        "--allow-outside", action="store_true", help="read meshes outside the scene's folder too"
+        "--extrapolate",
+        action="store_true",
+        help="let a scene's materials hold outside their bands, by the nearest band's law",
+    )
+    parser.add_argument(
+        "--allow-outside",
+        action="store_true",
+        help="read files outside the folder of a scene or mesh file too",
+    )
+
+
+def load_scene(path: str | Path, options: argparse.Namespace) -> wr.Scene:
+    """A scene file that Sionna RT opens, or a mesh file."""
+    materials = None if options.materials is None else existing(options.materials)
+    return wr.Scene.load(
+        existing(path),
+        materials=materials,
+        extrapolate=options.extrapolate,
+        allow_outside=options.allow_outside,
+        unit=options.unit,
+        up=options.up,
+        simplify=options.simplify,
     )
 
 
@@ -110,7 +131,7 @@ def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> A
     if source.is_dir():
         return wr.Reconstruction.load(source)
     if source.suffix == ".xml":
-        return wr.Scene.load(source, allow_outside=options.allow_outside)
+        return load_scene(source, options)
     if not is_mesh_file(source):
         raise ValueError(
             f"{source}: expected a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh "
@@ -125,4 +146,10 @@ def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> A
 
 
 def _load_mesh(path: str | Path, options: argparse.Namespace) -> wr.Mesh:
-    return wr.Mesh.load(existing(path), options.unit, options.up, simplify=options.simplify)
+    return wr.Mesh.load(
+        existing(path),
+        options.unit,
+        options.up,
+        simplify=options.simplify,
+        allow_outside=options.allow_outside,
+    )

@@ -15,12 +15,13 @@ from warprrf.checks import check_count
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import (
     Add,
-    add_allow_outside,
     add_mesh_options,
     add_out,
     add_point,
+    add_scene_options,
     existing,
     load_geometry,
+    load_scene,
     read_positions,
     read_receivers,
 )
@@ -66,12 +67,14 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
 def add_simulate(add: Add) -> None:
     """Define `simulate`."""
     sim = add("simulate", _simulate)
-    sim.add_argument("scene", help="scene XML (Mitsuba/Sionna RT), with materials.json beside it")
+    sim.add_argument("scene", help="scene file that Sionna RT opens (Mitsuba's XML), or mesh file")
+    add_mesh_options(sim)
     add_out(sim, "NetCDF file")
     add_point(sim, "--transmitter", "metres", required=True)
     sim.add_argument(
         "--receivers", nargs="+", required=True, help="CSV or NPY file of x,y,z rows, or x,y,z words"
     )
+    add_scene_options(sim)
     sim.add_argument("--frequency", type=float, default=300e9, metavar="HZ", help="carrier (default 300e9)")
     sim.add_argument(
         "--shape", nargs=2, type=int, default=(90, 180), metavar=("H", "W"), help="pixels (90 180)"
@@ -86,7 +89,6 @@ def add_simulate(add: Add) -> None:
     sim.add_argument("--beam-sigma-deg", type=float, default=2.0, help="receiver beam (default 2 degrees)")
     sim.add_argument("--refraction", action="store_true", help="transmission through walls (sionna)")
     sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
-    add_allow_outside(sim)
 
 
 def _simulate(args: argparse.Namespace, bars: Bars) -> None:
@@ -99,11 +101,12 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
 
     examples:
       warprrf simulate data/lobby/scene.xml -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 9,5,1.5
+      warprrf simulate room.glb -o one.nc --transmitter 2 3 3.2 --receivers 7,4,1.5 --materials materials.json
       warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
     """
     unfinished = Path(f"{args.out}.receivers")
     dataset = wr.simulate(
-        wr.Scene.load(existing(args.scene), allow_outside=args.allow_outside),
+        load_scene(args.scene, args),
         transmitter=np.array(args.transmitter, dtype=np.float64),
         receivers=read_receivers(args.receivers),
         frequency_hz=args.frequency,
@@ -143,6 +146,7 @@ def add_fit(add: Add) -> None:
     )
     fit.add_argument("--mesh", help="mesh for line of sight, where GEOMETRY is splats")
     add_mesh_options(fit)
+    add_scene_options(fit)
     fit.add_argument(
         "--relevance", metavar="FILE", help="what `warprrf relevance -o` wrote: terms ruled out are off"
     )
@@ -276,6 +280,7 @@ def add_relevance(add: Add) -> None:
     )
     rel.add_argument("--mesh", help="mesh for line of sight, where SOURCE is splats")
     add_mesh_options(rel)
+    add_scene_options(rel)
 
 
 def _relevance(args: argparse.Namespace, bars: Bars) -> None:

@@ -17,7 +17,7 @@ from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.gaussians import Gaussians
 
 GAUSSIANS = tuple(f.name for f in fields(Gaussians))
-MESH = ("vertices", "faces", "face_colours", "face_material")
+MESH = ("vertices", "faces", "face_colours", "face_label")
 PATCHES = tuple(f.name for f in fields(PlanarPatches) if f.name != "mesh")
 PATCH_ARRAYS = {
     "patch_face_patch": index_to("P", "F", -1),
@@ -80,15 +80,15 @@ def to_planes(arrays: Arrays) -> list[Plane]:
 
 
 def of_mesh(mesh: Mesh) -> Arrays:
-    """Arrays of a mesh; its materials' names are left to the header."""
+    """Arrays of a mesh; its labels are left to the header."""
     held = {name: getattr(mesh, name) for name in MESH}
     return {name: array for name, array in held.items() if array is not None}
 
 
-def to_mesh(arrays: Arrays, material_names: Sequence[str] = ()) -> Mesh:
+def to_mesh(arrays: Arrays, labels: Sequence[str] = ()) -> Mesh:
     """What :func:`of_mesh` took apart."""
     known = {name: arrays.get(name) for name in MESH[2:]}
-    return Mesh(arrays["vertices"], arrays["faces"], material_names=material_names, **known)
+    return Mesh(arrays["vertices"], arrays["faces"], labels=labels, **known)
 
 
 def of_patches(patches: PlanarPatches) -> Arrays:
@@ -97,9 +97,9 @@ def of_patches(patches: PlanarPatches) -> Arrays:
     return own | of_mesh(patches.mesh)
 
 
-def to_patches(arrays: Arrays, material_names: Sequence[str] = ()) -> PlanarPatches:
+def to_patches(arrays: Arrays, labels: Sequence[str] = ()) -> PlanarPatches:
     """What :func:`of_patches` took apart."""
-    mesh = to_mesh(arrays, material_names)
+    mesh = to_mesh(arrays, labels)
     if "patch_once" in arrays:  # older files say which faces repeat none, not which ones others repeat
         itself = arrays["patch_once"] | (arrays["patch_face_patch"] < 0)
         arrays = arrays | {"patch_first": np.where(itself, np.arange(len(itself)), mesh.first_at_place)}

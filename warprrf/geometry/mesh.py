@@ -33,7 +33,7 @@ ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
 
 
-_KEPT = ("vertices", "faces", "face_colours", "face_material", "material_names")
+_KEPT = ("vertices", "faces", "face_colours", "face_label", "labels")
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class Mesh:
         vertices: Positions [m], shape ``(V, 3)``; kept in float64.
         faces: Vertex indices, shape ``(F, 3)``, counter-clockwise seen from outside.
         face_colours: Colours as a photo has them (sRGB, 0 to 1), shape ``(F, 3)``, NaN where unknown.
-        face_material: Index into ``material_names`` of each face, -1 for none, shape ``(F,)``.
-        material_names: What the materials are called.
+        face_label: Index into ``labels`` of each face, -1 for none, shape ``(F,)``.
+        labels: Names that tell what faces are made of; their file's names of materials.
 
     Raises:
         TypeError: if the arguments don't read as arrays, or faces are not whole numbers.
@@ -75,8 +75,8 @@ class Mesh:
         faces: ArrayLike,
         *,
         face_colours: ArrayLike | None = None,
-        face_material: ArrayLike | None = None,
-        material_names: Sequence[str] = (),
+        face_label: ArrayLike | None = None,
+        labels: Sequence[str] = (),
     ) -> None:
         self.vertices: np.ndarray = check_array("vertices", vertices, (None, 3)).copy()
         if np.abs(self.vertices).max(initial=0.0) > LARGEST_M:
@@ -95,7 +95,7 @@ class Mesh:
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
         self.face_colours = self._checked_colours(face_colours)
-        self.face_material, self.material_names = self._checked_materials(face_material, material_names)
+        self.face_label, self.labels = self._checked_labels(face_label, labels)
 
     def _checked_colours(self, colours: ArrayLike | None) -> np.ndarray | None:
         if colours is None:
@@ -108,19 +108,19 @@ class Mesh:
         found.setflags(write=False)
         return found
 
-    def _checked_materials(
+    def _checked_labels(
         self, material: ArrayLike | None, names: Sequence[str]
     ) -> tuple[np.ndarray | None, tuple[str, ...]]:
         if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-            raise TypeError(f"material_names: got {names!r:.60}, expected a list of names")
+            raise TypeError(f"labels: got {names!r:.60}, expected a list of names")
         if material is None:
             if len(names):
-                raise ValueError("face_material: got none, expected one index a face to material_names")
+                raise ValueError("face_label: got none, expected one index a face to labels")
             return None, ()
-        found = check_array("face_material", material, (len(self.faces),), dtype=np.int32).copy()
+        found = check_array("face_label", material, (len(self.faces),), dtype=np.int32).copy()
         if found.min() < -1 or found.max() >= len(names):
             raise ValueError(
-                f"face_material: got indices from {found.min()} to {found.max()}, expected -1 (none) to {len(names) - 1}"
+                f"face_label: got indices from {found.min()} to {found.max()}, expected -1 (none) to {len(names) - 1}"
             )
         found.setflags(write=False)
         return found, tuple(names)
@@ -163,7 +163,7 @@ class Mesh:
         return cls(content.vertices, content.faces, **content.known)
 
     def __repr__(self) -> str:
-        known = f", materials {', '.join(self.material_names)}" if self.material_names else ""
+        known = f", labels {', '.join(self.labels)}" if self.labels else ""
         colours = ", colours" if self.face_colours is not None else ""
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces{known}{colours})"
 

@@ -45,7 +45,11 @@ class MeshContent:
     @property
     def known(self) -> dict[str, Any]:
         """What a mesh keeps of its faces, by the names that it has for it."""
-        return {name: getattr(self, name) for name in ("face_colours", "face_material", "material_names")}
+        return {
+            "face_colours": self.face_colours,
+            "face_label": self.face_material,
+            "labels": self.material_names,
+        }
 
     def with_faces(self, vertices: np.ndarray, faces: np.ndarray, parent: np.ndarray) -> MeshContent:
         """Other vertices and faces, each made of its ``parent`` (F,) among the faces now."""

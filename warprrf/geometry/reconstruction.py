@@ -118,7 +118,7 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
-            "material_names": () if self._mesh is None else self._mesh.material_names,
+            "labels": () if self._mesh is None else self._mesh.labels,
         }  # fmt: skip
         arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
         if self.patches is not None:
@@ -146,7 +146,7 @@ class Reconstruction:
                 "its photos (reconstruct)"
             )
         with named(path, "damaged or incomplete"):
-            names = header.get("material_names", ())
+            names = header.get("labels", ())
             patches = files.to_patches(arrays, names) if "patch_face_patch" in arrays else None
             mesh = None if patches is None else patches.mesh
             if mesh is None and "faces" in arrays:

@@ -17,7 +17,9 @@ from numpy.typing import ArrayLike
 from warprrf.checks import check_array, check_number, check_type, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.em.materials import Material, load_materials
+from warprrf.rf.scene_meshes import read_mesh_scene
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart
 from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml
@@ -88,19 +90,27 @@ class Scene:
         materials: Materials | None = None,
         extrapolate: bool = False,
         allow_outside: bool = False,
+        unit: str | None = None,
+        up: str | None = None,
+        simplify: int | None = None,
     ) -> Scene:
-        """Read a scene file: any that Sionna RT 2 opens, such as ``sionna.rt.scene.munich``.
+        """Read a scene file: any that Sionna RT 2 opens, such as ``sionna.rt.scene.munich``, or a mesh file.
+
+        A mesh file (PLY, OBJ, STL, glTF, GLB) gives names of materials at most. Those of ITU-R P.2040 are known
+        (``concrete``, ``itu_glass``, ``Wood_01``); the others are names alone until ``materials`` says more: they tell a
+        radio field which surfaces are alike, but nothing can be simulated with them.
 
         Materials named after those of ITU-R P.2040 are known; a table ``materials.json`` beside the file goes before
         what the file says, and ``materials`` goes before both. What scatters nothing in the file has a scattering
         coefficient of 0, as in Sionna.
 
         Args:
-            path: the scene file (Mitsuba's XML).
+            path: the scene file (Mitsuba's XML), or a mesh file.
             materials: materials by the name of those that they replace, or a table's file (:func:`load_materials`).
             extrapolate: let materials hold outside the bands in which they are known; see
                 :meth:`Material.extrapolated`.
             allow_outside: read files outside the folder of ``path`` too. A scene from elsewhere may name any file.
+            unit, up, simplify: of a mesh file, as of :meth:`Mesh.load`.
 
         Raises:
             FileNotFoundError: if the file, a mesh or the table is missing.
@@ -119,6 +129,12 @@ class Scene:
         beside = path.parent / "materials.json"
         table = load_materials(beside) if beside.is_file() else None
         choice = MaterialChoice(materials, table, extrapolate)
+        if is_mesh_file(path):
+            found = read_mesh_scene(path, choice, MeshOptions(unit, up, simplify, allow_outside))
+            choice.check_used()
+            return cls(**vars(found))
+        if (unit, up, simplify) != (None, None, None):
+            raise ValueError(f"unit, up, simplify: {path} is no mesh file; its units are metres, z up")
         parts = read_scene_xml(path, choice, allow_outside=allow_outside)
         choice.check_used()
         return cls._of_parts(parts, xml_path=path)

@@ -19,6 +19,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from warprrf.checks import LARGEST_M
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.itu import DEFAULT_THICKNESS_M, ITU_BANDS, itu_material, itu_name
 from warprrf.rf.em.materials import Material
@@ -53,6 +54,7 @@ class _SceneFile:
 
     def __init__(self, path: Path, choice: MaterialChoice, allow_outside: bool) -> None:
         self.path, self.choice, self.allow_outside = path, choice, allow_outside
+        self.folder = path.parent.resolve()
         self.top = list(self._included(path, 0))
         self._replace_names()
         self.bsdfs = {e.get("id"): e for e in self.top if e.tag == "bsdf" and e.get("id") is not None}
@@ -95,9 +97,8 @@ class _SceneFile:
         """The file of this name, relative to the scene's folder."""
         if not filename or "\0" in filename:
             raise ValueError(f"path: {self.path} gives no name of {what}")
-        folder = self.path.parent
-        found = folder / filename
-        if not self.allow_outside and not found.resolve().is_relative_to(folder.resolve()):
+        found = self.path.parent / filename
+        if not self.allow_outside and not found.resolve().is_relative_to(self.folder):
             raise ValueError(
                 f"path: {self.path}: {what} is {filename}, which lies outside the scene's folder; move it there, or "
                 "trust the scene and load it with allow_outside=True"
@@ -202,8 +203,8 @@ class _SceneFile:
             raise self.wrong(name, str(error)) from error
         if place is not None:
             vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-            if not np.isfinite(vertices).all():
-                raise self.wrong(name, "is transformed to places that are NaN or infinite")
+        if not (np.abs(vertices) <= LARGEST_M).all():
+            raise self.wrong(name, f"holds places that are NaN, infinite or beyond {LARGEST_M:g} m")
         flipped = (_text(shape, "flip_normals", "boolean") or "").strip().lower() == "true"
         if flipped != (np.linalg.det(matrix[:3, :3]) < 0):  # a mirrored solid keeps its outer side
             faces = faces[:, ::-1]
@@ -255,7 +256,7 @@ def _single_shapes(element: Element) -> list[Element]:
 
 
 def _text(element: Element, name: str, tag: str = "string") -> str | None:
-    return next((part.get("value") for part in element.findall(tag) if part.get("name") == name), None)
+    return next((part.get("value", "") for part in element.findall(tag) if part.get("name") == name), None)
 
 
 def _value(element: Element, name: str, default: float) -> float:

@@ -93,7 +93,6 @@ def test_the_first_row_that_holds_counts() -> None:
         ({"alpha_r": 0}, "alpha_r"),
         ({"alpha_r": 1001}, "alpha_r.*1 to 1000"),
         ({"alpha_r": 2.5}, "alpha_r"),
-        ({"bands": ()}, "bands"),
         ({"thickness_m": -0.1}, "thickness_m"),
         ({"thickness_m": math.nan}, "thickness_m"),
         ({"thickness_m": "0.1"}, "thickness_m"),

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_alike, check_array, check_count, checked
-from warprrf.rf.em.materials import NARROWEST_LOBE, Material
+from warprrf.rf.em.materials import NARROWEST_LOBE, Material, check_known
 
 LAMBERTIAN = 0
 """Value of ``SurfaceTable.alpha_r`` that stands for a Lambertian lobe."""
@@ -50,8 +50,9 @@ def surface_table(materials: Sequence[Material], frequency_hz: float) -> Surface
     """The table of ``materials`` at ``frequency_hz``.
 
     Raises:
-        ValueError: if the frequency lies outside a material's band.
+        ValueError: if the frequency lies outside a material's band, or materials are names alone.
     """
+    check_known(materials)
     alpha = [LAMBERTIAN if m.pattern == "lambertian" else int(m.alpha_r) for m in materials]
     return SurfaceTable(
         permittivity=np.array([m.permittivity(frequency_hz) for m in materials]),

@@ -11,7 +11,7 @@ incidence (Ament 1953; Degli-Esposti et al. 2007, eq. (2), for the power that le
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,8 @@ class Material:
 
     Attributes:
         name: the material's name.
-        bands: permittivity rows; the first whose band holds the frequency counts.
+        bands: permittivity rows; the first whose band holds the frequency counts. Without any it is a name alone, as a
+            mesh file gives: it tells a radio field which surfaces are alike, and every question about it is an error.
         thickness_m: slab thickness [m]; ``inf`` for a half-space.
         roughness_m: rms height of the surface sigma_h [m]; gives the scattering coefficient.
         scattering: scattering coefficient S in [0, 1] at every frequency, instead of one from ``roughness_m``.
@@ -135,8 +136,6 @@ class Material:
     xpd: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.bands:
-            raise ValueError(f"bands: material {self.name!r} has none, expected at least one row")
         for k, band in enumerate(self.bands):
             check_type(f"bands[{k}]", band, Band)
         of = f" of {self.name!r}"
@@ -192,6 +191,7 @@ class Material:
             ValueError: naming material, frequency and bands, if none does.
         """
         check_frequency(frequency_hz)
+        check_known((self,))
         for band in self.bands:
             if band.low_hz <= frequency_hz <= band.high_hz:
                 return band
@@ -209,6 +209,8 @@ class Material:
         The rows that are added say so in their ``source``; nobody measured there. Between two bands each holds up to
         the geometric mean of their ends. Where a law's relative permittivity would fall below 1 it ends.
         """
+        if not self.bands:
+            return self
         ends = sorted(self.bands, key=lambda band: (band.low_hz, band.high_hz))
         added, below, reach = [], ends[0], ends[0].high_hz
         added.append(ends[0].widened(WIDEST_HZ[0], ends[0].low_hz))
@@ -244,6 +246,26 @@ class Material:
         if self.scattering is not None:
             return float(self.scattering)
         return roughness_scattering(self.roughness_m, frequency_hz)
+
+
+def is_name_alone(material: object) -> bool:
+    """Whether nothing is known of a material but its name."""
+    return isinstance(material, Material) and not material.bands
+
+
+def check_known(materials: Iterable[Material]) -> None:
+    """Refuse materials that are names alone.
+
+    Raises:
+        ValueError: naming them all.
+    """
+    unknown = sorted({material.name for material in materials if is_name_alone(material)})
+    if unknown:
+        raise ValueError(
+            f"materials: nothing is known of {', '.join(map(repr, unknown))} but the name, expected radio materials: "
+            "give Scene.load or Scene.with_materials some, such as materials={"
+            f"{unknown[0]!r}: wr.em.itu_material('wood')}}"
+        )
 
 
 @checked
@@ -304,7 +326,7 @@ def _material(entry: object, where: str) -> Material:
             raise ValueError(f"{where} has no {key!r}")
     if "roughness_m" not in entry and "scattering" not in entry:
         raise ValueError(f"{where} has neither 'roughness_m' nor 'scattering', expected one of them")
-    if not isinstance(entry["permittivity"], list):
+    if not isinstance(entry["permittivity"], list) or not entry["permittivity"]:
         raise ValueError(f"{where}: 'permittivity' is no list of rows")
     parts = {key: _mapping(entry[key], f"{where}, {key!r}") for key in _PARTS if key in entry}
     alpha_r = check_count(f"{where}: 'alpha_r'", parts["pattern"].get("alpha_r", 4), 1, NARROWEST_LOBE)

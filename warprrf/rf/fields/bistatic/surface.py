@@ -25,6 +25,7 @@ from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
 from warprrf.kernels.radio import bounce
+from warprrf.rf.em.materials import is_name_alone
 from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
 from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
 
@@ -238,13 +239,13 @@ def _patches_and_colours(geometry: GeometryLike, mesh: Mesh) -> tuple[PlanarPatc
 def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Index of each face's material, or None where there are no names to tell faces apart, and the names: those of a
     Scene's materials, else of the mesh's, the last for faces of none."""
-    known = getattr(geometry, "face_material", None)
-    if known is not None and not isinstance(geometry, Mesh):
-        return np.asarray(known, np.int32), tuple(m.name for m in getattr(geometry, "materials", ()))
-    if mesh.face_material is None:
+    known, materials = getattr(geometry, "face_material", None), getattr(geometry, "materials", ())
+    if known is not None and (len(materials) > 1 or not any(map(is_name_alone, materials))):
+        return np.asarray(known, np.int32), tuple(m.name for m in materials)
+    if mesh.face_label is None:
         return None, ()
-    names = mesh.material_names
-    own = np.where(mesh.face_material < 0, len(names), mesh.face_material)
+    names = mesh.labels
+    own = np.where(mesh.face_label < 0, len(names), mesh.face_label)
     used, group = np.unique(own, return_inverse=True)
     if len(used) < 2:
         return None, ()
