@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warprrf.brief import one_line
-from warprrf.checks import check_array, checked
+from warprrf.checks import check_array, check_type, checked
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
@@ -269,12 +269,14 @@ class PathArrays:
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """All paths of one receiver."""
+        _check_parts(parts)
         joined: dict[str, Any] = {name: np.concatenate(arrays) for name, arrays in _columns(parts).items()}
         return cls(**joined, **_common(parts), receiver=parts[0].receiver)
 
     @classmethod
     def stack(cls, parts: Sequence[Self]) -> Self:
         """Paths of several receivers, padded to the longest list: arrays ``(R, L)``."""
+        _check_parts(parts)
         length = max((len(p.gain) for p in parts), default=0)
         stacked: dict[str, Any] = {
             name: np.stack([_padded(a, 0, length, _PADDING[name]) for a in arrays])
@@ -295,10 +297,16 @@ def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.nda
     return points
 
 
-def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
-    """The arrays of all parts by name, equally deep; without ``jones`` if no part has it, NaN for those that lack it."""
+def _check_parts(parts: Sequence[PathArrays]) -> None:
+    """Raise ValueError or TypeError unless these are some paths."""
     if not len(parts):
         raise ValueError("parts: got none, expected at least one")
+    for k, part in enumerate(parts):
+        check_type(f"parts[{k}]", part, PathArrays)
+
+
+def _columns(parts: Sequence[PathArrays]) -> dict[str, list[np.ndarray]]:
+    """The arrays of all parts by name, equally deep; without ``jones`` if no part has it, NaN for those that lack it."""
     columns = {name: [getattr(p, name) for p in parts] for name in _PADDING}
     depth = max((v.shape[1] for v in columns["vertices"]), default=1)
     columns["vertices"] = [_padded(v, 1, depth, np.nan) for v in columns["vertices"]]

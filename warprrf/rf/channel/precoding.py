@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 
-from warprrf.checks import check_positive, checked
+from warprrf.checks import check_array, check_positive, checked
 from warprrf.rf.channel.beams import Ends, Source, chunks, codebook_of, rays_of, squared
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.spectra.spectrum import Spectrum
@@ -171,11 +171,9 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 
 
 def _checked(channels: ArrayLike, allow_dark: bool = False) -> np.ndarray:
-    h = np.asarray(channels, dtype=complex)
+    h = check_array("channels", channels, dtype=complex)
     if h.ndim not in (2, 3) or 0 in h.shape or (h.ndim == 3 and h.shape[1] != h.shape[2]):
         raise ValueError(f"channels: got shape {h.shape}, expected channels (U, N) or covariances (U, N, N)")
-    if not np.isfinite(h).all():
-        raise ValueError("channels: got NaN or infinity, expected finite numbers")
     if h.ndim == 3:
         size = np.abs(h).max()
         if np.abs(h - np.swapaxes(h.conj(), 1, 2)).max() > 1e-9 * size:
