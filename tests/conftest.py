@@ -1,6 +1,7 @@
 """Fixtures of more than one folder."""
 
 import sys
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
@@ -27,4 +28,5 @@ def each_form(request, monkeypatch):
     """The rasteriser in each of its forms: blocks of pixels, and a thread per pixel as on a GPU."""
     from warprrf.geometry.splats.rasterizer import Rasterizer
 
-    monkeypatch.setitem(Rasterizer.__init__.__kwdefaults__, "per_pixel", request.param == "reference")
+    made = partialmethod(Rasterizer.__init__, per_pixel=request.param == "reference")
+    monkeypatch.setattr(Rasterizer, "__init__", made)

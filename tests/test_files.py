@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from warprrf import tensor_files
 from warprrf.files import (
     check_seal,
     partial_path,
@@ -77,10 +78,12 @@ def test_a_full_disk_is_an_error_that_names_the_file_and_leaves_the_old_one(tmp_
 def test_files_have_the_rights_that_the_umask_leaves(tmp_path: Path, mask: int) -> None:
     before = os.umask(mask)
     try:
-        write_bytes(tmp_path / "a", b"")
+        write_bytes(tmp_path / "bytes", b"")
+        tensor_files.write(tmp_path / "tensors", {"x": np.zeros(3)}, {})
     finally:
         os.umask(before)
-    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o666 & ~mask
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert modes == {"bytes": 0o666 & ~mask, "tensors": 0o666 & ~mask}
 
 
 def test_threads_may_write_one_file(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.files import UNREADABLE, write_atomically
+from warprrf.files import UNREADABLE, write_bytes
 
 FORMAT = "warprrf field 1"
 """Of radio fields."""
@@ -30,12 +30,12 @@ def write(
     kind: str | None = FORMAT,
 ) -> None:
     """Write ``tensors`` and ``header`` (plain values) to ``path``, as a file of a ``kind``."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     whole = {name: np.asarray(value, order="C") for name, value in tensors.items()}
     about = {"header": json.dumps(dict(header))} | ({} if kind is None else {"format": kind})
     about[_CHECKSUM] = _checksum(whole, about)
-    write_atomically(path, lambda file: save_file(whole, file, metadata=about))
+    write_bytes(path, save(whole, metadata=about))
 
 
 def read(

@@ -29,7 +29,7 @@ examples:
   python -m benchmarks fuzz --minutes 1 --only "file: splats" --fresh
   python -m benchmarks fuzz --again 'Mesh.cast: [["origins", "nan"]]'     one case, in this process
 """
-BATCH = 500
+BATCH = 200
 DRAWN = 40
 """Cases of every target between two looks at the clock, and of each that Hypothesis draws at a time."""
 
@@ -78,9 +78,9 @@ def stream(place: Place, seed: int, only: str) -> Iterator[cases.Case]:
 
 def run(options: Options, job: Job) -> Report | None:
     """Fuzz, and report."""
-    place = Place(job.out / "place").make()
+    place = Place(job.out.resolve() / "place").make()  # cases run in folders of their own
     if options.again:
-        print(cases.Trial(place, job.out / "again")(_case(options.again)))
+        print(cases.Trial(place, job.out.resolve() / "again")(_case(options.again)))
         return None
     state_file = job.out / "state.json"
     state: dict[str, Any] = {

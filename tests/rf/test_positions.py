@@ -156,9 +156,8 @@ def test_two_rooms_with_a_door_are_one_air():
     """Each room a shell of its own, one wound the other way, with a doorway in both shells."""
 
     def shell(low, high, door_x, inward):
-        vertices, faces = (
-            subdivided(joined(box_mesh(low, high, inward=inward))[0], 0.0, 0.0).__getstate__().values()
-        )
+        fine = subdivided(joined(box_mesh(low, high, inward=inward))[0], 0.0, 0.0)
+        vertices, faces = fine.vertices, fine.faces
         centre = vertices[faces].mean(axis=1)
         doorway = (np.abs(centre[:, 0] - door_x) < 1e-6) & (centre[:, 1] < 1.0) & (centre[:, 2] < 2.0)
         return vertices, faces[~doorway]

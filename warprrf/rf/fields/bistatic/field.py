@@ -101,7 +101,7 @@ class BistaticField(RadioField):
             if len(self.errors.covariance) not in (free, free + 1):
                 raise ValueError(
                     f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {free}, or "
-                    f"{free + 1} with a common gain"
+                    f"{free + 1} with a common gain; errors=None where terms were changed after the fit"
                 )
 
     @property
