@@ -270,7 +270,7 @@ def test_damaged_files_are_refused_and_survive_a_failed_save(whole, tmp_path):
     good = path.read_bytes()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "safetensors.numpy.save_file", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full"))
+            "safetensors.numpy.save", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full"))
         )
         with pytest.raises(OSError, match="disk full"):
             whole[3].save(tmp_path)

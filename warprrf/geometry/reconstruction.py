@@ -147,7 +147,7 @@ class Reconstruction:
             )
         with named(path, "damaged or incomplete"):
             names = header.get("labels", ())
-            patches = files.to_patches(arrays, names) if "patch_face_patch" in arrays else None
+            patches = files.to_patches(arrays, names) if any(n.startswith("patch") for n in arrays) else None
             mesh = None if patches is None else patches.mesh
             if mesh is None and "faces" in arrays:
                 mesh = files.to_mesh(arrays, names)
