@@ -167,7 +167,7 @@ print(f"fitted to ten spectra in {time.perf_counter() - start:.1f} s: {field.ter
 
 def with_terms(**changed):
     """The same field with other terms."""
-    return replace(field, terms=replace(field.terms, **changed), errors=None)
+    return replace(field, terms=replace(field.terms, **changed))
 
 
 def images(sub_pixels):

@@ -269,9 +269,7 @@ def test_damaged_files_are_refused_and_survive_a_failed_save(whole, tmp_path):
     path = tmp_path / "reconstruction.safetensors"
     good = path.read_bytes()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "safetensors.numpy.save", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full"))
-        )
+        patch.setattr("safetensors.numpy.save", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full")))
         with pytest.raises(OSError, match="disk full"):
             whole[3].save(tmp_path)
     assert path.read_bytes() == good and len(list(tmp_path.iterdir())) == 1

@@ -96,12 +96,16 @@ class BistaticField(RadioField):
             raise ValueError(
                 f"material: got {np.unique(self.material)}, expected all of 0 to {materials - 1}"
             )
-        if self.errors is not None:
-            free = Layout(materials, sizes["L"], indirect=self.terms.indirect, gain=False).size
-            if len(self.errors.covariance) not in (free, free + 1):
+
+        if self.errors is not None:  # terms may have changed since they were learned
+            known = [
+                Layout(materials, sizes["L"], indirect=indirect, gain=gain).size
+                for indirect in (False, True)
+                for gain in (False, True)
+            ]
+            if len(self.errors.covariance) not in known:
                 raise ValueError(
-                    f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected {free}, or "
-                    f"{free + 1} with a common gain; errors=None where terms were changed after the fit"
+                    f"errors: got a covariance of {len(self.errors.covariance)} parameters, expected one of {known}"
                 )
 
     @property
@@ -313,6 +317,13 @@ class BistaticField(RadioField):
             raise ValueError(
                 f"uncertainty: this field was fitted to {self.report.get('receivers', 0)} receivers, too few to hold "
                 "some out and learn its error from; fit to four or more"
+            )
+        materials, lobes = int(self.material.max()) + 1, len(self.terms.lobes)
+        free = Layout(materials, lobes, indirect=self.terms.indirect, gain=False).size
+        if len(self.errors.covariance) not in (free, free + 1):  # with a common gain
+            raise ValueError(
+                f"uncertainty: this field's errors were learned for {len(self.errors.covariance)} parameters, but its "
+                f"terms have {free} now; fit it with these terms"
             )
         return uncertainty.predicted_std_db(
             self.errors, view, rendered, self.materials, self.material, self._beam, self.floor
