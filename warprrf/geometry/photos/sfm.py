@@ -133,7 +133,14 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
             model = colmap.Reconstruction(str(root))
         except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
             raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
-        return replace(_sparse_model(model, sorted(i.name for i in model.images.values())), metric=True)
+        try:
+            names = sorted(i.name for i in model.images.values())
+            found = replace(_sparse_model(model, names), metric=True)
+        except (ValueError, TypeError) as error:  # cameras that are no pinholes, or damaged
+            raise ValueError(f"colmap: {root}: {str(error).removeprefix('colmap: ')}") from error
+    if not np.isfinite(found.points).all():
+        raise ValueError(f"colmap: {root} holds points that are NaN or infinite")
+    return found
 
 
 _RECORDS: dict[str, Callable[[bytes, int], int]] = {

@@ -58,6 +58,7 @@ class Codebook:
 
     def beam(self, index: int) -> np.ndarray:
         """Weights of one beam, shape ``(N,)``."""
+        check_count("index", index, 0, len(self) - 1)
         if len(self.factors) == 1:
             return self.factors[0][index]
         across, down = np.divmod(index, len(self.factors[1]))

@@ -108,6 +108,7 @@ def _slab(
                 f"{name}: got {values[~fits].flat[0]!r}, expected a passive slab and a wave that meets it"
             )
     root = np.sqrt(eta - (1.0 - cos**2))
+    root = np.where(root.imag > 0, -root, root)  # beyond total reflection the wave decays
     endless = np.isinf(thickness)
     q = 2.0 * np.pi * np.where(endless, 0.0, thickness) / wavelength * root
     once = np.where(endless, 0.0, np.exp(-1j * q))

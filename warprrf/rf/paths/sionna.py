@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, checked
+from warprrf.checks import check_array, check_count, checked
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
@@ -27,6 +27,7 @@ SPECULAR, DIFFUSE = 1, 2
 SAME_LENGTH_M = (
     5e-3  # paths nearer than this in length and direction are one: Sionna takes planes 1 cm apart for one
 )
+MOST_TIME_STEPS = 1_000_000
 SAME_DIRECTION_RAD = 1e-3
 
 
@@ -67,7 +68,8 @@ class SionnaPaths:
         """
         a, tau = impulse_response(self._paths, normalize_delays=normalize_delays, **self._options)
         a = _one_transmitter(a)[..., None]
-        a = np.broadcast_to(a, (*a.shape[:-1], num_time_steps)).copy()
+        steps = check_count("num_time_steps", num_time_steps, most=MOST_TIME_STEPS)
+        a = np.broadcast_to(a, (*a.shape[:-1], steps)).copy()
         return _as(a, out_type), _as(np.where(self.valid, tau[:, None], -1.0), out_type)
 
     def cfr(
@@ -267,6 +269,7 @@ def _one_transmitter(h: np.ndarray) -> np.ndarray:
 
 def _time_steps(h: np.ndarray, count: int, normalize: bool, *, mean: bool) -> np.ndarray:
     """``(R, M, N, F)`` as ``(R, M, 1, N, T, F)``; normalised over a link's mean energy, or its energy in all taps."""
+    count = check_count("num_time_steps", count, most=MOST_TIME_STEPS)
     if normalize:
         energy = np.abs(h) ** 2
         energy = energy.mean(axis=-1) if mean else energy.sum(axis=-1)

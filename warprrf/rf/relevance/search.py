@@ -120,8 +120,8 @@ class Relevance:
         """
         if abs(frequency_hz / self.frequency_hz - 1.0) > SAME_BAND:
             raise ValueError(
-                f"relevance: got one for {self.frequency_hz / 1e9:g} GHz, but the spectra are of "
-                f"{frequency_hz / 1e9:g} GHz; expected the same band, call warprrf.relevance for it"
+                f"frequency_hz: got spectra of {frequency_hz / 1e9:g} GHz, but this relevance is for "
+                f"{self.frequency_hz / 1e9:g} GHz; expected the same band, call warprrf.relevance for it"
             )
         t, out = self.terms, [e.name for e in self.effects if e.kept is False]
         off: dict[str, Any] = {

@@ -39,6 +39,7 @@ DYNAMIC_RANGE_DB = 60.0
 SCANNED = "scanned antenna: Richardson-Lucy on the sphere, then spread by the stated beam"
 FIXED = "fixed antenna: divided by its gain in each direction"
 
+LARGEST_GAIN_DBI = 100.0  # an aperture of ten thousand wavelengths
 _TOGETHER = 32  # receivers whose estimates are refined at once
 _FLAT_DB = 0.1  # a pattern that varies less cannot tell directions apart
 
@@ -290,6 +291,5 @@ def _gains(gain: np.ndarray, boresight_gain_dbi: float | None) -> np.ndarray:
         raise ValueError("pattern: got a gain of zero in all directions, expected linear power gains")
     if boresight_gain_dbi is None:
         return gain
-    if not np.isfinite(boresight_gain_dbi):
-        raise ValueError(f"boresight_gain_dbi: got {boresight_gain_dbi!r}, expected decibels over isotropic")
-    return gain / gain.max() * 10.0 ** (boresight_gain_dbi / 10.0)
+    peak_db = check_number("boresight_gain_dbi", boresight_gain_dbi, -LARGEST_GAIN_DBI, LARGEST_GAIN_DBI)
+    return gain / gain.max() * 10.0 ** (peak_db / 10.0)
