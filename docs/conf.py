@@ -39,3 +39,6 @@ napoleon_use_ivar = True
 napoleon_use_rtype = False
 python_maximum_signature_line_length = 88
 default_role = "code"
+
+# reStructuredText takes the underscore of numpy.str_ in an annotation for a link.
+rst_epilog = ".. _numpy.str: https://numpy.org/doc/stable/reference/arrays.scalars.html"

@@ -94,7 +94,8 @@ def _models() -> list[type]:
 def _options(model: Any) -> type:
     """The dataclass of the options that a model's ``fit`` takes."""
     annotation = inspect.signature(model.fit).parameters["options"].annotation
-    found: type = model.fit.__func__.__globals__[str(annotation).split(" ")[0]]
+    names = inspect.unwrap(model.fit.__func__).__globals__
+    found: type = names[str(annotation).split(" ")[0]]
     return found
 
 
