@@ -157,6 +157,16 @@ def test_no_material_gives_back_more_than_comes() -> None:
         assert power.min() < 0.9  # some absorb
 
 
+def test_beyond_total_reflection_a_thick_slab_without_loss_gives_back_all() -> None:
+    """sin^2 of the incidence above eta: the wave within decays, |r| = 1 of an endless one, and nothing comes through."""
+    grazing = np.array([0.05, 0.3, 0.6])
+    for thickness in (10.0, np.inf):
+        for r in slab_reflection(grazing, 0.5, thickness, 1e-3):
+            np.testing.assert_allclose(np.abs(r), 1.0, rtol=0, atol=1e-12)
+        for t in slab_transmission(grazing, 0.5, thickness, 1e-3):
+            np.testing.assert_allclose(np.abs(t), 0.0, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("row", "message"),
     [

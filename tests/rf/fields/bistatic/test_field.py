@@ -287,6 +287,13 @@ def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
     ).all()
 
 
+def test_terms_may_change_after_the_fit_but_not_for_the_uncertainty(field: BistaticField) -> None:
+    other = replace(field, terms=replace(field.terms, indirect=not field.terms.indirect))
+    assert (other.spectrum(RECEIVERS[7]).path_gain > 0).any()
+    with pytest.raises(ValueError, match="uncertainty: this field's errors were learned for"):
+        other.spectrum(RECEIVERS[7], uncertainty=True)
+
+
 def test_one_training_receiver_is_enough_for_a_field(scene: RadioScene, data: SpectrumDataset) -> None:
     single = RadioField.fit(scene, data.subset([0]))
     assert psnr(single, data.subset(np.arange(6, 10))) > 30
