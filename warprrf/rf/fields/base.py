@@ -83,8 +83,6 @@ class RadioField(ABC):
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.
         """
-        if not hasattr(ds, "path_gain"):
-            raise TypeError(f"ds: got {type(ds).__name__}, expected a SpectrumDataset")
         if not isinstance(model, str) or model not in cls.models:
             raise ValueError(f"model: got {model!r}, expected one of {', '.join(cls.models)}")
         return cls.models[model].fit(geometry, ds, model, **options)

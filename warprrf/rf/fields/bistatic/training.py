@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.checks import check_array, check_count, check_seed, checked
+from warprrf.checks import check_count, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
-from warprrf.rf.em.absorption import Air
-from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
+from warprrf.rf.fields.bistatic.fit import NEPER, Fitted, GroupFit, Reading, fit_groups
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
-from warprrf.rf.fields.bistatic.render import render, sent_radiance
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
+from warprrf.rf.fields.bistatic.observations import Data, Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
-from warprrf.rf.fields.bistatic.response import SpectrumPixels, respond, with_further_bounces
+from warprrf.rf.fields.bistatic.response import respond, with_further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
-from warprrf.rf.positions import check_dataset
-from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import to_db
+from warprrf.rf.spectra.readings import Readings
 
 MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_scatter", True),
@@ -195,20 +194,23 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """What training receivers see of the geometry, whatever the materials: traced once, reused by every fit.
+    """What is seen of the geometry at the places that were measured, whatever the materials: traced once, reused by every
+    fit.
 
     Attributes:
-        transport: surface, transmitter and grid.
-        views: one for each receiver.
-        frequency_hz, air: what it was traced for.
+        places: receivers under their transmitters.
+        views: one for each place.
         seconds: what it took.
     """
 
-    transport: Transport
+    places: list[Place] = field(repr=False)
     views: list[ReceiverView] = field(repr=False)
-    frequency_hz: float
-    air: Air | None
     seconds: float
+
+    @property
+    def transport(self) -> Transport:
+        """Surface, transmitter and grid of the first place."""
+        return self.views[0].transport
 
     @property
     def surface(self) -> Surface:
@@ -216,32 +218,26 @@ class TrainingViews:
         return self.transport.surface
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> TrainingViews:
-        """Some of its receivers."""
-        return replace(self, views=[self.views[int(i)] for i in indices])
+        """Some of its places."""
+        chosen = [int(i) for i in indices]
+        return replace(self, places=[self.places[i] for i in chosen], views=[self.views[i] for i in chosen])
 
-    def check(self, ds: SpectrumDataset, sub_pixels: int | None) -> None:
-        """Raise ValueError if they are not those of exactly the receivers of ``ds``."""
-        t = self.transport
-        same = (
-            len(self.views) == len(ds.receivers)
-            and t.grid.shape == tuple(ds.path_gain.shape[1:])
-            and all(np.array_equal(v.receivers[0], r) for v, r in zip(self.views, ds.receivers, strict=True))
-            and np.array_equal(t.transmitter, ds.transmitter)
-            and self.frequency_hz == ds.frequency_hz
-            and t.beam_sigma_rad == ds.beam_sigma_rad
-            and self.air == getattr(ds, "air", None)
-            and sub_pixels in (None, t.grid.sub_pixels)
+    def check(self, places: Sequence[Place], sub_pixels: int | None) -> None:
+        """Raise ValueError if they are not those of exactly ``places``."""
+        same = len(self.places) == len(places) and all(
+            a.seen_from == b.seen_from for a, b in zip(self.places, places, strict=True)
         )
-        if not same:
+        if not same or sub_pixels not in (None, self.transport.grid.sub_pixels):
             raise ValueError(
-                f"transport: got what {len(self.views)} receivers see with {t.grid.sub_pixels**2} rays a pixel; expected "
-                f"exactly the {len(ds.receivers)} receivers, transmitter, carrier, grid, beam, air and rays of this fit"
+                f"transport: got what {len(self.views)} receivers see with {self.transport.grid.sub_pixels**2} rays a "
+                f"pixel; expected exactly the {len(places)} receivers, transmitter, carrier, grid, beam, air and rays of "
+                "this fit"
             )
 
 
 def trace(
     geometry: GeometryLike,
-    ds: SpectrumDataset,
+    ds: Data,
     *,
     mirror_order: int | None = None,
     sub_pixels: int | None = None,
@@ -262,36 +258,41 @@ def trace(
         TypeError: for a geometry without a mesh.
     """
     started, tell = time.perf_counter(), progress or _silent
-    receivers, transmitter = check_dataset(as_mesh(geometry, "geometry"), ds, device=device)
+    places = places_of(as_list(ds), as_mesh(geometry, "geometry"), device)
     order = 3 if mirror_order is None else mirror_order
     terms = Terms(mirror_order=order, sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels)
-    _check_rays(ds.path_gain.shape, terms.sub_pixels)
+    _check_rays(places, terms.sub_pixels)
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
     tell("patches", 1, 1)
-    frequency_hz, air = float(ds.frequency_hz), getattr(ds, "air", None)
-    transport = Transport.of(
-        surface, transmitter, frequency_hz,
-        (int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])), terms.sub_pixels,
-        beam_sigma_rad=float(ds.beam_sigma_rad), loss_per_m=0.0 if air is None else air.loss_per_m(frequency_hz),
-        device=device,
-    )  # fmt: skip
-    found = transport.paths(receivers, order, progress)
-    views = []
-    for r, receiver in enumerate(receivers):
-        own = found.subset(np.flatnonzero(found.receiver == r))
-        views.append(transport.view(receiver, terms, paths=own))
-        tell("transport", r + 1, len(receivers))
-    return TrainingViews(transport, views, frequency_hz, air, time.perf_counter() - started)
+    together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
+    for k, place in enumerate(places):
+        together.setdefault((place.transmitter.tobytes(), *place.seen_from[2:]), []).append(k)
+    views: dict[int, ReceiverView] = {}
+    for own in together.values():
+        first = places[own[0]]
+        loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
+        transport = Transport.of(
+            surface, first.transmitter, first.frequency_hz, first.shape, terms.sub_pixels,
+            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=device,
+        )  # fmt: skip
+        receivers = np.stack([places[k].receiver for k in own])
+        found = transport.paths(receivers, order, progress)
+        for r, k in enumerate(own):
+            mine = found.subset(np.flatnonzero(found.receiver == r))
+            views[k] = transport.view(receivers[r], terms, paths=mine)
+            tell("transport", len(views), len(places))
+    return TrainingViews(places, [views[k] for k in range(len(places))], time.perf_counter() - started)
 
 
-def _check_rays(shape: tuple[int, ...], sub_pixels: int) -> None:
-    """Refuse spectra of ``shape`` (R, H, W) whose rays would not fit into memory."""
-    rays = int(np.prod(shape, dtype=np.int64)) * sub_pixels**2
+def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
+    """Refuse places whose rays would not fit into memory."""
+    rays = sum(place.shape[0] * place.shape[1] for place in places) * sub_pixels**2
     if rays > MOST_RAYS:
         raise ValueError(
-            f"ds: {shape[0]} spectra of {shape[1]} x {shape[2]} pixels take {rays:.2g} rays, {rays * RAY_BYTES / 1e9:.0f} "
-            f"GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, ds.subset) or sub_pixels=1"
+            f"ds: {len(places)} spectra of {places[0].shape[0]} x {places[0].shape[1]} pixels take {rays:.2g} rays, "
+            f"{rays * RAY_BYTES / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
+            "ds.subset) or sub_pixels=1"
         )
 
 
@@ -312,30 +313,32 @@ class Trained:
 
 def train(
     geometry: GeometryLike,
-    ds: SpectrumDataset,
+    ds: Data,
     options: FitOptions,
     *,
     transport: TrainingViews | None = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Trained:
-    """Fit materials to the spectra of ``ds``; arguments and errors as for :meth:`BistaticField.fit`."""
-    o = options.decided(float(ds.frequency_hz))
+    """Fit materials to what ``ds`` holds; arguments and errors as for :meth:`BistaticField.fit`."""
+    data = as_list(ds)
+    o = options.decided(float(data[0].frequency_hz))
     if transport is not None and options.sub_pixels is None:
         o = replace(o, sub_pixels=None)  # it is what the rays were traced with, quick or not
-    check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float32)
-    if len(ds.receivers) == 0 or not (ds.path_gain > ds.floor).any():
-        raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
+    for one in data:
+        if isinstance(one, SpectrumDataset) and not (one.path_gain > one.floor).any():
+            raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
+    if transport is not None:
+        transport.check(places_of(data, as_mesh(geometry, "geometry"), device), o.sub_pixels)
     seen = transport or trace(
-        geometry, ds, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
+        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
-    seen.check(ds, o.sub_pixels)
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
     if o.residuals is None:
         o = replace(o, residuals=QUICK_RESIDUAL if options.quick else ResidualFit())
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        return _Training(seen, ds, o, progress).run()
+        return _Training(seen, data, o, progress).run()
 
 
 @dataclass(frozen=True)
@@ -351,17 +354,21 @@ class _Training:
     """One fit: the state that its steps share."""
 
     def __init__(
-        self, seen: TrainingViews, ds: SpectrumDataset, options: FitOptions, progress: Progress | None
+        self,
+        seen: TrainingViews,
+        data: Sequence[SpectrumDataset | Readings],
+        options: FitOptions,
+        progress: Progress | None,
     ) -> None:
-        self.seen, self.ds, self.options, self.choose = seen, ds, options, options.selection
+        self.seen, self.options, self.choose = seen, options, options.selection
         self.started = time.perf_counter()
-        self.surface, self.count, self.floor = seen.surface, len(ds.receivers), float(ds.floor)
-        self.views = list(seen.views)
+        self.surface, self.count, self.views = seen.surface, len(seen.places), list(seen.views)
         self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
         self.material = self.surface.material
-        self.target = to_db(ds.path_gain, ds.floor) - 10.0 * np.log10(ds.floor)
-        grid = seen.transport.grid
-        self.beam = beam_operator(grid.shape, float(ds.beam_sigma_rad), grid.device)
+        self.observed, self.chains = observe(data, seen.places, self.views, options.groups.noise_db)
+        sources = {place.transmitter.tobytes() for place in seen.places}
+        # Light that surfaces send on falls elsewhere under each transmitter: of several, no gains of it are learned.
+        self.transmitter = seen.places[0].transmitter if len(sources) == 1 else np.full(3, np.nan)
         rng = np.random.default_rng(options.seed)
         self.held = np.zeros(0, int)
         if self.count >= self.choose.least_receivers:
@@ -370,15 +377,15 @@ class _Training:
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
         self.progress: Progress = progress or _silent
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
-        pixels = self.target[0].size
-        most = min(pixels, max(200, self.choose.readings // self.count))
         self.measured, self.readings = [], []
-        terms = options.terms()
-        for r in range(self.count):
-            chosen = np.sort(rng.choice(pixels, most, replace=False))
-            self.measured.append(SpectrumPixels(self.beam, chosen))
-            response = respond(self.views[r], self.measured[r], terms, self.floor)
-            self.readings.append(Reading(response, self.target[r].ravel()[chosen]))
+        terms, most = options.terms(), max(200, self.choose.readings // self.count)
+        for r, observed in enumerate(self.observed):
+            target = observed.target
+            known = np.arange(len(target.db)) if target.trust is None else np.flatnonzero(target.trust)
+            chosen = known[np.sort(rng.choice(len(known), min(len(known), most), replace=False))]
+            self.measured.append(observed.measured.part(chosen))
+            response = respond(self.views[r], self.measured[r], terms, observed.floor)
+            self.readings.append(Reading(response, target.part(chosen), observed.chain))
             self.progress("fit", r, (1 + self.steps) * self.count)
         self.log: list[dict[str, Any]] = []
 
@@ -402,7 +409,7 @@ class _Training:
         if terms.residual:
             materials = replace(materials, residual=self._residual(materials, everyone))
         if errors is not None:
-            errors = replace(errors, covariance=fit.covariance)
+            errors = replace(errors, covariance=self._covariance(fit))
         total = (1 + self.steps) * self.count
         self.progress("fit", total, total)
         return Trained(self.surface, materials, self.material, errors, self._report(fit))
@@ -435,9 +442,14 @@ class _Training:
             "choices": self.log,
         }
         if self.options.gain_offset:
-            to_db_ = 10.0 / np.log(10.0)
-            report["gain_offset_db"] = to_db_ * fit.parameters.log_gain
-            report["gain_offset_std_db"] = to_db_ * float(np.sqrt(fit.covariance[-1, -1]))
+            report["gain_offset_db"] = NEPER * fit.parameters.log_gain
+            place = len(fit.covariance) - len(self.chains) - 1
+            report["gain_offset_std_db"] = NEPER * float(np.sqrt(fit.covariance[place, place]))
+        variance = np.diag(fit.covariance)[len(fit.covariance) - len(self.chains) :]
+        report["chains"] = {
+            name: {"gain_db": NEPER * float(gain), "std_db": NEPER * float(np.sqrt(v))}
+            for name, gain, v in zip(self.chains, fit.parameters.log_gains, variance, strict=True)
+        }
         return report
 
     # ------------------------------------------------------------------------------------------ choosing
@@ -526,20 +538,42 @@ class _Training:
         return float(np.mean(np.concatenate(errors) ** 2))
 
     def _image_error(self, materials: Materials) -> float:
-        """Mean square error of the dB images of the held-out receivers [dB^2]."""
-        sent = sent_radiance(self.seen.transport, materials)
-        return float(
-            np.mean([np.mean((self._image(materials, sent, r) - self.target[r]) ** 2) for r in self.held])
-        )
+        """Mean square error of all readings of the held-out places [dB^2]."""
+        sent = self._sent(materials)
+        errors = [
+            np.mean(self.observed[r].target.error(self._predicted(materials, sent, r)) ** 2)
+            for r in self.held
+        ]
+        return float(np.mean(errors))
 
-    def _image(self, materials: Materials, sent: np.ndarray | None, receiver: int) -> np.ndarray:
-        """Predicted image of a training receiver, dB above the floor, shape ``(H, W)``."""
-        image = render(self._view(receiver, materials.terms), materials, self.beam, sent).image
-        return to_db(image, self.floor) - 10.0 * np.log10(self.floor)
+    def _predicted(
+        self, materials: Materials, sent: Callable[[ReceiverView], np.ndarray | None], place: int
+    ) -> np.ndarray:
+        """All that is read at a place, in units of its floor, shape ``(N,)``."""
+        observed, view = self.observed[place], self._view(place, materials.terms)
+        gains = materials.parameters.log_gains
+        gain = float(np.exp(gains[observed.chain])) if observed.chain >= 0 else 1.0
+        power = read(view, observed.measured, path_powers(view, materials, sent(view)))
+        return np.asarray(np.maximum(power, 0.0) * gain / observed.floor)
 
-    def _errors(self, terms: Terms, fit: Fitted, residual: np.ndarray | None) -> ErrorModel:
-        """Learned from the receivers held out; where they are few, from all, held out in turn."""
-        receivers = np.asarray(self.ds.receivers, float)
+    def _sent(self, materials: Materials) -> Callable[[ReceiverView], np.ndarray | None]:
+        """What elements send on under the transmitter of a view; computed once for each."""
+        known: dict[int, np.ndarray | None] = {}
+
+        def of(view: ReceiverView) -> np.ndarray | None:
+            key = id(view.transport)
+            if key not in known:
+                known[key] = sent_radiance(view.transport, materials)
+            return known[key]
+
+        return of
+
+    def _errors(self, terms: Terms, fit: Fitted, residual: np.ndarray | None) -> ErrorModel | None:
+        """Learned from the receivers held out; where they are few, from all, held out in turn. None where no whole spectra
+        were measured."""
+        if not all(isinstance(o.measured, SpectrumPixels) and o.target.trust is None for o in self.observed):
+            return None
+        receivers = np.stack([o.place.receiver for o in self.observed])
         images, errors, gaps = [], [], []
         for held in self._folds():
             kept = np.setdiff1d(np.arange(self.count), held)
@@ -550,12 +584,18 @@ class _Training:
                 materials = self._materials(terms, own)
                 if terms.residual:
                     materials = replace(materials, residual=self._residual(materials, kept))
-            sent = sent_radiance(self.seen.transport, materials)
+            sent = self._sent(materials)
             for r in held:
-                images.append(self._image(materials, sent, r))
-                errors.append(images[-1] - self.target[r])
+                power, shape = self._predicted(materials, sent, r), self.observed[r].place.shape
+                images.append((NEPER * np.log1p(power)).reshape(shape))
+                errors.append(self.observed[r].target.error(power).reshape(shape))
                 gaps.append(np.linalg.norm(receivers[kept] - receivers[r], axis=1).min())
-        return learn_errors(images, errors, np.array(gaps), receivers, fit.covariance)
+        return learn_errors(images, errors, np.array(gaps), receivers, self._covariance(fit))
+
+    def _covariance(self, fit: Fitted) -> np.ndarray:
+        """Of what a field keeps: without the gains of chains."""
+        kept = len(fit.covariance) - len(fit.parameters.log_gains)
+        return fit.covariance[:kept, :kept]
 
     def _folds(self) -> list[np.ndarray]:
         """Receivers that are held out in turn to learn errors."""
@@ -601,7 +641,7 @@ class _Training:
             return limited
         # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
         known = self._materials(replace(terms, indirect=False, residual=False), fit)
-        sent = sent_radiance(self.seen.transport, known)
+        sent = self._sent(known)
         return [
             replace(
                 reading,
@@ -610,8 +650,8 @@ class _Training:
                     self._view(r, terms),
                     self.measured[r],
                     known,
-                    sent,
-                    self.floor,
+                    sent(self.views[r]),
+                    self.observed[r].floor,
                     follow=follow,
                 ),
             )
@@ -620,17 +660,23 @@ class _Training:
 
     def _view(self, receiver: int, terms: Terms) -> ReceiverView:
         """What a training receiver sees, as far as ``terms`` want it; kept for the next time."""
-        self.views[receiver] = self.seen.transport.complete(self.views[receiver], terms)
+        self.views[receiver] = self.views[receiver].transport.complete(self.views[receiver], terms)
         return self.views[receiver]
 
     def _residual(self, materials: Materials, chosen: np.ndarray) -> np.ndarray:
         """Gains of surface cells over ``materials``, shape ``(2, X)``."""
-        sent = sent_radiance(self.seen.transport, materials)
-        shares = [
-            shares_of(self._view(r, materials.terms), materials, sent, self.beam, self.floor, self.target[r])
-            for r in chosen
-        ]
-        found = fit_residual(shares, self.beam, self.surface, self.options.residuals)
+        sent = self._sent(materials)
+        shares = []
+        for r in chosen:
+            view, observed, gain = self._view(r, materials.terms), self.observed[r], 1.0
+            if observed.chain >= 0:
+                gain = float(np.exp(materials.parameters.log_gains[observed.chain]))
+            shares.append(
+                shares_of(
+                    view, materials, sent(view), observed.measured, observed.floor / gain, observed.target
+                )
+            )
+        found = fit_residual(shares, self.surface, self.options.residuals)
         self._stepped()
         return found
 
@@ -641,5 +687,5 @@ class _Training:
             terms,
             fit.parameters.take(self.material),
             none if residual is None else residual,
-            self.ds.transmitter,
+            self.transmitter,
         )
