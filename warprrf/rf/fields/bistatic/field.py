@@ -169,7 +169,7 @@ class BistaticField(RadioField):
         fitted = replace(
             cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report, fitted_on=np.unique(receivers, axis=0),
+            errors=found.errors, report=found.report, fitted_on=receivers[np.sort(np.unique(receivers, axis=0, return_index=True)[1])],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
