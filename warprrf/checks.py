@@ -307,8 +307,11 @@ def _converter(kind: Any) -> Callable[[Any], object]:
         return lambda value: value if _is_row(value) and length in (None, len(value)) else _OTHER
     if origin is Callable:
         return lambda value: value if callable(value) else _OTHER
-    if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+    if origin is Any or not isinstance(origin, type):
         return lambda value: value
+    if getattr(origin, "_is_protocol", False):
+        known = getattr(origin, "_is_runtime_protocol", False)
+        return lambda value: value if not known or isinstance(value, origin) else _OTHER
     return functools.partial(_as_object, origin)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,9 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
             if path.suffix == ".npy":
                 found = np.load(path, mmap_mode="r", allow_pickle=False)
             else:
-                found = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "x"))
+                rows = [re.split("[#x]", row)[0] for row in path.read_text().splitlines()]
+                rows = [row for row in rows if row.strip()]
+                found = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.zeros((0, 3))
             return check_array("rows x,y,z in metres", found, (None, 3))
     try:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)
