@@ -48,7 +48,9 @@ def _leaves(value: Any, where: str, depth: int) -> Iterator[tuple[str, np.ndarra
     elif is_dataclass(value):
         inside = ((f.name, getattr(value, f.name)) for f in fields(value))
     elif type(value).__module__.startswith("warprrf"):
-        inside = ((name, own) for name, own in vars(value).items() if not name.startswith("_"))
+        # What is computed when first asked for is an attribute of the class too.
+        own_names = [n for n in vars(value) if not (n.startswith("_") or hasattr(type(value), n))]
+        inside = ((name, getattr(value, name)) for name in own_names)
     for name, own in inside:
         yield from _leaves(own, f"{where}.{name}", depth + 1)
 

@@ -73,9 +73,9 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
             if path.suffix == ".npy":
                 found = np.load(path, mmap_mode="r", allow_pickle=False)
             else:
-                rows = [re.split("[#x]", row)[0] for row in path.read_text().splitlines()]
-                rows = [row for row in rows if row.strip()]
-                found = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.zeros((0, 3))
+                lines = [re.split("[#x]", line)[0] for line in path.read_text().splitlines()]
+                lines = [line for line in lines if line.strip()]
+                found = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, 3))
             return check_array("rows x,y,z in metres", found, (None, 3))
     try:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)

@@ -23,7 +23,6 @@ from warprrf.rf.scene_meshes import read_mesh_scene
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart
 from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml
-from warprrf.tensor_files import named
 
 T = TypeVar("T")
 
@@ -133,14 +132,12 @@ class Scene:
         if is_mesh_file(path):
             found = read_mesh_scene(path, choice, MeshOptions(unit, up, simplify, allow_outside))
             choice.check_used()
-            with named(path, "no scene"):
-                return cls(**vars(found))
+            return cls(**vars(found))
         if (unit, up, simplify) != (None, None, None):
             raise ValueError(f"unit, up, simplify: {path} is no mesh file; its units are metres, z up")
         parts = read_scene_xml(path, choice, allow_outside=allow_outside)
         choice.check_used()
-        with named(path, "no scene"):
-            return cls._of_parts(parts, xml_path=path)
+        return cls._of_parts(parts, xml_path=path)
 
     @classmethod
     def from_sionna(

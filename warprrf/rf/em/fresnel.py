@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_alike, check_array, check_count, checked
+from warprrf.checks import LARGEST, check_alike, check_array, check_count, checked
 from warprrf.rf.em.materials import NARROWEST_LOBE, Material, check_known
 
 LAMBERTIAN = 0
@@ -108,7 +108,7 @@ def _slab(
         ("cos_incidence", cos, (cos >= 0) & (cos <= 1.0 + 1e-6)),
         ("permittivity", eta, (eta.real > 0) & (eta.imag <= 0) & (abs(eta) < 1e30)),
         ("thickness_m", thickness, thickness >= 0),
-        ("wavelength_m", wavelength, wavelength > 0),
+        ("wavelength_m", wavelength, wavelength >= 1 / LARGEST),
     ):
         if not fits.all():
             raise ValueError(
