@@ -44,7 +44,7 @@ class Readings:
         receivers: positions [m], shape ``(N, 3)``, or ``(3,)``.
         power: received over transmitted power [linear], shape ``(N,)``; NaN where nothing was measured.
         frequency_hz: carrier [Hz].
-        floor: noise floor [linear]: readings not above it only say that there was no more.
+        floor: noise floor [linear], one number or shape ``(N,)``: readings not above it only say that there was no more.
         arrival: zenith and azimuth [rad] that the receiving antenna is turned to, shape ``(N, 2)``; None for an isotropic
             one.
         departure: those of the transmitting antenna.
@@ -73,7 +73,7 @@ class Readings:
     receivers: np.ndarray
     power: np.ndarray
     frequency_hz: float
-    floor: float
+    floor: ArrayLike
     arrival: np.ndarray | None = None
     departure: np.ndarray | None = None
     receive_pattern: Pattern | None = None
@@ -94,9 +94,12 @@ class Readings:
             raise ValueError(
                 f"power: got {count} values, expected one or more, each a linear power or NaN where not measured"
             )
-        floor = check_positive("floor", self.floor, "linear noise floor")
+        floor = check_array("floor", self.floor)
+        if floor.shape not in ((), (count,)) or not (floor > 0).all():
+            raise ValueError(f"floor: got {self.floor!r}, expected one linear noise floor above 0, or {count}")
+        floor = np.broadcast_to(floor, (count,)).copy()
         if not (power > floor).any():
-            raise ValueError(f"power: got no value above the floor of {floor:g}")
+            raise ValueError(f"power: got no value above the floor of {floor.min():g}")
         fields: dict[str, Any] = {
             "power": power,
             "floor": floor,
@@ -148,7 +151,7 @@ class Readings:
     def subset(self, rows: ArrayLike) -> Readings:
         """Some of the readings, by index or mask."""
         index = np.arange(len(self))[np.asarray(rows)]
-        own = ("transmitters", "receivers", "power", "arrival", "departure", "delay_s", "chain", "std_db")
+        own = ("transmitters", "receivers", "power", "floor", "arrival", "departure", "delay_s", "chain", "std_db")
         columns = {name: getattr(self, name) for name in own}
         taken: dict[str, Any] = {name: value[index] for name, value in columns.items() if value is not None}
         return replace(self, **taken)

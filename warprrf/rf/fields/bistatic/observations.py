@@ -27,6 +27,9 @@ Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readin
 
 READINGS_SHAPE = (60, 120)
 """Rows and columns of the rays around a receiver of whom no spectrum is known, and of its field's spectra."""
+import os
+READING_ERROR_DB = float(os.environ.get("RE", 1.0))
+"""Standard deviation of what a field cannot explain of a reading without noise [dB]."""
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 
 
@@ -194,15 +197,16 @@ def observe(
             target = Target(above, None if known.all() else known.astype(float))
             found.append(Observed(place, whole[key], target, float(one.floor), -1))
             continue
-        rows, floor = place.rows, one.floor
+        rows = place.rows
+        floor = float(one.floor[rows].min())
         expected = one.expected_db[rows] - 10.0 * np.log10(floor)
-        above = NEPER * np.log1p(10.0 ** (np.maximum(expected, 0.0) / 10.0))
+        above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
         measured = WeighedPaths.of(
             view, partial(one.weigh, rows), departure=one.departure is not None, delay_step_s=step
         )
-        trust = noise_db / np.hypot(noise_db, one.noise_db[rows])
-        target = Target(above, trust, one.power[rows] <= floor)
+        trust = noise_db / np.hypot(READING_ERROR_DB, one.noise_db[rows])
+        target = Target(above, trust, one.power[rows] <= one.floor[rows])
         found.append(Observed(place, measured, target, floor, index.get(place.chain, -1)))
     return found, chains
 
@@ -242,7 +246,7 @@ class Frame:
         if not isinstance(first, Readings):
             raise TypeError(f"ds: got {type(first).__name__}, expected a SpectrumDataset or Readings")
         return cls(
-            first.transmitters[0], first.frequency_hz, READINGS_SHAPE, first.floor,
-            (10.0 * float(np.log10(first.floor)), 10.0 * float(np.log10(np.nanmax(first.power)))), BEAM_SIGMA_RAD,
+            first.transmitters[0], first.frequency_hz, READINGS_SHAPE, float(first.floor.min()),
+            (10.0 * float(np.log10(first.floor.min())), 10.0 * float(np.log10(np.nanmax(first.power)))), BEAM_SIGMA_RAD,
             first.air,
         )  # fmt: skip
