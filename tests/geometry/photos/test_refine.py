@@ -9,6 +9,7 @@ from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.refine import refine
+from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -70,14 +71,14 @@ def psnr(g, photos, cameras):
 
 def test_refinement_learns_the_photos_and_densifies(problem):
     start, photos, cameras = problem
-    end = refine(start, photos, cameras, config=CONFIG, device="cpu")
+    end = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
     assert psnr(end, photos, cameras) > psnr(start, photos, cameras) + 4
     assert len(end) > len(start)
 
 
 def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp_path):
     start, photos, cameras = problem
-    whole = refine(start, photos, cameras, config=CONFIG, device="cpu")
+    whole = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
 
     class Killed(Exception):
         pass
@@ -89,9 +90,9 @@ def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp
     file = tmp_path / "refine.safetensors"
     config = CONFIG
     with pytest.raises(Killed):
-        refine(start, photos, cameras, config=config, checkpoint=file, device="cpu",
+        refine(start, PosedPhotos(photos, cameras), config=config, checkpoint=file, device="cpu",
                progress=lambda stage, done, total: kill_after_the_second_checkpoint(stage, done, total))  # fmt: skip
-    resumed = refine(start, photos, cameras, config=config, checkpoint=file, device="cpu")
+    resumed = refine(start, PosedPhotos(photos, cameras), config=config, checkpoint=file, device="cpu")
     for name in ("means", "quaternions", "scales", "opacities", "sh"):
         assert np.array_equal(getattr(resumed, name), getattr(whole, name)), name
 
@@ -100,12 +101,12 @@ def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(problem, tmp
     start, photos, cameras = problem
     file = tmp_path / "refine.safetensors"
     short = RefineConfig(iterations=20, downscale=1, checkpoint_every=20)
-    refine(start, photos, cameras, config=short, checkpoint=file, device="cpu")
+    refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file, device="cpu")
     with pytest.raises(ValueError, match="other settings"):
-        refine(start, photos, cameras, config=CONFIG, checkpoint=file, device="cpu")
+        refine(start, PosedPhotos(photos, cameras), config=CONFIG, checkpoint=file, device="cpu")
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(ValueError, match="cannot be read"):
-        refine(start, photos, cameras, config=short, checkpoint=file, device="cpu")
+        refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file, device="cpu")
 
 
 @pytest.mark.usefixtures("device")
@@ -126,8 +127,8 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
         cell_m=0.5, occupied=np.ones((4, 4), bool),
     )  # fmt: skip
     config = RefineConfig(iterations=60, downscale=1, densify_from=999)
-    free = refine(start, photos, cameras, config=config, device="cpu")
-    held = refine(start, photos, cameras, config=config, planes=[plane], device="cpu")
+    free = refine(start, PosedPhotos(photos, cameras), config=config, device="cpu")
+    held = refine(start, PosedPhotos(photos, cameras), config=config, planes=[plane], device="cpu")
     assert np.abs(held.means[:, 2]).max() < 1e-3 < np.abs(free.means[:, 2]).mean()
     assert np.degrees(np.arccos(np.clip(np.abs(held.normals[:, 2]), 0, 1))).max() < 1.0
 
@@ -169,6 +170,6 @@ def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right():
     ],
 )
 def test_bad_input_is_named(problem, change, complaint):
-    start, photos, cameras = problem
+    _, photos, cameras = problem
     with pytest.raises(ValueError, match=complaint):
-        refine(**{"gaussians": start, "images": photos, "cameras": cameras, "device": "cpu", **change})
+        PosedPhotos(**{"images": photos, "cameras": cameras, **change})
