@@ -16,7 +16,7 @@ from warprrf.kernels import exposure as kernels
 
 KNEE = 0.03  # of the Huber loss, in display values: what differs more is no matter of exposure
 PRIOR = 1e-3  # weight of a gain of one, in squared display values per pixel
-RATE = 0.3  # share of the way to the best gain taken at a time
+LEAST_STEP = 0.1  # share of the way to the best gain that is taken at least; the first time all of it
 
 
 class Exposures:
@@ -48,8 +48,8 @@ class Exposures:
         slopes = [slope.flatten(), image.grad.flatten()]
         launch(kernels.show_adjoint, image.size // 3, inputs + slopes, device=image.device)
 
-    def fit(self, image: wp.array, target: Target) -> None:
-        """Move a photo's gain towards what its rendered image asks for."""
+    def fit(self, image: wp.array, target: Target, visits: int) -> None:
+        """Move a photo's gain towards what its rendered image asks for; ``visits``: how often that was done before."""
         if not self.fitted:
             return
         height, width, _ = image.shape
@@ -60,4 +60,5 @@ class Exposures:
         prior = PRIOR * height * width
         self.log_gains -= self.log_gains.mean(axis=0)
         wanted = np.log((of_photo + prior) / (of_image + prior))
-        self.log_gains[target.view] += RATE * (wanted - self.log_gains[target.view])
+        share = max(LEAST_STEP, 1 / (1 + visits))
+        self.log_gains[target.view] += share * (wanted - self.log_gains[target.view])

@@ -105,5 +105,10 @@ def _joined(a: Gaussians, b: Gaussians) -> Gaussians:
     """All Gaussians of both; ``b`` has degree 0."""
     sh = np.zeros((len(b), *a.sh.shape[1:]), np.float32)
     sh[:, :1] = b.sh
-    parts = ((getattr(a, n), getattr(b, n)) for n in ("means", "quaternions", "scales", "opacities"))
-    return Gaussians(*(np.concatenate(pair) for pair in parts), np.concatenate([a.sh, sh]))
+    pairs = (
+        (a.means, b.means),
+        (a.quaternions, b.quaternions),
+        (a.scales, b.scales),
+        (a.opacities, b.opacities),
+    )
+    return Gaussians(*(np.concatenate(pair) for pair in (*pairs, (a.sh, sh))))

@@ -168,7 +168,7 @@ class _Refinement:
         shown = self.exposures.shown(image.features, target)
         score = self.loss(shown, target.pixels, target.moments, shown.grad)
         self.exposures.adjoint(image.features, target, shown.grad)
-        self.exposures.fit(image.features, target)
+        self.exposures.fit(image.features, target, self.iteration // len(self.targets))
         weight = adjoint()
         self.raster.colors_adjoint(self.means, self.sh, origin, colors)
         scales, opacities = self.scales, self.opacities
