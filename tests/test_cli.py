@@ -313,6 +313,13 @@ def test_receivers_from_file_and_words_agree(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_receivers(words), expected)
 
 
+@pytest.mark.parametrize("text", ["", "x,y,z\n", "# none\n\n"])
+@pytest.mark.filterwarnings("error")
+def test_a_file_without_receivers_holds_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "r.csv").write_text(text)
+    assert read_receivers([str(tmp_path / "r.csv")]).shape == (0, 3)
+
+
 def test_look_at_puts_the_target_in_the_middle_with_z_up() -> None:
     camera = _look_at((1.0, 2.0, 1.5), (4.0, 6.0, 1.0), (640, 480), 90.0)
     pose = camera.world_to_camera

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,9 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
             if path.suffix == ".npy":
                 found = np.load(path, mmap_mode="r", allow_pickle=False)
             else:
-                found = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "x"))
+                lines = [re.split("[#x]", line)[0] for line in path.read_text().splitlines()]
+                lines = [line for line in lines if line.strip()]
+                found = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, 3))
             return check_array("rows x,y,z in metres", found, (None, 3))
     try:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)

@@ -26,13 +26,14 @@ from warprrf.geometry.photos.initialise import initialise
 from warprrf.geometry.photos.photo_files import Photos, find_photos, match_names, read_photo
 from warprrf.geometry.photos.refine import refine
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale, check_scale, scaled
+from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.photos.upright import upright
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 1, "surface": 1}
+VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 2, "surface": 1}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 
@@ -146,8 +147,7 @@ def _steps(
     def refined(attempt: Attempt) -> files.Arrays:
         gaussians = refine(
             files.to_gaussians(first),
-            photos(),
-            list(cameras.values()),
+            PosedPhotos(photos(), list(cameras.values())),
             config=config.refine,
             planes=planes,
             progress=attempt.progress,
