@@ -213,9 +213,9 @@ def test_gains_of_photos_are_recovered_whatever_is_masked_or_clipped():
         for view in range(4):
             exposures.fit(rendered, targets.at(view, 1), visit)
     found = np.array([exposures.gain(view) for view in range(4)])
-    # The prior is 1e-3 a pixel, the squares of what is neither masked nor clipped are a fifth or more: a gain keeps
-    # half a percent of its logarithm, which is below one half.
-    assert np.allclose(found, gains, rtol=2.5e-3)
+    # The prior is 1e-3 a pixel, the squares of what is neither masked nor clipped are a tenth or more: a gain keeps one
+    # percent of its logarithm, which is below one half.
+    assert np.allclose(found, gains, rtol=5e-3)
 
 
 def test_masked_pixels_take_no_part(problem):
