@@ -199,6 +199,7 @@ def test_gains_of_photos_are_recovered_whatever_is_masked_or_clipped():
     rng = np.random.default_rng(6)
     shape = (20, 30, 3)
     gains = np.exp(rng.normal(size=(4, 3)) * 0.2)
+    gains /= np.exp(np.log(gains).mean(axis=0))
     image = rng.random(shape, dtype=np.float32)
     photos = [np.minimum(image * g, 1).astype(np.float32) for g in gains]
     mask = np.zeros(shape[:2], bool)
@@ -212,8 +213,9 @@ def test_gains_of_photos_are_recovered_whatever_is_masked_or_clipped():
         for view in range(4):
             exposures.fit(rendered, targets.at(view, 1), visit)
     found = np.array([exposures.gain(view) for view in range(4)])
-    # The prior is 1e-3 a pixel beside squares of about a third: it holds back a gain by 0.3 % of its deviation.
-    assert np.allclose(found, gains / np.exp(np.log(gains).mean(axis=0)), rtol=3e-3)
+    # The prior is 1e-3 a pixel, the squares of what is neither masked nor clipped are a tenth or more: a gain keeps one
+    # percent of its logarithm, which is below one half.
+    assert np.allclose(found, gains, rtol=5e-3)
 
 
 def test_masked_pixels_take_no_part(problem):

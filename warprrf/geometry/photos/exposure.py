@@ -58,7 +58,6 @@ class Exposures:
         launch(kernels.gain_sums, height, inputs, device=image.device, grain=16)
         of_photo, of_image = (array.numpy().sum(axis=0, dtype=np.float64) for array in sums)
         prior = PRIOR * height * width
-        self.log_gains -= self.log_gains.mean(axis=0)
         wanted = np.log((of_photo + prior) / (of_image + prior))
         share = max(LEAST_STEP, 1 / (1 + visits))
         self.log_gains[target.view] += share * (wanted - self.log_gains[target.view])
