@@ -27,8 +27,7 @@ Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readin
 
 READINGS_SHAPE = (60, 120)
 """Rows and columns of the rays around a receiver of whom no spectrum is known, and of its field's spectra."""
-import os
-READING_ERROR_DB = float(os.environ.get("RE", 1.0))
+READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 

@@ -43,6 +43,11 @@ QUICK: dict[str, Any] = {
     "residual": True, "sub_pixels": 1,
 }  # fmt: skip
 """What a quick fit takes for given: light of more than one bounce is even but for the residual, one ray a pixel."""
+FEW: dict[str, Any] = {
+    "mirror_order": 2, "mirror_scatter": True, "scatter_mirror": False, "diffuse_order": 3, "indirect": False,
+    "residual": True,
+}  # fmt: skip
+"""What a fit takes for given of receivers too few to hold any out: bounces that rooms have, which bring no parameters."""
 TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "indirect", "residual")
 """Terms that a fit decides on where they are None."""
 MOST_RAYS = 500_000_000
@@ -64,7 +69,7 @@ class Selection:
     """How a fit decides about terms, on receivers that it holds out.
 
     Attributes:
-        least_receivers: training receivers below which nothing is held out, so no term is chosen.
+        least_receivers: training receivers below which nothing is held out: terms are those of :data:`FEW`.
         held_out: share of the receivers that are held out.
         most_held_out: receivers held out at most.
         few_receivers: up to which errors are learned from every receiver, held out in turn.
@@ -102,7 +107,7 @@ class FitOptions:
     """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
 
     A term given as None is kept only if it lowers the error on receivers held out of the data set (a quarter, ten at
-    most); with fewer than four receivers nothing is held out and only single bounces are modelled.
+    most); with fewer than four receivers nothing is held out, and :data:`FEW` is modelled.
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
@@ -174,12 +179,12 @@ class FitOptions:
         if self.relevance is not None and frequency_hz is not None:
             ruled = self.relevance.options(frequency_hz)
             both = {name: getattr(self, name) and ruled[name] for name in ("line_of_sight", "diffuse")}
-            found = replace(found, **both, relevance=None, **found._given(ruled, (*TERMS, "lobes")))
+            found = replace(found, **both, relevance=None, **found.given(ruled, (*TERMS, "lobes")))
         if self.quick:
-            found = replace(found, quick=False, **found._given(QUICK, QUICK))
+            found = replace(found, quick=False, **found.given(QUICK, QUICK))
         return found
 
-    def _given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    def given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         """Of ``values`` those of ``names`` that are None here."""
         return {name: values[name] for name in names if getattr(self, name) is None}
 
@@ -335,6 +340,8 @@ def train(
         geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
+    if len(seen.places) < o.selection.least_receivers:
+        o = replace(o, **o.given(FEW, FEW))
     if o.residuals is None:
         o = replace(o, residuals=QUICK_RESIDUAL if options.quick else ResidualFit())
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
