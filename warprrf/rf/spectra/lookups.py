@@ -140,6 +140,7 @@ def _receivers(train: SpectrumDataset) -> np.ndarray:
     receivers = np.asarray(train.receivers, dtype=np.float64)
     if len(receivers) == 0:
         raise ValueError("train: got no receivers, expected at least one")
+    train.check_whole("train")
     return receivers
 
 

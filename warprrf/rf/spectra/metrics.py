@@ -215,6 +215,7 @@ def evaluate(
     count = len(test.receivers)
     if count == 0:
         raise ValueError("test: got no receivers, expected at least one")
+    test.check_whole("test")
     fitted_on = _fitted_on(predict, test)
     if fitted_on:
         warnings.warn(

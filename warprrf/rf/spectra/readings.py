@@ -8,19 +8,20 @@ one row each; what a column is missing does not weigh.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import digamma, polygamma
 
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import check_array, check_count, check_number, check_positive, checked
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 NEPER = 10.0 / np.log(10.0)
@@ -32,6 +33,15 @@ COLUMNS = {
 }
 """Columns of a table of readings; beside them ``power_db``, ``delay_ns``, ``std_db`` and ``chain``."""
 WINDOWS = ("rectangular", "hann")
+
+
+@runtime_checkable
+class Table(Protocol):
+    """Columns by name: a dictionary of arrays, a pandas data frame, an xarray data set."""
+
+    def __iter__(self) -> Iterator[Any]: ...
+
+    def __getitem__(self, name: str, /) -> Any: ...
 
 
 @checked
@@ -81,7 +91,7 @@ class Readings:
     delay_s: np.ndarray | None = None
     bandwidth_hz: float | None = None
     window: str = "rectangular"
-    chain: Sequence[str] | np.ndarray | None = None
+    chain: Sequence[str] | NDArray[np.str_] | None = None
     std_db: ArrayLike = 0.0
     samples: int | None = None
     air: Air | None = None
@@ -96,7 +106,9 @@ class Readings:
             )
         floor = check_array("floor", self.floor)
         if floor.shape not in ((), (count,)) or not (floor > 0).all():
-            raise ValueError(f"floor: got {self.floor!r}, expected one linear noise floor above 0, or {count}")
+            raise ValueError(
+                f"floor: got {self.floor!r}, expected one linear noise floor above 0, or {count}"
+            )
         floor = np.broadcast_to(floor, (count,)).copy()
         if not (power > floor).any():
             raise ValueError(f"power: got no value above the floor of {floor.min():g}")
@@ -126,6 +138,8 @@ class Readings:
         if self.delay_s is not None:
             fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
             fields["bandwidth_hz"] = check_positive("bandwidth_hz", self.bandwidth_hz)
+        if self.samples is not None:
+            check_count("samples", self.samples)
         if self.window not in WINDOWS:
             raise ValueError(f"window: got {self.window!r}, expected one of {', '.join(WINDOWS)}")
         chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=str)
@@ -151,7 +165,17 @@ class Readings:
     def subset(self, rows: ArrayLike) -> Readings:
         """Some of the readings, by index or mask."""
         index = np.arange(len(self))[np.asarray(rows)]
-        own = ("transmitters", "receivers", "power", "floor", "arrival", "departure", "delay_s", "chain", "std_db")
+        own = (
+            "transmitters",
+            "receivers",
+            "power",
+            "floor",
+            "arrival",
+            "departure",
+            "delay_s",
+            "chain",
+            "std_db",
+        )
         columns = {name: getattr(self, name) for name in own}
         taken: dict[str, Any] = {name: value[index] for name, value in columns.items() if value is not None}
         return replace(self, **taken)
@@ -194,7 +218,7 @@ class Readings:
         return weight
 
     @classmethod
-    def from_table(cls, table: Mapping[str, Any], **settings: Any) -> Readings:
+    def from_table(cls, table: Table, **settings: Any) -> Readings:
         """Readings of a table by the names of its columns: a pandas data frame, an xarray data set, a dictionary.
 
         Args:
@@ -255,6 +279,10 @@ class Readings:
             return cls.from_table(table, **settings)
         except (KeyError, TypeError, ValueError, UnicodeError) as error:
             raise ValueError(f"path: {file}: {error.args[0] if error.args else error}") from error
+
+
+Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readings]
+"""What fields are fitted to: a set of spectra, a table of readings, or several of them."""
 
 
 def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:

@@ -185,7 +185,7 @@ def default_floor(path_gain: np.ndarray) -> float:
     Raises:
         ValueError: if more than half of the views are empty.
     """
-    peak = float(np.median(path_gain.reshape(len(path_gain), -1).max(axis=1)))
+    peak = float(np.median(np.nan_to_num(path_gain).reshape(len(path_gain), -1).max(axis=1)))
     if not peak > 0.0:
         raise ValueError(
             "path_gain: more than half of the spectra are empty, expected power to set a floor from"

@@ -32,7 +32,7 @@ from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
-from warprrf.rf.fields.bistatic.observations import Data, Frame, as_list, transmitters_of
+from warprrf.rf.fields.bistatic.observations import Frame, as_list, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.render import Rendered, render, sent_radiance
 from warprrf.rf.fields.bistatic.surface import Surface
@@ -43,6 +43,7 @@ from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.readings import Data
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, to_db
 
 
@@ -166,10 +167,11 @@ class BistaticField(RadioField):
         under = np.concatenate([np.atleast_2d(transmitters_of(one)) for one in data])
         own = (under == frame.transmitter).all(axis=1)
         receivers = np.concatenate([one.receivers for one in data])[own]
+        receivers = receivers[np.sort(np.unique(receivers, axis=0, return_index=True)[1])]
         fitted = replace(
             cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report, fitted_on=receivers[np.sort(np.unique(receivers, axis=0, return_index=True)[1])],
+            errors=found.errors, report=found.report, fitted_on=receivers,
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted

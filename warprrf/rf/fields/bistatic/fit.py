@@ -52,6 +52,10 @@ class Target:
         """Some of the readings."""
         return Target(*(None if a is None else a[index] for a in (self.db, self.trust, self.censored)))  # type: ignore[arg-type]
 
+    def trusted(self, trust: np.ndarray) -> Target:
+        """The same with errors multiplied by ``trust`` (N,)."""
+        return replace(self, trust=trust * (1.0 if self.trust is None else self.trust))
+
     def error(self, power: np.ndarray) -> np.ndarray:
         """Error of predicted powers ``(..., N)`` in units of the floor, as it counts [dB]."""
         error = NEPER * np.log1p(power) - self.db

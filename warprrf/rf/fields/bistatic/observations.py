@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 
@@ -19,11 +18,8 @@ from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.positions import check_dataset, check_positions, question_unit
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Readings
+from warprrf.rf.spectra.readings import Data, Readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
-
-Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readings]
-"""What fields are fitted to: a set of spectra, a table of readings, or several of them."""
 
 READINGS_SHAPE = (60, 120)
 """Rows and columns of the rays around a receiver of whom no spectrum is known, and of its field's spectra."""
@@ -196,8 +192,8 @@ def observe(
             target = Target(above, None if known.all() else known.astype(float))
             found.append(Observed(place, whole[key], target, float(one.floor), -1))
             continue
-        rows = place.rows
-        floor = float(one.floor[rows].min())
+        rows, floors = place.rows, np.asarray(one.floor)[place.rows]
+        floor = float(floors.min())
         expected = one.expected_db[rows] - 10.0 * np.log10(floor)
         above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
@@ -205,7 +201,7 @@ def observe(
             view, partial(one.weigh, rows), departure=one.departure is not None, delay_step_s=step
         )
         trust = noise_db / np.hypot(READING_ERROR_DB, one.noise_db[rows])
-        target = Target(above, trust, one.power[rows] <= one.floor[rows])
+        target = Target(above, trust, one.power[rows] <= floors)
         found.append(Observed(place, measured, target, floor, index.get(place.chain, -1)))
     return found, chains
 
@@ -244,8 +240,14 @@ class Frame:
         first = data[0]
         if not isinstance(first, Readings):
             raise TypeError(f"ds: got {type(first).__name__}, expected a SpectrumDataset or Readings")
+        floor = float(np.min(first.floor))
+        levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(first.power)))
         return cls(
-            first.transmitters[0], first.frequency_hz, READINGS_SHAPE, float(first.floor.min()),
-            (10.0 * float(np.log10(first.floor.min())), 10.0 * float(np.log10(np.nanmax(first.power)))), BEAM_SIGMA_RAD,
+            first.transmitters[0],
+            first.frequency_hz,
+            READINGS_SHAPE,
+            floor,
+            levels,
+            BEAM_SIGMA_RAD,
             first.air,
-        )  # fmt: skip
+        )

@@ -17,7 +17,7 @@ from warprrf.rf.fields.bistatic.fit import NEPER, Fitted, GroupFit, Reading, fit
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
-from warprrf.rf.fields.bistatic.observations import Data, Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.observations import Place, as_list, observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
@@ -27,7 +27,7 @@ from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Readings
+from warprrf.rf.spectra.readings import Data, Readings
 
 MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_scatter", True),
@@ -81,6 +81,7 @@ class Selection:
         few_materials: up to which light that is sent on follows the parameters of its group.
         regrouped: rounds of deciding what is of one material, and fitting.
         rounds: of further bounces and groups in turn, where no choice came before.
+        unexplained: standard deviations beyond which a reading of a table is taken to be wrong: it is named, and left out.
         readings: pixels that groups are fitted to, spread over the training receivers.
         regrouping: what it takes to be of one material; None for :data:`BY_SHAPE` where only shapes tell groups apart.
     """
@@ -97,6 +98,7 @@ class Selection:
     few_materials: int = 30
     regrouped: int = 3
     rounds: int = 2
+    unexplained: float = 5.0
     readings: int = 12_000
     regrouping: Regrouping | None = None
 
@@ -385,12 +387,14 @@ class _Training:
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
         self.progress: Progress = progress or _silent
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
-        self.measured, self.readings = [], []
+        self.names = [getattr(one, "name", "") for one in data]
+        self.measured, self.readings, self.chosen = [], [], []
         terms, most = options.terms(), max(200, self.choose.readings // self.count)
         for r, observed in enumerate(self.observed):
             target = observed.target
             known = np.arange(len(target.db)) if target.trust is None else np.flatnonzero(target.trust)
             chosen = known[np.sort(rng.choice(len(known), min(len(known), most), replace=False))]
+            self.chosen.append(chosen)
             self.measured.append(observed.measured.part(chosen))
             response = respond(self.views[r], self.measured[r], terms, observed.floor)
             self.readings.append(Reading(response, target.part(chosen), observed.chain))
@@ -416,11 +420,18 @@ class _Training:
         materials = self._materials(terms, fit)
         if terms.residual:
             materials = replace(materials, residual=self._residual(materials, everyone))
+        wrong = self._unexplained(materials)
+        if any(len(rows) for rows in wrong):
+            self._leave_out(wrong)
+            fit = self._fit_groups(terms, fit.parameters, everyone, o.iterations, rounds=1)
+            materials = self._materials(terms, fit)
+            if terms.residual:
+                materials = replace(materials, residual=self._residual(materials, everyone))
         if errors is not None:
             errors = replace(errors, covariance=self._covariance(fit))
         total = (1 + self.steps) * self.count
         self.progress("fit", total, total)
-        return Trained(self.surface, materials, self.material, errors, self._report(fit))
+        return Trained(self.surface, materials, self.material, errors, self._report(fit, wrong))
 
     def _planned(self) -> int:
         """Most fits of groups and residuals, each of which is a step of the progress that is told."""
@@ -436,8 +447,31 @@ class _Training:
         self.behind += 1
         self.progress("fit", (1 + min(self.behind, self.steps)) * self.count, (1 + self.steps) * self.count)
 
-    def _report(self, fit: Fitted) -> dict[str, Any]:
-        report = {
+    def _unexplained(self, materials: Materials) -> list[np.ndarray]:
+        """Of each place the readings of tables that the fit misses by more than :attr:`Selection.unexplained` of their
+        standard deviations."""
+        sent, sd, found = self._sent(materials), self.options.groups.noise_db, []
+        for k, observed in enumerate(self.observed):
+            rows = np.zeros(0, int)
+            if not isinstance(observed.measured, SpectrumPixels):
+                error = observed.target.error(self._predicted(materials, sent, k)) / sd
+                rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
+            found.append(rows)
+        return found
+
+    def _leave_out(self, wrong: Sequence[np.ndarray]) -> None:
+        """Readings that count no longer."""
+        for k, rows in enumerate(wrong):
+            if len(rows) == 0:
+                continue
+            observed, reading = self.observed[k], self.readings[k]
+            left = ~np.isin(np.arange(len(observed.target.db)), rows)
+            self.observed[k] = replace(observed, target=observed.target.trusted(left))
+            chosen = self.chosen[k]
+            self.readings[k] = replace(reading, target=reading.target.trusted(left[chosen]))
+
+    def _report(self, fit: Fitted, wrong: Sequence[np.ndarray]) -> dict[str, Any]:
+        report: dict[str, Any] = {
             "receivers": self.count,
             "held_out": len(self.held),
             "transport_time_s": self.seen.seconds,
@@ -458,6 +492,11 @@ class _Training:
             name: {"gain_db": NEPER * float(gain), "std_db": NEPER * float(np.sqrt(v))}
             for name, gain, v in zip(self.chains, fit.parameters.log_gains, variance, strict=True)
         }
+        report["unexplained"] = {}
+        for observed, rows in zip(self.observed, wrong, strict=True):
+            if len(rows):
+                listed = report["unexplained"].setdefault(self.names[observed.place.data], [])
+                listed += observed.place.rows[rows].tolist()
         return report
 
     # ------------------------------------------------------------------------------------------ choosing
