@@ -18,11 +18,13 @@ from warprrf.cli.inputs import (
     add_mesh_options,
     add_out,
     add_point,
+    add_readings_options,
     add_scene_options,
     existing,
     load_geometry,
     load_scene,
     read_positions,
+    read_readings,
     read_receivers,
     read_scale,
 )
@@ -152,8 +154,11 @@ def add_fit(add: Add) -> None:
     fit.add_argument(
         "geometry", help="a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh file"
     )
-    fit.add_argument("spectra", help="NetCDF file of spectra")
+    fit.add_argument(
+        "measurements", nargs="+", help="NetCDF files of spectra, CSV files of received power, of one carrier"
+    )
     add_out(fit, "field file (.safetensors)")
+    add_readings_options(fit)
     fit.add_argument(
         "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
     )
@@ -196,14 +201,10 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
       warprrf fit room.glb spectra.nc -o field.safetensors
       warprrf fit scan.stl spectra.nc -o field.safetensors --unit mm --simplify 200000
       warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
+      warprrf fit room.glb horn.csv -o field.safetensors --carrier 300e9 --noise-floor-db -120 --horn-deg 10
     """
     geometry = load_geometry(args.geometry, args.mesh, args)
-    dataset = wr.SpectrumDataset.load(existing(args.spectra))
-    training = dataset.role == "train"
-    if args.train is not None:
-        dataset = dataset.split(args.train, seed=args.seed)[0]
-    elif training.any():
-        dataset = dataset.subset(training)
+    data = [_training_set(path, args) for path in args.measurements]
     options: dict[str, Any] = {}
     if args.relevance is not None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
@@ -215,7 +216,7 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
         options["iterations"] = args.iterations
     field = wr.RadioField.fit(
         geometry,
-        dataset,
+        data[0] if len(data) == 1 else data,
         model=args.model,
         seed=args.seed,
         progress=bars,
@@ -223,7 +224,24 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
         **options,
     )
     field.save(args.out)
-    print(f"{args.out}: {args.model} fitted on {len(dataset.receivers)} receivers")
+    places = sum(len(np.unique(one.receivers, axis=0)) for one in data)
+    print(f"{args.out}: {args.model} fitted on {places} receivers")
+    for name, chain in field.report.get("chains", {}).items():
+        print(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
+    for name, rows in field.report.get("unexplained", {}).items():
+        print(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
+
+
+def _training_set(path: str, args: argparse.Namespace) -> wr.SpectrumDataset | wr.Readings:
+    """The training receivers of a file of spectra, or a table of received power."""
+    file = existing(path)
+    if file.suffix.lower() == ".csv":
+        return read_readings(file, args)
+    dataset = wr.SpectrumDataset.load(file)
+    training = dataset.role == "train"
+    if args.train is not None:
+        return dataset.split(args.train, seed=args.seed)[0]
+    return dataset.subset(training) if training.any() else dataset
 
 
 def add_evaluate(add: Add) -> None:

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from warprrf.checks import check_count, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
-from warprrf.rf.fields.bistatic.fit import NEPER, Fitted, GroupFit, Reading, fit_groups
+from warprrf.rf.fields.bistatic.fit import NEPER, Fitted, GroupFit, Reading, fit_groups, huber
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
@@ -582,16 +582,21 @@ class _Training:
             return self._image_error(self._materials(replace(terms, residual=False), fit))
         readings = self._readings(terms, fit, self.held, follow=False)
         errors = [r.tied(self.material).error_db(fit.parameters) for r in readings]
-        return float(np.mean(np.concatenate(errors) ** 2))
+        return float(
+            np.mean(np.concatenate([self._losses(r, e) for r, e in zip(self.held, errors, strict=True)]))
+        )
 
     def _image_error(self, materials: Materials) -> float:
-        """Mean square error of all readings of the held-out places [dB^2]."""
+        """Mean loss of all readings of the held-out places [dB^2]."""
         sent = self._sent(materials)
-        errors = [
-            np.mean(self.observed[r].target.error(self._predicted(materials, sent, r)) ** 2)
-            for r in self.held
-        ]
-        return float(np.mean(errors))
+        errors = [self.observed[r].target.error(self._predicted(materials, sent, r)) for r in self.held]
+        return float(np.mean([self._losses(r, e).mean() for r, e in zip(self.held, errors, strict=True)]))
+
+    def _losses(self, place: int, error: np.ndarray) -> np.ndarray:
+        """Squares of errors (N,) at a place [dB^2]; of tables robust ones: some readings may be wrong."""
+        if isinstance(self.observed[place].measured, SpectrumPixels):
+            return error**2
+        return huber(error, self.options.groups.huber_db)[0]
 
     def _predicted(
         self, materials: Materials, sent: Callable[[ReceiverView], np.ndarray | None], place: int
