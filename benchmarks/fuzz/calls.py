@@ -262,10 +262,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "Readings.load": lambda p: {"path": p.folder / "readings.csv", "frequency_hz": CARRIER, "floor": 1e-14},
     "Readings.subset": lambda p: {"self": wr.Readings(**_readings(p)), "rows": np.array([0, 2])},
-    "Readings.weigh": lambda p: {
-        "self": wr.Readings(**_readings(p)), "rows": np.array([0, 2]), "arrival": np.eye(3), "departure": np.eye(3),
-        "delay_s": np.full(3, 1e-8),
-    },
     "horn": lambda p: {"width_rad": 0.2},
     "SpectrumDataset": _spectra,
     "SpectrumDataset.check_whole": _on(lambda p: p.train, name="ds"),

@@ -164,7 +164,15 @@ class Readings:
 
     def subset(self, rows: ArrayLike) -> Readings:
         """Some of the readings, by index or mask."""
-        index = np.arange(len(self))[np.asarray(rows)]
+        chosen = np.asarray(rows)
+        if chosen.ndim != 1 or not (
+            (chosen.dtype == bool and len(chosen) == len(self))
+            or (chosen.dtype.kind in "iu" and len(chosen) and (np.abs(chosen + 0.5) < len(self)).all())
+        ):
+            raise ValueError(
+                f"rows: got {rows!r}, expected whole numbers from 0 to {len(self) - 1}, or a mask ({len(self)},)"
+            )
+        index = np.arange(len(self))[chosen]
         own = (
             "transmitters",
             "receivers",
@@ -192,30 +200,6 @@ class Readings:
         """Standard deviation of each reading, fading included [dB], shape ``(N,)``."""
         fading = 0.0 if self.samples is None else NEPER * np.sqrt(polygamma(1, self.samples))
         return np.asarray(np.hypot(self.std_db, fading))
-
-    def weigh(
-        self, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
-    ) -> np.ndarray:
-        """What readings ``rows`` (M,) take of unit power on paths, shape ``(M, K)``.
-
-        Args:
-            rows: which readings.
-            arrival: unit vectors from the receiver, shape ``(K, 3)``.
-            departure: unit vectors from the transmitter, shape ``(K, 3)``.
-            delay_s: delays [s], shape ``(K,)``.
-        """
-        weight = np.ones((len(rows), len(delay_s)))
-        ends = (
-            (self.arrival, self.receive_pattern, arrival),
-            (self.departure, self.transmit_pattern, departure),
-        )
-        for turned, pattern, path in ends:
-            if turned is not None and pattern is not None:
-                cosine = directions_from_angles(*turned[rows].T) @ path.T
-                weight *= sample_pattern(pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
-        if self.delay_s is not None and self.bandwidth_hz is not None:
-            weight *= _tap(self.bandwidth_hz * (self.delay_s[rows, None] - delay_s), self.window)
-        return weight
 
     @classmethod
     def from_table(cls, table: Table, **settings: Any) -> Readings:
@@ -283,6 +267,29 @@ class Readings:
 
 Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readings]
 """What fields are fitted to: a set of spectra, a table of readings, or several of them."""
+
+
+def path_weights(
+    readings: Readings, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
+) -> np.ndarray:
+    """What ``rows`` (M,) of ``readings`` take of unit power on paths, shape ``(M, K)``.
+
+    Args:
+        arrival: unit vectors from the receiver, shape ``(K, 3)``.
+        departure: unit vectors from the transmitter, shape ``(K, 3)``.
+        delay_s: delays [s], shape ``(K,)``.
+    """
+    r, weight = readings, np.ones((len(rows), len(delay_s)))
+    for turned, pattern, path in (
+        (r.arrival, r.receive_pattern, arrival),
+        (r.departure, r.transmit_pattern, departure),
+    ):
+        if turned is not None and pattern is not None:
+            cosine = directions_from_angles(*turned[rows].T) @ path.T
+            weight *= sample_pattern(pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
+    if r.delay_s is not None and r.bandwidth_hz is not None:
+        weight *= _tap(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
+    return weight
 
 
 def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:

@@ -12,7 +12,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.fit import Target
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
-from warprrf.rf.spectra.readings import Readings, horn
+from warprrf.rf.spectra.readings import Readings, horn, path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
@@ -151,14 +151,14 @@ def test_a_reading_weighs_paths_by_directions_and_delay() -> None:
         receive_pattern=horn(0.2), delay_s=[10e-9, 10e-9], bandwidth_hz=2e9, window="hann",
     )  # fmt: skip
     arrival = np.stack([east, north])
-    on_tap = one.weigh(np.arange(2), arrival, arrival, np.array([10e-9, 10e-9]))
+    on_tap = path_weights(one, np.arange(2), arrival, arrival, np.array([10e-9, 10e-9]))
     assert on_tap[0, 0] == pytest.approx(on_tap[1, 1]) and on_tap[0, 1] < 1e-5 * on_tap[0, 0]
     taps = np.arange(40) / 2e9
     many = replace(
         one, arrival=None, receive_pattern=None, receivers=np.tile(RECEIVERS[0], (40, 1)), transmitters=TX,
         power=np.full(40, 1e-9), floor=1e-15, delay_s=taps, chain=None, std_db=0.0,
     )  # fmt: skip
-    shares = many.weigh(np.arange(40), arrival[:1], arrival[:1], np.array([9.83e-9]))
+    shares = path_weights(many, np.arange(40), arrival[:1], arrival[:1], np.array([9.83e-9]))
     assert shares.sum() == pytest.approx(1.0, abs=1e-3)  # all taps share the path's power
 
 

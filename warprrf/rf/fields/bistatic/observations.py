@@ -18,7 +18,7 @@ from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.positions import check_dataset, check_positions, question_unit
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data, Readings
+from warprrf.rf.spectra.readings import Data, Readings, path_weights
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 
 READINGS_SHAPE = (60, 120)
@@ -198,7 +198,7 @@ def observe(
         above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
         measured = WeighedPaths.of(
-            view, partial(one.weigh, rows), departure=one.departure is not None, delay_step_s=step
+            view, partial(path_weights, one, rows), departure=one.departure is not None, delay_step_s=step
         )
         trust = noise_db / np.hypot(READING_ERROR_DB, one.noise_db[rows])
         target = Target(above, trust, one.power[rows] <= floors)

@@ -21,7 +21,7 @@ from warprrf.rf.fields.bistatic.observations import Place, as_list, observe, pla
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
-from warprrf.rf.fields.bistatic.response import respond, with_further_bounces
+from warprrf.rf.fields.bistatic.response import Response, predict, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
@@ -50,6 +50,8 @@ FEW: dict[str, Any] = {
 """What a fit takes for given of receivers too few to hold any out: bounces that rooms have, which bring no parameters."""
 TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "indirect", "residual")
 """Terms that a fit decides on where they are None."""
+KNOWN_BETTER = 2.0
+"""By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
 MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
 RAY_BYTES = 40  # kept of each ray
@@ -351,6 +353,13 @@ def train(
         return _Training(seen, data, o, progress).run()
 
 
+def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
+    """Share of readings (N,) that comes straight from the transmitter."""
+    direct = (response.path_group < 0).all(axis=1)
+    power = response.path_power[direct] @ response.path[direct]
+    return np.asarray(power / np.maximum(predict(response, p), np.maximum(power, 1e-300)))
+
+
 @dataclass(frozen=True)
 class _Candidate:
     """Terms with their fit, and the held-out mean square error [dB^2]."""
@@ -389,6 +398,7 @@ class _Training:
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
         self.names = [getattr(one, "name", "") for one in data]
         self.measured, self.readings, self.chosen = [], [], []
+        start = Parameters.prior(self.surface.groups, len(options.terms().lobes))
         terms, most = options.terms(), max(200, self.choose.readings // self.count)
         for r, observed in enumerate(self.observed):
             target = observed.target
@@ -397,7 +407,10 @@ class _Training:
             self.chosen.append(chosen)
             self.measured.append(observed.measured.part(chosen))
             response = respond(self.views[r], self.measured[r], terms, observed.floor)
-            self.readings.append(Reading(response, target.part(chosen), observed.chain))
+            part = target.part(chosen)
+            if not isinstance(observed.measured, SpectrumPixels):
+                part = part.trusted(1.0 + KNOWN_BETTER * _line_of_sight_share(response, start))
+            self.readings.append(Reading(response, part, observed.chain))
             self.progress("fit", r, (1 + self.steps) * self.count)
         self.log: list[dict[str, Any]] = []
 
