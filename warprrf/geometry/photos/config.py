@@ -99,6 +99,8 @@ class RefineConfig:
     Attributes:
         iterations: steps, one photo each.
         downscale: photos are averaged over squares of this many pixels while training.
+        coarse_pixels, fine_from: until this share of the iterations squares are twice as wide, and twice again, as long
+            as photos would have more pixels than this.
         full_from: share of the iterations after which photos are taken as they are.
         sh_degree: of the colours; rendered rooms are nearly matt, so 1.
         ssim_share: weight of 1 - SSIM; L1 has the rest.
@@ -122,6 +124,8 @@ class RefineConfig:
 
     iterations: int = 2400
     downscale: int = 2
+    coarse_pixels: int = 100_000
+    fine_from: float = 0.5
     full_from: float = 0.9
     sh_degree: int = 1
     ssim_share: float = 0.2
@@ -148,7 +152,14 @@ class RefineConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "downscale", "densify_every", "max_gaussians", "checkpoint_every"):
+        for name in (
+            "iterations",
+            "downscale",
+            "coarse_pixels",
+            "densify_every",
+            "max_gaussians",
+            "checkpoint_every",
+        ):
             check_count(name, getattr(self, name))
         check_seed(self.seed)
         if self.sh_degree not in COEFFICIENTS:
