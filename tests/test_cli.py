@@ -193,6 +193,10 @@ BAD = {
         ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/deep.json"],
         "deep.json",
     ),
+    "scale that is no number": (
+        ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--scale", "a.jpg", "b.jpg", "far"],
+        "--scale",
+    ),
     "geometry of unknown kind": (
         ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
         ".ply",

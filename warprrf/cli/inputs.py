@@ -65,6 +65,16 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
         ) from error
 
 
+def read_scale(words: Sequence[str]) -> tuple[str, str, float]:
+    """Two photos and the distance between their cameras [m], from three words."""
+    try:
+        return words[0], words[1], float(words[2])
+    except ValueError as error:
+        raise ValueError(
+            f"--scale: got {words[2]!r}, expected a distance in metres after two photos"
+        ) from error
+
+
 def read_receivers(values: Sequence[str]) -> np.ndarray:
     """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
     if len(values) == 1 and "," not in values[0]:
