@@ -111,6 +111,7 @@ class RefineConfig:
         densify_from, densify_until, densify_every: in iterations; ``until`` as a share of all.
         densify_share: at most this share of the Gaussians is split or cloned at a time, those with the largest mean
             gradient of the projected position.
+        densify_to: and more than that, up to half of them, where otherwise fewer than these would be there in the end.
         max_gaussians: densification stops here.
         split_above_m: larger ones are split, smaller ones cloned.
         prune_opacity: fainter ones are removed.
@@ -140,6 +141,7 @@ class RefineConfig:
     densify_until: float = 0.65
     densify_every: int = 200
     densify_share: float = 0.08
+    densify_to: int = 40_000
     max_gaussians: int = 60_000
     split_above_m: float = 0.03
     prune_opacity: float = 0.02

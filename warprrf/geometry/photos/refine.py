@@ -157,7 +157,8 @@ class _Refinement:
         until = c.densify_until * c.iterations
         if c.densify_from <= self.iteration <= until and self.iteration % c.densify_every == 0:
             rng = np.random.default_rng([c.seed, 2, self.iteration])
-            self.load(self.on_planes(densified(self.arrays(), c, rng)))
+            left = 1 + int((until - self.iteration) // c.densify_every)
+            self.load(self.on_planes(densified(self.arrays(), c, rng, rounds_left=left)))
 
     def scale(self, iteration: int) -> int:
         """Side in pixels of the squares that photos are averaged over."""
