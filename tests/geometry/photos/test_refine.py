@@ -80,6 +80,20 @@ def test_refinement_learns_the_photos_and_densifies(problem):
     assert len(end) > len(start)
 
 
+def test_few_gaussians_at_the_start_are_split_until_enough_are_there(problem):
+    start, photos, cameras = problem
+    rounds = replace(CONFIG, densify_from=10, densify_every=10, prune_opacity=1e-6)  # at 10, 20 and 30
+    counts = [
+        len(
+            refine(start, PosedPhotos(photos, cameras), config=replace(rounds, densify_to=most), device="cpu")
+        )
+        for most in (1, 600, 10_000)
+    ]
+    assert counts[0] == 300 + 24 + 25 + 27  # 8 % at a time
+    assert counts[1] == 600
+    assert counts[2] == 300 + 150 + 225 + 337  # half of them at a time
+
+
 def test_progress_counts_work_and_begins_where_a_run_was_stopped(problem, tmp_path):
     start, photos, cameras = problem
     told = []
