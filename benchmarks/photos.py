@@ -121,7 +121,7 @@ def recoloured(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 def psnr(image: np.ndarray, photo: np.ndarray) -> float:
     """Of images in [0, 1] [dB]."""
-    return float(-10 * np.log10(np.mean((image.astype(np.float64) - photo) ** 2)))
+    return float(-10 * np.log10(max(np.mean((image.astype(np.float64) - photo) ** 2), 1e-12)))
 
 
 def summary(figures: dict[str, Any]) -> str:

@@ -8,11 +8,12 @@ import warp as wp
 from skimage.metrics import structural_similarity
 
 from warprrf.geometry.photos.config import RefineConfig
+from warprrf.geometry.photos.densify import densified
 from warprrf.geometry.photos.exposure import Exposures
 from warprrf.geometry.photos.fill import filled
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.refine import OVERHEAD, refine
+from warprrf.geometry.photos.refine import OVERHEAD, _initial, refine
 from warprrf.geometry.photos.targets import PosedPhotos, Targets
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -80,18 +81,18 @@ def test_refinement_learns_the_photos_and_densifies(problem):
     assert len(end) > len(start)
 
 
-def test_few_gaussians_at_the_start_are_split_until_enough_are_there(problem):
-    start, photos, cameras = problem
-    rounds = replace(CONFIG, densify_from=10, densify_every=10, prune_opacity=1e-6)  # at 10, 20 and 30
-    counts = [
-        len(
-            refine(start, PosedPhotos(photos, cameras), config=replace(rounds, densify_to=most), device="cpu")
-        )
-        for most in (1, 600, 10_000)
-    ]
-    assert counts[0] == 300 + 24 + 25 + 27  # 8 % at a time
-    assert counts[1] == 600
-    assert counts[2] == 300 + 150 + 225 + 337  # half of them at a time
+def test_few_gaussians_are_split_until_enough_are_there(problem):
+    arrays = _initial(problem[0], CONFIG)
+    for name in ("pull", "hits", "seen"):
+        arrays[name] += 1
+
+    def count(most, rounds_left):
+        config = replace(CONFIG, densify_to=most)
+        return len(densified(arrays, config, np.random.default_rng(0), rounds_left=rounds_left)["means"])
+
+    assert count(1, 3) == 300 + 24  # 8 %
+    assert count(600, 3) == 300 + 100 and count(600, 2) == 300 + 150
+    assert count(10_000, 3) == 300 + 150  # half of them at most
 
 
 def test_progress_counts_work_and_begins_where_a_run_was_stopped(problem, tmp_path):
