@@ -82,7 +82,7 @@ def test_refinement_learns_the_photos_and_densifies(problem):
 
 
 def test_few_gaussians_are_split_until_enough_are_there(problem):
-    arrays = _initial(problem[0], CONFIG)
+    arrays = {name: value.reshape(300, -1) for name, value in _initial(problem[0], CONFIG).items()}
     for name in ("pull", "hits", "seen"):
         arrays[name] += 1
 
