@@ -18,6 +18,7 @@ from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
+from warprrf.rf.open_air import warn_of_unmodelled
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -81,6 +82,9 @@ def simulate(
             near field of the transmitter; on a frequency outside a material's band, or P.676's with ``gas``; on an
             unknown engine.
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
+
+    Warns:
+        UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
@@ -95,6 +99,8 @@ def simulate(
     mesh, wavelength_m = as_mesh(scene, "scene"), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
     check_positions(mesh, source, points, wavelength_m, device=device)
+    through = engine == "sionna" and refraction
+    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, transmission=through, device=device)
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
     common |= {"shape": check_shape(shape), "beam_sigma_rad": beam_sigma_rad}
