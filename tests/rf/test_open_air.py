@@ -204,3 +204,21 @@ def test_elements_grow_with_the_scene():
     assert len(large.element_area) < 2.0 * ELEMENTS
     assert few.element_area.max() < 2.0 * ELEMENT_M**2
     assert large.element_area.sum() == pytest.approx(large.mesh.areas.sum())
+
+
+def test_a_receiver_that_sees_nothing_lit_says_nothing_of_materials(capfd):
+    """Nor does the linear algebra complain of a matrix without columns."""
+    s, corner = scene(small()), np.array([-6.9, -5.9, 0.3])
+    dark = np.array([[6.42, 5.11, 0.25]])
+    ds = wr.simulate(
+        s,
+        transmitter=corner,
+        receivers=np.concatenate([SMALL * STREET, dark]),
+        frequency_hz=F,
+        shape=(16, 32),
+    )
+    assert ds.path_gain[:-1].reshape(4, -1).any(axis=1).all()
+    assert not ds.path_gain[-1].any()
+    field = wr.RadioField.fit(s, ds, quick=True, mirror_order=1, indirect=False)
+    assert "illegal" not in "".join(capfd.readouterr())
+    assert field.spectrum(dark[0]).path_gain.max() < field.floor
