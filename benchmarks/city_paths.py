@@ -34,6 +34,7 @@ POINT_M = 0.05
 GAIN_DB = 0.05
 ABOVE_GROUND_M = 1.5
 MOST_RECEIVERS = 100  # in streets
+PLACES = 3000  # at which roofs are looked for
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,25 @@ class Links:
         )
         street = np.flatnonzero(np.isin(hit.face, scene.object_faces(self.ground)))[:MOST_RECEIVERS]
         return np.column_stack([drawn[street], top - hit.t[street] + ABOVE_GROUND_M])
+
+
+def roofs(scene: Scene, links: Links) -> dict[str, int]:
+    """Of :data:`PLACES` places over the ground how many have a roof above, and how many of those, and of those under the
+    sky, the library takes for places in a building."""
+    drawn = np.random.default_rng(1).uniform(-links.around_m, links.around_m, (PLACES, 2))
+    drawn = np.clip(drawn + links.transmitter[:2], scene.bounds[0, :2], scene.bounds[1, :2])
+    top, down = scene.bounds[1, 2] + 1.0, np.tile([0.0, 0.0, -1.0], (PLACES, 1))
+    ground = Mesh(scene.mesh.vertices, scene.mesh.faces[scene.object_faces(links.ground)])
+    depth = ground.cast(np.column_stack([drawn, np.full(PLACES, top)]), down).t
+    places = np.column_stack([drawn, top - depth + ABOVE_GROUND_M])[np.isfinite(depth)]
+    roofed = scene.mesh.cast(places, -down[: len(places)]).face >= 0
+    refused = ~scene.is_free(places)
+    return {
+        "roofed": int(roofed.sum()),
+        "roofed_refused": int(refused[roofed].sum()),
+        "open": int((~roofed).sum()),
+        "open_refused": int(refused[~roofed].sum()),
+    }
 
 
 BOX = (0.5, -0.8, 1.9), ((2.1, 1.3, 3.3), (-1.7, 2.2, 4.1))
@@ -269,6 +289,7 @@ def compare(links: Links, order: int = 2) -> dict[str, Any]:
         "gain_error_db": found["gain_error_db"],
         "gain_apart": len(again),
         "gain_apart_near_origin_db": max(again, default=0.0),
+        "roofs": roofs(scene, links) if links.ground else None,
         "only_ours": len(found["extra"]),
         "only_ours_wrong": wrong,
         "load_s": load_s,
