@@ -113,6 +113,15 @@ def test_sampled_places_stand_in_streets():
     assert np.ptp(y) > 110.0
 
 
+def test_places_above_the_ground_follow_a_slope():
+    places = wr.sample_receivers(
+        scene(small(0.2, 7.0)), 100, z=(0.1, 0.2), clearance=0.05, above_ground=True, seed=1
+    )
+    height = places[:, 2] - 0.2 * places[:, 0] - 7.0
+    assert (height > 0.1 - 1e-6).all() and (height < 0.2 + 1e-6).all()
+    assert np.ptp(places[:, 0]) > 12.0
+
+
 def test_a_map_of_a_street_masks_houses_and_nothing_else(field):
     found = field.radio_map(0.15, 0.4, bounds=[-6.9, -5.9, 6.9, 5.9], shape=(6, 12))
     x, y = found.positions[..., 0] / SMALL, found.positions[..., 1] / SMALL

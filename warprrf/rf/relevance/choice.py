@@ -158,7 +158,8 @@ def _beside(model: FullModel, name: str) -> str:
         else ""
     )
     if not reached.any():
-        return f"no such path to any blocked receiver{assumed}"
+        over = "over one edge (ways over two are not sought) " if name == "diffraction" else ""
+        return f"no such path {over}to any blocked receiver{assumed}"
     dark = int((rest[reached] == 0).sum())
     if dark:
         return f"nothing else reaches {dark} of {len(rest)} blocked receivers{assumed}"
