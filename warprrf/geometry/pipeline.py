@@ -119,6 +119,8 @@ def reconstruct(
         unposed=sparse.unposed,
         held_out=sorted(skipped),
         guessed=sparse.guessed,
+        causes=sparse.causes,
+        photos={name: named[name] for name in sparse.cameras},
     )
 
 
