@@ -23,15 +23,24 @@ from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.initialise import initialise
-from warprrf.geometry.photos.photo_files import Photos, find_photos, match_names, read_photo
+from warprrf.geometry.photos.photo_files import (
+    Photos,
+    find_photos,
+    mask_beside,
+    match_names,
+    read_mask,
+    read_photo,
+)
 from warprrf.geometry.photos.refine import refine
-from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale
+from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale, check_scale, scaled
+from warprrf.geometry.photos.targets import PosedPhotos
+from warprrf.geometry.photos.upright import upright
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 1, "surface": 1}
+VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 2, "surface": 1}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 
@@ -41,6 +50,7 @@ def reconstruct(
     *,
     workspace: str | os.PathLike[str],
     known_positions: Mapping[str, ArrayLike] | None = None,
+    scale: tuple[str, str, float] | None = None,
     held_out: Sequence[str] = (),
     iterations: int | None = None,
     config: ReconstructionConfig | None = None,
@@ -51,10 +61,13 @@ def reconstruct(
     """Geometry of a static place from photos of it.
 
     Args:
-        photos: a folder, or a sequence of image files: one size, one undistorted camera.
+        photos: a folder, or a sequence of image files, of any cameras and sizes. Lenses are estimated; EXIF's focal
+            length and orientation are used; where ``NAME.mask.png`` beside a photo ``NAME.jpg`` is black, it is ignored.
         workspace: folder of unfinished and finished steps; a stopped run continues from it.
         known_positions: photo name to surveyed camera position (3,) [m], three or more that are not on a line. Without
-            them scale and axes are assumed: median viewing distance 3 m, z against the mean "down" of the photos.
+            them vertical edges, planes and the floor set z and its origin.
+        scale: ``("a.jpg", "b.jpg", 1.52)``: how far apart the cameras of two photos were [m], where nobody surveyed
+            positions. Without either, the median distance that photos look is taken for 3 m.
         held_out: names of photos that get a pose but that the Gaussians are not fitted to.
         iterations: of the photometric refinement; default: the configuration's.
         config: all other settings.
@@ -63,7 +76,8 @@ def reconstruct(
         device: Warp device of the refinement and the depth maps.
 
     Raises:
-        ValueError: for bad photos or positions (see :func:`~warprrf.geometry.photos.sfm.structure_from_motion` and
+        ValueError: for ``scale`` beside ``known_positions``, and for bad photos or positions (see
+            :func:`~warprrf.geometry.photos.sfm.structure_from_motion` and
             :func:`~warprrf.geometry.photos.sparse.align_to_known`).
         ImportError: if the extra ``photos`` is not installed.
     """
@@ -76,17 +90,29 @@ def reconstruct(
     skipped = set(match_names("held_out", held_out, list(named)))
     if known_positions is not None:
         match_names("known_positions", known_positions, list(named))
+        if scale is not None:
+            raise ValueError(
+                "scale, known_positions: got both, expected one; surveyed positions set the scale"
+            )
+    if scale is not None:
+        check_scale(scale, list(named))
 
     sparse = sfm.structure_from_motion(
         photos,
         workspace=workspace,
         max_features=config.max_features,
+        lens=config.lens,
+        max_pixels=config.max_pixels,
         pairs=config.pairs,
         seed=seed,
         progress=progress,
     )
-    sparse = align_to_known(sparse, known_positions) if known_positions is not None else assume_scale(sparse)
-    fitted = {name: named[name] for name in sparse.cameras if name not in skipped}
+    if known_positions is not None:
+        sparse = align_to_known(sparse, known_positions)
+    else:
+        sparse = assume_scale(sparse) if scale is None else scaled(sparse, scale)
+        sparse = upright(sparse, lambda name: read_photo(sparse.photos[name]), seed=seed)
+    fitted = {name: photo for name, photo in sparse.photos.items() if name not in skipped}
     if not fitted:
         raise ValueError(
             f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to"
@@ -102,6 +128,8 @@ def reconstruct(
         metric=sparse.metric,
         unposed=sparse.unposed,
         held_out=sorted(skipped),
+        guessed=sparse.guessed,
+        lenses=sparse.lenses,
     )
 
 
@@ -120,6 +148,7 @@ def _steps(
     """
     cameras = {name: sparse.cameras[name] for name in fitted}
     photos = cache(lambda: [read_photo(photo) for photo in fitted.values()])
+    masks = [mask_beside(photo) for photo in fitted.values()]
 
     def initial(attempt: Attempt) -> files.Arrays:
         planes, gaussians = initialise(
@@ -130,8 +159,7 @@ def _steps(
     def refined(attempt: Attempt) -> files.Arrays:
         gaussians = refine(
             files.to_gaussians(first),
-            photos(),
-            list(cameras.values()),
+            PosedPhotos(photos(), list(cameras.values()), [read_mask(photo) for photo in fitted.values()]),
             config=config.refine,
             planes=planes,
             progress=attempt.progress,
@@ -148,7 +176,7 @@ def _steps(
         return files.of_patches(patches)
 
     settings = [config.max_reprojection_error, config.planes, config.sweep, config.gaussians, seed]
-    first = _kept(steps, "initial", initial, [sparse, list(fitted), list(fitted.values()), *settings])
+    first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
     planes = files.to_planes(first)
     gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
     photos.cache_clear()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.sfm import read_colmap
+from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -37,6 +39,9 @@ class Reconstruction:
         metric: whether lengths are metres (else they are an assumed scale).
         unposed: names of photos without a pose.
         held_out: names of photos that the Gaussians were not fitted to.
+        guessed: what nobody measured and the photos do not show, a sentence each.
+        lenses: photo name to the :class:`~warprrf.geometry.photos.undistort.Lens` that took it; ``cameras`` are those of the
+            photos undistorted, turned upright and reduced.
     """
 
     def __init__(
@@ -50,6 +55,8 @@ class Reconstruction:
         metric: bool = True,
         unposed: Sequence[str] = (),
         held_out: Sequence[str] = (),
+        guessed: Sequence[str] = (),
+        lenses: Mapping[str, Lens] | None = None,
     ) -> None:
         if gaussians is None and mesh is None:
             raise ValueError("gaussians, mesh: got neither, expected Gaussians, a mesh or both")
@@ -61,6 +68,8 @@ class Reconstruction:
         self.metric = bool(metric)
         self.unposed = tuple(unposed)
         self.held_out = tuple(held_out)
+        self.guessed = tuple(guessed)
+        self.lenses = dict(lenses or {})
 
     def __repr__(self) -> str:
         faces = f"{len(self._mesh.faces)} triangles" if self._mesh is not None else "no mesh"
@@ -118,6 +127,8 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
+            "guessed": self.guessed,
+            "lenses": [{**asdict(lens), "photos": names} for lens, names in lenses_in_use(self.lenses).items()],
             "labels": () if self._mesh is None else self._mesh.labels,
         }  # fmt: skip
         arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
@@ -154,8 +165,9 @@ class Reconstruction:
             splats = None if mesh is not None and "means" not in arrays else files.to_gaussians(arrays)
             rms = header["scale_rms_m"]
             check_type("metric", header["metric"], bool)
-            for name in (*header["unposed"], *header["held_out"]):
-                check_type("unposed, held_out", name, str)
+            guessed = header.get("guessed", ())
+            for name in (*header["unposed"], *header["held_out"], *guessed):
+                check_type("unposed, held_out, guessed", name, str)
             return cls(
                 splats,
                 mesh,
@@ -165,6 +177,8 @@ class Reconstruction:
                 metric=header["metric"],
                 unposed=header["unposed"],
                 held_out=header["held_out"],
+                guessed=guessed,
+                lenses=_lenses(header.get("lenses", ())),
             )
 
     @classmethod
@@ -206,6 +220,16 @@ class Reconstruction:
             )
             mesh = patches.mesh
         return cls(gaussians, mesh, cameras, patches=patches)
+
+
+def _lenses(stored: Sequence[Mapping[str, Any]]) -> dict[str, Lens]:
+    """Lenses by photo, from a list of lenses with their photos."""
+    found: dict[str, Lens] = {}
+    for entry in stored:
+        values = dict(entry)
+        names = values.pop("photos")
+        found |= dict.fromkeys(names, Lens(**values))
+    return dict(sorted(found.items()))
 
 
 def _camera(stored: Mapping[str, Any]) -> Camera:

@@ -102,6 +102,7 @@ class RefineConfig:
         full_from: share of the iterations after which photos are taken as they are.
         sh_degree: of the colours; rendered rooms are nearly matt, so 1.
         ssim_share: weight of 1 - SSIM; L1 has the rest.
+        fit_exposure: whether every photo has a gain for each colour of its own.
         mean_rate, final_mean_rate: metres a step at the start and the end, exponential in between.
         scale_rate, quaternion_rate, opacity_rate, color_rate: of the logarithms of scales, quaternions, logits of
             opacities, and constant colours; other coefficients take a twentieth.
@@ -124,6 +125,7 @@ class RefineConfig:
     full_from: float = 0.9
     sh_degree: int = 1
     ssim_share: float = 0.2
+    fit_exposure: bool = True
     mean_rate: float = 4e-4
     final_mean_rate: float = 4e-5
     scale_rate: float = 5e-3
@@ -262,6 +264,9 @@ class ReconstructionConfig:
 
     Attributes:
         max_features: SIFT features per photo.
+        lens: COLMAP's model of the lenses, or ``"auto"``: see
+            :func:`~warprrf.geometry.photos.sfm.structure_from_motion`.
+        max_pixels: photos are reduced to about so many pixels before Gaussians are fitted to them.
         pairs: which photos are matched, ``"auto"`` or ``"exhaustive"``.
         max_reprojection_error: sparse points above it are dropped [pixels].
         planes: how planes are found among sparse points.
@@ -273,6 +278,8 @@ class ReconstructionConfig:
     """
 
     max_features: int = 2400
+    lens: str = "auto"
+    max_pixels: int = 1_000_000
     pairs: str = "auto"
     max_reprojection_error: float = 1.0
     planes: PlaneConfig = field(default_factory=PlaneConfig)

@@ -52,6 +52,8 @@ def find_photos(photos: Photos) -> dict[str, Path]:
                 f"photos: {len(stray)} masks are of no photo: {some(stray)}; the mask of 0007.jpg is 0007.mask.png"
             )
     else:
+        if odd := [p for p in photos if not isinstance(p, str | os.PathLike)]:
+            raise TypeError(f"photos: got {type(odd[0]).__name__} in a list, expected image files")
         files = [Path(p) for p in photos if not str(p).lower().endswith(MASK_SUFFIX)]
         missing = [str(p) for p in files if not p.is_file()]
         if missing:
@@ -219,13 +221,13 @@ def read_photo(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_mask(photo: str | os.PathLike[str]) -> np.ndarray | None:
-    """Where ``photo`` counts, shape ``(H, W)`` bool, from the mask beside it; None without one.
+    """Where ``photo`` is to be ignored, shape ``(H, W)`` bool, from the mask beside it; None without one.
 
     Raises:
         ValueError: if the mask does not read as an image.
     """
     path = mask_beside(Path(photo))
-    return None if path is None else np.asarray(open_photo(path, "L")) >= 128
+    return None if path is None else np.asarray(open_photo(path, "L")) < 128
 
 
 def some(items: Sequence[str], limit: int = 5) -> str:

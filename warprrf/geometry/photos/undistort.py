@@ -23,6 +23,7 @@ from warprrf.geometry.splats.camera import Camera
 
 COEFFICIENTS = {
     "SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 4,
+    "FULL_OPENCV": 8,
 }  # fmt: skip
 """COLMAP's lens models that are known here, and how many distortion coefficients each has."""
 
@@ -35,11 +36,11 @@ class Lens:
     """A camera's lens and sensor, as COLMAP's models have it. Pixel centres lie at +0.5.
 
     Attributes:
-        model: COLMAP's name of the model: ``"SIMPLE_PINHOLE"``, ``"PINHOLE"``, ``"SIMPLE_RADIAL"``, ``"RADIAL"``, ``"OPENCV"``
-            or ``"OPENCV_FISHEYE"``.
+        model: COLMAP's name of the model, one of :data:`COEFFICIENTS`.
         width, height: size of the photos as stored, before they are turned or reduced [pixels].
         fx, fy, cx, cy: focal lengths and principal point [pixels].
-        coefficients: of the distortion: none; k1; k1, k2; k1, k2, p1, p2; of the fisheye k1, k2, k3, k4.
+        coefficients: of the distortion: none; k1; k1, k2; k1, k2, p1, p2 (and k3 to k6); of the
+            fisheye k1, k2, k3, k4.
 
     Raises:
         TypeError, ValueError: for another model, or numbers that are no lens.
@@ -106,10 +107,15 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
     if lens.straight and turns == 0 and small == lens:
         shutil.copyfile(source, target)
     else:
-        _save(_resampled(open_photo(source, "RGB"), source, lens, small).rotate(-90 * turns, expand=True), target)
+        _save(
+            _resampled(open_photo(source, "RGB"), source, lens, small).rotate(-90 * turns, expand=True),
+            target,
+        )
     if mask is not None:
         image = require("PIL.Image", extra="photos")
-        stored = open_photo(mask, "L").rotate(90 * turns, expand=True)  # a mask is upright, as its photo is seen
+        stored = open_photo(mask, "L").rotate(
+            90 * turns, expand=True
+        )  # a mask is upright, as its photo is seen
         straight = np.asarray(_resampled(stored, mask, lens, small))
         whole = np.where(straight > 254, 255, 0).astype(np.uint8)
         _save(image.fromarray(whole).rotate(-90 * turns, expand=True), mask_name(target))
@@ -128,9 +134,8 @@ def _save(picture: Any, target: Path) -> None:
 
 def _camera(colmap: Any, lens: Lens) -> Any:
     """``lens`` as COLMAP's camera, in a model with two focal lengths, so that it scales without rounding."""
-    fisheye = lens.model == "OPENCV_FISHEYE"
-    model = "OPENCV_FISHEYE" if fisheye else "OPENCV"
-    bends = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0][:4]
+    model = lens.model if lens.model in ("OPENCV_FISHEYE", "FULL_OPENCV") else "OPENCV"
+    bends = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[model]]
     params = [lens.fx, lens.fy, lens.cx, lens.cy, *bends]
     return colmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=1)
 
@@ -143,8 +148,8 @@ def _reduced(lens: Lens, max_pixels: int) -> Lens:
         return lens
     width, height = max(int(lens.width * share), 1), max(int(lens.height * share), 1)
     sx, sy = width / lens.width, height / lens.height
-    size = {"width": width, "height": height}
-    return replace(lens, **size, fx=lens.fx * sx, fy=lens.fy * sy, cx=lens.cx * sx, cy=lens.cy * sy)
+    focal = {"fx": lens.fx * sx, "fy": lens.fy * sy}
+    return replace(lens, width=width, height=height, cx=lens.cx * sx, cy=lens.cy * sy, **focal)
 
 
 def _undistorted(lens: Lens) -> Any:
