@@ -71,6 +71,11 @@ def _adjusted(colmap: ModuleType, model: Path, kind: str, principal_point: bool)
     options.print_summary = False
     options.refine_principal_point = principal_point
     options.ceres.solver_options.num_threads = 1  # sums in a fixed order
-    colmap.bundle_adjustment(found, options)
+    everything = colmap.BundleAdjustmentConfig()
+    for key, image in found.images.items():
+        if image.has_pose:
+            everything.add_image(key)
+    everything.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    colmap.create_default_bundle_adjuster(options, everything, found).solve()
     found.update_point_3d_errors()
     return found

@@ -148,8 +148,8 @@ def _reduced(lens: Lens, max_pixels: int) -> Lens:
         return lens
     width, height = max(int(lens.width * share), 1), max(int(lens.height * share), 1)
     sx, sy = width / lens.width, height / lens.height
-    focal = {"fx": lens.fx * sx, "fy": lens.fy * sy}
-    return replace(lens, width=width, height=height, cx=lens.cx * sx, cy=lens.cy * sy, **focal)
+    fx, fy, cx, cy = lens.fx * sx, lens.fy * sy, lens.cx * sx, lens.cy * sy
+    return replace(lens, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
 def _undistorted(lens: Lens) -> Any:
