@@ -130,6 +130,8 @@ def reconstruct(
         held_out=sorted(skipped),
         guessed=sparse.guessed,
         lenses=sparse.lenses,
+        causes=sparse.causes,
+        photos=sparse.photos,
     )
 
 
