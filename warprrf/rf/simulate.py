@@ -170,7 +170,7 @@ def sample_receivers(
     Raises:
         ValueError: if there is no such place, or the range is empty.
     """
-    check_count("n", n)
+    check_count("n", n, most=_TRIES * _BATCH)
     check_number("clearance", clearance, 0.0)
     z = check_array("z", z, (2,))
     if z[0] > z[1]:
