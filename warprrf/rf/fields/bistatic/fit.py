@@ -290,6 +290,8 @@ def _normal_equations(
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     for reading in readings:
         error, table, index = reading.linearised(p, layout)
+        if len(index) == 0:  # nothing that it sees is lit
+            continue
         root = np.sqrt(huber(error, options.huber_db)[1]) / options.noise_db
         table *= root.astype(np.float32)
         hessian[np.ix_(index, index)] += ssyrk(1.0, table.T, trans=1)  # its upper triangle

@@ -15,6 +15,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.fit import NEPER, Target
 from warprrf.rf.fields.bistatic.measured import Measurement, SpectrumPixels, WeighedPaths
 from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.open_air import warn_of_unmodelled
 from warprrf.rf.positions import check_dataset, check_positions, question_unit
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -143,6 +144,7 @@ def _check_readings(mesh: Mesh | None, one: Readings, device: DeviceLike) -> Non
         receivers = np.unique(one.receivers[under.reshape(-1) == k], axis=0)
         names = "ds.transmitters", "ds.receivers"
         check_positions(mesh, transmitter, receivers, wavelength_m, names=names, device=device)
+        warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=one.frequency_hz, device=device)
 
 
 @dataclass(frozen=True)
