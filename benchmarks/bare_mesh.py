@@ -17,7 +17,6 @@ from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import require
 from warprrf.geometry.mesh_topology import components, edge_pairs
 from warprrf.rf.fields.bistatic.training import trace
-from warprrf.rf.simulate import sample_receivers
 from warprrf.rf.spectra import metrics
 from warprrf.rf.spectra.dataset import assign_roles
 from warprrf.steps import digest
@@ -28,7 +27,7 @@ of it: faces of a few centimetres that were seen from the receivers, errors of t
 
 examples:
   python -m benchmarks bare-mesh
-  python -m benchmarks bare-mesh --room conferenceroom.stl     beside it, a room that was not made here
+  python -m benchmarks bare-mesh --room shared/external/newrf     beside it, a room that was not made here
   python -m benchmarks bare-mesh --truths spectra.nc --counts 10 --every 5     a first look, in minutes
 """
 
@@ -57,7 +56,7 @@ class Options:
     Attributes:
         scene: true scene (XML).
         truths: spectra (NetCDF), each in a file.
-        room: another room's mesh; its parts get materials, and exact spectra are computed.
+        room: folder of NeWRF's conference room (see :func:`warprrf.load_newrf`), whose parts get materials.
         counts: training receivers.
         every: each how-manieth test receiver counts.
         edge_m: longest edge of a scan's faces.
@@ -69,7 +68,9 @@ class Options:
     truths: tuple[str, ...] = option(
         tuple(str(Path(DATA) / file) for file in FILES.values()), "files of spectra (NetCDF)"
     )
-    room: str = option("", "another room's mesh, with exact spectra of materials drawn by part")
+    room: str = option(
+        "", "folder of NeWRF's conference room, which gets materials by part and exact spectra"
+    )
     counts: tuple[int, ...] = option((10, 50), "training receivers")
     every: int = option(1, "each how-manieth test receiver counts")
     edge_m: float = option(0.07, "longest edge of a scan's faces")
@@ -106,15 +107,15 @@ def named_by_part(mesh: wr.Mesh) -> wr.Scene:
     return wr.Scene(mesh, MATERIALS, np.where(part == area.argmax(), side, things[part]))
 
 
-def furnished(file: str, options: Options, job: Job) -> tuple[wr.Scene, Truth]:
-    """A room made elsewhere, its materials drawn by part, and exact spectra in it."""
-    scene = named_by_part(wr.Mesh.load(file))
+def furnished(folder: str, options: Options, job: Job) -> tuple[wr.Scene, Truth]:
+    """NeWRF's conference room in ``folder``, its materials drawn by part, and exact spectra at some of its receivers."""
+    rays = wr.load_newrf(folder)
+    scene, count = named_by_part(rays.mesh), max(options.counts) + TESTED
     low, high = scene.mesh.bounds
-    count = max(options.counts) + TESTED
     ds = wr.simulate(
         scene,
         transmitter=low + [0.9, 0.9, 0.9] * (high - low),
-        receivers=sample_receivers(scene, count, seed=job.seed),
+        receivers=np.random.default_rng(job.seed).permutation(rays.receivers)[:count],
         frequency_hz=300e9,
         shape=SHAPE,
         engine="exact",
@@ -122,7 +123,7 @@ def furnished(file: str, options: Options, job: Job) -> tuple[wr.Scene, Truth]:
         device=job.device,
         progress=job.progress,
     )
-    return scene, Truth(ds.engine, digest(file), ds, tuple(sorted(options.counts)), (), 1)
+    return scene, Truth(ds.engine, digest(Path(folder)), ds, tuple(sorted(options.counts)), (), 1)
 
 
 def compare(room: str, scene: wr.Scene, truth: Truth, options: Options, job: Job) -> list[dict[str, Any]]:
@@ -166,7 +167,7 @@ def run(options: Options, job: Job) -> Report:
         ("lobby", scene, Truth.load(Path(file), options.counts, options.every)) for file in options.truths
     ]
     if options.room:
-        cases.append((Path(options.room).stem, *furnished(options.room, options, job)))
+        cases.append(("conference room", *furnished(options.room, options, job)))
     rows = [row for room, place, truth in cases for row in compare(room, place, truth, options, job)]
     about = {"machine": machine(job.device), "error_m": options.error_m, "holes": options.holes}
     text = (
