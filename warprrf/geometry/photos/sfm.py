@@ -37,6 +37,10 @@ MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
 COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
+FEWEST_FEATURES, FEWEST_MATCHES = (
+    8,
+    15,
+)  # of a photo that can be matched, and of a pair that COLMAP counts as matched
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 
@@ -105,7 +109,8 @@ def structure_from_motion(
         inputs = [steps.key("matches"), seed]
         found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _sparse_model(colmap.Reconstruction(str(folder / "model")), list(named))
-        return replace(result, other_models=tuple(found["other_models"]))
+        causes = _causes(colmap, folder / "matches.db", result) if result.unposed else {}
+        return replace(result, other_models=tuple(found["other_models"]), causes=causes)
 
 
 def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
@@ -135,7 +140,7 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
             raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
         try:
             names = sorted(i.name for i in model.images.values())
-            found = replace(_sparse_model(model, names), metric=True)
+            found = replace(_sparse_model(model, names), metric=True, upright=True)
         except (ValueError, TypeError) as error:  # cameras that are no pinholes, or damaged
             raise ValueError(f"colmap: {root}: {str(error).removeprefix('colmap: ')}") from error
     if not np.isfinite(found.points).all():
@@ -244,11 +249,11 @@ def _match(
     )
     with colmap.Database.open(str(working)) as database:
         counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
-        blank = [n for n in names if counts[n] < 8]
+        blank = [n for n in names if counts[n] < FEWEST_FEATURES]
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
-                f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), "
-                f"too few remain to work with: {some(blank)}"
+                f"photos: {len(blank)} of {len(names)} photos show fewer than {FEWEST_FEATURES} features (blank, dark or "
+                f"blurred?), too few remain to work with: {some(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
         if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
@@ -366,6 +371,34 @@ def _map(
     os.replace(whole, folder / "model")
     report("mapping", len(named), len(named))
     return [m.num_reg_images() for m in others]
+
+
+def _causes(colmap: ModuleType, matches: Path, sparse: SparseModel) -> dict[str, str]:
+    """Why photos have no pose, by name."""
+    with colmap.Database.open(str(matches)) as database:
+        names = {i.image_id: i.name for i in database.read_all_images()}
+        features = {name: database.num_keypoints_for_image(k) for k, name in names.items()}
+        pairs, inliers = database.read_two_view_geometry_num_inliers()
+    best: dict[str, tuple[int, str]] = {}
+    for pair, count in zip(pairs, inliers, strict=True):
+        ends = [names[k] for k in (pair if np.ndim(pair) else colmap.pair_id_to_image_pair(pair))]
+        for one, other in (ends, ends[::-1]):
+            if other in sparse.cameras:
+                best[one] = max(best.get(one, (0, "")), (int(count), other))
+    causes = {}
+    for name in sparse.unposed:
+        count, other = best.get(name, (0, ""))
+        if features.get(name, 0) < FEWEST_FEATURES:
+            causes[name] = f"shows {features.get(name, 0)} features: blank, dark or blurred"
+        elif count < FEWEST_MATCHES:
+            causes[name] = (
+                f"shares {count or 'no'} features with any photo that has a pose: too little overlap"
+            )
+        else:
+            causes[name] = (
+                f"matches {other} in {count} features that do not fit the rest: too few, or of something alike"
+            )
+    return causes
 
 
 def _sparse_model(model: Any, names: Sequence[str]) -> SparseModel:
