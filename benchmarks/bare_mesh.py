@@ -32,6 +32,7 @@ examples:
 """
 
 OFF_M = 1e-4  # sight lines end this far before a face
+LEFT_OUT = ("per_receiver", "seconds_per_spectrum")  # of a report's figures
 TESTED = 40  # receivers in another room
 MATERIALS = (
     wr.Material.custom("carpet", relative_permittivity=2.0, conductivity=0.5, scattering=0.9),
@@ -45,7 +46,6 @@ COLUMNS = (
     ("room", "room", "{}"), ("truth", "truth", "{}"), ("n_train", "spectra", "{}"), ("mesh", "mesh", "{}"),
     ("psnr_db", "PSNR [dB]", "{:.2f}"), ("lost_db", "lost [dB]", "{:.2f}"),
     ("psnr_db_blocked", "where blocked [dB]", "{:.2f}"), ("groups", "pieces", "{}"), ("materials", "materials", "{}"),
-    ("fit_s", "fit [s]", "{:.1f}"),
 )  # fmt: skip
 
 
@@ -146,10 +146,9 @@ def compare(room: str, scene: wr.Scene, truth: Truth, options: Options, job: Job
                 progress=job.progress,
             )
             found = metrics.evaluate(truth.test, field.spectrum, progress=job.progress)
-            del found["per_receiver"]
-            row = {"room": room, "mesh": name, "truth": truth.name, "n_train": count, **found}
+            figures = {key: value for key, value in found.items() if key not in LEFT_OUT}
+            row = {"room": room, "mesh": name, "truth": truth.name, "n_train": count, **figures}
             row |= {key: field.report[key] for key in ("groups", "materials", "elements", "choices")}
-            row["fit_s"], row["trace_s"] = field.report["fit_time_s"], seen.seconds
             rows.append(row)
             named = next(r for r in rows if r["n_train"] == count)
             row["lost_db"] = named["psnr_db"] - row["psnr_db"]

@@ -606,15 +606,10 @@ def _bare_mesh() -> str:
     if found is None:
         return missing("python -m benchmarks bare-mesh")
     meshes = {"named": "names", "bare": "no names, no colours", "scan": "the same, scanned"}
-    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "where blocked [dB]", "fit [s]")
+    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "where blocked [dB]")
     lines = []
     for r in found["rows"]:
-        figures = (
-            show(r["psnr_db"]),
-            show(r["lost_db"], "{:.2f}"),
-            show(r["psnr_db_blocked"]),
-            show(r["fit_s"]),
-        )
+        figures = (show(r["psnr_db"]), show(r["lost_db"], "{:.2f}"), show(r["psnr_db_blocked"]))
         lines.append([r["room"], TRUTHS[r["truth"]], str(r["n_train"]), meshes[r["mesh"]], *figures])
     return markdown(head, lines)
 
