@@ -78,7 +78,7 @@ class Selection:
         most_to_choose: receivers that fits which only decide about a term learn from.
         short_steps: of such a fit.
         better: share to which a term must lower the held-out mean square error.
-        clearly_better: and the residual: it has thousands of unknowns and blurs the strongest paths.
+        clearly_worse: share to which the residual may raise it: one that is learned from all receivers gains more.
         not_much_worse: share to which it may rise where fewer materials fit the training receivers better.
         few_materials: up to which light that is sent on follows the parameters of its group.
         regrouped: rounds of deciding what is of one material, and fitting.
@@ -95,7 +95,7 @@ class Selection:
     most_to_choose: int = 12
     short_steps: int = 10
     better: float = 0.995
-    clearly_better: float = 0.95
+    clearly_worse: float = 1.05
     not_much_worse: float = 1.5
     few_materials: int = 30
     regrouped: int = 3
@@ -427,11 +427,8 @@ class _Training:
         if len(self.held):
             first = self._fit_groups(terms, start, self._few(1), self.choose.short_steps * 2)
             best = self._choose(_Candidate(terms, first, self._held_error(terms, first)))
-            residual = self._choose_residual(best)
-            terms, start = best.terms, best.fit.parameters
-            if residual is not None:
-                terms = replace(terms, residual=True)
-            errors = self._errors(terms, best.fit, residual)
+            residual, errors = self._held_in_turn(best)
+            terms, start = replace(best.terms, residual=residual), best.fit.parameters
         # Chosen terms come with a fit to most receivers, under which light that goes on is settled: one round is left.
         rounds = 1 if len(self.held) else self.choose.rounds
         fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=rounds)
@@ -546,17 +543,6 @@ class _Training:
             best = self._tried("indirect", True, best)
         return best
 
-    def _choose_residual(self, best: _Candidate) -> np.ndarray | None:
-        """The residual (2, X) on the receivers kept, if it is wanted or lowers the held-out error clearly."""
-        if not (best.terms.residual or self.options.residual is None):
-            return None
-        bare = self._materials(replace(best.terms, residual=False), best.fit)
-        found = self._residual(bare, self.kept)
-        error = self._image_error(replace(bare, terms=replace(best.terms, residual=True), residual=found))
-        keep = best.terms.residual or error < self.choose.clearly_better * self._image_error(bare)
-        self._note("residual", keep, error)
-        return found if keep else None
-
     def _tried(self, name: str, value: Any, best: _Candidate) -> _Candidate:
         """The candidate with one term more, if its error is lower; else as it was."""
         trial = replace(best.terms, **{name: value})
@@ -638,29 +624,46 @@ class _Training:
 
         return of
 
-    def _errors(self, terms: Terms, fit: Fitted, residual: np.ndarray | None) -> ErrorModel | None:
-        """Learned from the receivers held out; where they are few, from all, held out in turn. None where no whole spectra
-        were measured."""
-        if not all(isinstance(o.measured, SpectrumPixels) and o.target.trust is None for o in self.observed):
-            return None
-        receivers = np.stack([o.place.receiver for o in self.observed])
-        images, errors, gaps = [], [], []
+    def _held_in_turn(self, best: _Candidate) -> tuple[bool, ErrorModel | None]:
+        """Whether the residual is wanted, or does not clearly raise the held-out error, and the errors that then remain:
+        of the receivers held out; where they are few, of all, held out in turn. No errors where no whole spectra were
+        measured."""
+        wanted, places = self.options.residual, np.stack([o.place.receiver for o in self.observed])
+        power: dict[bool, list[np.ndarray]] = {one: [] for one in (False, True) if wanted in (None, one)}
+        order: list[int] = []
+        gaps = []
         for held in self._folds():
             kept = np.setdiff1d(np.arange(self.count), held)
-            if held is self.held:
-                materials = self._materials(terms, fit, residual)
-            else:
-                own = self._fit_groups(terms, fit.parameters, kept, self.choose.short_steps, rounds=1)
-                materials = self._materials(terms, own)
-                if terms.residual:
-                    materials = replace(materials, residual=self._residual(materials, kept))
-            sent = self._sent(materials)
-            for r in held:
-                power, shape = self._predicted(materials, sent, r), self.observed[r].place.shape
-                images.append((NEPER * np.log1p(power)).reshape(shape))
-                errors.append(self.observed[r].target.error(power).reshape(shape))
-                gaps.append(np.linalg.norm(receivers[kept] - receivers[r], axis=1).min())
-        return learn_errors(images, errors, np.array(gaps), receivers, self._covariance(fit))
+            fit = best.fit
+            if held is not self.held:
+                fit = self._fit_groups(best.terms, fit.parameters, kept, self.choose.short_steps, rounds=1)
+            order += held.tolist()
+            gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
+            bare = self._materials(replace(best.terms, residual=False), fit)
+            for residual, found in power.items():
+                materials = bare
+                if residual:
+                    terms = replace(best.terms, residual=True)
+                    materials = replace(bare, terms=terms, residual=self._residual(bare, kept))
+                sent = self._sent(materials)
+                found += [self._predicted(materials, sent, r) for r in held]
+        errors = {
+            one: [self.observed[r].target.error(x) for r, x in zip(order, found, strict=True)]
+            for one, found in power.items()
+        }
+        loss = {
+            one: float(np.mean([self._losses(r, e).mean() for r, e in zip(order, own, strict=True)]))
+            for one, own in errors.items()
+        }
+        keep = wanted if wanted is not None else loss[True] < self.choose.clearly_worse * loss[False]
+        for one, error in loss.items():
+            self._note("residual" if one else "no residual", one == keep, error)
+        if not all(isinstance(o.measured, SpectrumPixels) and o.target.trust is None for o in self.observed):
+            return keep, None
+        shapes = [self.observed[r].place.shape for r in order]
+        images = [(NEPER * np.log1p(x)).reshape(shape) for x, shape in zip(power[keep], shapes, strict=True)]
+        missed = [e.reshape(shape) for e, shape in zip(errors[keep], shapes, strict=True)]
+        return keep, learn_errors(images, missed, np.array(gaps), places, self._covariance(best.fit))
 
     def _covariance(self, fit: Fitted) -> np.ndarray:
         """Of what a field keeps: without the gains of chains."""
@@ -750,12 +753,7 @@ class _Training:
         self._stepped()
         return found
 
-    def _materials(self, terms: Terms, fit: Fitted, residual: np.ndarray | None = None) -> Materials:
-        """What ``fit`` found, by groups."""
+    def _materials(self, terms: Terms, fit: Fitted) -> Materials:
+        """What ``fit`` found, by groups, without a residual."""
         none = np.zeros((2, self.surface.cells))
-        return Materials(
-            terms,
-            fit.parameters.take(self.material),
-            none if residual is None else residual,
-            self.transmitter,
-        )
+        return Materials(terms, fit.parameters.take(self.material), none, self.transmitter)
