@@ -47,7 +47,12 @@ FEW: dict[str, Any] = {
     "mirror_order": 2, "mirror_scatter": True, "scatter_mirror": False, "diffuse_order": 3, "indirect": False,
     "residual": True,
 }  # fmt: skip
-"""What a fit takes for given of receivers too few to hold any out: bounces that rooms have, which bring no parameters."""
+"""What a fit tries first on receivers too few to hold any out: bounces that rooms have, which bring no parameters."""
+SINGLE: dict[str, Any] = {
+    "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False,
+    "residual": True,
+}  # fmt: skip
+"""What it takes where that fits much worse."""
 TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "indirect", "residual")
 """Terms that a fit decides on where they are None."""
 KNOWN_BETTER = 2.0
@@ -71,18 +76,19 @@ class Selection:
     """How a fit decides about terms, on receivers that it holds out.
 
     Attributes:
-        least_receivers: training receivers below which nothing is held out: terms are those of :data:`FEW`.
+        least_receivers: training receivers below which nothing is held out.
         held_out: share of the receivers that are held out.
         most_held_out: receivers held out at most.
         few_receivers: up to which errors are learned from every receiver, held out in turn.
         most_to_choose: receivers that fits which only decide about a term learn from.
         short_steps: of such a fit.
         better: share to which a term must lower the held-out mean square error.
+        much_better: share to which single bounces alone must lower the mean square error where receivers are few.
         clearly_worse: share to which the residual may raise it: one that is learned from all receivers gains more.
         not_much_worse: share to which it may rise where fewer materials fit the training receivers better.
         few_materials: up to which light that is sent on follows the parameters of its group.
         regrouped: rounds of deciding what is of one material, and fitting.
-        rounds: of further bounces and groups in turn, where no choice came before.
+        rounds: of further bounces and groups in turn in a first fit.
         unexplained: standard deviations beyond which a reading of a table is taken to be wrong: it is named, and left out.
         readings: pixels that groups are fitted to, spread over the training receivers.
         regrouping: what it takes to be of one material; None for :data:`BY_SHAPE` where only shapes tell groups apart.
@@ -95,6 +101,7 @@ class Selection:
     most_to_choose: int = 12
     short_steps: int = 10
     better: float = 0.995
+    much_better: float = 0.5
     clearly_worse: float = 1.05
     not_much_worse: float = 1.5
     few_materials: int = 30
@@ -111,7 +118,8 @@ class FitOptions:
     """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
 
     A term given as None is kept only if it lowers the error on receivers held out of the data set (a quarter, ten at
-    most); with fewer than four receivers nothing is held out, and :data:`FEW` is modelled.
+    most); with fewer than four receivers nothing is held out: :data:`FEW` is modelled, or
+    :data:`SINGLE` if it fits much better.
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
@@ -349,8 +357,6 @@ def train(
         geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
-    if len(seen.places) < o.selection.least_receivers:
-        o = replace(o, **o.given(FEW, FEW))
     if o.residuals is None:
         o = replace(o, residuals=QUICK_RESIDUAL if options.quick else ResidualFit())
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
@@ -429,9 +435,11 @@ class _Training:
             best = self._choose(_Candidate(terms, first, self._held_error(terms, first)))
             residual, errors = self._held_in_turn(best)
             terms, start = replace(best.terms, residual=residual), best.fit.parameters
+        else:
+            best = self._choose_of_few()
+            terms, start = best.terms, best.fit.parameters
         # Chosen terms come with a fit to most receivers, under which light that goes on is settled: one round is left.
-        rounds = 1 if len(self.held) else self.choose.rounds
-        fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=rounds)
+        fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=1)
         materials = self._materials(terms, fit)
         if terms.residual:
             materials = replace(materials, residual=self._residual(materials, everyone))
@@ -523,6 +531,21 @@ class _Training:
     def _note(self, term: str, kept: bool, error: float) -> None:
         self.log.append({"term": term, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(error))})
 
+    def _choose_of_few(self) -> _Candidate:
+        """With too few receivers to hold any out: further bounces as rooms have them, unless none fit much better."""
+        found = []
+        for given in (FEW, SINGLE):
+            terms = replace(self.options, **self.options.given(given, TERMS)).terms()
+            start = Parameters.prior(int(self.material.max()) + 1, len(terms.lobes))
+            fit = self._fit_groups(terms, start, np.arange(self.count), self.options.iterations)
+            bare = self._materials(replace(terms, residual=False), fit)
+            found.append(_Candidate(terms, fit, self._image_error(bare, np.arange(self.count))))
+        further, single = found
+        fewer = single.error < self.choose.much_better * further.error
+        self._note("further bounces", not fewer, further.error)
+        self._note("single bounces", fewer, single.error)
+        return single if fewer else further
+
     def _choose(self, best: _Candidate) -> _Candidate:
         """Terms that lower the held-out error, one after another, each with a short fit of its own."""
         free = {name for name in TERMS if getattr(self.options, name) is None}
@@ -583,18 +606,18 @@ class _Training:
         """Mean square error of the held-out receivers without residual [dB^2]: of whole images where they are few,
         else at the chosen pixels."""
         if len(self.held) <= self.choose.least_receivers:
-            return self._image_error(self._materials(replace(terms, residual=False), fit))
+            return self._image_error(self._materials(replace(terms, residual=False), fit), self.held)
         readings = self._readings(terms, fit, self.held, follow=False)
         errors = [r.tied(self.material).error_db(fit.parameters) for r in readings]
         return float(
             np.mean(np.concatenate([self._losses(r, e) for r, e in zip(self.held, errors, strict=True)]))
         )
 
-    def _image_error(self, materials: Materials) -> float:
-        """Mean loss of all readings of the held-out places [dB^2]."""
+    def _image_error(self, materials: Materials, places: np.ndarray) -> float:
+        """Mean loss of all readings of ``places`` [dB^2]."""
         sent = self._sent(materials)
-        errors = [self.observed[r].target.error(self._predicted(materials, sent, r)) for r in self.held]
-        return float(np.mean([self._losses(r, e).mean() for r, e in zip(self.held, errors, strict=True)]))
+        errors = [self.observed[r].target.error(self._predicted(materials, sent, r)) for r in places]
+        return float(np.mean([self._losses(r, e).mean() for r, e in zip(places, errors, strict=True)]))
 
     def _losses(self, place: int, error: np.ndarray) -> np.ndarray:
         """Squares of errors (N,) at a place [dB^2]; of tables robust ones: some readings may be wrong."""
