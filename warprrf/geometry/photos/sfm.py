@@ -23,6 +23,7 @@ import numpy as np
 
 from warprrf.checks import check_count
 from warprrf.device import Progress, require
+from warprrf.geometry.photos.config import LENSES
 from warprrf.geometry.photos.lens_choice import FREE_MODEL, choose_lens, lens_of
 from warprrf.geometry.photos.photo_files import (
     MIN_PHOTOS,
@@ -43,7 +44,6 @@ from warprrf.steps import Attempt, Steps
 VERSIONS = {"features": 2, "matches": 1, "model": 2, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
-LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 LEAST_PIXELS = 10_000  # of max_pixels
 FEATURE_SIDE = 1600  # features are found in photos reduced to this length of their longer side [pixels]
 
@@ -85,8 +85,9 @@ def structure_from_motion(
         photos: a folder, or a sequence of image files.
         workspace: folder for the feature database, the model and the undistorted photos; made if it is not there.
         max_features: SIFT features kept per photo (the largest ones).
-        lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
-            ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
+        lens: COLMAP's model of the lenses, one of :data:`~warprrf.geometry.photos.config.LENSES`; ``"auto"`` takes the
+            simplest of pinhole, ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has
+            to be named.
         max_pixels: undistorted photos are reduced to about so many pixels.
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
