@@ -123,6 +123,7 @@ def structure_from_motion(
         return {"other_models": _map(colmap, folder, named, (lens, seed), attempt)}
 
     def straight(attempt: Attempt) -> dict[str, Any]:
+        shutil.rmtree(kept, ignore_errors=True)  # of other photos, or with masks that are gone
         for k, name in enumerate(lenses):
             attempt.progress("undistorting", k, len(lenses))
             write_undistorted(named[name], kept / name, lenses[name], max_pixels)
@@ -131,6 +132,8 @@ def structure_from_motion(
 
     folder = Path(workspace).absolute() / "sfm"
     kept = folder / "photos"
+    if any(path.resolve().is_relative_to(kept.resolve()) for path in named.values()):
+        raise ValueError(f"workspace: {kept} holds the photos and would be overwritten; name another folder")
     with Steps(folder, progress=progress) as steps, _quiet(colmap):
         colmap.set_random_seed(seed)
         masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
