@@ -30,6 +30,7 @@ from warprrf.cli.inputs import (
 )
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
+from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 
 
 def add_reconstruct(add: Add) -> None:
@@ -47,6 +48,16 @@ def add_reconstruct(add: Add) -> None:
         help="how far apart the cameras of two photos were: sets metres where nobody surveyed",
     )
     rec.add_argument("--workspace", help="where unfinished work lives (default OUT/workspace)")
+    rec.add_argument(
+        "--lens", default="auto", choices=LENSES, help="COLMAP's model of the lenses (default auto)"
+    )
+    rec.add_argument(
+        "--max-pixels",
+        type=int,
+        default=ReconstructionConfig.max_pixels,
+        metavar="N",
+        help="photos are reduced to about so many before the fit (default %(default)s)",
+    )
 
 
 def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
@@ -54,6 +65,7 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
 
     The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
     their depth is fused into a mesh. OUT/report.html shows what came out and how far it can be trusted.
+    Lenses are estimated, and photos are turned upright by EXIF; NAME.mask.png beside a photo is black where it is ignored.
     Photos know no scale: name the measured positions of at least three cameras, or the distance between two. Without
     positions z is up by vertical edges and the floor is at 0.
 
@@ -72,6 +84,7 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
         workspace=workspace,
         known_positions=known,
         scale=scale,
+        config=ReconstructionConfig(lens=args.lens, max_pixels=args.max_pixels),
         seed=args.seed,
         progress=bars,
         device=args.device,

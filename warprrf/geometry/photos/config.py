@@ -9,6 +9,9 @@ import numpy as np
 from warprrf.checks import check_count, check_positive, check_seed
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
+LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+"""COLMAP's lens models that photos can be taken through; "auto": the simplest that explains them."""
+
 
 @dataclass(frozen=True)
 class PlaneConfig:

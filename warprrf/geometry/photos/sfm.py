@@ -23,6 +23,7 @@ import numpy as np
 
 from warprrf.checks import check_count
 from warprrf.device import Progress, require
+from warprrf.geometry.photos.config import LENSES
 from warprrf.geometry.photos.lens_choice import FREE_MODEL, choose_lens, lens_of
 from warprrf.geometry.photos.photo_files import (
     MIN_PHOTOS,
@@ -43,7 +44,6 @@ from warprrf.steps import Attempt, Steps
 VERSIONS = {"features": 2, "matches": 1, "model": 2, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
-LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 LEAST_PIXELS = 10_000  # of max_pixels
 FEATURE_SIDE = 1600  # features are found in photos reduced to this length of their longer side [pixels]
 
@@ -85,8 +85,9 @@ def structure_from_motion(
         photos: a folder, or a sequence of image files.
         workspace: folder for the feature database, the model and the undistorted photos; made if it is not there.
         max_features: SIFT features kept per photo (the largest ones).
-        lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
-            ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
+        lens: COLMAP's model of the lenses, one of :data:`~warprrf.geometry.photos.config.LENSES`; ``"auto"`` takes the
+            simplest of pinhole, ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has
+            to be named.
         max_pixels: undistorted photos are reduced to about so many pixels.
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
@@ -122,6 +123,7 @@ def structure_from_motion(
         return {"other_models": _map(colmap, folder, named, (lens, seed), attempt)}
 
     def straight(attempt: Attempt) -> dict[str, Any]:
+        shutil.rmtree(kept, ignore_errors=True)  # of other photos, or with masks that are gone
         for k, name in enumerate(lenses):
             attempt.progress("undistorting", k, len(lenses))
             write_undistorted(named[name], kept / name, lenses[name], max_pixels)
@@ -130,6 +132,8 @@ def structure_from_motion(
 
     folder = Path(workspace).absolute() / "sfm"
     kept = folder / "photos"
+    if any(path.resolve().is_relative_to(kept.resolve()) for path in named.values()):
+        raise ValueError(f"workspace: {kept} holds the photos and would be overwritten; name another folder")
     with Steps(folder, progress=progress) as steps, _quiet(colmap):
         colmap.set_random_seed(seed)
         masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}

@@ -107,18 +107,16 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
     if lens.straight and turns == 0 and small == lens:
         shutil.copyfile(source, target)
     else:
-        _save(
-            _resampled(open_photo(source, "RGB"), source, lens, small).rotate(-90 * turns, expand=True),
-            target,
-        )
+        straight = _resampled(open_photo(source, "RGB"), source, lens, small)
+        _save(straight.rotate(-90 * turns, expand=True), target)
     if mask is not None:
         image = require("PIL.Image", extra="photos")
         stored = open_photo(mask, "L").rotate(
             90 * turns, expand=True
         )  # a mask is upright, as its photo is seen
-        straight = np.asarray(_resampled(stored, mask, lens, small))
-        whole = np.where(straight > 254, 255, 0).astype(np.uint8)
-        _save(image.fromarray(whole).rotate(-90 * turns, expand=True), mask_name(target))
+        counts = np.asarray(_resampled(stored, mask, lens, small)) > 254
+        whole = image.fromarray(np.where(counts, 255, 0).astype(np.uint8))
+        _save(whole.rotate(-90 * turns, expand=True), mask_name(target))
 
 
 def load_colmap() -> Any:
