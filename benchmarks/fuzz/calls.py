@@ -264,7 +264,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Readings.subset": lambda p: {"self": wr.Readings(**_readings(p)), "rows": np.array([0, 2])},
     "horn": lambda p: {"width_rad": 0.2},
     "SpectrumDataset": _spectra,
-    "SpectrumDataset.check_whole": _on(lambda p: p.train, name="ds"),
     "SpectrumDataset.deembed": _on(
         lambda p: p.train.subset([0]), pattern=np.cos(np.linspace(0, np.pi / 2, 19)) ** 8, iterations=20, snapshots=1,
         tolerance=1e-2,

@@ -22,6 +22,7 @@ from warprrf.rf.spectra.spectrum import (
     check_pixels,
     check_range_db,
     check_shape,
+    check_whole,
     default_floor,
     pixel_directions,
     to_db,
@@ -212,14 +213,6 @@ class SpectrumDataset:
         """Rows and columns of a spectrum."""
         return self.path_gain.shape[1], self.path_gain.shape[2]
 
-    def check_whole(self, name: str) -> None:
-        """Raise ValueError, naming the argument that this is, if pixels were not measured."""
-        missing = int(np.isnan(self.path_gain).sum())
-        if missing:
-            raise ValueError(
-                f"{name}: {missing} of {self.path_gain.size} pixels were not measured (NaN), expected whole spectra"
-            )
-
     @property
     def air(self) -> Air | None:
         """The air whose absorption is in the path gains, by the attributes ``air_...``; None for none."""
@@ -302,7 +295,7 @@ class SpectrumDataset:
             TypeError: on a pattern that does not read as numbers, or an option of the other kind of antenna.
             ValueError: on negative, NaN or infinite gains, a scanned antenna without directivity, another shape.
         """
-        self.check_whole("path_gain")
+        check_whole("path_gain", self.path_gain)
         done = deembed(
             self.path_gain,
             pattern,

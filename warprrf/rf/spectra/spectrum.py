@@ -94,6 +94,15 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
             )
 
 
+def check_whole(name: str, path_gain: ArrayLike) -> None:
+    """Raise ValueError, naming the argument, if pixels of spectra were not measured."""
+    missing = int(np.isnan(path_gain).sum())
+    if missing:
+        raise ValueError(
+            f"{name}: {missing} of {np.size(path_gain)} pixels were not measured (NaN), expected whole spectra"
+        )
+
+
 def pixel_angles(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Zenith of the rows, shape ``(H,)``, and azimuth of the columns, shape ``(W,)`` [rad], at pixel centres."""
     rows, columns = check_shape(shape)

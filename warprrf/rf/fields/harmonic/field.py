@@ -55,7 +55,6 @@ from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.positions import check_dataset
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
 from warprrf.steps import digest
 
@@ -133,7 +132,7 @@ class HarmonicField(RadioField):
     def fit(  # type: ignore[override]
         cls,
         geometry: GeometryLike | Gaussians,
-        ds: Data,
+        ds: SpectrumDataset,
         model: str = "rf3dgs+",
         *,
         options: FieldOptions | None = None,
@@ -164,10 +163,6 @@ class HarmonicField(RadioField):
         chosen = FieldOptions.of(options, {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
-        if not isinstance(ds, SpectrumDataset):
-            raise TypeError(
-                f"ds: got {type(ds).__name__}, expected a SpectrumDataset; only bistatic fields take others"
-            )
         receivers, transmitter = check_dataset(mesh, ds, device=device)
         if mesh is None and (chosen.line_of_sight == "explicit" or chosen.interaction_point == "mesh"):
             raise ValueError(
