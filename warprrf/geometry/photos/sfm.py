@@ -220,8 +220,8 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
             found = replace(_sparse_model(model, names), metric=True, upright=True)
         except (ValueError, TypeError) as error:  # cameras that are no pinholes, or damaged
             raise ValueError(f"colmap: {root}: {str(error).removeprefix('colmap: ')}") from error
-    if not np.isfinite(found.points).all():
-        raise ValueError(f"colmap: {root} holds points that are NaN or infinite")
+    if not (np.isfinite(found.points).all() and np.isfinite(found.reprojection_error).all()):
+        raise ValueError(f"colmap: {root} holds points, or errors of theirs, that are NaN or infinite")
     return found
 
 
@@ -647,7 +647,9 @@ def _sparse_model(
         cameras[name] = pinhole_of(lens, _pose(images[name]), (turns or {}).get(name, 0), max_pixels)
         share[images[name].image_id] = (cameras[name].fx + cameras[name].fy) / (lens.fx + lens.fy)
     position = {images[n].image_id: i for i, n in enumerate(cameras)}
-    points = [model.points3D[i] for i in sorted(model.points3D)]
+    points = [
+        p for _, p in sorted(model.points3D.items()) if p.track.elements
+    ]  # what no photo shows is no use
     tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
     length = np.array([len(t) for t in tracks], dtype=np.int64)
     return SparseModel(
