@@ -127,16 +127,7 @@ def reconstruct(
     measured = {} if known is None else known.depth
     if known_positions is not None:
         sparse = align_to_known(sparse, known_positions)
-    elif scale is not None or measured:
-        sparse = scaled(sparse, 1.0 if scale is None else scale)
-    else:
-        sparse = assume_scale(sparse)
-    if measured:
-        sparse = with_points(sparse, measured)
-    if up is not None:
-        sparse = turned(sparse, up)
-    elif known_positions is None:
-        sparse = upright(sparse, lambda name: read_photo(sparse.photos[name]), seed=seed)
+    sparse = _placed(sparse, measured, scale, up, seed)
     fitted = {name: photo for name, photo in sparse.photos.items() if name not in skipped}
     if not fitted:
         raise ValueError(
@@ -176,6 +167,26 @@ def _check_world(poses: object, depth: object, known_positions: object, scale: o
         raise ValueError(
             f'scale: got {scale}, expected ("a.jpg", "b.jpg", metres); a number of metres for each unit goes with poses'
         )
+
+
+def _placed(
+    sparse: SparseModel,
+    measured: Mapping[str, DepthFile],
+    scale: float | tuple[str, str, float] | None,
+    up: str | None,
+    seed: int,
+) -> SparseModel:
+    """``sparse`` in metres, z up, unless surveyed positions have brought it there; with points of ``measured`` depth."""
+    if not sparse.metric and scale is None and not measured:
+        sparse = assume_scale(sparse)
+    elif not sparse.metric:
+        sparse = scaled(sparse, 1.0 if scale is None else scale)
+    if measured:
+        sparse = with_points(sparse, measured)
+    if up is not None:
+        return turned(sparse, up)
+    photos = sparse.photos
+    return sparse if sparse.upright else upright(sparse, lambda name: read_photo(photos[name]), seed=seed)
 
 
 def _known_poses(poses: Path, depth: Path | None, photos: Mapping[str, Path], warn: bool) -> KnownPoses:

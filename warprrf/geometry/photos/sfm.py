@@ -101,8 +101,7 @@ def structure_from_motion(
         max_pixels: undistorted photos are reduced to about so many pixels.
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
-        poses: poses and lenses that are known: points alone are triangulated, and nothing at all is matched where they
-            are known too or depth is.
+        poses: poses and lenses that are known; points are triangulated, where they and depth are not known too.
         seed: seed of every random draw.
         progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
 
@@ -115,8 +114,7 @@ def structure_from_motion(
         raise ValueError(f"lens: got {lens!r}, expected one of {', '.join(LENSES)}")
     if pairs not in ("auto", "exhaustive"):
         raise ValueError(f'pairs: got {pairs!r}, expected "auto" or "exhaustive"')
-    if max_features < 100:
-        raise ValueError(f"max_features: got {max_features}, expected at least 100")
+    check_count("max_features", max_features, 100)
     check_count("max_pixels", max_pixels, LEAST_PIXELS)
     everything = named = find_photos(photos)
     colmap = load_colmap()
@@ -144,14 +142,6 @@ def structure_from_motion(
         _keep_known(colmap, folder, named, (known, match, seed), attempt)
         return {"other_models": []}
 
-    def straight(attempt: Attempt) -> dict[str, Any]:
-        shutil.rmtree(kept, ignore_errors=True)  # of other photos, or with masks that are gone
-        for k, name in enumerate(lenses):
-            attempt.progress("undistorting", k, len(lenses))
-            write_undistorted(named[name], kept / name, lenses[name], max_pixels)
-        attempt.progress("undistorting", len(lenses), len(lenses))
-        return {}
-
     folder = Path(workspace).absolute() / "sfm"
     kept = folder / "photos"
     if any(path.resolve().is_relative_to(kept.resolve()) for path in named.values()):
@@ -171,22 +161,39 @@ def structure_from_motion(
         if known is not None:
             inputs += [list(named.values()), *_content(known)]
         found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
-        stored = colmap.Reconstruction(str(folder / "model"))
-        lenses = lenses_of(stored)
-        outputs = [f"photos/{name}" for name in lenses]
-        inputs = [steps.key("model"), max_pixels]
-        steps.run("photos", straight, version=VERSIONS["photos"], inputs=inputs, outputs=outputs)
-        turns = {name: turns_of(named[name]) for name in lenses}
-        result = _sparse_model(
-            stored, list(named) if poses is None else [*named, *poses.unposed(everything)], turns, max_pixels
-        )
-        photos_of = {name: kept / name for name in lenses}
+        result = _straightened(colmap, steps, named, max_pixels)
+        unposed = [name for name in named if name not in result.cameras]
         if poses is not None:
-            causes = dict.fromkeys(result.unposed, "the poses given have none of it")
+            unposed += poses.unposed(everything)
+            causes = dict.fromkeys(unposed, "the poses given have none of it")
         else:
-            causes = _causes(colmap, folder / "matches.db", result) if result.unposed else {}
-        others = tuple(found["other_models"])
-        return replace(result, other_models=others, causes=causes, photos=photos_of, lenses=lenses)
+            causes = _causes(colmap, folder / "matches.db", result) if unposed else {}
+        return replace(
+            result, unposed=tuple(unposed), causes=causes, other_models=tuple(found["other_models"])
+        )
+
+
+def _straightened(
+    colmap: ModuleType, steps: Steps, named: Mapping[str, Path], max_pixels: int
+) -> SparseModel:
+    """The model in the folder of ``steps``, with undistorted photos beside it."""
+    model, kept = colmap.Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
+    lenses = lenses_of(model)
+
+    def straight(attempt: Attempt) -> dict[str, Any]:
+        shutil.rmtree(kept, ignore_errors=True)  # of other photos, or with masks that are gone
+        for k, name in enumerate(lenses):
+            attempt.progress("undistorting", k, len(lenses))
+            write_undistorted(named[name], kept / name, lenses[name], max_pixels)
+        attempt.progress("undistorting", len(lenses), len(lenses))
+        return {}
+
+    outputs = [f"photos/{name}" for name in lenses]
+    inputs = [steps.key("model"), max_pixels]
+    steps.run("photos", straight, version=VERSIONS["photos"], inputs=inputs, outputs=outputs)
+    turns = {name: turns_of(named[name]) for name in lenses}
+    result = _sparse_model(model, list(named), turns, max_pixels)
+    return replace(result, photos={name: kept / name for name in lenses}, lenses=lenses)
 
 
 def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
@@ -213,8 +220,8 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
             found = replace(_sparse_model(model, names), metric=True, upright=True)
         except (ValueError, TypeError) as error:  # cameras that are no pinholes, or damaged
             raise ValueError(f"colmap: {root}: {str(error).removeprefix('colmap: ')}") from error
-    if not np.isfinite(found.points).all():
-        raise ValueError(f"colmap: {root} holds points that are NaN or infinite")
+    if not (np.isfinite(found.points).all() and np.isfinite(found.reprojection_error).all()):
+        raise ValueError(f"colmap: {root} holds points, or errors of theirs, that are NaN or infinite")
     return found
 
 
@@ -640,7 +647,9 @@ def _sparse_model(
         cameras[name] = pinhole_of(lens, _pose(images[name]), (turns or {}).get(name, 0), max_pixels)
         share[images[name].image_id] = (cameras[name].fx + cameras[name].fy) / (lens.fx + lens.fy)
     position = {images[n].image_id: i for i, n in enumerate(cameras)}
-    points = [model.points3D[i] for i in sorted(model.points3D)]
+    points = [
+        p for _, p in sorted(model.points3D.items()) if p.track.elements
+    ]  # what no photo shows is no use
     tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
     length = np.array([len(t) for t in tracks], dtype=np.int64)
     return SparseModel(
