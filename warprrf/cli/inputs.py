@@ -92,14 +92,16 @@ def read_readings(path: Path, args: argparse.Namespace) -> wr.Readings:
     )  # fmt: skip
 
 
-def read_scale(words: Sequence[str]) -> tuple[str, str, float]:
-    """Two photos and the distance between their cameras [m], from three words."""
+def read_scale(words: Sequence[str]) -> float | tuple[str, str, float]:
+    """Two photos and the distance between their cameras [m], or metres for each unit, from three words or one."""
     try:
-        return words[0], words[1], float(words[2])
+        *photos, number = words
+        length = float(number)
     except ValueError as error:
-        raise ValueError(
-            f"--scale: got {words[2]!r}, expected a distance in metres after two photos"
-        ) from error
+        raise ValueError(f"--scale: got {words[-1]!r}, expected a number of metres") from error
+    if len(photos) not in (0, 2):
+        raise ValueError(f"--scale: got {' '.join(words)!r}, expected two photos and metres, or one number")
+    return (photos[0], photos[1], length) if photos else length
 
 
 def read_receivers(values: Sequence[str]) -> np.ndarray:

@@ -43,9 +43,20 @@ def add_reconstruct(add: Add) -> None:
     )
     rec.add_argument(
         "--scale",
-        nargs=3,
-        metavar=("PHOTO", "PHOTO", "METRES"),
-        help="how far apart the cameras of two photos were: sets metres where nobody surveyed",
+        nargs="+",
+        metavar="WORD",
+        help="two photos and how far apart their cameras were, in metres; or metres for each unit of --poses",
+    )
+    rec.add_argument(
+        "--poses",
+        metavar="PATH",
+        help="known poses: a transforms.json, a COLMAP model, or RGB-D frames as of 7-Scenes",
+    )
+    rec.add_argument(
+        "--depth", metavar="FOLDER", help="depth images in mm, PNG of 16 bits named as the photos are"
+    )
+    rec.add_argument(
+        "--up", choices=("x", "y", "z"), help="axis of --poses that points up; default: found in the photos"
     )
     rec.add_argument("--workspace", help="where unfinished work lives (default OUT/workspace)")
     rec.add_argument(
@@ -72,6 +83,7 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
     examples:
       warprrf reconstruct photos/ -o room --known-positions surveyed.json
       warprrf reconstruct photos/ -o room --scale IMG_0001.jpg IMG_0040.jpg 3.25
+      warprrf reconstruct scan/ -o room --poses scan/transforms.json --scale 1 --up z
       where surveyed.json holds {"view_000.jpg": [1.20, 0.85, 1.60], ...} in metres
     Overlap matters most: every surface in five photos or more, loops that look across the room.
     """
@@ -82,8 +94,11 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
     reconstruction = wr.reconstruct(
         photos,
         workspace=workspace,
+        poses=None if args.poses is None else existing(args.poses),
+        depth=None if args.depth is None else existing(args.depth),
         known_positions=known,
         scale=scale,
+        up=args.up,
         config=ReconstructionConfig(lens=args.lens, max_pixels=args.max_pixels),
         seed=args.seed,
         progress=bars,

@@ -178,6 +178,7 @@ class Reconstruction:
                 photos=self.photos,
                 held_out=self.held_out,
                 unposed={name: self.causes.get(name, "") for name in self.unposed},
+                lenses=self.lenses,
                 guessed=self.guessed,
                 metric=self.metric,
                 scale_rms_m=self.scale_rms_m,

@@ -163,7 +163,8 @@ class _Refinement:
     def scale(self, iteration: int) -> int:
         """Side in pixels of the squares that photos are averaged over."""
         c, scale = self.config, self.config.downscale
-        if iteration >= c.full_from * c.iterations:
+        in_full = (1 - c.full_from) * min(1.0, c.full_pixels / self.targets.pixels)
+        if iteration >= c.iterations - round(in_full * c.iterations):
             return 1
         if iteration < c.fine_from * c.iterations:
             while self.targets.pixels > c.coarse_pixels * scale**2:
