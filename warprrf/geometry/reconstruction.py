@@ -76,6 +76,9 @@ class Reconstruction:
         self.guessed = tuple(guessed)
         self.lenses = dict(lenses or {})
         self.causes = dict(causes or {})
+        for name, file in (photos or {}).items():
+            if not isinstance(file, str | os.PathLike):
+                raise TypeError(f"photos: got {type(file).__name__} for {name!r}, expected an image file")
         self.photos = {name: Path(file) for name, file in (photos or {}).items()}
 
     def __repr__(self) -> str:
