@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,8 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
 
 def load_colmap() -> Any:
     """The package pycolmap. Pillow is loaded before it: the other way round its PNG files hang or crash the process."""
-    require("PIL.Image", extra="photos")
+    if find_spec("pycolmap") is not None:
+        require("PIL.Image", extra="photos")
     return require("pycolmap", extra="photos")
 
 

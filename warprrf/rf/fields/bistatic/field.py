@@ -205,11 +205,12 @@ class BistaticField(RadioField):
             TypeError: for a geometry without a mesh.
         """
         modelled, surface = terms or Terms(), Surface.of(geometry)
+        rows, columns = ds.shape if isinstance(ds, Frame) else ds.path_gain.shape[1:]
         return cls(
             surface=surface,
             transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
             frequency_hz=float(ds.frequency_hz),
-            shape=(int(ds.shape[0]), int(ds.shape[1])),
+            shape=(int(rows), int(columns)),
             floor=float(ds.floor),
             range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
             beam_sigma_rad=float(ds.beam_sigma_rad),
@@ -217,7 +218,7 @@ class BistaticField(RadioField):
             parameters=Parameters.prior(surface.groups, len(modelled.lobes)),
             material=surface.material,
             residual=np.zeros((2, surface.cells)),
-            air=ds.air,
+            air=getattr(ds, "air", None),
             fitted_on=np.zeros((0, 3)),
             device=device,
         )
