@@ -16,7 +16,7 @@ from golden import make
 from warprrf.steps import Steps
 
 HEAD = """
-import multiprocessing, os, sys, threading, time
+import faulthandler, multiprocessing, os, sys, threading, time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 sys.path[:0] = {path!r}
 import numpy as np
@@ -65,7 +65,12 @@ def in_fork(use, wait_s=60):
     \"\"\"What ``use`` returns in a forked child; an error if it is not done in time.\"\"\"
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
-    child = context.Process(target=lambda: theirs.send(use()))
+
+    def work():
+        faulthandler.dump_traceback_later(0.75 * wait_s, file=sys.__stderr__)  # where a child hangs, if it does
+        theirs.send(use())
+
+    child = context.Process(target=work)
     child.start()
     try:
         assert ours.poll(wait_s), "the child hangs or died"
