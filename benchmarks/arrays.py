@@ -168,7 +168,7 @@ def compare(
     """A row for each way to predict the pictures ``seen`` of the test receivers, which follow those of training."""
     known, asked = seen[: len(train)], seen[len(train) :]
     blocked = ~np.asarray(test.line_of_sight)
-    measured = wr.ArraySpectra(
+    measured = wr.channel.ArraySpectra(
         train.transmitter, train.receivers, known, carrier * 1e9, array(), hemisphere(SHAPE)
     )
     nearest = known[np.linalg.norm(test.receivers[:, None] - train.receivers, axis=2).argmin(axis=1)]

@@ -54,9 +54,6 @@ from warprrf.rf.spectra.dataset import SpectrumDataset as SpectrumDataset
 # received powers of horns, sounders and receivers, as they were measured
 from warprrf.rf.spectra.readings import Readings as Readings
 
-# angular spectra of small coherent arrays, NeRF2's folders among them
-from warprrf.rf.channel.array_spectra import ArraySpectra as ArraySpectra
-
 # the pattern of a horn antenna
 from warprrf.rf.spectra.readings import horn as horn
 

@@ -273,9 +273,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "Readings.load": lambda p: {"path": p.folder / "readings.csv", "frequency_hz": CARRIER, "floor": 1e-14},
     "Readings.subset": lambda p: {"self": wr.Readings(**_readings(p)), "rows": np.array([0, 2])},
-    "ArraySpectra": _array_spectra,
-    "ArraySpectra.load": lambda p: {"path": p.folder / "pictures", "frequency_hz": CARRIER, "part": "train"},
-    "ArraySpectra.subset": lambda p: {"self": wr.ArraySpectra(**_array_spectra(p)), "rows": np.array([0])},
+    "channel.ArraySpectra": _array_spectra,
+    "channel.ArraySpectra.load": lambda p: {"path": p.folder / "pictures", "frequency_hz": CARRIER, "part": "train"},
+    "channel.ArraySpectra.subset": lambda p: {"self": wr.channel.ArraySpectra(**_array_spectra(p)), "rows": np.array([0])},
     "horn": lambda p: {"width_rad": 0.2},
     "SpectrumDataset": _spectra,
     "SpectrumDataset.deembed": _on(
