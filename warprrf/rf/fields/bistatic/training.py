@@ -438,7 +438,8 @@ class _Training:
         o, everyone = self.options, np.arange(self.count)
         terms, errors = o.terms(), None
         start = Parameters.prior(int(self.material.max()) + 1, len(terms.lobes))
-        if len(self.held) >= self.choose.least_held_out:
+        free = any(getattr(o, name) is None for name in TERMS)
+        if len(self.held) >= (self.choose.least_held_out if free else 1):
             first = self._fit_groups(terms, start, self._few(1), self.choose.short_steps * 2)
             best = self._choose(_Candidate(terms, first, self._held_error(terms, first)))
         else:
