@@ -8,8 +8,7 @@ from typing import Any
 
 from warprrf.checks import check_count, check_seed, checked
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
-from warprrf.rf.fields.harmonic.interaction import INTERACTION_POINTS
-from warprrf.rf.fields.harmonic.transport import TOP_K, TRANSMITTANCE
+from warprrf.rf.fields.harmonic.transport import INTERACTION_POINTS, TOP_K, TRANSMITTANCE
 
 MODELS = ("rf3dgs+", "rf3dgs")
 GAINS = ("exp", "linear")

@@ -16,10 +16,8 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.harmonic import interaction as _interaction
-from warprrf.rf.fields.harmonic.interaction import Lengths
 from warprrf.rf.fields.harmonic.options import FieldOptions
-from warprrf.rf.fields.harmonic.transport import Transport
+from warprrf.rf.fields.harmonic.transport import Lengths, Transport, interaction_points, path_lengths
 from warprrf.rf.spectra.spectrum import pixel_solid_angles, spread
 
 
@@ -47,10 +45,10 @@ class SingleBounce:
 
     def lengths(self, seen: Transport, transmitter: np.ndarray) -> Lengths:
         """Path lengths of every pixel of ``seen`` by the interaction point that the options name."""
-        points = _interaction.interaction_points(
+        points = interaction_points(
             seen, self.gaussians, self.options.interaction_point, mesh=self.mesh, device=self.device
         )
-        return _interaction.path_lengths(points, transmitter, seen.receivers)
+        return path_lengths(points, transmitter, seen.receivers)
 
     def factor(self, lengths: Lengths) -> np.ndarray:
         """Solid angle [sr], times spreading loss for ``rf3dgs+``; zero where the ray meets nothing."""
