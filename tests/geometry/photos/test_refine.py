@@ -8,8 +8,7 @@ import warp as wp
 from skimage.metrics import structural_similarity
 
 from warprrf.geometry.photos.config import RefineConfig
-from warprrf.geometry.photos.densify import densified
-from warprrf.geometry.photos.fill import filled
+from warprrf.geometry.photos.densify import densified, filled
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.refine import OVERHEAD, _initial, refine

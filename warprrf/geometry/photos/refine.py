@@ -19,8 +19,14 @@ from warprrf import tensor_files
 from warprrf.checks import check_count
 from warprrf.device import DeviceLike, Progress, launch, resolve
 from warprrf.geometry.photos.config import RefineConfig
-from warprrf.geometry.photos.densify import PARAMETERS, STATISTICS, Arrays, densified, opacity_and_scales
-from warprrf.geometry.photos.fill import filled
+from warprrf.geometry.photos.densify import (
+    PARAMETERS,
+    STATISTICS,
+    Arrays,
+    densified,
+    filled,
+    opacity_and_scales,
+)
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.targets import Exposures, PosedPhotos, Target, Targets

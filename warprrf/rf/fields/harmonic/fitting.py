@@ -23,9 +23,8 @@ from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.opacity import RATE as OPACITY_RATE
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining
-from warprrf.rf.fields.harmonic.options import Rates
+from warprrf.rf.fields.harmonic.options import Rates, SingleBounce
 from warprrf.rf.fields.harmonic.problem import Problem
-from warprrf.rf.fields.harmonic.single_bounce import SingleBounce
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles, to_db
