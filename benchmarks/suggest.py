@@ -18,7 +18,7 @@ from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.training import trace
 
 HELP = """\
-Fields on the reconstruction of `make lobby` are fitted to spectra of no, one, two, three, six and ten receivers drawn at random, and
+Fields on the reconstruction of `make lobby` are fitted to spectra of no receiver, of one to ten drawn at random, and
 to three that the field suggests: all from no measurement, or two after a first random one. Truth is Sionna RT's; the test
 receivers score.
 
@@ -78,11 +78,11 @@ def run(options: Options, job: Job) -> Report:
             chosen: Sequence[int] | np.ndarray, settings: dict[str, Any] = settings, seen: Any = seen
         ) -> wr.RadioField:
             part = pool.subset(np.asarray(chosen, int))
-            return wr.RadioField.fit(surface, part, transport=seen.subset(chosen), device=job.device, **settings)
+            return wr.RadioField.fit(
+                surface, part, transport=seen.subset(chosen), device=job.device, **settings
+            )
 
-        def add(
-            name: str, fields: list[wr.RadioField], kind: str = "quick" if quick else "default"
-        ) -> None:
+        def add(name: str, fields: list[wr.RadioField], kind: str = "quick" if quick else "default") -> None:
             each = []
             for k, field in enumerate(fields):
                 job.progress(f"{kind}, {name}", k, len(fields))

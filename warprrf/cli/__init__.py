@@ -72,7 +72,15 @@ def _parser() -> argparse.ArgumentParser:
         "Radio radiance fields from photos and a few radio measurements.",
         EPILOG,
         (
-            add_reconstruct, add_simulate, add_fit, add_suggest, add_relevance, add_render, add_evaluate, add_map, add_twin,
+            add_reconstruct,
+            add_simulate,
+            add_fit,
+            add_suggest,
+            add_relevance,
+            add_render,
+            add_evaluate,
+            add_map,
+            add_twin,
         ),  # fmt: skip
     )
 

@@ -275,7 +275,9 @@ def _training_set(path: str, args: argparse.Namespace) -> wr.SpectrumDataset | w
 def add_suggest(add: Add) -> None:
     """Define `suggest`."""
     sug = add("suggest", _suggest)
-    sug.add_argument("source", help="a field (.safetensors), or geometry as of `warprrf fit` before any measurement")
+    sug.add_argument(
+        "source", help="a field (.safetensors), or geometry as of `warprrf fit` before any measurement"
+    )
     sug.add_argument("candidates", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")
     sug.add_argument("-n", type=int, default=1, help="how many (default 1)")
     add_out(sug, "CSV file of the places chosen, best first", required=False)

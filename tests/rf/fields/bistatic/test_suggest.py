@@ -22,12 +22,20 @@ def scene() -> RadioScene:
     mesh, part = joined(
         box_mesh([0, 0, 0], [6, 4, 3], inward=True), box_mesh([2.9, -0.01, -0.01], [3.1, 3.0, 3.01])
     )
-    return RadioScene(mesh, part, [SlabMaterial("walls", 4.0, 0.5, np.inf, 0.7), SlabMaterial("block", 6.0, 0.5)])
+    return RadioScene(
+        mesh, part, [SlabMaterial("walls", 4.0, 0.5, np.inf, 0.7), SlabMaterial("block", 6.0, 0.5)]
+    )
 
 
 def spectra(scene: RadioScene, places: np.ndarray) -> wr.SpectrumDataset:
     return exact_spectra(
-        scene, places, transmitter=TX, frequency_hz=CARRIER_HZ, shape=(24, 48), sigma=np.radians(5.0), sub_pixels=2
+        scene,
+        places,
+        transmitter=TX,
+        frequency_hz=CARRIER_HZ,
+        shape=(24, 48),
+        sigma=np.radians(5.0),
+        sub_pixels=2,
     )
 
 
@@ -73,7 +81,10 @@ def test_both_sides_of_a_wall_are_measured_before_a_place_again(unmeasured) -> N
 
 def test_the_order_of_candidates_does_not_matter(unmeasured) -> None:
     turned = np.array([3, 5, 0, 4, 1, 2])
-    assert turned[unmeasured.suggest(CANDIDATES[turned], 3)].tolist() == unmeasured.suggest(CANDIDATES, 3).tolist()
+    assert (
+        turned[unmeasured.suggest(CANDIDATES[turned], 3)].tolist()
+        == unmeasured.suggest(CANDIDATES, 3).tolist()
+    )
 
 
 def test_what_was_measured_is_not_measured_again(scene, unmeasured) -> None:
