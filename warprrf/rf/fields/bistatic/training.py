@@ -360,7 +360,8 @@ def train(
     if transport is not None:
         places = places_of(data, as_mesh(geometry, "geometry"), device)
         transport.check(places, o.sub_pixels)
-        transport = replace(transport, places=places)  # of a part, they say where in the whole their readings are
+        # Places of a part of what was traced say where in the whole their readings are.
+        transport = replace(transport, places=places)
     seen = transport or trace(
         geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
