@@ -49,7 +49,7 @@ $(VENV)/.sionna: $(VENV)/.lobby
 	touch $@
 
 $(VENV)/.test: $(VENV)/.made pyproject.toml constraints.txt
-	bash tools/system_packages.sh llvm
+	bash tools/system_packages.sh llvm browser
 	$(RUN) -m pip install -q -c constraints.txt -e '.[all,docs,test]'
 	# Its wheel asks for an older NumPy than it needs, so it is no extra: only its scenario reader is tested against.
 	$(RUN) -m pip install -q --no-deps 'DeepMIMO==4.0.5' && $(RUN) -m pip install -q requests

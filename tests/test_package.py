@@ -37,6 +37,7 @@ HEAVY = (
     "PIL",
     "skimage",
     "tqdm",
+    "viser",
 )
 
 # The public names that notebooks and outside checks rely on, and the members that they use.

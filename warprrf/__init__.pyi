@@ -23,6 +23,9 @@ from warprrf.rf.relevance.search import relevance as relevance
 # errors of predicted spectra at held-out receivers
 from warprrf.rf.spectra.metrics import evaluate as evaluate
 
+# what any of them holds, in the browser: drag a receiver
+from warprrf.viewer import view as view
+
 # == nouns ==
 # pinhole and spherical cameras
 from warprrf.geometry.splats.camera import Camera as Camera
