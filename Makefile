@@ -40,12 +40,12 @@ $(VENV)/.made:
 # One stamp for what the main job needs, one for everything (torch is only in the second).
 $(VENV)/.lobby: $(VENV)/.made pyproject.toml constraints.txt
 	bash tools/system_packages.sh
-	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots]'
+	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,view]'
 	touch $@
 
 $(VENV)/.sionna: $(VENV)/.lobby
 	bash tools/system_packages.sh llvm
-	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,sionna,exr]'
+	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,view,sionna,exr]'
 	touch $@
 
 $(VENV)/.test: $(VENV)/.made pyproject.toml constraints.txt

@@ -97,6 +97,15 @@ def test_what_is_shown_is_saved_as_one_page_and_as_a_picture(viewer, tmp_path):
         viewer.save(tmp_path / "scene.obj")
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"host": "192.0.2.1"}, "host: got '192.0.2.1'"), ({"port": 0}, "port: got 0"), ({"port": 2.5}, "port: got 2.5")],
+)
+def test_an_address_that_is_none_is_refused(given, said):
+    with pytest.raises((ValueError, TypeError), match=said):
+        wr.view(make.room_mesh()[0], **given)
+
+
 def test_a_notebook_shows_the_page(viewer):
     assert viewer.url in viewer._repr_html_() and viewer.url.startswith("http://127.0.0.1:")
 

@@ -29,7 +29,7 @@ def view(*things: Any, host: str = "127.0.0.1", port: int = 8080) -> Viewer:
 
     Raises:
         TypeError: for things of another kind, or none.
-        ValueError: for a file that cannot be read, or two things of one kind.
+        ValueError: for a file that cannot be read, two things of one kind, or a host or port that is none.
         ImportError: if viser is not installed.
 
     Example::

@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import os
+import socket
 import threading
 import time
 from collections import deque
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_type
+from warprrf.checks import check_array, check_count, check_type
 from warprrf.files import write_atomically
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.maps.radio_map import QUANTITIES
@@ -55,6 +56,12 @@ class Viewer:
 
     def __init__(self, subject: Subject, *, host: str, port: int) -> None:
         check_type("host", host, str)
+        check_count("port", port, 1, 65535)
+        try:
+            with socket.create_server((host, 0)):
+                pass
+        except OSError as error:
+            raise ValueError(f"host: got {host!r}, expected an address of this machine ({error})") from error
         viser = _device.require("viser", extra="view")
         self.subject, self.message = subject, ""
         self.last: Answer | None = None
