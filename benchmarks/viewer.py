@@ -122,6 +122,9 @@ def _browsed(viewer: Any, page: Any, options: Options, job: Job) -> dict[str, An
     opened = time.perf_counter() - start
     (client,) = viewer.clients
     client.get_render(300, 400)
+    page.execute_script(
+        "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+    )
     times, frames = [], []
     for k, share in enumerate(np.linspace(0.0, 1.0, FRAMES)):
         viewer.receiver = LINE[0] + share * (LINE[1] - LINE[0])

@@ -99,7 +99,11 @@ def test_what_is_shown_is_saved_as_one_page_and_as_a_picture(viewer, tmp_path):
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [({"host": "192.0.2.1"}, "host: got '192.0.2.1'"), ({"port": 0}, "port: got 0"), ({"port": 2.5}, "port: got 2.5")],
+    [
+        ({"host": "192.0.2.1"}, "host: got '192.0.2.1'"),
+        ({"port": 0}, "port: got 0"),
+        ({"port": 2.5}, "port: got 2.5"),
+    ],
 )
 def test_an_address_that_is_none_is_refused(given, said):
     with pytest.raises((ValueError, TypeError), match=said):

@@ -172,7 +172,7 @@ class Viewer:
         # Its share button would send the scene through somebody else's machine.
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
-        server.initial_camera.position = tuple(middle + size * np.array([-0.3, -0.6, 0.7]))
+        server.initial_camera.position = tuple(middle + size * np.array([-0.2, -0.5, 0.55]))
         server.initial_camera.look_at = tuple(middle)
         if self.subject.cameras:
             layers.draw_cameras(server, self.subject)
