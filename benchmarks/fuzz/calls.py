@@ -26,6 +26,8 @@ IGNORED = ("self", "progress", "ax", "args", "kwargs")
 MISSING = inspect.Parameter.empty
 UNCHECKED = ("RadioField.trace_links",)
 """What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
+SERVERS = ("view",)
+"""What starts a server for each call: tests/viewer has its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
 ABSTRACT = ("RadioField",)
@@ -37,7 +39,7 @@ def public() -> dict[str, Callable[..., Any]]:
     found: dict[str, Callable[..., Any]] = {}
     homes: dict[Any, str] = {}
     for name, value in _names(wr, ""):
-        if not callable(value) or value in homes:
+        if not callable(value) or value in homes or name in SERVERS:
             continue
         homes[value] = name
         if not inspect.isclass(value):
@@ -201,7 +203,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "sample_receivers": lambda p: {"scene": p.scene, "n": 3, "seed": 0},
     "trace_paths": lambda p: {**TRACE, "mesh_or_scene": p.scene, "receivers": p.receivers[:3], "device": "cpu"},
-    "fit_reflections": lambda p: {
+    "interop.fit_reflections": lambda p: {
         **TRACE, "mesh": p.mesh, "receivers": p.receivers[:4], "csi": np.full(4, 1e-6 + 1e-6j), "order": 1,
     },
     "relevance": lambda p: {**TRACE, "geometry": p.field, "receivers": p.receivers[:2], "device": "cpu"},

@@ -288,7 +288,12 @@ class BistaticField(RadioField):
         return replace(spectrum, std_db=self._std_db(seen, found)) if uncertainty else spectrum
 
     def paths(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
+        self,
+        rx: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        max_paths: int | None = None,
+        *,
+        view: ReceiverView | None = None,
     ) -> Paths:
         """Propagation paths at ``rx``: line of sight, mirrors, and one diffuse path per pixel above the floor.
 
@@ -300,12 +305,15 @@ class BistaticField(RadioField):
             rx: receiver position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded.
             transmitter: as for :meth:`spectrum`.
             max_paths: keep the strongest only (the sum is then what they carry).
+            view: what the one receiver sees, if it was traced before (:meth:`view`).
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
+        if view is not None:
+            return paths_of(view, self.render(view), self.floor, self.air, max_paths)
         positions, source = self.check_positions(rx, transmitter)
         found = []
         for position in np.atleast_2d(positions):
