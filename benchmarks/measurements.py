@@ -48,7 +48,7 @@ BANDWIDTH_HZ, TAPS = 2e9, 120
 SCANS, PROFILES, POWERS = 10, 20, 50  # receivers of each kind
 AT_ONCE = 20_000  # paths
 ZERO_DEG = 143.0  # of a rotator whose zero is to be found
-OTHERS = {"B": (1.2, 1.4, 2.6), "C": (13.8, 1.2, 2.4), "D": (1.4, 10.6, 2.5)}
+OTHERS = {"B": (1.2, 1.4, 2.6), "C": (13.8, 1.2, 2.4), "D": (2.0, 9.0, 2.5)}
 """Transmitters beside that of the data set [m]; nothing is fitted under the last."""
 SHARE = 4  # spectra under each of three transmitters
 OTHER_HZ = 140e9
