@@ -93,9 +93,7 @@ def show(value: Any, form: str = "{:.1f}") -> str:
 
 
 def _machine(name: str) -> str:
-    found = measured(name)
-    if found is None:
-        return ""
+    found = read(name)
     m = found["machine"]
     device = "" if m["device"] == "cpu" else f", {m['device']}"
     versions = m["versions"]
