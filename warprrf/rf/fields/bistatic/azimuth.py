@@ -15,7 +15,7 @@ from warprrf.rf.fields.bistatic.materials import Parameters, mirror_power
 from warprrf.rf.fields.bistatic.measured import direct_paths
 from warprrf.rf.fields.bistatic.observations import Place
 from warprrf.rf.fields.bistatic.transport import ReceiverView
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.fields.data import Measured
 from warprrf.rf.spectra.readings import Readings, path_weights
 
 STRONGEST = 20  # paths that count
@@ -23,8 +23,8 @@ STEPS = 360
 
 
 def with_azimuths(
-    data: Sequence[SpectrumDataset | Readings], places: Sequence[Place], views: Sequence[ReceiverView]
-) -> tuple[list[SpectrumDataset | Readings], dict[str, float]]:
+    data: Sequence[Measured], places: Sequence[Place], views: Sequence[ReceiverView]
+) -> tuple[list[Measured], dict[str, float]]:
     """``data`` with azimuths that count from x, and by data set's name what was added to those of unknown zero [degrees].
 
     Raises:
