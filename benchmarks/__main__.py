@@ -38,6 +38,10 @@ NAMES = {
         "benchmarks.measurements",
         "horns, power alone, delay profiles and one spectrum, beside ten spectra",
     ),
+    "suggest": (
+        "benchmarks.suggest",
+        "receivers that the field suggests beside random ones, from none to ten",
+    ),
     "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

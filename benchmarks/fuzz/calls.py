@@ -268,6 +268,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         lambda p: p.train.subset([0]), pattern=np.cos(np.linspace(0, np.pi / 2, 19)) ** 8, iterations=20, snapshots=1,
         tolerance=1e-2,
     ),
+    "SpectrumDataset.empty": lambda p: {
+        "transmitter": TRANSMITTER, "frequency_hz": CARRIER, "shape": (12, 24), "beam_sigma_rad": 0.1, "floor": 1e-15,
+    },
     "SpectrumDataset.export_exr": _on(lambda p: p.train, path="one.exr", index=0),
     "SpectrumDataset.from_spectra": lambda p: {
         k: v for k, v in _spectra(p).items() if k not in ("range_db", "polarisation")
@@ -287,6 +290,10 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "RadioField.radio_map": _on(lambda p: p.field, height=1.2, cell=1.0),
     "RadioField.save": _on(lambda p: p.field, path="field.safetensors"),
     "RadioField.spectrum": _on(lambda p: p.field, rx=POINTS[0], transmitter=TRANSMITTER + 0.1),
+    "RadioField.suggest": _on(
+        lambda p: p.field, candidates=POINTS, n=1, arrival=np.full((len(POINTS), 2), 1.5),
+        receive_pattern=np.linspace(1.0, 0.1, 19),
+    ),
     "RadioField.was_fitted_on": lambda p: {"self": p.field, "ds": p.spectra},
     "RadioField.with_gas": _on(lambda p: p.field),
     "Paths": lambda p: _field_of(p.paths),
