@@ -23,7 +23,7 @@ from warprrf.rf.positions import check_positions
 
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = (
-    "reconstruct", "simulate", "fit", "suggest", "relevance", "render", "evaluate", "map", "twin",
+    "reconstruct", "simulate", "fit", "suggest", "relevance", "render", "evaluate", "map", "twin", "view",
 )  # fmt: skip
 
 

@@ -39,6 +39,7 @@ HEAVY = (
     "PIL",
     "skimage",
     "tqdm",
+    "viser",
 )
 
 # The public names that notebooks and outside checks rely on, and the members that they use.

@@ -26,6 +26,8 @@ IGNORED = ("self", "progress", "ax", "args", "kwargs")
 MISSING = inspect.Parameter.empty
 UNCHECKED = ("RadioField.trace_links",)
 """What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
+SERVERS = ("view",)
+"""What starts a server for each call: tests/viewer has its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
 ABSTRACT = ("RadioField",)
@@ -37,7 +39,7 @@ def public() -> dict[str, Callable[..., Any]]:
     found: dict[str, Callable[..., Any]] = {}
     homes: dict[Any, str] = {}
     for name, value in _names(wr, ""):
-        if not callable(value) or value in homes:
+        if not callable(value) or value in homes or name in SERVERS:
             continue
         homes[value] = name
         if not inspect.isclass(value):
@@ -109,6 +111,17 @@ def _readings(p: Place) -> dict[str, Any]:
         "arrival": np.array([[1.5, 0.0], [1.5, 1.0], [1.5, 2.0]]),
         "receive_pattern": np.linspace(1.0, 0.0, 19),
         "std_db": 1.0,
+    }
+
+
+def _array_spectra(p: Place) -> dict[str, Any]:
+    return {
+        "transmitters": TRANSMITTER,
+        "receivers": POINTS,
+        "power": np.full((len(POINTS), 2), 0.5),
+        "frequency_hz": CARRIER,
+        "array": p.array,
+        "directions": np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]]),
     }
 
 
@@ -190,7 +203,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "sample_receivers": lambda p: {"scene": p.scene, "n": 3, "seed": 0},
     "trace_paths": lambda p: {**TRACE, "mesh_or_scene": p.scene, "receivers": p.receivers[:3], "device": "cpu"},
-    "fit_reflections": lambda p: {
+    "interop.fit_reflections": lambda p: {
         **TRACE, "mesh": p.mesh, "receivers": p.receivers[:4], "csi": np.full(4, 1e-6 + 1e-6j), "order": 1,
     },
     "relevance": lambda p: {**TRACE, "geometry": p.field, "receivers": p.receivers[:2], "device": "cpu"},
@@ -262,6 +275,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "Readings.load": lambda p: {"path": p.folder / "readings.csv", "frequency_hz": CARRIER, "floor": 1e-14},
     "Readings.subset": lambda p: {"self": wr.Readings(**_readings(p)), "rows": np.array([0, 2])},
+    "channel.ArraySpectra": _array_spectra,
+    "channel.ArraySpectra.load": lambda p: {"path": p.folder / "pictures", "frequency_hz": CARRIER, "part": "train"},
+    "channel.ArraySpectra.subset": lambda p: {"self": wr.channel.ArraySpectra(**_array_spectra(p)), "rows": np.array([0])},
     "horn": lambda p: {"width_rad": 0.2},
     "SpectrumDataset": _spectra,
     "SpectrumDataset.deembed": _on(

@@ -17,7 +17,7 @@ import warprrf as wr
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add
 from warprrf.cli.steps import add_evaluate, add_fit, add_reconstruct, add_relevance, add_simulate, add_suggest
-from warprrf.cli.views import add_map, add_render, add_twin
+from warprrf.cli.views import add_map, add_render, add_twin, add_view
 
 EPILOG = """\
 a walk through:
@@ -28,6 +28,7 @@ a walk through:
   warprrf evaluate field.safetensors spectra.nc --train 50
   warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
   warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
+  warprrf view room field.safetensors              in the browser: drag a receiver
   warprrf twin field.safetensors -o twin           scene.xml and materials.json for Sionna RT
 
 Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
@@ -81,7 +82,8 @@ def _parser() -> argparse.ArgumentParser:
             add_evaluate,
             add_map,
             add_twin,
-        ),  # fmt: skip
+            add_view,
+        ),
     )
 
 
