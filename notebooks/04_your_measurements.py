@@ -140,11 +140,9 @@ power_db = 10 * np.log10(first.power)
 for start, elevation in enumerate((-30, 0, 30)):
     ax.plot(AZIMUTH[:36], power_db[36 * start : 36 * start + 36], "o-", ms=3, label=f"elevation {elevation}")
 ax.plot(AZIMUTH[named], power_db[named], "x", color="#c0392b", ms=11, mew=2, label="not explained")
-(
-    ax.set(xlabel="azimuth [degrees]", ylabel="power [dB]"),
-    ax.grid(alpha=0.3),
-    ax.legend(loc="upper left", fontsize=8),
-)
+ax.set(xlabel="azimuth [degrees]", ylabel="power [dB]"), ax.grid(alpha=0.3)
+ax.legend(loc="upper left", fontsize=8)
+plt.show()
 
 # %% [markdown]
 # <a id="error"></a>
