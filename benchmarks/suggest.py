@@ -82,7 +82,7 @@ def run(options: Options, job: Job) -> Report:
         return wr.RadioField.fit(surface, part, transport=transport, device=job.device, quick=options.quick)
 
     def add(name: str, fields: Iterable[wr.RadioField]) -> None:
-        each = []
+        each: list[dict[str, Any]] = []
         for field in fields:
             job.progress(name, len(each), options.draws)
             each.append(wr.evaluate(test, field.spectrum))
