@@ -657,6 +657,23 @@ def _bare_mesh() -> str:
     return markdown(head, lines)
 
 
+@entry("arrays")
+def _arrays() -> str:
+    found = measured("arrays")
+    if found is None:
+        return missing("python -m benchmarks arrays")
+    lines = [
+        [
+            f"{r['carrier_ghz']:g}",
+            r["method"],
+            *(show(r[key]) for key in ("psnr_db", "gained_db", "psnr_db_blocked")),
+        ]
+        for r in found["rows"]
+    ]
+    head = ("carrier [GHz]", "prediction", "PSNR [dB]", "over the nearest [dB]", "where blocked [dB]")
+    return markdown(head, lines)
+
+
 @entry("map")
 def _map() -> str:
     found = read("map")

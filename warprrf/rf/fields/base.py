@@ -19,13 +19,13 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.data import Data
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
-from warprrf.rf.spectra.readings import Data
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")

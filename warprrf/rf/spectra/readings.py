@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,6 @@ from warprrf.checks import check_array, check_count, check_number, check_positiv
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
-from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 NEPER = 10.0 / np.log(10.0)
@@ -263,10 +262,6 @@ class Readings:
             return cls.from_table(table, **settings)
         except (KeyError, TypeError, ValueError, UnicodeError) as error:
             raise ValueError(f"path: {file}: {error.args[0] if error.args else error}") from error
-
-
-Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readings]
-"""What fields are fitted to: a set of spectra, a table of readings, or several of them."""
 
 
 def path_weights(

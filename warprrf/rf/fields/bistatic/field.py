@@ -22,9 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, checked, index_to
+from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked, index_to
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.rf.channel.array_spectra import check_steering
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.itu import assumed_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -33,6 +35,7 @@ from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
+from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.render import Rendered, images, path_powers, render, sent_radiance
@@ -42,12 +45,13 @@ from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data, Readings, check_gains
+from warprrf.rf.spectra.readings import check_gains
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 
 
@@ -191,7 +195,7 @@ class BistaticField(RadioField):
 
     @classmethod
     def _unmeasured(
-        cls, geometry: GeometryLike, data: list[SpectrumDataset | Readings], o: FitOptions, device: DeviceLike
+        cls, geometry: GeometryLike, data: list[Measured], o: FitOptions, device: DeviceLike
     ) -> BistaticField:
         """What a fit to no measurement gives: permittivities of ITU-R P.2040, by the names of materials where it has
         them, terms left free as for few receivers."""
@@ -334,6 +338,38 @@ class BistaticField(RadioField):
             if progress is not None:
                 progress("spectra", min(first + batch, len(receivers)), len(receivers))
         return found
+
+    def array_spectrum(
+        self,
+        rx: ArrayLike,
+        array: PlanarArray,
+        directions: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        *,
+        length_std_m: float = 0.0,
+    ) -> np.ndarray:
+        """Angular spectrum |a^H h|^2 / M^2 of a coherent array at ``rx`` (3,) [m], in expectation over the phases of what
+        is scattered; see :class:`ArraySpectra`.
+
+        Args:
+            rx: the array's centre.
+            array: turned as it stands; without polarisation.
+            directions: unit vectors in world axes, shape ``(..., 3)``.
+            transmitter: as for :meth:`spectrum`.
+            length_std_m: how well the lengths of paths are known [m].
+
+        Returns:
+            Path gain, shape ``(...)``.
+
+        Raises:
+            TypeError, ValueError: as for :meth:`spectrum`, and naming the argument.
+        """
+        steered = check_steering(array, directions)
+        std = check_number("length_std_m", length_std_m, 0.0)
+        view = self.view(rx, transmitter)
+        image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
+        powers = path_powers(view, self.materials, self.sent_radiance(view.transport))
+        return np.maximum(read(view, image, powers), 0.0).reshape(steered.shape[:-1])
 
     def view(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> ReceiverView:
         """What the receiver at ``rx`` (3,) sees of the geometry, whatever the materials: the costly part of a spectrum.

@@ -13,10 +13,20 @@ from threadpoolctl import threadpool_limits
 from warprrf.checks import check_count, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
-from warprrf.rf.fields.bistatic.fit import NEPER, Fitted, GroupFit, Reading, fit_groups, huber
+from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.fields.bistatic.fit import (
+    NEPER,
+    OWN_GAIN,
+    Fitted,
+    GroupFit,
+    Reading,
+    fit_groups,
+    gain_of,
+    huber,
+)
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
-from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import Place, as_list, observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
@@ -26,8 +36,8 @@ from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
+from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data, Readings
 
 MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_scatter", True),
@@ -124,7 +134,8 @@ class FitOptions:
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
-        mirror_order: mirror reflections on a path: 0 to 3; None also stops short of 3 where a search would be refused.
+        mirror_order: mirror reflections on a path: 0 to 3; None also stops short of 3 where a search would be refused, and
+            tries nothing for spectra of arrays: they hear the phases of all.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
             Degli-Esposti et al. (2007), Sionna RT's, which do not.
@@ -366,6 +377,8 @@ def train(
         geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
+    if o.mirror_order is None and any(isinstance(one, ArraySpectra) for one in data):
+        o = replace(o, mirror_order=max(int(view.paths.order.max(initial=0)) for view in seen.views))
     if o.residuals is None:
         o = replace(o, residuals=QUICK_RESIDUAL if options.quick else ResidualFit())
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
@@ -395,7 +408,7 @@ class _Training:
     def __init__(
         self,
         seen: TrainingViews,
-        data: Sequence[SpectrumDataset | Readings],
+        data: Sequence[Measured],
         options: FitOptions,
         progress: Progress | None,
     ) -> None:
@@ -428,7 +441,7 @@ class _Training:
             self.measured.append(observed.measured.part(chosen))
             response = respond(self.views[r], self.measured[r], terms, observed.floor)
             part = target.part(chosen)
-            if not isinstance(observed.measured, SpectrumPixels):
+            if isinstance(observed.measured, WeighedPaths):
                 part = part.trusted(1.0 + KNOWN_BETTER * _line_of_sight_share(response, start))
             self.readings.append(Reading(response, part, observed.chain))
             self.progress("fit", r, (1 + self.steps) * self.count)
@@ -487,7 +500,7 @@ class _Training:
         sent, sd, found = self._sent(materials), self.options.groups.noise_db, []
         for k, observed in enumerate(self.observed):
             rows = np.zeros(0, int)
-            if not isinstance(observed.measured, SpectrumPixels):
+            if isinstance(observed.measured, WeighedPaths):
                 error = observed.target.error(self._predicted(materials, sent, k)) / sd
                 rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
             found.append(rows)
@@ -642,10 +655,9 @@ class _Training:
     ) -> np.ndarray:
         """All that is read at a place, in units of its floor, shape ``(N,)``."""
         observed, view = self.observed[place], self._view(place, materials.terms)
-        gains = materials.parameters.log_gains
-        gain = float(np.exp(gains[observed.chain])) if observed.chain >= 0 else 1.0
         power = read(view, observed.measured, path_powers(view, materials, sent(view)))
-        return np.asarray(np.maximum(power, 0.0) * gain / observed.floor)
+        power = np.maximum(power, 0.0) / observed.floor
+        return np.asarray(gain_of(observed.chain, materials.parameters, observed.target, power) * power)
 
     def _sent(self, materials: Materials) -> Callable[[ReceiverView], np.ndarray | None]:
         """What elements send on under the transmitter of a view; computed once for each."""
@@ -776,9 +788,13 @@ class _Training:
         sent = self._sent(materials)
         shares = []
         for r in chosen:
-            view, observed, gain = self._view(r, materials.terms), self.observed[r], 1.0
-            if observed.chain >= 0:
-                gain = float(np.exp(materials.parameters.log_gains[observed.chain]))
+            view, observed, p = self._view(r, materials.terms), self.observed[r], materials.parameters
+            power = np.zeros(0)
+            if observed.chain == OWN_GAIN:
+                power = (
+                    read(view, observed.measured, path_powers(view, materials, sent(view))) / observed.floor
+                )
+            gain = gain_of(observed.chain, p, observed.target, power)
             shares.append(
                 shares_of(
                     view, materials, sent(view), observed.measured, observed.floor / gain, observed.target
