@@ -13,6 +13,7 @@ from model_files import BLUE, RED, changed_glb, obj_with_materials, room_glb, ro
 from places import ROOT
 
 import warprrf as wr
+from warprrf.geometry import gltf_files
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh
 
 BLUE_SRGB = np.array(BLUE) / 255.0
@@ -187,6 +188,13 @@ def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told: str, 
         return
     with pytest.raises(ValueError, match=rf"room\.glb.*({told})"):
         wr.Mesh.load(path)
+
+
+@pytest.mark.parametrize("most", [10, 15])
+def test_a_small_file_that_makes_many_triangles_is_refused(most: int, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(gltf_files, "LARGEST_FACES", most)  # 12 and 2 are made, 2 of them stand there twice
+    with pytest.raises(ValueError, match=rf"room\.glb.*more than {most} triangles"):
+        wr.Mesh.load(room_glb(tmp_path))
 
 
 @pytest.mark.parametrize("make", [room_glb, room_gltf, obj_with_materials])

@@ -43,7 +43,8 @@ class RadioField(ABC):
         frequency_hz: carrier [Hz].
         shape: rows and columns of its spectra.
         floor, range_db, beam_sigma_rad: of the data set it was fitted to.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where an older file does not say.
+        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where an older file does not say.
+        fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
         mesh: what blocks; None if the geometry has no mesh.
         air: absorption in its path gains, that of the data set it was fitted to; None for none.
         device: where it computes.
@@ -58,6 +59,7 @@ class RadioField(ABC):
     range_db: tuple[float, float]
     beam_sigma_rad: float
     fitted_on: np.ndarray | None
+    fitted_under: np.ndarray | None = None
     mesh: Mesh | None
     air: Air | None
     device: DeviceLike
@@ -121,8 +123,9 @@ class RadioField(ABC):
         """Write everything to one safetensors file, in one go."""
         tensors, header = self._taken_apart()
         tensors["transmitter"] = self.transmitter
-        if self.fitted_on is not None:
-            tensors["fitted_on"] = self.fitted_on
+        for name in ("fitted_on", "fitted_under"):
+            if getattr(self, name) is not None:
+                tensors[name] = getattr(self, name)
         header |= {name: getattr(self, name) for name in _PLAIN} | {
             "model": self.model,
             "report": self.report,
@@ -157,6 +160,30 @@ class RadioField(ABC):
     @abstractmethod
     def spectrum(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> Spectrum:
         """The spatial spectrum at ``rx`` (3,) [m]."""
+
+    def spectra(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, progress: Progress | None = None
+    ) -> np.ndarray:
+        """Path gain of the spectra at many receivers: what :meth:`spectrum` says of each, without delays and departures.
+
+        Args:
+            rx: positions [m], shape ``(R, 3)``.
+            transmitter: as for :meth:`spectrum`.
+            progress: called as ``progress("spectra", done, total)``.
+
+        Returns:
+            Path gain [linear], shape ``(R, H, W)``, float32.
+
+        Raises:
+            ValueError: as for :meth:`spectrum`.
+        """
+        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
+        found = np.empty((len(receivers), *self.shape), np.float32)
+        for k, receiver in enumerate(receivers):
+            found[k] = self.spectrum(receiver, source).path_gain
+            if progress is not None:
+                progress("spectra", k + 1, len(receivers))
+        return found
 
     @abstractmethod
     def paths(
@@ -281,7 +308,8 @@ class RadioField(ABC):
         """Which receivers of ``ds`` it was fitted on, under the same transmitter, shape ``(R,)`` bool."""
         if self.fitted_on is None:
             return np.zeros(len(ds.receivers), dtype=bool)
-        return measured_at(ds, self.fitted_on, self.transmitter)
+        under = self.transmitter if self.fitted_under is None else self.fitted_under
+        return measured_at(ds, self.fitted_on, under)
 
     def __post_init__(self) -> None:
         """Check what every model has; ValueError or TypeError names the attribute."""
@@ -296,7 +324,9 @@ class RadioField(ABC):
             raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
         check_number("beam_sigma_rad", self.beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
         if self.fitted_on is not None:
-            check_array("fitted_on", self.fitted_on, (None, 3))
+            known = check_array("fitted_on", self.fitted_on, (None, 3))
+            if self.fitted_under is not None:
+                check_array("fitted_under", self.fitted_under, known.shape)
         if np.abs(self.transmitter).max() > LARGEST_M:
             raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
         if self.air is not None:

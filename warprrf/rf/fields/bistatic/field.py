@@ -29,16 +29,16 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.itu import assumed_permittivity
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
-from warprrf.rf.fields.bistatic.links import LinkTracer
+from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
-from warprrf.rf.fields.bistatic.render import Rendered, path_powers, render, sent_radiance
+from warprrf.rf.fields.bistatic.render import Rendered, images, path_powers, render, sent_radiance
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
@@ -73,7 +73,8 @@ class BistaticField(RadioField):
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residuals`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         air: absorption of every path: that of the data set it was fitted to; None for none.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
         report: how the fit went.
         device: where it computes.
     """
@@ -92,6 +93,7 @@ class BistaticField(RadioField):
     errors: uncertainty.ErrorModel | None = field(default=None, repr=False)
     air: Air | None = None
     fitted_on: np.ndarray | None = field(default=None, repr=False)
+    fitted_under: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _sent: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
@@ -175,14 +177,13 @@ class BistaticField(RadioField):
             return cls._unmeasured(geometry, data, chosen, device)
         found = train(geometry, data, chosen, transport=transport, device=device, progress=progress)
         frame = Frame.of(data)
-        under = np.concatenate([np.atleast_2d(transmitters_of(one)) for one in data])
-        own = (under == frame.transmitter).all(axis=1)
-        receivers = np.concatenate([one.receivers for one in data])[own]
-        receivers = receivers[np.sort(np.unique(receivers, axis=0, return_index=True)[1])]
+        ends = np.concatenate([np.column_stack([transmitters_of(one), one.receivers]) for one in data])
+        ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
+        receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
             cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report, fitted_on=receivers,
+            errors=found.errors, report=found.report, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
@@ -252,6 +253,32 @@ class BistaticField(RadioField):
         """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
         return replace(self, air=air_of(gas, self.frequency_hz))
 
+    def at_frequency(self, frequency_hz: float) -> BistaticField:
+        """The same room at another carrier, with nothing measured there.
+
+        What carries over: geometry, and so directions and delays; permittivities, which ITU-R P.2040-4 has constant above
+        100 GHz for every indoor material; how surfaces differ; the roughness that their mirrored and scattered shares tell,
+        counted in the new wavelengths (Ament 1953); absorption by the air, at the new carrier. Floor and range move with
+        the square of the wavelength. What does not: the width of scattering lobes stays as it was, thin slabs are none,
+        gains of measuring chains and the stated uncertainty are not known there.
+
+        Args:
+            frequency_hz: the other carrier [Hz].
+
+        Raises:
+            ValueError: for no carrier; for one outside ITU-R P.676, where the field has absorption.
+
+        Example::
+
+            field_140 = field_300.at_frequency(140e9)
+        """
+        ratio = check_frequency(frequency_hz) / self.frequency_hz
+        fall = 20.0 * float(np.log10(ratio))
+        return replace(
+            self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
+            floor=self.floor / ratio**2, range_db=(self.range_db[0] - fall, self.range_db[1] - fall),
+        )  # fmt: skip
+
     # ------------------------------------------------------------------------------------------ asking
 
     def spectrum(
@@ -320,6 +347,24 @@ class BistaticField(RadioField):
             view = self.transport(source).view(position, self.terms)
             found.append(paths_of(view, self.render(view), self.floor, self.air, max_paths))
         return found[0] if positions.ndim == 1 else Paths.stack(found)
+
+    def spectra(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, progress: Progress | None = None
+    ) -> np.ndarray:
+        """Path gain of the spectra at ``rx`` (R, 3); see :meth:`RadioField.spectra`. Several receivers are traced at once."""
+        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
+        transport = self.transport(source)
+        sent, found = self.sent_radiance(transport), np.empty((len(receivers), *self.shape), np.float32)
+        batch = max(1, RAYS_AT_A_TIME // len(transport.grid.directions))
+        for first in range(0, len(receivers), batch):
+            view = transport.view(receivers[first : first + batch], self.terms)
+            powers = path_powers(view, self.materials, sent)
+            found[first : first + batch] = images(
+                view, powers, powers.single + powers.further.by_ray(), self._beam
+            )
+            if progress is not None:
+                progress("spectra", min(first + batch, len(receivers)), len(receivers))
+        return found
 
     def array_spectrum(
         self,

@@ -114,6 +114,14 @@ Weigh = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 each, shape ``(N, K)``."""
 
 
+def direct_paths(view: ReceiverView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's line of sight and mirror paths."""
+    paths, transmitter = view.paths, view.transport.transmitter
+    toward = np.where((paths.order > 0)[:, None], paths.point[:, 0], view.receivers[0]) - transmitter
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    return paths.arrival, toward, paths.length_m / SPEED_OF_LIGHT
+
+
 @dataclass(frozen=True, eq=False)
 class WeighedPaths:
     """Readings that weigh paths by where they arrive, where they left and how late they are: horns, profiles of delay.
@@ -131,7 +139,7 @@ class WeighedPaths:
 
     @classmethod
     def of(
-        cls, view: ReceiverView, weigh: Weigh, *, departure: bool, delay_step_s: float | None
+        cls, view: ReceiverView, weigh: Weigh, *, arrival: bool, departure: bool, delay_step_s: float | None
     ) -> WeighedPaths:
         """Those of one receiver.
 
@@ -141,17 +149,18 @@ class WeighedPaths:
         Args:
             view: what the receiver sees.
             weigh: what is read of a path.
-            departure: whether that depends on where a path left.
+            arrival: whether that depends on where a path arrives.
+            departure: whether it depends on where a path left.
             delay_step_s: delays that differ by less are not told apart; None where they do not count.
         """
         grid, transmitter, hit = view.transport.grid, view.transport.transmitter, view.hits.face.numpy() >= 0
         ray = np.flatnonzero(hit)
-        arrival = grid.directions[ray % len(grid.directions)]
+        toward = grid.directions[ray % len(grid.directions)]
         out = view.hits.points(ray) - transmitter
         length = np.linalg.norm(out, axis=1)
         delay = (length + view.hits.range_m.numpy()[ray]) / SPEED_OF_LIGHT
         out /= np.maximum(length, 1e-9)[:, None]
-        key = [ray // grid.sub_pixels**2]
+        key = [ray // grid.sub_pixels**2 if arrival else np.zeros(len(ray), int)]
         if departure:
             rows, columns = DEPARTURES
             row = np.arccos(np.clip(out[:, 2], -1.0, 1.0)) / np.pi * rows
@@ -163,20 +172,16 @@ class WeighedPaths:
         own, number = own.reshape(-1), len(first)
         mean = [
             np.stack([np.bincount(own, column, minlength=number) for column in values.T], axis=1)
-            for values in (arrival, out, delay[:, None])
+            for values in (toward, out, delay[:, None])
         ]
         ray_bin = np.full(len(hit), -1)
         ray_bin[ray] = own
-        paths = view.paths
-        toward = np.where((paths.order > 0)[:, None], paths.point[:, 0], view.receivers[0]) - transmitter
-        unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (*mean[:2], toward)]
+        unit = [v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in mean[:2]]
         count = np.bincount(own, minlength=number)
         return cls(
             ray_bin,
             weigh(unit[0], unit[1], mean[2][:, 0] / np.maximum(count, 1)).astype(np.float32),
-            np.ascontiguousarray(
-                weigh(paths.arrival, unit[2], paths.length_m / SPEED_OF_LIGHT).T, np.float32
-            ),
+            np.ascontiguousarray(weigh(*direct_paths(view)).T, np.float32),
         )
 
     def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:

@@ -33,6 +33,8 @@ PIXELS_PER_LAG = 4
 """Directions of an array's spectrum that a fit takes, per pair of elements that tells something of its own."""
 READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
+TOTAL_ERROR_DB = 0.5
+"""The same of all power of a place: errors of single directions average out."""
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 
 
@@ -214,9 +216,11 @@ def observe(
         above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
         measured = WeighedPaths.of(
-            view, partial(path_weights, one, rows), departure=one.departure is not None, delay_step_s=step
-        )
-        trust = noise_db / np.hypot(READING_ERROR_DB, one.noise_db[rows])
+            view, partial(path_weights, one, rows), arrival=one.arrival is not None,
+            departure=one.departure is not None, delay_step_s=step,
+        )  # fmt: skip
+        unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
+        trust = noise_db / np.hypot(unexplained, one.noise_db[rows])
         target = Target(above, trust, one.power[rows] <= floors)
         found.append(Observed(place, measured, target, floor, index.get(place.chain, -1)))
     return found, chains
