@@ -36,6 +36,7 @@ class Reconstruction:
         scale_rms_m: rms distance left between surveyed and reconstructed camera positions [m]; NaN without survey.
         metric: whether lengths are metres (else they are an assumed scale).
         unposed: names of photos without a pose.
+        unposed_causes: why they have none, one for each.
         held_out: names of photos that the Gaussians were not fitted to.
         guessed: what nobody measured and the photos do not show, a sentence each.
     """
@@ -50,6 +51,7 @@ class Reconstruction:
         scale_rms_m: float = float("nan"),
         metric: bool = True,
         unposed: Sequence[str] = (),
+        unposed_causes: Sequence[str] = (),
         held_out: Sequence[str] = (),
         guessed: Sequence[str] = (),
     ) -> None:
@@ -62,6 +64,7 @@ class Reconstruction:
         self.scale_rms_m = float(scale_rms_m)
         self.metric = bool(metric)
         self.unposed = tuple(unposed)
+        self.unposed_causes = tuple(unposed_causes)
         self.held_out = tuple(held_out)
         self.guessed = tuple(guessed)
 
@@ -121,7 +124,7 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
-            "guessed": self.guessed,
+            "unposed_causes": self.unposed_causes, "guessed": self.guessed,
             "labels": () if self._mesh is None else self._mesh.labels,
         }  # fmt: skip
         arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
@@ -158,9 +161,9 @@ class Reconstruction:
             splats = None if mesh is not None and "means" not in arrays else files.to_gaussians(arrays)
             rms = header["scale_rms_m"]
             check_type("metric", header["metric"], bool)
-            guessed = header.get("guessed", ())
-            for name in (*header["unposed"], *header["held_out"], *guessed):
-                check_type("unposed, held_out, guessed", name, str)
+            guessed, causes = (header.get(name, ()) for name in ("guessed", "unposed_causes"))
+            for name in (*header["unposed"], *header["held_out"], *guessed, *causes):
+                check_type("unposed, unposed_causes, held_out, guessed", name, str)
             return cls(
                 splats,
                 mesh,
@@ -169,6 +172,7 @@ class Reconstruction:
                 scale_rms_m=float("nan") if rms is None else check_number("scale_rms_m", rms, 0.0),
                 metric=header["metric"],
                 unposed=header["unposed"],
+                unposed_causes=causes,
                 held_out=header["held_out"],
                 guessed=guessed,
             )

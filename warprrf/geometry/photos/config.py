@@ -104,6 +104,7 @@ class PlainConfig:
         line_views: fewest photos that show an edge; from ``sure_views`` on it counts, when it is ``line_m`` long.
         line_m, sure_views: see above.
         plain, plain_px: a pixel is plain where no pixel in a square of this side changes by more than this.
+        shown_share: where so much of an edge shows in a photo, all of it parts regions.
         least_share: photos with fewer plain pixels than this share, all together, show no plain surface.
         region_px: fewest pixels of a plain region.
         votes_px: fewest pixels of its border on a plane.
@@ -131,6 +132,7 @@ class PlainConfig:
     sure_views: int = 4
     plain: float = 0.006
     plain_px: int = 7
+    shown_share: float = 0.15
     least_share: float = 0.03
     region_px: int = 150
     votes_px: float = 25.0

@@ -167,7 +167,9 @@ def find_segments(
             used[run] = True
             ends = float(rise[pixels[0]]), float(rise[pixels[-1]])
             outward = np.sign(turn[pixels])[:, None] * across[pixels]
-            sides = np.stack([_colour(image, position[pixels] + s * config.side_px * outward) for s in (-1, 1)])
+            sides = np.stack(
+                [_colour(image, position[pixels] + s * config.side_px * outward) for s in (-1, 1)]
+            )
             angle, pixel = float(np.median(bearing[pixels])), float(np.abs(turn[pixels]).mean())
             result.append((number, angle, ends, pixel, length, sides))
     return result
@@ -291,7 +293,12 @@ def _fitted(
 
 
 def _extent(
-    place: np.ndarray, chosen: np.ndarray, segments: Segments, across: np.ndarray, along: np.ndarray, axis: int
+    place: np.ndarray,
+    chosen: np.ndarray,
+    segments: Segments,
+    across: np.ndarray,
+    along: np.ndarray,
+    axis: int,
 ) -> Line | None:
     """The line at ``place``, from where to where two photos at least show it."""
     picked = np.flatnonzero(chosen)

@@ -18,7 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from warprrf.geometry.photos.config import PlainConfig
+from warprrf.geometry.photos.cells import PARALLEL
+from warprrf.geometry.photos.config import PlainConfig, PlaneConfig
 from warprrf.geometry.photos.edges import FARTHEST_M, Edgels, Line, find_edgels, find_lines, lines_through
 from warprrf.geometry.photos.planes import Plane, dilate
 from warprrf.geometry.splats.camera import Camera
@@ -71,7 +72,9 @@ class PlainSurfaces:
     def reflected(self, eyes: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """Which lines of sight, in world coordinates, end on what a mirror shows, shape ``(L,)`` bool."""
         eyes, targets = eyes @ self.axes.T, targets @ self.axes.T
-        return np.any([pane.between(eyes, targets) for pane in self.panes] + [np.zeros(len(eyes), bool)], axis=0)
+        return np.any(
+            [pane.between(eyes, targets) for pane in self.panes] + [np.zeros(len(eyes), bool)], axis=0
+        )
 
 
 def plain_surfaces(
@@ -103,7 +106,7 @@ def plain_surfaces(
     if not heights:
         return PlainSurfaces([], panes, axes)
     seen = [
-        _regions_on(heights, lines, *view, config) for view in zip(cameras, edgels, plain, strict=True)
+        _regions_on(heights, lines, *view, panes, config) for view in zip(cameras, edgels, plain, strict=True)
     ]
     planes = [
         plane
@@ -119,7 +122,8 @@ def _heights(lines: Sequence[Line], config: PlainConfig) -> list[Height]:
     result = []
     for axis in range(3):
         own = [line for line in lines if line.axis != axis]
-        place, weight = (np.array([f(x) for x in own]) for f in (lambda x: x.height(axis), lambda x: x.weight))
+        place = np.array([line.height(axis) for line in own])
+        weight = np.array([line.weight for line in own])
         left = np.ones(len(own), dtype=bool)
         while left.any():
             near = (np.abs(place[:, None] - place) < config.same_m) & left & left[:, None]
@@ -189,6 +193,7 @@ def _regions_on(
     camera: Camera,
     edgels: Edgels,
     plain: np.ndarray,
+    panes: Sequence[Pane],
     config: PlainConfig,
 ) -> _View:
     """The plain regions of a photo, each on the plane that its border votes for."""
@@ -206,11 +211,15 @@ def _regions_on(
         if not own.any():
             continue
         rivals = []
-        for number in np.flatnonzero(votes[k] >= config.rival * votes[k].max()):
+        for number in np.flatnonzero(votes[k] >= config.rival * votes[k].max()).tolist():
             axis, height, _ = heights[number]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (height - camera.position[axis]) / rays[own][:, axis]
             good = (t > 0.1) & (t < FARTHEST_M)
+            hits = camera.position + np.where(good, t, 0.0)[:, None] * rays[own]
+            eyes = np.broadcast_to(camera.position, hits.shape)
+            for pane in panes:
+                good &= ~pane.between(eyes, hits)
             if good.mean() > 0.98:
                 rivals.append((float(np.median(t[good])), weight[k, number], number, np.where(good, t, 0.0)))
         if rivals:
@@ -223,7 +232,8 @@ def _regions_on(
 def _shown(
     lines: Sequence[Line], camera: Camera, edgels: Edgels, config: PlainConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The line that each edgel lies on (-1: none), and the pixels along the shown parts of lines, gaps bridged."""
+    """The line that each edgel lies on (-1: none), and the pixels that part regions: lines, where enough of them shows
+    in whole, else their shown parts with gaps bridged."""
     height, width = edgels.strength.shape
     place = np.full((height, width), -1)
     place[edgels.pixel] = np.arange(len(edgels.position))
@@ -248,8 +258,10 @@ def _shown(
         if on.sum() < config.segment_px / 2:
             continue
         of_line[near[on]] = number
-        bridged = ndimage.binary_closing(np.pad(on, 40), np.ones(40))[40:-40]
-        barrier[y[bridged], x[bridged]] = True
+        if on.mean() < config.shown_share:
+            on = ndimage.binary_closing(np.pad(on, 40), np.ones(40))[40:-40]
+            x, y = x[on], y[on]
+        barrier[y, x] = True
     return of_line, barrier
 
 
@@ -265,16 +277,16 @@ def _votes(
     """For each region and plane: edgels of the border on the plane less those behind it, shape ``(regions, planes)``,
     and the same by the weight of the lines."""
     on = np.flatnonzero(of_line >= 0)
-    beside, edgel = [], []
+    regions, borders = [], []
     for side in (1, -1):
         found = np.zeros(len(on), dtype=int)
         for step in range(3, 12):  # pixels: where the smoothing and the square of a plain pixel end
             x, y = (edgels.position[on] + side * step * edgels.across[on]).astype(int).T
             ok = (found == 0) & (x >= 0) & (y >= 0) & (y < region.shape[0]) & (x < region.shape[1])
             found[ok] = region[y[ok], x[ok]]
-        beside.append(found[found > 0])
-        edgel.append(on[found > 0])
-    beside, edgel = np.concatenate(beside), np.concatenate(edgel)
+        regions.append(found[found > 0])
+        borders.append(on[found > 0])
+    beside, edgel = np.concatenate(regions), np.concatenate(borders)
     votes, weight = (np.zeros((region.max() + 1, len(heights))) for _ in range(2))
     if not len(edgel):
         return votes, weight
@@ -316,7 +328,9 @@ def _agreed(
             hits.append(camera.position + view.range_m[own][:, None] * rays)
     if not hits:
         return []
-    empty = Plane(side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=config.cell_m)
+    empty = Plane(
+        side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=config.cell_m, plain=True
+    )
     uv = empty.to_plane(np.concatenate(hits))
     low, high = np.percentile(uv, [0.5, 99.5], axis=0)
     low = np.floor(low / config.cell_m - 1) * config.cell_m
@@ -358,28 +372,34 @@ def _in_world(plane: Plane, axes: np.ndarray) -> Plane:
     return replace(grid, occupied=grid.count(points) >= 2)
 
 
-def with_plain(planes: Sequence[Plane], plain: Sequence[Plane], points: np.ndarray, contested_m: float) -> list[Plane]:
+def with_plain(
+    planes: Sequence[Plane],
+    plain: Sequence[Plane],
+    points: np.ndarray,
+    sight: tuple[np.ndarray, np.ndarray],
+    config: PlaneConfig,
+) -> list[Plane]:
     """``planes`` and ``plain`` ones, each cell with one of them: of planes that face alike and lie closer than
-    ``contested_m``, the one with points of its own there, else the plain one."""
-    result = []
+    ``config.contested_m``, the one with points of its own there has it, else the plain one.
+
+    Args:
+        points: that the inliers of ``planes`` index, shape ``(P, 3)``.
+        sight: lines of sight, from eyes to points, shape ``(L, 3)`` each: plain cells that some cross are none.
+    """
+    plain = [replace(p, occupied=p.occupied & (p.seen_through(*sight, config.behind_m) < 2)) for p in plain]
+    theirs = []
     for plane in planes:
-        cells = plane.cells()
-        lost = np.zeros(len(cells), dtype=bool)
-        own = dilate(plane.count(points[plane.inliers]) > 0, 1)[plane.occupied]
-        for other in plain:
-            if other.normal @ plane.normal > 0.98:
-                lost |= (np.abs(other.distance(cells)) < contested_m) & other.covers(cells) & ~own
-        occupied = plane.occupied.copy()
-        occupied[plane.occupied] = ~lost
-        result.append(replace(plane, occupied=occupied))
-    for other in plain:
-        cells = other.cells()
-        taken = np.zeros(len(cells), dtype=bool)
-        for plane in result[: len(planes)]:
-            if other.normal @ plane.normal > 0.98:
-                taken |= (np.abs(plane.distance(cells)) < contested_m) & plane.covers(cells)
-        occupied = other.occupied.copy()
-        occupied[other.occupied] = ~taken
-        if occupied.any():
-            result.append(replace(other, occupied=occupied))
-    return result
+        own = dilate(plane.count(points[plane.inliers]) > 0, 1)
+        theirs.append(replace(plane, occupied=plane.occupied & (own | ~_covered(plane, plain, config))))
+    mine = [replace(p, occupied=p.occupied & ~_covered(p, theirs, config)) for p in plain]
+    return theirs + [plane for plane in mine if plane.occupied.any()]
+
+
+def _covered(plane: Plane, others: Sequence[Plane], config: PlaneConfig) -> np.ndarray:
+    """Which cells of the grid lie close to a cell of ``others`` that faces alike, shape of ``occupied``."""
+    cells = plane.cells(np.ones_like(plane.occupied))
+    covered = np.zeros(len(cells), dtype=bool)
+    for other in others:
+        if other.normal @ plane.normal > PARALLEL:
+            covered |= (np.abs(other.distance(cells)) < config.contested_m) & other.covers(cells)
+    return covered.reshape(plane.occupied.shape)

@@ -37,6 +37,7 @@ MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
 COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
+FEW_FEATURES = 100  # of a photo that nothing else needs to explain
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 
@@ -105,7 +106,30 @@ def structure_from_motion(
         inputs = [steps.key("matches"), seed]
         found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _sparse_model(colmap.Reconstruction(str(folder / "model")), list(named))
-        return replace(result, other_models=tuple(found["other_models"]))
+        causes = _causes(colmap, folder / "matches.db", result.unposed)
+        return replace(result, other_models=tuple(found["other_models"]), unposed_causes=causes)
+
+
+def _causes(colmap: ModuleType, path: Path, unposed: Sequence[str]) -> tuple[str, ...]:
+    """Why each of these photos has no pose: too few features, or too few that agree with a posed photo's."""
+    if not unposed:
+        return ()
+    with colmap.Database.open(str(path)) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        features = {name: database.num_keypoints_for_image(key) for key, name in names.items()}
+        pairs, inliers = database.read_two_view_geometry_num_inliers()
+    most = dict.fromkeys(unposed, 0)
+    for pair, count in zip(pairs, inliers, strict=True):
+        first, second = (names[key] for key in colmap.pair_id_to_image_pair(pair))
+        for one, other in ((first, second), (second, first)):
+            if one in most and other not in most:
+                most[one] = max(most[one], int(count))
+    return tuple(
+        f"fewer than {FEW_FEATURES} features ({features[name]}): plain, dark or blurred"
+        if features[name] < FEW_FEATURES
+        else f"{features[name]} features, of which at most {most[name]} agree with those of a posed photo"
+        for name in unposed
+    )
 
 
 def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:

@@ -33,6 +33,7 @@ class SparseModel:
         track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
         track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
+        unposed_causes: why, for each of them.
         other_models: number of photos in each smaller model that was left out.
         metric: whether lengths are metres.
         upright: whether z is up.
@@ -48,6 +49,7 @@ class SparseModel:
     track_start: np.ndarray
     track_camera: np.ndarray
     unposed: tuple[str, ...] = ()
+    unposed_causes: tuple[str, ...] = ()
     other_models: tuple[int, ...] = ()
     metric: bool = False
     upright: bool = False
