@@ -253,9 +253,7 @@ class Lobby:
             "scale_rms_m": found.scale_rms_m,
             "photos": len(files),
             "posed": len(found.cameras),
-            "unposed": [
-                f"{name}: {why}" for name, why in zip(found.unposed, found.unposed_causes, strict=True)
-            ],
+            "unposed": {name: found.causes.get(name, "") for name in found.unposed},
             "guessed": list(found.guessed),
             "held_out": len(held_out),
             "surveyed": len(surveyed),

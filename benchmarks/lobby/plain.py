@@ -93,7 +93,8 @@ def summary(figures: dict[str, Any]) -> str:
         for key in path.split("."):
             value = value[key]
         rows.append([name, form.format(value)])
-    said = [f"- {line}" for line in (*figures["geometry"]["unposed"], *figures["geometry"]["guessed"])]
+    lost = [f"no pose, {name}: {why}" for name, why in figures["geometry"]["unposed"].items()]
+    said = [f"- {line}" for line in (*lost, *figures["geometry"]["guessed"])]
     met = table(["asked", "bound", "found", ""], compared("lobby_plain", figures))
     return "\n\n".join([table(["figure", "value"], rows), met, "\n".join(said)])
 

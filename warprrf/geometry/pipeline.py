@@ -122,9 +122,10 @@ def reconstruct(
         scale_rms_m=sparse.scale_rms_m,
         metric=sparse.metric,
         unposed=sparse.unposed,
-        unposed_causes=sparse.unposed_causes,
         held_out=sorted(skipped),
         guessed=(*sparse.guessed, *said),
+        causes=sparse.causes,
+        photos={name: named[name] for name in sparse.cameras},
     )
 
 

@@ -15,6 +15,7 @@ from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
+from warprrf.geometry.photos.report import Subject, write_report
 from warprrf.geometry.photos.sfm import read_colmap
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.camera import Camera
@@ -36,7 +37,8 @@ class Reconstruction:
         scale_rms_m: rms distance left between surveyed and reconstructed camera positions [m]; NaN without survey.
         metric: whether lengths are metres (else they are an assumed scale).
         unposed: names of photos without a pose.
-        unposed_causes: why they have none, one for each.
+        causes: why each of them has none, by name, where that is known.
+        photos: image files of the cameras, by name, as the Gaussians were fitted to them.
         held_out: names of photos that the Gaussians were not fitted to.
         guessed: what nobody measured and the photos do not show, a sentence each.
     """
@@ -51,9 +53,10 @@ class Reconstruction:
         scale_rms_m: float = float("nan"),
         metric: bool = True,
         unposed: Sequence[str] = (),
-        unposed_causes: Sequence[str] = (),
         held_out: Sequence[str] = (),
         guessed: Sequence[str] = (),
+        causes: Mapping[str, str] | None = None,
+        photos: Mapping[str, Path] | None = None,
     ) -> None:
         if gaussians is None and mesh is None:
             raise ValueError("gaussians, mesh: got neither, expected Gaussians, a mesh or both")
@@ -64,9 +67,10 @@ class Reconstruction:
         self.scale_rms_m = float(scale_rms_m)
         self.metric = bool(metric)
         self.unposed = tuple(unposed)
-        self.unposed_causes = tuple(unposed_causes)
         self.held_out = tuple(held_out)
         self.guessed = tuple(guessed)
+        self.causes = dict(causes or {})
+        self.photos = {name: Path(file) for name, file in (photos or {}).items()}
 
     def __repr__(self) -> str:
         faces = f"{len(self._mesh.faces)} triangles" if self._mesh is not None else "no mesh"
@@ -124,7 +128,8 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
-            "unposed_causes": self.unposed_causes, "guessed": self.guessed,
+            "guessed": self.guessed, "causes": self.causes,
+            "photos": {name: str(file) for name, file in self.photos.items()},
             "labels": () if self._mesh is None else self._mesh.labels,
         }  # fmt: skip
         arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
@@ -133,6 +138,46 @@ class Reconstruction:
         elif self._mesh is not None:
             arrays |= files.of_mesh(self._mesh)
         files.write(Path(folder) / FILE, arrays, header)
+
+    def report(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        progress: Progress | None = None,
+        device: DeviceLike = None,
+    ) -> None:
+        """Write what went in, what came out and how far it can be trusted as one HTML page, pictures included.
+
+        Cameras from above, held-out photos beside their renderings, the mesh from four sides and coloured by how often
+        each surface was seen, lenses, photos without a pose, and what was guessed::
+
+            rec.report("room.html")
+
+        Args:
+            path: file to write.
+            progress: called as ``progress("report", done, total)``.
+            device: Warp device.
+
+        Raises:
+            OSError: if ``path`` cannot be written.
+            ImportError: if Pillow is not installed.
+        """
+        write_report(
+            path,
+            Subject(
+                self._gaussians,
+                self._mesh,
+                self.cameras,
+                photos=self.photos,
+                held_out=self.held_out,
+                unposed={name: self.causes.get(name, "") for name in self.unposed},
+                guessed=self.guessed,
+                metric=self.metric,
+                scale_rms_m=self.scale_rms_m,
+            ),
+            progress=progress,
+            device=device,
+        )
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Reconstruction:
@@ -161,9 +206,11 @@ class Reconstruction:
             splats = None if mesh is not None and "means" not in arrays else files.to_gaussians(arrays)
             rms = header["scale_rms_m"]
             check_type("metric", header["metric"], bool)
-            guessed, causes = (header.get(name, ()) for name in ("guessed", "unposed_causes"))
-            for name in (*header["unposed"], *header["held_out"], *guessed, *causes):
-                check_type("unposed, unposed_causes, held_out, guessed", name, str)
+            guessed = header.get("guessed", ())
+            causes, photos = header.get("causes", {}), header.get("photos", {})
+            words = (*causes.values(), *photos.values())
+            for name in (*header["unposed"], *header["held_out"], *guessed, *words):
+                check_type("unposed, held_out, guessed, causes, photos", name, str)
             return cls(
                 splats,
                 mesh,
@@ -172,9 +219,10 @@ class Reconstruction:
                 scale_rms_m=float("nan") if rms is None else check_number("scale_rms_m", rms, 0.0),
                 metric=header["metric"],
                 unposed=header["unposed"],
-                unposed_causes=causes,
                 held_out=header["held_out"],
                 guessed=guessed,
+                causes=causes,
+                photos=photos,
             )
 
     @classmethod

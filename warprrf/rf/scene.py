@@ -256,17 +256,14 @@ class Scene:
         points = check_array("points", points, (None, 3))
         check_number("clearance_m", clearance_m, 0.0)
         free = np.ones(len(points), dtype=bool)
+        if clearance_m > 0:
+            free = self.mesh.distance(points, device=device) >= clearance_m
         for direction in ((0.021, 0.013, 1.0), (0.017, -0.011, -1.0), (1.0, 0.37, 0.113)):
             unit = np.asarray(direction) / np.linalg.norm(direction)
-            hit = self.mesh.cast(points, np.tile(unit, (len(points), 1)), device=device)
-            outer = np.where(hit.face >= 0, self.mesh.face_normals[hit.face] @ unit < 0, False)
-            free &= outer
+            hit = self.mesh.cast(points[free], np.tile(unit, (int(free.sum()), 1)), device=device)
+            free[free] = np.where(hit.face >= 0, self.mesh.face_normals[hit.face] @ unit < 0, False)
         if self.mesh.is_closed and free.any():
             free[free] = self.mesh.winding_number(points[free]) < 0.5
-        if clearance_m > 0 and free.any():
-            near = free.copy()
-            near[free] = self.mesh.distance(points[free], device=device) >= clearance_m
-            free = near
         return free
 
 

@@ -200,6 +200,17 @@ def test_other_photos_do_not_reuse_old_work(posed, lobby, tmp_path):
     assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:9])
 
 
+def test_why_a_photo_has_no_pose_is_said(posed):
+    import pycolmap
+
+    workspace, sparse = posed
+    cameras = {name: camera for name, camera in sparse.cameras.items() if name != VIEWS[4]}
+    lost = replace(sparse, cameras=cameras, unposed=(VIEWS[4], "black.jpg"))
+    causes = sfm._causes(pycolmap, workspace / "sfm" / "matches.db", lost)
+    assert list(causes) == [VIEWS[4], "black.jpg"] and causes["black.jpg"].startswith("shows 0 features")
+    assert any(f"matches {name} in" in causes[VIEWS[4]] for name in cameras)
+
+
 def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
     import pycolmap
 

@@ -37,7 +37,10 @@ MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
 COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
-FEW_FEATURES = 100  # of a photo that nothing else needs to explain
+FEWEST_FEATURES, FEWEST_MATCHES = (
+    8,
+    15,
+)  # of a photo that can be matched, and of a pair that COLMAP counts as matched
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 
@@ -106,30 +109,8 @@ def structure_from_motion(
         inputs = [steps.key("matches"), seed]
         found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
         result = _sparse_model(colmap.Reconstruction(str(folder / "model")), list(named))
-        causes = _causes(colmap, folder / "matches.db", result.unposed)
-        return replace(result, other_models=tuple(found["other_models"]), unposed_causes=causes)
-
-
-def _causes(colmap: ModuleType, path: Path, unposed: Sequence[str]) -> tuple[str, ...]:
-    """Why each of these photos has no pose: too few features, or too few that agree with a posed photo's."""
-    if not unposed:
-        return ()
-    with colmap.Database.open(str(path)) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        features = {name: database.num_keypoints_for_image(key) for key, name in names.items()}
-        pairs, inliers = database.read_two_view_geometry_num_inliers()
-    most = dict.fromkeys(unposed, 0)
-    for pair, count in zip(pairs, inliers, strict=True):
-        first, second = (names[key] for key in colmap.pair_id_to_image_pair(pair))
-        for one, other in ((first, second), (second, first)):
-            if one in most and other not in most:
-                most[one] = max(most[one], int(count))
-    return tuple(
-        f"fewer than {FEW_FEATURES} features ({features[name]}): plain, dark or blurred"
-        if features[name] < FEW_FEATURES
-        else f"{features[name]} features, of which at most {most[name]} agree with those of a posed photo"
-        for name in unposed
-    )
+        causes = _causes(colmap, folder / "matches.db", result) if result.unposed else {}
+        return replace(result, other_models=tuple(found["other_models"]), causes=causes)
 
 
 def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
@@ -268,11 +249,11 @@ def _match(
     )
     with colmap.Database.open(str(working)) as database:
         counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
-        blank = [n for n in names if counts[n] < 8]
+        blank = [n for n in names if counts[n] < FEWEST_FEATURES]
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
-                f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), "
-                f"too few remain to work with: {some(blank)}"
+                f"photos: {len(blank)} of {len(names)} photos show fewer than {FEWEST_FEATURES} features (blank, dark or "
+                f"blurred?), too few remain to work with: {some(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
         if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
@@ -390,6 +371,34 @@ def _map(
     os.replace(whole, folder / "model")
     report("mapping", len(named), len(named))
     return [m.num_reg_images() for m in others]
+
+
+def _causes(colmap: ModuleType, matches: Path, sparse: SparseModel) -> dict[str, str]:
+    """Why photos have no pose, by name."""
+    with colmap.Database.open(str(matches)) as database:
+        names = {i.image_id: i.name for i in database.read_all_images()}
+        features = {name: database.num_keypoints_for_image(k) for k, name in names.items()}
+        pairs, inliers = database.read_two_view_geometry_num_inliers()
+    best: dict[str, tuple[int, str]] = {}
+    for pair, count in zip(pairs, inliers, strict=True):
+        ends = [names[k] for k in (pair if np.ndim(pair) else colmap.pair_id_to_image_pair(pair))]
+        for one, other in (ends, ends[::-1]):
+            if other in sparse.cameras:
+                best[one] = max(best.get(one, (0, "")), (int(count), other))
+    causes = {}
+    for name in sparse.unposed:
+        count, other = best.get(name, (0, ""))
+        if features.get(name, 0) < FEWEST_FEATURES:
+            causes[name] = f"shows {features.get(name, 0)} features: blank, dark or blurred"
+        elif count < FEWEST_MATCHES:
+            causes[name] = (
+                f"shares {count or 'no'} features with any photo that has a pose: too little overlap"
+            )
+        else:
+            causes[name] = (
+                f"matches {other} in {count} features that do not fit the rest: too few, or of something alike"
+            )
+    return causes
 
 
 def _sparse_model(model: Any, names: Sequence[str]) -> SparseModel:

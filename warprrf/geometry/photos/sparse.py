@@ -7,7 +7,7 @@ the world; without a survey a plausible one is assumed.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,7 +33,7 @@ class SparseModel:
         track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
         track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
-        unposed_causes: why, for each of them.
+        causes: why each of these has no pose, by name, where that is known.
         other_models: number of photos in each smaller model that was left out.
         metric: whether lengths are metres.
         upright: whether z is up.
@@ -49,7 +49,7 @@ class SparseModel:
     track_start: np.ndarray
     track_camera: np.ndarray
     unposed: tuple[str, ...] = ()
-    unposed_causes: tuple[str, ...] = ()
+    causes: Mapping[str, str] = field(default_factory=dict)
     other_models: tuple[int, ...] = ()
     metric: bool = False
     upright: bool = False
