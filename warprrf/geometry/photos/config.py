@@ -133,7 +133,7 @@ class PlainConfig:
     plain: float = 0.006
     plain_px: int = 7
     shown_share: float = 0.15
-    least_share: float = 0.03
+    least_share: float = 0.12
     region_px: int = 150
     votes_px: float = 25.0
     same_m: float = 0.04
