@@ -149,14 +149,22 @@ def _mirrors(
         ends = np.concatenate([x.points(np.array([x.low, x.high])) for x in on])
         for side in (1, -1):
             pane = Pane(axis, height, side, ends.min(axis=0) - 0.1, ends.max(axis=0) + 0.1)
-            through = [_only_through(pane, x, positions) for x in lines]
-            shown = [x for x, only in zip(lines, through, strict=True) if only]
+            parts = [part for x in lines for part in _parted(pane, x)]
+            through = [_only_through(pane, x, positions) for x in parts]
+            shown = [x for x, only in zip(parts, through, strict=True) if only]
             total = sum(x.weight for x in shown)
-            twins = sum(x.weight for x in shown if _has_twin(pane, x, lines, config))
+            twins = sum(x.weight for x in shown if _has_twin(pane, x, parts, config))
             if total > config.mirror_m and twins > config.mirror_share * total:
                 panes.append(pane)
-                lines = [x for x, only in zip(lines, through, strict=True) if not only]
+                lines = [x for x, only in zip(parts, through, strict=True) if not only]
     return panes, lines
+
+
+def _parted(pane: Pane, line: Line) -> list[Line]:
+    """A line cut where it goes through the plane of a pane: its reflection carries it on."""
+    if line.axis != pane.axis or min(pane.height - line.low, line.high - pane.height) < 0.3:
+        return [line]
+    return [replace(line, high=pane.height), replace(line, low=pane.height)]
 
 
 def _only_through(pane: Pane, line: Line, positions: np.ndarray) -> bool:
