@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.report import Subject, write_report
 from warprrf.geometry.photos.sfm import read_colmap
+from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -41,6 +43,8 @@ class Reconstruction:
         photos: image files of the cameras, by name, as the Gaussians were fitted to them.
         held_out: names of photos that the Gaussians were not fitted to.
         guessed: what nobody measured and the photos do not show, a sentence each.
+        lenses: photo name to the :class:`~warprrf.geometry.photos.undistort.Lens` that took it; ``cameras`` are those of the
+            photos undistorted, turned upright and reduced.
     """
 
     def __init__(
@@ -55,6 +59,7 @@ class Reconstruction:
         unposed: Sequence[str] = (),
         held_out: Sequence[str] = (),
         guessed: Sequence[str] = (),
+        lenses: Mapping[str, Lens] | None = None,
         causes: Mapping[str, str] | None = None,
         photos: Mapping[str, Path] | None = None,
     ) -> None:
@@ -69,6 +74,7 @@ class Reconstruction:
         self.unposed = tuple(unposed)
         self.held_out = tuple(held_out)
         self.guessed = tuple(guessed)
+        self.lenses = dict(lenses or {})
         self.causes = dict(causes or {})
         self.photos = {name: Path(file) for name, file in (photos or {}).items()}
 
@@ -130,6 +136,7 @@ class Reconstruction:
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
             "guessed": self.guessed, "causes": self.causes,
             "photos": {name: str(file) for name, file in self.photos.items()},
+            "lenses": [{**asdict(lens), "photos": names} for lens, names in lenses_in_use(self.lenses).items()],
             "labels": () if self._mesh is None else self._mesh.labels,
         }  # fmt: skip
         arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
@@ -221,6 +228,7 @@ class Reconstruction:
                 unposed=header["unposed"],
                 held_out=header["held_out"],
                 guessed=guessed,
+                lenses=_lenses(header.get("lenses", ())),
                 causes=causes,
                 photos=photos,
             )
@@ -264,6 +272,16 @@ class Reconstruction:
             )
             mesh = patches.mesh
         return cls(gaussians, mesh, cameras, patches=patches)
+
+
+def _lenses(stored: Sequence[Mapping[str, Any]]) -> dict[str, Lens]:
+    """Lenses by photo, from a list of lenses with their photos."""
+    found: dict[str, Lens] = {}
+    for entry in stored:
+        values = dict(entry)
+        names = values.pop("photos")
+        found |= dict.fromkeys(names, Lens(**values))
+    return dict(sorted(found.items()))
 
 
 def _camera(stored: Mapping[str, Any]) -> Camera:

@@ -156,6 +156,8 @@ class RefineConfig:
     Attributes:
         iterations: steps, one photo each.
         downscale: photos are averaged over squares of this many pixels while training.
+        coarse_pixels, fine_from: until this share of the iterations squares are twice as wide, and twice again, as long
+            as photos would have more pixels than this.
         full_from: share of the iterations after which photos are taken as they are.
         sh_degree: of the colours; rendered rooms are nearly matt, so 1.
         ssim_share: weight of 1 - SSIM; L1 has the rest.
@@ -166,6 +168,7 @@ class RefineConfig:
         densify_from, densify_until, densify_every: in iterations; ``until`` as a share of all.
         densify_share: at most this share of the Gaussians is split or cloned at a time, those with the largest mean
             gradient of the projected position.
+        densify_to: and more than that, up to half of them, where otherwise fewer than these would be there in the end.
         max_gaussians: densification stops here.
         split_above_m: larger ones are split, smaller ones cloned.
         prune_opacity: fainter ones are removed.
@@ -179,6 +182,8 @@ class RefineConfig:
 
     iterations: int = 2400
     downscale: int = 2
+    coarse_pixels: int = 100_000
+    fine_from: float = 0.5
     full_from: float = 0.9
     sh_degree: int = 1
     ssim_share: float = 0.2
@@ -193,6 +198,7 @@ class RefineConfig:
     densify_until: float = 0.65
     densify_every: int = 200
     densify_share: float = 0.08
+    densify_to: int = 40_000
     max_gaussians: int = 60_000
     split_above_m: float = 0.03
     prune_opacity: float = 0.02
@@ -205,7 +211,14 @@ class RefineConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "downscale", "densify_every", "max_gaussians", "checkpoint_every"):
+        for name in (
+            "iterations",
+            "downscale",
+            "coarse_pixels",
+            "densify_every",
+            "max_gaussians",
+            "checkpoint_every",
+        ):
             check_count(name, getattr(self, name))
         check_seed(self.seed)
         if self.sh_degree not in COEFFICIENTS:
@@ -321,6 +334,9 @@ class ReconstructionConfig:
 
     Attributes:
         max_features: SIFT features per photo.
+        lens: COLMAP's model of the lenses, or ``"auto"``: see
+            :func:`~warprrf.geometry.photos.sfm.structure_from_motion`.
+        max_pixels: photos are reduced to about so many pixels before Gaussians are fitted to them.
         pairs: which photos are matched, ``"auto"`` or ``"exhaustive"``.
         max_reprojection_error: sparse points above it are dropped [pixels].
         planes: how planes are found among sparse points.
@@ -333,6 +349,8 @@ class ReconstructionConfig:
     """
 
     max_features: int = 2400
+    lens: str = "auto"
+    max_pixels: int = 1_000_000
     pairs: str = "auto"
     max_reprojection_error: float = 1.0
     planes: PlaneConfig = field(default_factory=PlaneConfig)

@@ -72,7 +72,7 @@ class Selection:
         most_to_choose: receivers that fits which only decide about a term learn from.
         short_steps: of such a fit.
         better: share to which a term must lower the held-out mean square error.
-        clearly_better: and the residual: it has thousands of unknowns and blurs the strongest paths.
+        clearly_worse: share to which the residual may raise it: one that is learned from all receivers gains more.
         not_much_worse: share to which it may rise where fewer materials fit the training receivers better.
         few_materials: up to which light that is sent on follows the parameters of its group.
         regrouped: rounds of deciding what is of one material, and fitting.
@@ -88,7 +88,7 @@ class Selection:
     most_to_choose: int = 12
     short_steps: int = 10
     better: float = 0.995
-    clearly_better: float = 0.95
+    clearly_worse: float = 1.05
     not_much_worse: float = 1.5
     few_materials: int = 30
     regrouped: int = 3
@@ -107,7 +107,7 @@ class FitOptions:
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
-        mirror_order: mirror reflections on a path: 0 to 3.
+        mirror_order: mirror reflections on a path: 0 to 3; None also stops short of 3 where a search would be refused.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
             Degli-Esposti et al. (2007), Sionna RT's, which do not.
@@ -252,7 +252,7 @@ def trace(
     """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
 
     Args:
-        mirror_order: most mirror reflections on a path; 3 by default.
+        mirror_order: most mirror reflections on a path; 3 by default, or as many as can be searched (2 in a city).
         sub_pixels: square root of the rays per pixel; 3 by default.
         device: where rays are cast.
         progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
@@ -264,8 +264,10 @@ def trace(
     """
     started, tell = time.perf_counter(), progress or _silent
     receivers, transmitter = check_dataset(as_mesh(geometry, "geometry"), ds, device=device)
-    order = 3 if mirror_order is None else mirror_order
-    terms = Terms(mirror_order=order, sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels)
+    terms = Terms(
+        mirror_order=3 if mirror_order is None else mirror_order,
+        sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels,
+    )
     _check_rays(ds.path_gain.shape, terms.sub_pixels)
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
@@ -277,7 +279,9 @@ def trace(
         beam_sigma_rad=float(ds.beam_sigma_rad), loss_per_m=0.0 if air is None else air.loss_per_m(frequency_hz),
         device=device,
     )  # fmt: skip
-    found = transport.paths(receivers, order, progress)
+    if mirror_order is None:
+        terms = replace(terms, mirror_order=transport.images.affordable(receivers, terms.mirror_order))
+    found = transport.paths(receivers, terms.mirror_order, progress)
     views = []
     for r, receiver in enumerate(receivers):
         own = found.subset(np.flatnonzero(found.receiver == r))
@@ -391,11 +395,8 @@ class _Training:
         if len(self.held):
             first = self._fit_groups(terms, start, self._few(1), self.choose.short_steps * 2)
             best = self._choose(_Candidate(terms, first, self._held_error(terms, first)))
-            residual = self._choose_residual(best)
-            terms, start = best.terms, best.fit.parameters
-            if residual is not None:
-                terms = replace(terms, residual=True)
-            errors = self._errors(terms, best.fit, residual)
+            residual, errors = self._held_in_turn(best)
+            terms, start = replace(best.terms, residual=residual), best.fit.parameters
         # Chosen terms come with a fit to most receivers, under which light that goes on is settled: one round is left.
         rounds = 1 if len(self.held) else self.choose.rounds
         fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=rounds)
@@ -470,17 +471,6 @@ class _Training:
             best = self._tried("indirect", True, best)
         return best
 
-    def _choose_residual(self, best: _Candidate) -> np.ndarray | None:
-        """The residual (2, X) on the receivers kept, if it is wanted or lowers the held-out error clearly."""
-        if not (best.terms.residual or self.options.residual is None):
-            return None
-        bare = self._materials(replace(best.terms, residual=False), best.fit)
-        found = self._residual(bare, self.kept)
-        error = self._image_error(replace(bare, terms=replace(best.terms, residual=True), residual=found))
-        keep = best.terms.residual or error < self.choose.clearly_better * self._image_error(bare)
-        self._note("residual", keep, error)
-        return found if keep else None
-
     def _tried(self, name: str, value: Any, best: _Candidate) -> _Candidate:
         """The candidate with one term more, if its error is lower; else as it was."""
         trial = replace(best.terms, **{name: value})
@@ -538,25 +528,34 @@ class _Training:
         image = render(self._view(receiver, materials.terms), materials, self.beam, sent).image
         return to_db(image, self.floor) - 10.0 * np.log10(self.floor)
 
-    def _errors(self, terms: Terms, fit: Fitted, residual: np.ndarray | None) -> ErrorModel:
-        """Learned from the receivers held out; where they are few, from all, held out in turn."""
-        receivers = np.asarray(self.ds.receivers, float)
-        images, errors, gaps = [], [], []
+    def _held_in_turn(self, best: _Candidate) -> tuple[bool, ErrorModel]:
+        """Whether the residual is wanted, or does not clearly raise the held-out error, and the errors that then remain:
+        of the receivers held out; where they are few, of all, held out in turn."""
+        wanted, receivers = self.options.residual, np.asarray(self.ds.receivers, float)
+        images: dict[bool, list[np.ndarray]] = {one: [] for one in (False, True) if wanted in (None, one)}
+        order, gaps = [], []
         for held in self._folds():
             kept = np.setdiff1d(np.arange(self.count), held)
-            if held is self.held:
-                materials = self._materials(terms, fit, residual)
-            else:
-                own = self._fit_groups(terms, fit.parameters, kept, self.choose.short_steps, rounds=1)
-                materials = self._materials(terms, own)
-                if terms.residual:
-                    materials = replace(materials, residual=self._residual(materials, kept))
-            sent = sent_radiance(self.seen.transport, materials)
-            for r in held:
-                images.append(self._image(materials, sent, r))
-                errors.append(images[-1] - self.target[r])
-                gaps.append(np.linalg.norm(receivers[kept] - receivers[r], axis=1).min())
-        return learn_errors(images, errors, np.array(gaps), receivers, fit.covariance)
+            fit = best.fit
+            if held is not self.held:
+                fit = self._fit_groups(best.terms, fit.parameters, kept, self.choose.short_steps, rounds=1)
+            order += list(held)
+            gaps += [np.linalg.norm(receivers[kept] - receivers[r], axis=1).min() for r in held]
+            bare = self._materials(replace(best.terms, residual=False), fit)
+            for residual, found in images.items():
+                materials = bare
+                if residual:
+                    terms = replace(best.terms, residual=True)
+                    materials = replace(bare, terms=terms, residual=self._residual(bare, kept))
+                sent = sent_radiance(self.seen.transport, materials)
+                found += [self._image(materials, sent, r) for r in held]
+        errors = {one: np.stack(found) - self.target[order] for one, found in images.items()}
+        square = {one: float(np.mean(error**2)) for one, error in errors.items()}
+        keep = wanted if wanted is not None else square[True] < self.choose.clearly_worse * square[False]
+        for one, error in square.items():
+            self._note("residual" if one else "no residual", one == keep, error)
+        model = learn_errors(images[keep], list(errors[keep]), np.array(gaps), receivers, best.fit.covariance)
+        return keep, model
 
     def _folds(self) -> list[np.ndarray]:
         """Receivers that are held out in turn to learn errors."""
@@ -635,12 +634,7 @@ class _Training:
         self._stepped()
         return found
 
-    def _materials(self, terms: Terms, fit: Fitted, residual: np.ndarray | None = None) -> Materials:
-        """What ``fit`` found, by groups."""
+    def _materials(self, terms: Terms, fit: Fitted) -> Materials:
+        """What ``fit`` found, by groups, without a residual."""
         none = np.zeros((2, self.surface.cells))
-        return Materials(
-            terms,
-            fit.parameters.take(self.material),
-            none if residual is None else residual,
-            self.ds.transmitter,
-        )
+        return Materials(terms, fit.parameters.take(self.material), none, self.ds.transmitter)
