@@ -35,6 +35,10 @@ NAMES = {
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
     "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
+    "measurements": (
+        "benchmarks.measurements",
+        "horns, power alone, delay profiles and one spectrum, beside ten spectra",
+    ),
     "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

@@ -1,4 +1,5 @@
-"""L1 and structural similarity of photos with their derivative: :mod:`.ssim` for several numbers at a time.
+"""L1 and structural similarity of photos with their derivative: :mod:`.ssim` for several numbers at a time; beyond the
+border the window sees zeros.
 
 The filter is most of a photo's loss, and along rows and columns alike it adds shifted stretches of memory. An image is
 a plane here: row after row, each a margin of zeros, the numbers (pixel after pixel, channel after channel), zeros up to

@@ -171,11 +171,12 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
 
 
 @pytest.mark.usefixtures("device")
-def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right():
+@pytest.mark.parametrize("lanes", [1, 16])  # of a GPU's threads and of a CPU's
+def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right(lanes):
     rng = np.random.default_rng(2)
     shape = (24, 20, 3)
     image, target = rng.random(shape), rng.random(shape)
-    loss = PhotoLoss("cpu", 0.2, real=wp.float64)
+    loss = PhotoLoss("cpu", 0.2, real=wp.float64, lanes=lanes)
 
     def evaluate(values):
         size = shape[:2]

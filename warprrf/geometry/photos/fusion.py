@@ -41,7 +41,21 @@ def fuse_gaussians(
     known beforehand are what it is snapped to."""
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    views, depths = depth_maps(gaussians, cameras, config=config.surface, progress=report, device=device)
+    maps = depth_maps(gaussians, cameras, config=config.surface, progress=report, device=device)
+    return fuse_maps(*maps, planes=planes, config=config, progress=report)
+
+
+def fuse_maps(
+    views: Sequence[Camera],
+    depths: Sequence[np.ndarray],
+    *,
+    planes: Sequence[Plane] = (),
+    config: ReconstructionConfig | None = None,
+    progress: Progress | None = None,
+) -> PlanarPatches:
+    """As :func:`fuse_gaussians`, from ranges [m], 0 where unknown, that are there already, each of one of ``views``."""
+    config = config or ReconstructionConfig()
+    report = progress or (lambda stage, done, total: None)
     report("surface", 0, 4)
     mesh = fuse_depth(depths, views, config=config.surface)
     report("surface", 1, 4)

@@ -34,11 +34,14 @@ class PhotoLoss:
         device: Warp device.
         ssim_share: weight ``s`` of 1 - SSIM.
         real: scalar type of the images.
+        lanes: numbers that a thread works on; default: one on a GPU, a vector register's worth on a CPU.
     """
 
-    def __init__(self, device: DeviceLike, ssim_share: float, real: type = wp.float32) -> None:
+    def __init__(
+        self, device: DeviceLike, ssim_share: float, real: type = wp.float32, lanes: int | None = None
+    ) -> None:
         self.device, self.ssim_share, self.real = resolve(device), ssim_share, real
-        self.lanes = 1 if self.device.is_cuda else kernels.LANES
+        self.lanes = lanes or (1 if self.device.is_cuda else kernels.LANES)
         self.kernels = kernels.build(real, self.lanes)
         self.rooms: dict[tuple[int, int], _Room] = {}
 

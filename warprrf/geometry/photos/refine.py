@@ -31,6 +31,8 @@ from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
 from warprrf.steps import digest
 
+ENOUGH_TO_FILL = 100
+"""Iterations from which on holes are filled: new Gaussians stand at a guessed depth until photos have moved them."""
 CHECKPOINT = "warprrf refinement 2"
 
 PARTS = 1000  # of the work: what progress counts, as iterations become slower when photos are compared larger
@@ -94,8 +96,9 @@ class _Refinement:
         self.plane_table = wp.array(table, dtype=wp.vec4, device=self.device)
 
     def start(self, gaussians: Gaussians) -> None:
-        """Begin with ``gaussians``, and others where they leave holes in the photos."""
-        gaussians = filled(gaussians, self.targets.photos, device=self.device)
+        """Begin with ``gaussians``, and others where they leave holes in the photos, if there is time to move those."""
+        if self.config.iterations >= ENOUGH_TO_FILL:
+            gaussians = filled(gaussians, self.targets.photos, device=self.device)
         self.load(self.on_planes(_initial(gaussians, self.config)))
 
     def on_planes(self, arrays: Arrays) -> Arrays:
@@ -163,7 +166,8 @@ class _Refinement:
     def scale(self, iteration: int) -> int:
         """Side in pixels of the squares that photos are averaged over."""
         c, scale = self.config, self.config.downscale
-        if iteration >= c.full_from * c.iterations:
+        in_full = (1 - c.full_from) * min(1.0, c.full_pixels / self.targets.pixels)
+        if iteration >= c.iterations - round(in_full * c.iterations):
             return 1
         if iteration < c.fine_from * c.iterations:
             while self.targets.pixels > c.coarse_pixels * scale**2:
