@@ -22,6 +22,7 @@ LEAST_SLOPE = 0.15  # a ray closer to the direction than this (sine) fixes no be
 FARTHEST_M = 25.0  # a line is sought so far from a camera
 POSE_M = 0.02  # what poses may be off
 REFITS = 5
+LEAST_SUPPORT = 0.5  # segments that meet, by how sharply: a guess with less is not tried
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ def _placed(segments: Segments, positions: np.ndarray, axis: int, config: PlainC
     support = np.array([weight for weight, _ in guesses])
     free, lines = np.ones(len(support), dtype=bool), []
     for k in np.argsort(-support, kind="stable"):
-        if support[k] < 1.5:
+        if support[k] < LEAST_SUPPORT:
             break
         if not free[k]:
             continue

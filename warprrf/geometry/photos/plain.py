@@ -154,7 +154,9 @@ def _mirrors(
             shown = [x for x, only in zip(parts, through, strict=True) if only]
             total = sum(x.weight for x in shown)
             twins = sum(x.weight for x in shown if _has_twin(pane, x, parts, config))
-            if total > config.mirror_m and twins > config.mirror_share * total:
+            behind = sum(x.weight for x in parts if _is_behind(pane, x))
+            # A mirror bounds the room: what lies behind it is seen through it alone.
+            if total > max(config.mirror_m, 0.8 * behind) and twins > config.mirror_share * total:
                 panes.append(pane)
                 lines = [x for x, only in zip(parts, through, strict=True) if not only]
     return panes, lines
@@ -165,6 +167,12 @@ def _parted(pane: Pane, line: Line) -> list[Line]:
     if line.axis != pane.axis or min(pane.height - line.low, line.high - pane.height) < 0.3:
         return [line]
     return [replace(line, high=pane.height), replace(line, low=pane.height)]
+
+
+def _is_behind(pane: Pane, line: Line) -> bool:
+    """Whether a line lies behind the plane of a pane, by its middle."""
+    middle = line.points(np.array([(line.low + line.high) / 2]))[0, pane.axis]
+    return bool(pane.side * (middle - pane.height) < -0.1)
 
 
 def _only_through(pane: Pane, line: Line, positions: np.ndarray) -> bool:
