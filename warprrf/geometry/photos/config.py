@@ -108,7 +108,7 @@ class PlainConfig:
         line_m, sure_views: see above.
         plain, plain_px: a pixel is plain where no pixel in a square of this side changes by more than this.
         shown_share: where so much of an edge shows in a photo, all of it parts regions.
-        least_share: photos with fewer plain pixels than this share, all together, show no plain surface.
+        least_share: photos with fewer plain pixels than this share, in a dozen of them, show no plain surface.
         region_px: fewest pixels of a plain region.
         votes_px: fewest pixels of its border on a plane.
         same_m: an edge this close to a plane lies on it.
