@@ -26,11 +26,13 @@ from warprrf.geometry.splats.camera import Camera
 
 
 class Height(NamedTuple):
-    """A plane across one of the directions, on which edges lie: direction, place along it [m], and their weight."""
+    """A plane across one of the directions, on which edges lie: direction, place along it [m], their weight, and the
+    box that they span, shape ``(2, 3)`` [m]."""
 
     axis: int
     height: float
     weight: float
+    bounds: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,15 @@ def _heights(lines: Sequence[Line], config: PlainConfig) -> list[Height]:
             group = near[k]
             middle = float(np.average(place[group], weights=weight[group]))
             group = left & (np.abs(place - middle) < config.same_m) | group
-            result.append(Height(axis, middle, float(weight[group].sum())))
+            ends = np.array(
+                [
+                    line.points(np.array([line.low, line.high]))
+                    for line, on in zip(own, group, strict=True)
+                    if on
+                ]
+            )
+            bounds = np.stack([ends.min(axis=(0, 1)), ends.max(axis=(0, 1))])
+            result.append(Height(axis, middle, float(weight[group].sum()), bounds))
             left &= ~group
     return sorted(result, key=lambda h: -h.weight)
 
@@ -151,13 +161,11 @@ def _mirrors(
     """Panes that show a reflection, and the lines that are none."""
     positions = np.array([camera.position for camera in cameras])
     panes: list[Pane] = []
-    for axis, height, _ in _heights(lines, config):
-        on = [x for x in lines if x.axis != axis and abs(x.height(axis) - height) < config.same_m]
-        if len(on) < 2:  # a pane has edges on several sides
+    for axis, height, _, (low, high) in _heights(lines, config):
+        if np.delete(high - low, axis).min() < config.line_m:  # a pane has edges on several sides
             continue
-        ends = np.concatenate([x.points(np.array([x.low, x.high])) for x in on])
         for side in (1, -1):
-            pane = Pane(axis, height, side, ends.min(axis=0) - 0.1, ends.max(axis=0) + 0.1)
+            pane = Pane(axis, height, side, low - 0.1, high + 0.1)
             parts = [part for x in lines for part in _parted(pane, x)]
             through = [_only_through(pane, x, positions) for x in parts]
             shown = [x for x, only in zip(parts, through, strict=True) if only]
@@ -237,7 +245,7 @@ def _regions_on(
             continue
         rivals = []
         for number in np.flatnonzero(votes[k] >= config.rival * votes[k].max()).tolist():
-            axis, height, _ = heights[number]
+            axis, height, *_ = heights[number]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (height - camera.position[axis]) / rays[own][:, axis]
             good = (t > 0.1) & (t < FARTHEST_M)
@@ -321,7 +329,7 @@ def _votes(
     across = np.arange(3) != axis[:, None]
     line_at = np.linalg.norm(np.where(across, place - camera.position, 0.0), axis=1)
     line_at /= np.maximum(np.linalg.norm(np.where(across, rays, 0.0), axis=1), 1e-9)
-    for number, (a, height, worth) in enumerate(heights):
+    for number, (a, height, worth, _) in enumerate(heights):
         with np.errstate(divide="ignore", invalid="ignore"):
             lies_on = np.abs(place[:, a] - height) < config.same_m
             plane_at = (height - camera.position[a]) / rays[:, a]
@@ -341,7 +349,7 @@ def _agreed(
     config: PlainConfig,
 ) -> list[Plane]:
     """The plane with the cells that more photos put on it than see through it; none where those are few."""
-    axis, height, _ = heights[number]
+    axis, height, _, bounds = heights[number]
     some = config.stride // 2
     hits = []
     for camera, view in zip(cameras, seen, strict=True):
@@ -357,7 +365,11 @@ def _agreed(
         side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=config.cell_m, plain=True
     )
     uv = empty.to_plane(np.concatenate(hits))
-    low, high = np.percentile(uv, [0.5, 99.5], axis=0)
+    edges = empty.to_plane(bounds)  # a surface ends where its edges do
+    low = np.maximum(uv.min(axis=0), edges.min(axis=0) - config.cell_m)
+    high = np.minimum(uv.max(axis=0), edges.max(axis=0) + config.cell_m)
+    if (low >= high).any():
+        return []
     low = np.floor(low / config.cell_m - 1) * config.cell_m
     shape = np.ceil((high - low) / config.cell_m).astype(int) + 1
     plane = replace(empty, corner=low, occupied=np.ones(shape, dtype=bool))
