@@ -22,29 +22,37 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, checked, index_to
+from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked, index_to
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.rf.channel.array_spectra import check_steering
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.itu import assumed_permittivity
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
-from warprrf.rf.fields.bistatic.observations import Frame, as_list, transmitters_of
+from warprrf.rf.fields.bistatic.measured import ArrayImage, read
+from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
-from warprrf.rf.fields.bistatic.render import Rendered, render, sent_radiance
+from warprrf.rf.fields.bistatic.render import Rendered, path_powers, render, sent_radiance
+from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
+from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data
-from warprrf.rf.spectra.spectrum import Spectrum, default_floor, to_db
+from warprrf.rf.spectra.readings import check_gains
+from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 
 
 @checked
@@ -65,7 +73,8 @@ class BistaticField(RadioField):
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residuals`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         air: absorption of every path: that of the data set it was fitted to; None for none.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
         report: how the fit went.
         device: where it computes.
     """
@@ -84,6 +93,7 @@ class BistaticField(RadioField):
     errors: uncertainty.ErrorModel | None = field(default=None, repr=False)
     air: Air | None = None
     fitted_on: np.ndarray | None = field(default=None, repr=False)
+    fitted_under: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _sent: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
@@ -148,6 +158,7 @@ class BistaticField(RadioField):
         Args:
             geometry: Reconstruction, Scene (its materials name the groups, nothing else is taken from them) or Mesh.
             ds: training set: spectra, readings, or a list of them, of one carrier. The field's own transmitter is the first.
+                Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
             transport: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
@@ -162,16 +173,17 @@ class BistaticField(RadioField):
             TypeError: for a geometry without a mesh, or an unknown option.
         """
         chosen, data = FitOptions.of(options, settings), as_list(ds)
+        if not any(map(len, data)):
+            return cls._unmeasured(geometry, data, chosen, device)
         found = train(geometry, data, chosen, transport=transport, device=device, progress=progress)
         frame = Frame.of(data)
-        under = np.concatenate([np.atleast_2d(transmitters_of(one)) for one in data])
-        own = (under == frame.transmitter).all(axis=1)
-        receivers = np.concatenate([one.receivers for one in data])[own]
-        receivers = receivers[np.sort(np.unique(receivers, axis=0, return_index=True)[1])]
+        ends = np.concatenate([np.column_stack([transmitters_of(one), one.receivers]) for one in data])
+        ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
+        receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
             cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report, fitted_on=receivers,
+            errors=found.errors, report=found.report, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
@@ -181,6 +193,20 @@ class BistaticField(RadioField):
         return replace(
             fitted, floor=floor, range_db=(10.0 * float(np.log10(floor)), float(to_db(gains.max(), floor)))
         )
+
+    @classmethod
+    def _unmeasured(
+        cls, geometry: GeometryLike, data: list[Measured], o: FitOptions, device: DeviceLike
+    ) -> BistaticField:
+        """What a fit to no measurement gives: permittivities of ITU-R P.2040, by the names of materials where it has
+        them, terms left free as for few receivers."""
+        frame = Frame.of(data)
+        prior = cls.prior(geometry, frame, terms=o.unmeasured(frame.frequency_hz), device=device)
+        places_of(data, prior.mesh, device)
+        known = [assumed_permittivity(name, prior.frequency_hz) for name in prior.surface.group_names]
+        parameters = replace(prior.parameters, log_excess=np.log(np.array(known) - 1.0))
+        report = {"receivers": 0, "held_out": 0, "chains": {}, "unexplained": {}}
+        return replace(prior, parameters=parameters, report=report)
 
     @classmethod
     def prior(
@@ -227,6 +253,32 @@ class BistaticField(RadioField):
         """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
         return replace(self, air=air_of(gas, self.frequency_hz))
 
+    def at_frequency(self, frequency_hz: float) -> BistaticField:
+        """The same room at another carrier, with nothing measured there.
+
+        What carries over: geometry, and so directions and delays; permittivities, which ITU-R P.2040-4 has constant above
+        100 GHz for every indoor material; how surfaces differ; the roughness that their mirrored and scattered shares tell,
+        counted in the new wavelengths (Ament 1953); absorption by the air, at the new carrier. Floor and range move with
+        the square of the wavelength. What does not: the width of scattering lobes stays as it was, thin slabs are none,
+        gains of measuring chains and the stated uncertainty are not known there.
+
+        Args:
+            frequency_hz: the other carrier [Hz].
+
+        Raises:
+            ValueError: for no carrier; for one outside ITU-R P.676, where the field has absorption.
+
+        Example::
+
+            field_140 = field_300.at_frequency(140e9)
+        """
+        ratio = check_frequency(frequency_hz) / self.frequency_hz
+        fall = 20.0 * float(np.log10(ratio))
+        return replace(
+            self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
+            floor=self.floor / ratio**2, range_db=(self.range_db[0] - fall, self.range_db[1] - fall),
+        )  # fmt: skip
+
     # ------------------------------------------------------------------------------------------ asking
 
     def spectrum(
@@ -263,7 +315,12 @@ class BistaticField(RadioField):
         return replace(spectrum, std_db=self._std_db(seen, found)) if uncertainty else spectrum
 
     def paths(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
+        self,
+        rx: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        max_paths: int | None = None,
+        *,
+        view: ReceiverView | None = None,
     ) -> Paths:
         """Propagation paths at ``rx``: line of sight, mirrors, and one diffuse path per pixel above the floor.
 
@@ -275,18 +332,53 @@ class BistaticField(RadioField):
             rx: receiver position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded.
             transmitter: as for :meth:`spectrum`.
             max_paths: keep the strongest only (the sum is then what they carry).
+            view: what the one receiver sees, if it was traced before (:meth:`view`).
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
+        if view is not None:
+            return paths_of(view, self.render(view), self.floor, self.air, max_paths)
         positions, source = self.check_positions(rx, transmitter)
         found = []
         for position in np.atleast_2d(positions):
             view = self.transport(source).view(position, self.terms)
             found.append(paths_of(view, self.render(view), self.floor, self.air, max_paths))
         return found[0] if positions.ndim == 1 else Paths.stack(found)
+
+    def array_spectrum(
+        self,
+        rx: ArrayLike,
+        array: PlanarArray,
+        directions: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        *,
+        length_std_m: float = 0.0,
+    ) -> np.ndarray:
+        """Angular spectrum |a^H h|^2 / M^2 of a coherent array at ``rx`` (3,) [m], in expectation over the phases of what
+        is scattered; see :class:`ArraySpectra`.
+
+        Args:
+            rx: the array's centre.
+            array: turned as it stands; without polarisation.
+            directions: unit vectors in world axes, shape ``(..., 3)``.
+            transmitter: as for :meth:`spectrum`.
+            length_std_m: how well the lengths of paths are known [m].
+
+        Returns:
+            Path gain, shape ``(...)``.
+
+        Raises:
+            TypeError, ValueError: as for :meth:`spectrum`, and naming the argument.
+        """
+        steered = check_steering(array, directions)
+        std = check_number("length_std_m", length_std_m, 0.0)
+        view = self.view(rx, transmitter)
+        image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
+        powers = path_powers(view, self.materials, self.sent_radiance(view.transport))
+        return np.maximum(read(view, image, powers), 0.0).reshape(steered.shape[:-1])
 
     def view(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> ReceiverView:
         """What the receiver at ``rx`` (3,) sees of the geometry, whatever the materials: the costly part of a spectrum.
@@ -316,6 +408,35 @@ class BistaticField(RadioField):
         :func:`warprrf.rf.fields.bistatic.render.sent_radiance`."""
         key = transport.transmitter.tobytes()
         return self._sent.get(key, lambda: sent_radiance(transport, self.materials))
+
+    def suggest(
+        self,
+        candidates: ArrayLike,
+        n: int = 1,
+        *,
+        arrival: ArrayLike | None = None,
+        receive_pattern: Pattern | None = None,
+        progress: Progress | None = None,
+    ) -> np.ndarray:
+        """Where to measure next; see :meth:`RadioField.suggest`, and :mod:`warprrf.rf.fields.bistatic.suggest` for how."""
+        places, source = self.check_positions(check_array("candidates", candidates, (None, 3)))
+        check_count("n", n, 1, len(places))
+        pointings = None
+        if (arrival is None) != (receive_pattern is None):
+            raise ValueError(
+                "receive_pattern: it goes with arrival, got one of the two; expected both or neither"
+            )
+        if arrival is not None and receive_pattern is not None:
+            check_gains("receive_pattern", receive_pattern)
+            angles = check_array("arrival", arrival, (len(places), 2))
+            pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
+        transport = self.transport(source).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
+        floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
+        return suggest(
+            Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material), places, n,
+            measured=np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on,
+            pointings=pointings, progress=progress,
+        )  # fmt: skip
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked, several at a time."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from warprrf.checks import Expected, check_arrays, check_number
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.paths.polarisation import chain_reflection
 
@@ -73,6 +73,21 @@ class Parameters:
         return replace(
             self, log_weight=self.log_weight[index], log_excess=self.log_excess[index],
             log_mirror=self.log_mirror[index], log_indirect=self.log_indirect[index],
+        )  # fmt: skip
+
+    def at_ratio(self, ratio: float) -> Parameters:
+        """Those of the same surfaces at ``ratio`` times the carrier: roughness counts in wavelengths.
+
+        What is not scattered, exp(-(4 pi sigma_h / lambda)^2) (Ament 1953), is raised to the square of the ratio; the sum
+        of both shares, the mix of lobes and the permittivity stay.
+        """
+        scattered = self.weight.sum(axis=1)
+        both = scattered + np.exp(self.log_mirror)
+        log_smooth = ratio**2 * (self.log_mirror - np.log(both))
+        grown = np.log(np.maximum(-np.expm1(log_smooth), 1e-12) * both / scattered)
+        return replace(
+            self, log_weight=np.maximum(self.log_weight + grown[:, None], -MOST_NEPERS),
+            log_mirror=np.maximum(log_smooth + np.log(both), -MOST_NEPERS), log_indirect=self.log_indirect + grown,
         )  # fmt: skip
 
     @classmethod
