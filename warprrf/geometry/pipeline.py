@@ -121,10 +121,7 @@ def reconstruct(
     sparse = sfm.structure_from_motion(
         photos,
         workspace=workspace,
-        max_features=config.max_features,
-        lens=config.lens,
-        max_pixels=config.max_pixels,
-        pairs=config.pairs,
+        config=config,
         poses=known,
         seed=seed,
         progress=progress,

@@ -338,11 +338,12 @@ class ReconstructionConfig:
     """Settings of :func:`warprrf.reconstruct`.
 
     Attributes:
-        max_features: SIFT features per photo.
-        lens: COLMAP's model of the lenses, or ``"auto"``: see
-            :func:`~warprrf.geometry.photos.sfm.structure_from_motion`.
-        max_pixels: photos are reduced to about so many pixels before Gaussians are fitted to them.
-        pairs: which photos are matched, ``"auto"`` or ``"exhaustive"``.
+        max_features: SIFT features kept per photo (the largest ones).
+        lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
+            ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
+        max_pixels: undistorted photos are reduced to about so many pixels.
+        pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
+            largest features finds promising, once there are more than 2000 pairs.
         max_reprojection_error: sparse points above it are dropped [pixels].
         planes: how planes are found among sparse points.
         sweep: how planes are corrected and completed by comparing the photos; None: not at all.
