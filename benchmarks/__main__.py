@@ -14,6 +14,7 @@ from warprrf import cli
 
 NAMES = {
     "lobby": ("benchmarks.lobby.pipeline", "the main job: photos -> geometry -> radio -> evaluation"),
+    "lobby-plain": ("benchmarks.lobby.plain", "the lobby with plain walls: photos -> geometry -> one field"),
     "lobby-seeds": ("benchmarks.lobby.seeds", "the main job's figures over several seeds: mean and spread"),
     "data": ("benchmarks.lobby.make_data", "regenerate data/lobby/ from nothing (hours; resumable)"),
     "table1": ("benchmarks.evaluation.command", "every method of the paper's table, and more, side by side"),
