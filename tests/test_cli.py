@@ -192,6 +192,10 @@ BAD = {
         ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/deep.json"],
         "deep.json",
     ),
+    "scale that is no number": (
+        ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--scale", "a.jpg", "b.jpg", "far"],
+        "--scale",
+    ),
     "geometry of unknown kind": (
         ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
         ".ply",
@@ -307,6 +311,13 @@ def test_receivers_from_file_and_words_agree(tmp_path: Path) -> None:
     np.save(tmp_path / "r.npy", expected)
     for words in (["1,2,1.5", "3,4,1.5"], [str(tmp_path / "r.csv")], [str(tmp_path / "r.npy")]):
         np.testing.assert_array_equal(read_receivers(words), expected)
+
+
+@pytest.mark.parametrize("text", ["", "x,y,z\n", "# none\n\n"])
+@pytest.mark.filterwarnings("error")
+def test_a_file_without_receivers_holds_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "r.csv").write_text(text)
+    assert read_receivers([str(tmp_path / "r.csv")]).shape == (0, 3)
 
 
 def test_look_at_puts_the_target_in_the_middle_with_z_up() -> None:

@@ -95,6 +95,13 @@ def test_a_header_of_another_kind_is_refused(header: str, tmp_path: Path) -> Non
         wr.RadioField.load(path)
 
 
+def test_nan_in_a_report_is_unknown(tmp_path: Path) -> None:
+    path = bistatic_field(tmp_path)
+    _, header = tensor_files.read(path)
+    spoilt(path, report=header["report"] | {"fit_time_s": float("nan")})
+    assert wr.RadioField.load(path).report == header["report"] | {"fit_time_s": None}
+
+
 def test_other_tools_open_what_carries_a_checksum(tmp_path: Path) -> None:
     from safetensors import safe_open
 

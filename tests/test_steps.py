@@ -106,12 +106,21 @@ def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path: Path) -> N
         np.testing.assert_array_equal(found["gain"], value)
     assert made == [1, 2]
     whole = (tmp_path / "receiver.npz").read_bytes()
+    with np.load(tmp_path / "receiver.npz") as known:
+        held = dict(known)
     flipped = bytearray(whole)
     flipped[whole.index(np.float32(2).tobytes()) + 3] ^= 1
     for damage in (b"", whole[: len(whole) // 2], bytes(flipped)):
         (tmp_path / "receiver.npz").write_bytes(damage)
         np.testing.assert_array_equal(ask(2)["gain"], 2)
-    assert made == [1, 2, 2, 2, 2]
+    np.savez(tmp_path / "receiver.npz", **held | {"gain": np.full(6, np.nan)})  # without a checksum
+    np.testing.assert_array_equal(ask(2)["gain"], 2)
+    assert made == [1, 2, 2, 2, 2, 2]
+
+
+def unsealed(text: str, **changes: object) -> str:
+    """A record with other values, without a checksum."""
+    return json.dumps({k: v for k, v in json.loads(text).items() if k != "sha256"} | changes)
 
 
 @pytest.mark.parametrize(
@@ -122,6 +131,8 @@ def test_arrays_are_kept_by_key_and_made_again_when_damaged(tmp_path: Path) -> N
         lambda text: '{"key": 5}',
         lambda text: text[: len(text) // 2],
         lambda text: text.replace("true", "null"),
+        lambda text: unsealed(text, figures=None),
+        lambda text: unsealed(text, attempts="many"),
     ],
 )
 def test_a_step_whose_record_is_damaged_is_done_again(tmp_path: Path, change: Callable[[str], str]) -> None:

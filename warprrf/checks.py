@@ -304,11 +304,14 @@ def _converter(kind: Any) -> Callable[[Any], object]:
         return functools.partial(_as_array, "U" if "str_" in repr(inside) else "biufc", origin is np.ndarray)
     if origin is tuple:
         length = None if Ellipsis in inside else len(inside)
-        return lambda value: value if _is_row(value) and length in (None, len(value)) else _OTHER
+        return functools.partial(_as_row, length)
     if origin is Callable:
         return lambda value: value if callable(value) else _OTHER
-    if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+    if origin is Any or not isinstance(origin, type):
         return lambda value: value
+    if getattr(origin, "_is_protocol", False):
+        known = getattr(origin, "_is_runtime_protocol", False)
+        return lambda value: value if not known or isinstance(value, origin) else _OTHER
     return functools.partial(_as_object, origin)
 
 
@@ -325,6 +328,14 @@ def _is_of_numpy(kind: Any) -> bool:
 
 def _is_row(value: object) -> bool:
     return isinstance(value, (tuple, list)) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
+def _as_row(length: int | None, value: Any) -> object:
+    if not _is_row(value) or length not in (None, len(value)):
+        return _OTHER
+    if isinstance(value, np.ndarray):
+        return tuple(value.tolist() if value.ndim == 1 else value)
+    return value
 
 
 def _as_bool(value: object) -> object:

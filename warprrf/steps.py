@@ -25,9 +25,11 @@ from typing import IO, Any
 import numpy as np
 
 from warprrf.device import Progress
-from warprrf.files import plain, read_arrays, read_json, write_arrays, write_json
+from warprrf.files import check_seal, plain, read_arrays, read_json, write_arrays, write_json
 
-_RECORDED = {"key", "finished", "seconds", "attempts", "stages", "figures"}
+_RECORDED = {
+    "key": str, "finished": bool, "seconds": float, "attempts": int, "stages": dict, "figures": dict,
+}  # fmt: skip
 HEARTBEAT_S = 5.0  # how much time of a killed attempt may go unrecorded
 
 
@@ -198,7 +200,7 @@ class Steps:
         key, path = digest(name, version, list(inputs)), self.folder / f"{name}.npz"
         if path.is_file() and not self._fresh:
             try:
-                found = read_arrays(path)
+                found = read_arrays(path) if check_seal(path) else {}
             except ValueError:  # damaged: to be replaced
                 found = {}
             if str(found.pop("key", "")) == key:
@@ -248,7 +250,7 @@ class Steps:
             record = read_json(self._file(name))
         except (FileNotFoundError, ValueError):  # what is damaged is done again
             return {}
-        return record if _RECORDED <= record.keys() else {}
+        return record if all(isinstance(record.get(k), kind) for k, kind in _RECORDED.items()) else {}
 
 
 def _add(total: Any, part: Any) -> None:

@@ -6,6 +6,7 @@ transfer changed is found before anything is computed from it. Files without one
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -51,7 +52,7 @@ def read(
 
     name = os.fspath(path)
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{name}: no such file")
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
@@ -71,7 +72,10 @@ def read(
             f"{name}: corrupt: its checksum is not that of what it holds; take another copy, or make it again"
         )
     with named(path, "corrupt header"):
-        header = json.loads(metadata["header"])
+        # NaN is what nobody knows, as in strict JSON; an infinite thickness is one.
+        header = json.loads(
+            metadata["header"], parse_constant=lambda word: None if word == "NaN" else float(word)
+        )
         if not isinstance(header, dict):
             raise TypeError(f"got {type(header).__name__}, expected names and values")
     return tensors, header

@@ -25,7 +25,9 @@ IGNORED = ("self", "progress", "ax", "args", "kwargs")
 
 MISSING = inspect.Parameter.empty
 UNCHECKED = ("RadioField.trace_links",)
-"""What is given arguments that were checked, as it says."""
+"""What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
+SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
+"""What is NaN where there is no power, as their documentation says."""
 ABSTRACT = ("RadioField",)
 """Classes that nobody makes by calling them."""
 
@@ -251,7 +253,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "RadioField.check_positions": _on(lambda p: p.field, rx=POINTS),
     "RadioField.fit": lambda p: {
         "geometry": p.scene, "ds": p.train, "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False,
-        "residual": False, "sub_pixels": 1, "device": "cpu",
+        "residual": False, "sub_pixels": 1, "device": "cpu", "relevance": p.relevance,
     },
     "RadioField.links": _on(lambda p: p.field, rx=POINTS, shape=(8, 16)),
     "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": "cpu"},
@@ -388,7 +390,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "splats.Rasterizer.strongest": _raster("prepared", top_k=2),
     "splats.Rasterizer.upload": lambda p: {**_raster()(p), "g": p.gaussians},
-    "splats.Rasterizer.vector": _raster(size=3),
     # metrics and lookups
     "metrics.angle_deg": lambda p: {"a": TOWARDS, "b": TOWARDS[::-1].copy()},
     "metrics.beam_gain_loss_db": lambda p: {"path_gain": _image(p), "direction": TOWARDS[0], "width_rad": 0.2},

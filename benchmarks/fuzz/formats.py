@@ -31,12 +31,14 @@ class Format:
         read: reads it, and asks what a user would ask of it.
         codec: how its contents are edited, by :data:`benchmarks.fuzz.damage.CODECS`; empty: bytes only.
         sealed: it carries a checksum: edits of bytes are refused, or change nothing.
+        held: attributes of what was read that its answers may be refused by.
     """
 
     make: Callable[[Place, Path], Path]
     read: Callable[[Path], Any]
     codec: str = ""
     sealed: bool = False
+    held: tuple[str, ...] = ()
 
 
 def _copy(*names: str) -> Callable[[Place, Path], Path]:
@@ -132,9 +134,10 @@ SURVEYED = '{"0.png": [1.0, 2.0, 1.5], "1.jpg": [3.0, 1.0, 1.2]}\n'
 FORMATS: dict[str, Format] = {
     "spectra": Format(_copy("spectra.nc"), wr.SpectrumDataset.load, "netcdf", True),
     "compact spectra": Format(_copy("compact.nc"), wr.SpectrumDataset.load, "netcdf", True),
-    "bistatic field": Format(_copy("bistatic.safetensors"), _field, "tensors", True),
-    "harmonic field": Format(_copy("harmonic.safetensors"), _field, "tensors", True),
-    "rf3dgs field": Format(_copy("rf3dgs.safetensors"), _field, "tensors", True),
+    **{
+        f"{name} field": Format(_copy(f"{name}.safetensors"), _field, "tensors", True, ("transmitter",))
+        for name in ("bistatic", "harmonic", "rf3dgs")
+    },
     "paths": Format(_copy("paths.nc"), _paths, "netcdf", True),
     "reconstruction": Format(
         _copy("reconstruction/reconstruction.safetensors"),

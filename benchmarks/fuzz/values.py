@@ -15,6 +15,13 @@ class Array(np.ndarray):
     """An array of a class of its own."""
 
 
+class Anything:
+    """A class that takes any arguments, where a function is asked for, and is no answer to anything."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        pass
+
+
 def _with(value: Any, one: float) -> np.ndarray:
     """``value`` as numbers, one of them replaced."""
     array = np.array(value, dtype=complex if np.iscomplexobj(value) else float)
@@ -75,7 +82,7 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "numpy integer": lambda v: np.int8(3),
     "function": lambda v: lambda *a, **k: None,
     "object": lambda v: object(),
-    "class": lambda v: dict,
+    "class": lambda v: Anything,
     "generator": lambda v: iter([1.0, 2.0, 3.0]),
     "date": lambda v: np.array(["2020-01-01"], dtype="datetime64[s]"),
     "record": lambda v: np.zeros(3, dtype=[("a", "f8"), ("b", "i4")]),

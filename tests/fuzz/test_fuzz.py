@@ -43,6 +43,53 @@ def test_a_minute_of_fuzzing_finds_nothing(place):
     assert not findings, "\n".join(findings)
 
 
+FOUND = [
+    ("Paths.select", ("chosen", "2^63")),
+    ("RadioField.fit", ("relevance", "text")),
+    ("RadioField.links", ("shape", "with inf")),
+    ("RadioField.load", ("path", "no text")),
+    ("Spectrum", ("range_db", "as objects")),
+    ("SpectrumDataset.deembed", ("pattern", "class")),
+    ("SpectrumDataset.deembed", ("pattern", "ragged")),
+    ("SpectrumDataset.from_spectra", ("path_gain", "negated"), ("aod", "with 1e20")),
+    ("channel.Codebook", ("factors", "as objects")),
+    ("channel.coherence_bandwidth", ("power", "zeros")),
+    ("channel.delay_spread", ("power", "as int8")),
+    ("em.Band.conductivity", ("frequency_hz", "minus one")),
+    ("em.slab_reflection", ("thickness_m", "nested"), ("cos_incidence", "zero")),
+    ("em.slab_reflection", ("wavelength_m", "tiny")),
+    ("em.slab_transmission", ("thickness_m", "zero"), ("cos_incidence", "zero")),
+    ("evaluate", ("beam_width_rad", "tiny")),
+    ("evaluate", ("predict", "class")),
+    ("fit_reflections", ("csi", "as list")),
+    ("metrics.beam_gain_loss_db", ("width_rad", "tiny")),
+    ("metrics.beam_response", ("width_rad", "tiny")),
+    ("metrics.psnr", ("truth", "empty"), ("prediction", "no list")),
+    ("metrics.unit_image", ("floor", "minus one")),
+    ("reconstruct", ("photos", "list")),
+]
+"""Findings of earlier hours, one of each cause."""
+
+
+@pytest.fixture(scope="module")
+def trial(place, tmp_path_factory):
+    return cases.Trial(place, tmp_path_factory.mktemp("trial"))
+
+
+@pytest.mark.parametrize("target_and_edits", FOUND, ids=lambda case: f"{case[0]}-{case[1][0]}-{case[1][1]}")
+def test_what_was_found_once_is_right_now(trial, target_and_edits, monkeypatch):
+    monkeypatch.chdir(trial.scratch)
+    target, *edits = target_and_edits
+    outcome = trial(cases.Case(target, tuple(edits)))
+    assert outcome.kind in ("refused", "answered"), outcome.text
+
+
+def test_cases_of_a_target_do_not_depend_on_other_targets(place):
+    alone = cases.drawn(place, 3, 0, "channel.thz_channel")
+    among = [case for case in cases.drawn(place, 3, 0, "channel.") if case.target == "channel.thz_channel"]
+    assert alone == among
+
+
 def misbehaving(scratch):
     return {
         "answers": str,

@@ -117,20 +117,17 @@ def test_nothing_to_start_from_is_an_error():
         initial_gaussians(empty, empty, empty, images=[np.zeros((4, 4, 3))])
 
 
-def test_without_a_survey_z_is_up_and_the_size_is_plausible():
+def test_without_a_survey_the_size_is_plausible_and_said_to_be_assumed():
     cameras = {f"{k}": look([0.1 * k, 0.02 * k**2, 0.0], [1 + k, 2.0, 0.1]) for k in range(4)}
     rng = np.random.default_rng(0)
     points = rng.uniform(5, 6, (30, 3))
     model = sparse.SparseModel(
         cameras, points, points, np.ones(30), np.full(30, 2), np.arange(0, 61, 2), np.tile([0, 3], 30)
     )
-    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    turn *= np.linalg.det(turn)
-    out = sparse.assume_scale(sparse.transformed(model, 0.2, turn, np.ones(3)))
-    for camera in out.cameras.values():
-        assert camera.rotation[1] @ [0, 0, 1] < -0.9  # the photo's down
+    out = sparse.assume_scale(sparse.transformed(model, 0.2, np.eye(3), np.ones(3)))
     gap = [np.linalg.norm(p - c.position) for c in list(out.cameras.values())[::3] for p in out.points]
     assert np.median(gap) == pytest.approx(3.0, rel=0.05)
+    assert not out.metric and [text.split(":")[0] for text in out.guessed] == ["scale"]
 
 
 # ------------------------------------------------------------------------------------------- the whole
@@ -239,6 +236,12 @@ def test_bad_names_are_refused_before_any_work(tmp_path):
         reconstruct(photos, workspace=tmp_path, held_out=["nobody.jpg"])
     with pytest.raises(ValueError, match=r"known_positions: no such photo: nobody\.jpg"):
         reconstruct(photos, workspace=tmp_path, known_positions={"nobody.jpg": [0, 0, 0]})
+    with pytest.raises(ValueError, match=r"scale: no such photo: nobody\.jpg"):
+        reconstruct(photos, workspace=tmp_path, scale=("nobody.jpg", VIEWS[0], 1.0))
+    with pytest.raises(ValueError, match="got both"):
+        reconstruct(
+            photos, workspace=tmp_path, scale=(VIEWS[0], VIEWS[1], 1.0), known_positions=surveyed(VIEWS[:3])
+        )
     with pytest.raises(ValueError, match="not a folder"):
         reconstruct(tmp_path / "nowhere", workspace=tmp_path)
 

@@ -203,6 +203,7 @@ HOSTILE = {
     "a file above": ('<include filename="../scene.xml"/>', "outside"),
     "a file of the system": ('<include filename="/etc/passwd"/>', "outside"),
     "a name with zero": ('<shape type="ply"><bsdf id="itu_wood"/></shape>', "no name"),
+    "a name twice": (2 * CUBE.replace("cube", 'cube" id="a').format(""), "alike"),
     "no shapes": ('<shape type="merge"/>', "no shapes"),
     "an unknown shape": (CUBE.replace("cube", "hair"), "'hair'.*export it as a mesh"),
     "a matrix of 8": (

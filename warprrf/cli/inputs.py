@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,16 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
         ) from error
 
 
+def read_scale(words: Sequence[str]) -> tuple[str, str, float]:
+    """Two photos and the distance between their cameras [m], from three words."""
+    try:
+        return words[0], words[1], float(words[2])
+    except ValueError as error:
+        raise ValueError(
+            f"--scale: got {words[2]!r}, expected a distance in metres after two photos"
+        ) from error
+
+
 def read_receivers(values: Sequence[str]) -> np.ndarray:
     """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
     if len(values) == 1 and "," not in values[0]:
@@ -72,7 +83,9 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
             if path.suffix == ".npy":
                 found = np.load(path, mmap_mode="r", allow_pickle=False)
             else:
-                found = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "x"))
+                lines = [re.split("[#x]", line)[0] for line in path.read_text().splitlines()]
+                lines = [line for line in lines if line.strip()]
+                found = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, 3))
             return check_array("rows x,y,z in metres", found, (None, 3))
     try:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)

@@ -24,6 +24,7 @@ from warprrf.cli.inputs import (
     load_scene,
     read_positions,
     read_receivers,
+    read_scale,
 )
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
@@ -37,6 +38,12 @@ def add_reconstruct(add: Add) -> None:
     rec.add_argument(
         "--known-positions", metavar="FILE", help="surveyed camera positions, JSON or CSV: sets metres"
     )
+    rec.add_argument(
+        "--scale",
+        nargs=3,
+        metavar=("PHOTO", "PHOTO", "METRES"),
+        help="how far apart the cameras of two photos were: sets metres where nobody surveyed",
+    )
     rec.add_argument("--workspace", help="where unfinished work lives (default OUT/workspace)")
 
 
@@ -44,18 +51,27 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
     """Photos -> cameras, Gaussians, mesh and planar patches.
 
     The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
-    their depth is fused into a mesh. Photos know no scale: name the measured positions of at least three cameras.
+    their depth is fused into a mesh. Photos know no scale: name the measured positions of at least three cameras, or the
+    distance between two. Without positions z is up by vertical edges and the floor is at 0.
 
     examples:
       warprrf reconstruct photos/ -o room --known-positions surveyed.json
+      warprrf reconstruct photos/ -o room --scale IMG_0001.jpg IMG_0040.jpg 3.25
       where surveyed.json holds {"view_000.jpg": [1.20, 0.85, 1.60], ...} in metres
     Overlap matters most: every surface in five photos or more, loops that look across the room.
     """
     known = read_positions(args.known_positions) if args.known_positions else None
     photos = existing(args.photos)
+    scale = None if args.scale is None else read_scale(args.scale)
     workspace = args.workspace or Path(args.out) / "workspace"
     reconstruction = wr.reconstruct(
-        photos, workspace=workspace, known_positions=known, seed=args.seed, progress=bars, device=args.device
+        photos,
+        workspace=workspace,
+        known_positions=known,
+        scale=scale,
+        seed=args.seed,
+        progress=bars,
+        device=args.device,
     )
     reconstruction.save(args.out)
     print(

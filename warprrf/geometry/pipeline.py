@@ -25,13 +25,15 @@ from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.initialise import initialise
 from warprrf.geometry.photos.photo_files import Photos, find_photos, match_names, read_photo
 from warprrf.geometry.photos.refine import refine
-from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale
+from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale, check_scale, scaled
+from warprrf.geometry.photos.targets import PosedPhotos
+from warprrf.geometry.photos.upright import upright
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 1, "surface": 1}
+VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 2, "surface": 1}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 
@@ -41,6 +43,7 @@ def reconstruct(
     *,
     workspace: str | os.PathLike[str],
     known_positions: Mapping[str, ArrayLike] | None = None,
+    scale: tuple[str, str, float] | None = None,
     held_out: Sequence[str] = (),
     iterations: int | None = None,
     config: ReconstructionConfig | None = None,
@@ -54,7 +57,9 @@ def reconstruct(
         photos: a folder, or a sequence of image files: one size, one undistorted camera.
         workspace: folder of unfinished and finished steps; a stopped run continues from it.
         known_positions: photo name to surveyed camera position (3,) [m], three or more that are not on a line. Without
-            them scale and axes are assumed: median viewing distance 3 m, z against the mean "down" of the photos.
+            them vertical edges, planes and the floor set z and its origin.
+        scale: ``("a.jpg", "b.jpg", 1.52)``: how far apart the cameras of two photos were [m], where nobody surveyed
+            positions. Without either, the median distance that photos look is taken for 3 m.
         held_out: names of photos that get a pose but that the Gaussians are not fitted to.
         iterations: of the photometric refinement; default: the configuration's.
         config: all other settings.
@@ -63,7 +68,8 @@ def reconstruct(
         device: Warp device of the refinement and the depth maps.
 
     Raises:
-        ValueError: for bad photos or positions (see :func:`~warprrf.geometry.photos.sfm.structure_from_motion` and
+        ValueError: for ``scale`` beside ``known_positions``, and for bad photos or positions (see
+            :func:`~warprrf.geometry.photos.sfm.structure_from_motion` and
             :func:`~warprrf.geometry.photos.sparse.align_to_known`).
         ImportError: if the extra ``photos`` is not installed.
     """
@@ -76,6 +82,12 @@ def reconstruct(
     skipped = set(match_names("held_out", held_out, list(named)))
     if known_positions is not None:
         match_names("known_positions", known_positions, list(named))
+        if scale is not None:
+            raise ValueError(
+                "scale, known_positions: got both, expected one; surveyed positions set the scale"
+            )
+    if scale is not None:
+        check_scale(scale, list(named))
 
     sparse = sfm.structure_from_motion(
         photos,
@@ -85,7 +97,11 @@ def reconstruct(
         seed=seed,
         progress=progress,
     )
-    sparse = align_to_known(sparse, known_positions) if known_positions is not None else assume_scale(sparse)
+    if known_positions is not None:
+        sparse = align_to_known(sparse, known_positions)
+    else:
+        sparse = assume_scale(sparse) if scale is None else scaled(sparse, scale)
+        sparse = upright(sparse, lambda name: read_photo(named[name]), seed=seed)
     fitted = {name: named[name] for name in sparse.cameras if name not in skipped}
     if not fitted:
         raise ValueError(
@@ -102,6 +118,7 @@ def reconstruct(
         metric=sparse.metric,
         unposed=sparse.unposed,
         held_out=sorted(skipped),
+        guessed=sparse.guessed,
     )
 
 
@@ -130,8 +147,7 @@ def _steps(
     def refined(attempt: Attempt) -> files.Arrays:
         gaussians = refine(
             files.to_gaussians(first),
-            photos(),
-            list(cameras.values()),
+            PosedPhotos(photos(), list(cameras.values())),
             config=config.refine,
             planes=planes,
             progress=attempt.progress,

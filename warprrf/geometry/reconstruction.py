@@ -37,6 +37,7 @@ class Reconstruction:
         metric: whether lengths are metres (else they are an assumed scale).
         unposed: names of photos without a pose.
         held_out: names of photos that the Gaussians were not fitted to.
+        guessed: what nobody measured and the photos do not show, a sentence each.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class Reconstruction:
         metric: bool = True,
         unposed: Sequence[str] = (),
         held_out: Sequence[str] = (),
+        guessed: Sequence[str] = (),
     ) -> None:
         if gaussians is None and mesh is None:
             raise ValueError("gaussians, mesh: got neither, expected Gaussians, a mesh or both")
@@ -61,6 +63,7 @@ class Reconstruction:
         self.metric = bool(metric)
         self.unposed = tuple(unposed)
         self.held_out = tuple(held_out)
+        self.guessed = tuple(guessed)
 
     def __repr__(self) -> str:
         faces = f"{len(self._mesh.faces)} triangles" if self._mesh is not None else "no mesh"
@@ -118,6 +121,7 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
+            "guessed": self.guessed,
             "labels": () if self._mesh is None else self._mesh.labels,
         }  # fmt: skip
         arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
@@ -154,8 +158,9 @@ class Reconstruction:
             splats = None if mesh is not None and "means" not in arrays else files.to_gaussians(arrays)
             rms = header["scale_rms_m"]
             check_type("metric", header["metric"], bool)
-            for name in (*header["unposed"], *header["held_out"]):
-                check_type("unposed, held_out", name, str)
+            guessed = header.get("guessed", ())
+            for name in (*header["unposed"], *header["held_out"], *guessed):
+                check_type("unposed, held_out, guessed", name, str)
             return cls(
                 splats,
                 mesh,
@@ -165,6 +170,7 @@ class Reconstruction:
                 metric=header["metric"],
                 unposed=header["unposed"],
                 held_out=header["held_out"],
+                guessed=guessed,
             )
 
     @classmethod

@@ -69,6 +69,8 @@ class _SceneFile:
         ids = [shape.get("id") or f"shape_{k}" for k, shape in enumerate(shapes)]
         plain = [identifier.removeprefix("mesh-") for identifier in ids]  # as Sionna RT names its objects
         names = plain if len(set(plain)) == len(plain) else ids
+        if len(set(names)) < len(names):
+            raise ValueError(f"path: {self.path} names two shapes alike, expected an id of its own for each")
         found = []
         for shape, name in zip(shapes, names, strict=True):
             material = self._material(shape, name)

@@ -1,14 +1,19 @@
 """Refinement: the loss and its derivative, learning, and that stopping does not change the result."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
 from skimage.metrics import structural_similarity
 
 from warprrf.geometry.photos.config import RefineConfig
+from warprrf.geometry.photos.exposure import Exposures
+from warprrf.geometry.photos.fill import filled
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.refine import refine
+from warprrf.geometry.photos.targets import PosedPhotos, Targets
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -70,14 +75,14 @@ def psnr(g, photos, cameras):
 
 def test_refinement_learns_the_photos_and_densifies(problem):
     start, photos, cameras = problem
-    end = refine(start, photos, cameras, config=CONFIG, device="cpu")
+    end = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
     assert psnr(end, photos, cameras) > psnr(start, photos, cameras) + 4
     assert len(end) > len(start)
 
 
 def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp_path):
     start, photos, cameras = problem
-    whole = refine(start, photos, cameras, config=CONFIG, device="cpu")
+    whole = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
 
     class Killed(Exception):
         pass
@@ -89,9 +94,9 @@ def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp
     file = tmp_path / "refine.safetensors"
     config = CONFIG
     with pytest.raises(Killed):
-        refine(start, photos, cameras, config=config, checkpoint=file, device="cpu",
+        refine(start, PosedPhotos(photos, cameras), config=config, checkpoint=file, device="cpu",
                progress=lambda stage, done, total: kill_after_the_second_checkpoint(stage, done, total))  # fmt: skip
-    resumed = refine(start, photos, cameras, config=config, checkpoint=file, device="cpu")
+    resumed = refine(start, PosedPhotos(photos, cameras), config=config, checkpoint=file, device="cpu")
     for name in ("means", "quaternions", "scales", "opacities", "sh"):
         assert np.array_equal(getattr(resumed, name), getattr(whole, name)), name
 
@@ -100,12 +105,12 @@ def test_a_checkpoint_of_other_settings_or_a_damaged_one_is_refused(problem, tmp
     start, photos, cameras = problem
     file = tmp_path / "refine.safetensors"
     short = RefineConfig(iterations=20, downscale=1, checkpoint_every=20)
-    refine(start, photos, cameras, config=short, checkpoint=file, device="cpu")
+    refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file, device="cpu")
     with pytest.raises(ValueError, match="other settings"):
-        refine(start, photos, cameras, config=CONFIG, checkpoint=file, device="cpu")
+        refine(start, PosedPhotos(photos, cameras), config=CONFIG, checkpoint=file, device="cpu")
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(ValueError, match="cannot be read"):
-        refine(start, photos, cameras, config=short, checkpoint=file, device="cpu")
+        refine(start, PosedPhotos(photos, cameras), config=short, checkpoint=file, device="cpu")
 
 
 @pytest.mark.usefixtures("device")
@@ -126,8 +131,8 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
         cell_m=0.5, occupied=np.ones((4, 4), bool),
     )  # fmt: skip
     config = RefineConfig(iterations=60, downscale=1, densify_from=999)
-    free = refine(start, photos, cameras, config=config, device="cpu")
-    held = refine(start, photos, cameras, config=config, planes=[plane], device="cpu")
+    free = refine(start, PosedPhotos(photos, cameras), config=config, device="cpu")
+    held = refine(start, PosedPhotos(photos, cameras), config=config, planes=[plane], device="cpu")
     assert np.abs(held.means[:, 2]).max() < 1e-3 < np.abs(free.means[:, 2]).mean()
     assert np.degrees(np.arccos(np.clip(np.abs(held.normals[:, 2]), 0, 1))).max() < 1.0
 
@@ -169,6 +174,75 @@ def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right():
     ],
 )
 def test_bad_input_is_named(problem, change, complaint):
-    start, photos, cameras = problem
+    _, photos, cameras = problem
     with pytest.raises(ValueError, match=complaint):
-        refine(**{"gaussians": start, "images": photos, "cameras": cameras, "device": "cpu", **change})
+        PosedPhotos(**{"images": photos, "cameras": cameras, **change})
+
+
+def test_photos_of_changed_exposure_and_white_balance_give_the_same_colours(problem):
+    start, photos, cameras = problem
+    rng = np.random.default_rng(3)
+    gains = np.exp(rng.uniform(-0.25, 0.25, (len(photos), 3)))
+    gains /= np.exp(np.log(gains).mean(axis=0))
+    changed = [np.minimum(0.6 * p * g, 1) for p, g in zip(photos, gains, strict=True)]
+    kept = [0.6 * p for p in photos]
+    posed = PosedPhotos(changed, cameras)
+    fitted = refine(start, posed, config=CONFIG, device="cpu")
+    blind = refine(start, posed, config=replace(CONFIG, fit_exposure=False), device="cpu")
+    straight = refine(start, PosedPhotos(kept, cameras), config=CONFIG, device="cpu")
+    found, lost, best = (psnr(g, kept, cameras) for g in (fitted, blind, straight))
+    assert best - found < 0.15 and best - lost > 3 * (best - found)
+
+
+@pytest.mark.usefixtures("device")
+def test_gains_of_photos_are_recovered_whatever_is_masked_or_clipped():
+    rng = np.random.default_rng(6)
+    shape = (20, 30, 3)
+    gains = np.exp(rng.normal(size=(4, 3)) * 0.2)
+    gains /= np.exp(np.log(gains).mean(axis=0))
+    image = rng.random(shape, dtype=np.float32)
+    photos = [np.minimum(image * g, 1).astype(np.float32) for g in gains]
+    mask = np.zeros(shape[:2], bool)
+    mask[:, :10] = True
+    photos[1][mask] = 0.3
+    camera = Camera.pinhole(30, 20, fx=30, fy=30, cx=15, cy=10, world_to_camera=np.eye(4))
+    targets = Targets(PosedPhotos(photos, [camera] * 4, [None, mask, None, None]), PhotoLoss("cpu", 0.2))
+    exposures = Exposures(4, fitted=True)
+    rendered = wp.array(image, dtype=float, device="cpu")
+    for visit in range(20):
+        for view in range(4):
+            exposures.fit(rendered, targets.at(view, 1), visit)
+    found = np.array([exposures.gain(view) for view in range(4)])
+    # The prior is 1e-3 a pixel, the squares of what is neither masked nor clipped are a tenth or more: a gain keeps one
+    # percent of its logarithm, which is below one half.
+    assert np.allclose(found, gains, rtol=5e-3)
+
+
+def test_masked_pixels_take_no_part(problem):
+    start, photos, cameras = problem
+    masks = [np.zeros(p.shape[:2], bool) for p in photos]
+    masks[0][10:30, 20:40] = masks[3][:, :15] = True
+    rng = np.random.default_rng(4)
+    spoilt = [np.where(m[..., None], rng.random(p.shape), p) for p, m in zip(photos, masks, strict=True)]
+    one, other = (
+        refine(start, PosedPhotos(images, cameras, masks), config=CONFIG, device="cpu")
+        for images in (photos, spoilt)
+    )
+    assert np.array_equal(one.sh, other.sh) and np.array_equal(one.means, other.means)
+
+
+def test_a_hole_in_the_start_is_filled(problem):
+    _, photos, cameras = problem
+    start = Gaussians(
+        np.random.default_rng(5).uniform([-1.5, -1.5, -0.5], [0.0, 1.5, 0.5], (300, 3)),
+        np.tile([1.0, 0, 0, 0], (300, 1)), np.full((300, 3), 0.12), np.full(300, 0.9), np.zeros((300, 1, 3)),
+    )  # fmt: skip
+    wall = [np.full_like(p, 0.6) for p in photos]
+    posed = PosedPhotos(wall, cameras)
+    uncovered = [(render(start, c, device="cpu").alpha < 0.5).mean() for c in cameras]
+    end = filled(start, posed, device="cpu")
+    left = [(render(end, c, device="cpu").alpha < 0.5).mean() for c in cameras]
+    assert np.mean(uncovered) > 0.3 and np.mean(left) < 0.02
+    masked = PosedPhotos(wall, cameras, [np.ones(p.shape[:2], bool) for p in wall])
+    assert len(filled(start, masked, device="cpu")) == len(start)
+    assert len(filled(end, posed, device="cpu")) <= len(end) + 20

@@ -217,6 +217,9 @@ def test_bad_input_is_named() -> None:
         wr.dft_codebook(wr.PlanarArray(2, 2, polarisation="V"))
     with pytest.raises(ValueError, match="rx_array: got polarisation 'V'"):
         wr.select_beams(paths, array, wr.PlanarArray(2, 2, polarisation="V"))
+    for factors in ((np.ones((2, 5)),), (np.ones((2, array.cols)),) * 3, ()):
+        with pytest.raises(ValueError, match="factors: got"):
+            wr.channel.Codebook(array, factors)
     with pytest.raises(ValueError, match="oversampling: got 0"):
         wr.dft_codebook(array, 0)
     with pytest.raises(ValueError, match="directions: got a vector of length zero"):

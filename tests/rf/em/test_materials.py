@@ -210,6 +210,7 @@ HOSTILE = {
     "a lobe too narrow": {"pattern": {"value": "directive", "alpha_r": 10**9}},
     "a pattern of a list": {"pattern": {"value": [1]}},
     "negative roughness": {"roughness_m": {"value": -1.0}},
+    "a number for a name of ITU's": {"itu": 1.5},
 }
 
 

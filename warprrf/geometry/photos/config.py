@@ -102,6 +102,7 @@ class RefineConfig:
         full_from: share of the iterations after which photos are taken as they are.
         sh_degree: of the colours; rendered rooms are nearly matt, so 1.
         ssim_share: weight of 1 - SSIM; L1 has the rest.
+        fit_exposure: whether every photo has a gain for each colour of its own.
         mean_rate, final_mean_rate: metres a step at the start and the end, exponential in between.
         scale_rate, quaternion_rate, opacity_rate, color_rate: of the logarithms of scales, quaternions, logits of
             opacities, and constant colours; other coefficients take a twentieth.
@@ -124,6 +125,7 @@ class RefineConfig:
     full_from: float = 0.9
     sh_degree: int = 1
     ssim_share: float = 0.2
+    fit_exposure: bool = True
     mean_rate: float = 4e-4
     final_mean_rate: float = 4e-5
     scale_rate: float = 5e-3

@@ -71,10 +71,11 @@ def initial_gaussians(
     centres, facing, sizes, shades = (np.concatenate(p) for p in zip(*parts, strict=True))
     if not len(centres):
         raise ValueError("points: got none, and no plane that a photo sees; nothing to start from")
-    return _discs(centres, facing, sizes, shades)
+    return discs(centres, facing, sizes, shades)
 
 
-def _discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: np.ndarray) -> Gaussians:
+def discs(centres: np.ndarray, normals: np.ndarray, radius: np.ndarray, colors: np.ndarray) -> Gaussians:
+    """Flat discs of degree 0: centres and unit normals ``(N, 3)``, radii ``(N,)`` [m], colours ``(N, 3)`` in [0, 1]."""
     kinds, which = np.unique(normals, axis=0, return_inverse=True)
     axes = np.array([plane_axes(n) for n in kinds])[which.ravel()]
     rotation = np.stack([axes[:, 0], axes[:, 1], normals], axis=2)

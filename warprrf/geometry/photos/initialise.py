@@ -60,7 +60,8 @@ def initialise(
     points, viewpoints = sparse.points, sparse.viewpoints()
     normals = estimate_normals(points, viewpoints)
     planes = detect_room_planes(points, normals, viewpoints, config=config.planes, seed=seed)
-    planes = aligned(planes, points) if sparse.metric else planes
+    level = sparse.metric and sparse.upright
+    planes = aligned(planes, points) if level else planes
     eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
     lines = eyes, np.repeat(points, sparse.track_length, axis=0)
     planes = occupancy(planes, points, *lines, config=config.planes)
@@ -69,7 +70,7 @@ def initialise(
         photos = GreyPhotos.upload(list(cameras.values()), images, config.sweep, device)
         planes = proven_cells(planes, points, photos)
         report("planes", 2, 5)
-        if sparse.metric:  # else z is not up
+        if level:
             levels = []
             for k, up in enumerate((True, False)):
                 levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)

@@ -35,6 +35,8 @@ def find_photos(photos: Photos) -> dict[str, Path]:
         found = (p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
         files = sorted(p for p in found if not p.name.startswith("."))
     else:
+        if odd := [p for p in photos if not isinstance(p, str | os.PathLike)]:
+            raise TypeError(f"photos: got {type(odd[0]).__name__} in a list, expected image files")
         files = [Path(p) for p in photos]
         missing = [str(p) for p in files if not p.is_file()]
         if missing:

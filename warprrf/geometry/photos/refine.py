@@ -16,28 +16,29 @@ import numpy as np
 import warp as wp
 
 from warprrf import tensor_files
-from warprrf.checks import check_array, check_count
+from warprrf.checks import check_count
 from warprrf.device import DeviceLike, Progress, launch, resolve
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import PARAMETERS, STATISTICS, Arrays, densified, opacity_and_scales
+from warprrf.geometry.photos.exposure import Exposures
+from warprrf.geometry.photos.fill import filled
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.photos.targets import PosedPhotos, Target, Targets
 from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotations_of
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
 from warprrf.steps import digest
 
-CHECKPOINT = "warprrf refinement 1"
+CHECKPOINT = "warprrf refinement 2"
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999  # of Adam's moments
 
 
 def refine(
     gaussians: Gaussians,
-    images: Sequence[np.ndarray],
-    cameras: Sequence[Camera],
+    photos: PosedPhotos,
     *,
     config: RefineConfig | None = None,
     planes: Sequence[Plane] = (),
@@ -48,28 +49,21 @@ def refine(
     """Optimise Gaussians against photos.
 
     Args:
-        images: photos in [0, 1], each ``(H, W, 3)``, one per camera.
-        cameras: pinhole cameras of the same sizes.
+        photos: with their cameras and masks.
         planes: detected planes; Gaussians on them are kept flat.
         checkpoint: file to continue from if it exists and to keep up to date; of the same photos.
 
     Raises:
-        ValueError: if images and cameras do not match, or a checkpoint is of other arguments or damaged.
+        ValueError: if a checkpoint is of other arguments or damaged.
         RuntimeError: if the loss becomes NaN.
     """
     config = config or RefineConfig()
-    if len(images) != len(cameras) or not images:
-        raise ValueError(
-            f"images: got {len(images)} for {len(cameras)} cameras, expected one each and at least one"
-        )
-    for k, (image, camera) in enumerate(zip(images, cameras, strict=True)):
-        if camera.kind != "pinhole":
-            raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole")
-        check_array(f"images[{k}]", image, (camera.height, camera.width, 3), np.float32)
-    run = _Refinement(gaussians, _Targets(images, cameras, config, resolve(device)), config, planes)
-    key = "" if checkpoint is None else digest(config, gaussians, list(cameras), list(planes))
+    run = _Refinement(photos, config, planes, resolve(device))
+    key = "" if checkpoint is None else digest(config, gaussians, list(photos.cameras), list(planes))
     if checkpoint is not None and Path(checkpoint).exists():
         run.restore(Path(checkpoint), key)
+    else:
+        run.start(gaussians)
     while run.iteration < config.iterations:
         run.step()
         if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
@@ -79,42 +73,25 @@ def refine(
     return run.result()
 
 
-class _Targets:
-    """Photos at the sizes that they are compared at, on a device, made when first asked for."""
-
-    def __init__(
-        self, images: Sequence[np.ndarray], cameras: Sequence[Camera], config: RefineConfig, device: wp.Device
-    ) -> None:
-        self.images, self.cameras, self.device = images, cameras, device
-        self.loss = PhotoLoss(device, config.ssim_share)
-        self.kept: dict[tuple[int, int], tuple[Camera, wp.array, wp.array]] = {}
-
-    def at(self, view: int, scale: int) -> tuple[Camera, wp.array, wp.array]:
-        """Camera, photo (flat) and the photo's window averages, averaged over squares of ``scale`` pixels."""
-        if (view, scale) not in self.kept:
-            image, camera = np.asarray(self.images[view], dtype=np.float32), self.cameras[view]
-            height, width = image.shape[0] // scale, image.shape[1] // scale
-            blocks = image[: height * scale, : width * scale].reshape(height, scale, width, scale, 3)
-            small = blocks.mean(axis=(1, 3), dtype=np.float32)
-            lens = {name: getattr(camera, name) / scale for name in ("fx", "fy", "cx", "cy")}
-            smaller = Camera.pinhole(width, height, world_to_camera=camera.world_to_camera, **lens)
-            pixels = wp.array(small.reshape(-1), dtype=float, device=self.device)
-            self.kept[view, scale] = smaller, pixels, self.loss.moments(pixels, pixels, small.shape)
-        return self.kept[view, scale]
-
-
 class _Refinement:
     """State of a run: what Adam moves, its moments, densification statistics, the iteration."""
 
     def __init__(
-        self, gaussians: Gaussians, targets: _Targets, config: RefineConfig, planes: Sequence[Plane]
+        self, photos: PosedPhotos, config: RefineConfig, planes: Sequence[Plane], device: wp.Device
     ) -> None:
-        self.config, self.planes, self.targets, self.device = config, list(planes), targets, targets.device
+        self.config, self.planes, self.device = config, list(planes), device
+        self.loss = PhotoLoss(device, config.ssim_share)
+        self.targets = Targets(photos, self.loss)
+        self.exposures = Exposures(len(self.targets), config.fit_exposure)
         self.iteration = 0
         self.raster = Rasterizer(device=self.device, blending=Blending())
         table = np.array([[*p.normal, p.offset] for p in self.planes], dtype=np.float32).reshape(-1, 4)
         self.plane_table = wp.array(table, dtype=wp.vec4, device=self.device)
-        self.load(self.on_planes(_initial(gaussians, config)))
+
+    def start(self, gaussians: Gaussians) -> None:
+        """Begin with ``gaussians``, and others where they leave holes in the photos."""
+        gaussians = filled(gaussians, self.targets.photos, device=self.device)
+        self.load(self.on_planes(_initial(gaussians, self.config)))
 
     def on_planes(self, arrays: Arrays) -> Arrays:
         """``arrays`` with ``plane_of``, the nearest plane that each Gaussian lies on, -1 for none."""
@@ -164,11 +141,11 @@ class _Refinement:
 
     def step(self) -> None:
         """One photo: render, differentiate, move; densify when it is time."""
-        c, count = self.config, len(self.targets.images)
+        c, count = self.config, len(self.targets)
         epoch, position = divmod(self.iteration, count)
         view = int(np.random.default_rng([c.seed, 1, epoch]).permutation(count)[position])
         scale = c.downscale if self.iteration < c.full_from * c.iterations else 1
-        score = self.differentiate(*self.targets.at(view, scale))
+        score = self.differentiate(self.targets.at(view, scale))
         self.iteration += 1
         self.move()
         if self.iteration % 100 == 0 and not np.isfinite(score.numpy()).all():
@@ -178,8 +155,9 @@ class _Refinement:
             rng = np.random.default_rng([c.seed, 2, self.iteration])
             self.load(self.on_planes(densified(self.arrays(), c, rng)))
 
-    def differentiate(self, camera: Camera, target: wp.array, target_moments: wp.array) -> wp.array:
+    def differentiate(self, target: Target) -> wp.array:
         """Render one photo and leave the loss's gradients in ``self.gradients``; returns the SSIM of every element."""
+        camera = target.camera
         n, device, state = self.count, self.device, self.state
         logits, logits_grad = state["logits"], self.gradients["logits"]
         launch(optimize.activate, n, [self.log_scales, logits, self.scales, self.opacities], device=device)
@@ -187,7 +165,10 @@ class _Refinement:
         origin = self.raster.colors_into(self.means, self.sh, camera, colors)
         prepared = self.raster.prepare(self.means, self.quaternions, self.scales, self.opacities, camera)
         image, adjoint = self.raster.blend_with_adjoint(prepared, colors)
-        score = self.targets.loss(image.features, target, target_moments, image.features.grad)
+        shown = self.exposures.shown(image.features, target)
+        score = self.loss(shown, target.pixels, target.moments, shown.grad)
+        self.exposures.adjoint(image.features, target, shown.grad)
+        self.exposures.fit(image.features, target, self.iteration // len(self.targets))
         weight = adjoint()
         self.raster.colors_adjoint(self.means, self.sh, origin, colors)
         scales, opacities = self.scales, self.opacities
@@ -231,7 +212,8 @@ class _Refinement:
 
     def store(self, path: Path, key: str) -> None:
         """Write the whole state; ``key`` tells what it was made from."""
-        tensor_files.write(path, self.arrays(), {"iteration": self.iteration, "key": key}, CHECKPOINT)
+        arrays = {**self.arrays(), "log_gains": self.exposures.log_gains}
+        tensor_files.write(path, arrays, {"iteration": self.iteration, "key": key}, CHECKPOINT)
 
     def restore(self, path: Path, key: str) -> None:
         """Continue from a checkpoint."""
@@ -244,6 +226,7 @@ class _Refinement:
                 f"checkpoint: {path} is of other settings or inputs; delete it or give another file"
             )
         self.iteration = check_count("iteration", header.get("iteration"), 0)
+        self.exposures.log_gains = arrays.pop("log_gains")
         self.load(arrays)
 
 

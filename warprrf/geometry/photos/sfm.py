@@ -135,7 +135,7 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
             raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
         try:
             names = sorted(i.name for i in model.images.values())
-            found = replace(_sparse_model(model, names), metric=True)
+            found = replace(_sparse_model(model, names), metric=True, upright=True)
         except (ValueError, TypeError) as error:  # cameras that are no pinholes, or damaged
             raise ValueError(f"colmap: {root}: {str(error).removeprefix('colmap: ')}") from error
     if not np.isfinite(found.points).all():

@@ -6,13 +6,13 @@ the world; without a survey a plausible one is assumed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, check_positive
 from warprrf.geometry.photos.photo_files import match_names, some
 from warprrf.geometry.splats.camera import Camera
 
@@ -34,8 +34,10 @@ class SparseModel:
         track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
         other_models: number of photos in each smaller model that was left out.
-        metric: True once :func:`align_to_known` has brought the model to metres.
+        metric: whether lengths are metres.
+        upright: whether z is up.
         scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
+        guessed: what nobody measured and the photos do not show, a sentence each.
     """
 
     cameras: dict[str, Camera]
@@ -48,7 +50,9 @@ class SparseModel:
     unposed: tuple[str, ...] = ()
     other_models: tuple[int, ...] = ()
     metric: bool = False
+    upright: bool = False
     scale_rms_m: float = float("nan")
+    guessed: tuple[str, ...] = ()
 
     def viewpoints(self) -> np.ndarray:
         """Mean position of the cameras that see each point, shape ``(P, 3)``: normals are turned towards it."""
@@ -103,23 +107,63 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]
     except ValueError as error:
         raise ValueError(f"known_positions: {error}") from error
     rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
-    return replace(transformed(sparse, scale, rotation, shift), metric=True, scale_rms_m=rms)
+    moved = transformed(sparse, scale, rotation, shift)
+    return replace(moved, metric=True, upright=True, scale_rms_m=rms)
+
+
+Scale = float | tuple[str, str, float]
+"""Metres for each unit of a model, or two photos and the distance between their cameras [m]."""
+
+
+def check_scale(scale: Scale, names: Sequence[str]) -> Scale:
+    """``scale`` with the full names of two of the photos ``names``.
+
+    Raises:
+        ValueError: for a distance or factor that is not positive, names of no photo, or twice the same.
+    """
+    if not isinstance(scale, (tuple, list)):
+        return check_positive("scale", scale, "number of metres for each unit")
+    if len(scale) != 3:
+        raise ValueError(
+            f'scale: got {scale!r}, expected ("a.jpg", "b.jpg", metres): two photos and how far apart their cameras were'
+        )
+    first, second = match_names("scale", scale[:2], names)
+    if first == second:
+        raise ValueError(f"scale: got {first} twice, expected two photos")
+    return first, second, check_positive("scale", scale[2], "distance in metres between two cameras")
+
+
+def scaled(sparse: SparseModel, scale: Scale) -> SparseModel:
+    """``sparse`` in metres, axes as they are.
+
+    Raises:
+        ValueError: as :func:`check_scale`, for a photo without a pose, or cameras at one place.
+    """
+    scale = check_scale(scale, (*sparse.cameras, *sparse.unposed))
+    if isinstance(scale, tuple):
+        lost = [name for name in scale[:2] if name not in sparse.cameras]
+        if lost:
+            raise ValueError(f"scale: no pose was found for {some(lost)}; name two photos that have one")
+        positions = np.array([c.position for c in sparse.cameras.values()])
+        gap = float(np.linalg.norm(sparse.cameras[scale[0]].position - sparse.cameras[scale[1]].position))
+        if gap <= 1e-3 * float(np.ptp(positions, axis=0).max()):
+            raise ValueError(
+                f"scale: {scale[0]} and {scale[1]} were taken at one place; name two photos that are far apart"
+            )
+        scale = scale[2] / gap
+    return replace(transformed(sparse, scale, np.eye(3), np.zeros(3)), metric=True)
 
 
 def assume_scale(sparse: SparseModel) -> SparseModel:
-    """``sparse`` with z up and a plausible size, where nobody measured either."""
-    poses = list(sparse.cameras.values())
-    up = -np.mean([c.rotation[1] for c in poses], axis=0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
-    ahead = np.cross([0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0], up)
-    ahead /= np.linalg.norm(ahead)
-    rotation = np.stack([ahead, np.cross(up, ahead), up])
-    positions = np.array([c.position for c in poses])
+    """``sparse`` in a plausible size, axes as they are, where nobody measured any."""
+    positions = np.array([c.position for c in sparse.cameras.values()])
     gap = np.linalg.norm(
         np.repeat(sparse.points, sparse.track_length, axis=0) - positions[sparse.track_camera], axis=1
     )
     scale = ASSUMED_DISTANCE_M / float(np.median(gap)) if len(gap) else 1.0
-    return transformed(sparse, scale, rotation, -scale * rotation @ positions.mean(axis=0))
+    said = f"scale: nobody measured one; the median distance that photos look is taken for {ASSUMED_DISTANCE_M:g} m"
+    moved = transformed(sparse, scale, np.eye(3), np.zeros(3))
+    return replace(moved, guessed=(*sparse.guessed, said))
 
 
 def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndarray, np.ndarray]:

@@ -113,16 +113,16 @@ class Rasterizer:
         self.tile = PIXEL_TILE if self.per_pixel else blocks.BLOCK
         self.threads_per_tile = PIXEL_TILE**2 if self.per_pixel else 1
 
-    def vector(self, size: int) -> Any:
+    def _vector(self, size: int) -> Any:
         """Warp's vector type of this precision."""
         return wp.types.vector(size, self.real)
 
     def upload(self, g: Gaussians) -> Parameters:
         """Means, quaternions, scales and opacities as arrays of this precision."""
         return (
-            wp.array(g.means, dtype=self.vector(3), device=self.device),
-            wp.array(g.quaternions, dtype=self.vector(4), device=self.device),
-            wp.array(g.scales, dtype=self.vector(3), device=self.device),
+            wp.array(g.means, dtype=self._vector(3), device=self.device),
+            wp.array(g.quaternions, dtype=self._vector(4), device=self.device),
+            wp.array(g.scales, dtype=self._vector(3), device=self.device),
             wp.array(g.opacities, dtype=self.real, device=self.device),
         )
 
@@ -153,14 +153,14 @@ class Rasterizer:
     def colors_into(self, means: wp.array, sh: wp.array, cam: Camera, out: wp.array) -> wp.array:
         """Write the colours to ``out``; returns the ray origin that :meth:`colors_adjoint` wants. Records nothing."""
         self._check_colors(means, sh, out)
-        origin = wp.array([cam.position], dtype=self.vector(3), device=self.device)
+        origin = wp.array([cam.position], dtype=self._vector(3), device=self.device)
         launch(harmonics.build(self.real).colors, len(means), [means, sh, origin, out], device=self.device)
         return origin
 
     def colors_adjoint(self, means: wp.array, sh: wp.array, origin: wp.array, out: wp.array) -> None:
         """Add the gradients of ``means`` and ``sh`` for ``out.grad``."""
         self._check_colors(means, sh, out)
-        self._fits("origin", origin, self.vector(3), (1,))
+        self._fits("origin", origin, self._vector(3), (1,))
         kernel = harmonics.build(self.real).colors
         launch(kernel, len(means), [means, sh, origin, out], device=self.device, adjoint=True)
 
@@ -174,9 +174,9 @@ class Rasterizer:
                 precision.
         """
         n, device = len(means), self.device
-        self._fits("means", means, self.vector(3), (n,))
-        self._fits("quaternions", quaternions, self.vector(4), (n,))
-        self._fits("scales", scales, self.vector(3), (n,))
+        self._fits("means", means, self._vector(3), (n,))
+        self._fits("quaternions", quaternions, self._vector(4), (n,))
+        self._fits("scales", scales, self._vector(3), (n,))
         self._fits("opacities", opacities, self.real, (n,))
         view = _view(cam, self.tile)
         inputs = (means, quaternions, scales, opacities)
@@ -255,7 +255,7 @@ class Rasterizer:
         return wp.array(values, dtype=self.real, device=self.device)
 
     def _check_colors(self, means: wp.array, sh: wp.array, out: wp.array) -> None:
-        self._fits("means", means, self.vector(3), (None,))
+        self._fits("means", means, self._vector(3), (None,))
         self._fits("sh", sh, self.real, (len(means), None, None))
         if sh.shape[1] not in harmonics.COEFFICIENTS.values():
             raise ValueError(
@@ -316,7 +316,7 @@ class Rasterizer:
         slopes = [gradient(array) for array in image.differentiable]
         parameter_gradients = [gradient(array) for array in prepared.inputs]
         feature_gradient = gradient(features)
-        sums_of_one = self.vector(projection.SUMS)
+        sums_of_one = self._vector(projection.SUMS)
         seen = wp.zeros(n, dtype=self.real, device=self.device)
         for first in range(0, channels, projection.CHANNELS):
             kernel = self.kernels.build_adjoint(self.real, min(channels - first, projection.CHANNELS))

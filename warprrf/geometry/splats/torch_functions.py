@@ -225,7 +225,7 @@ class _Rasterize(torch.autograd.Function):
     @_in_stream
     def forward(ctx: Any, cam: Camera, blending: Blending | None, *tensors: torch.Tensor) -> Any:
         r = _raster(tensors[0], blending)
-        types = (r.vector(3), r.vector(4), r.vector(3), r.real, r.real, r.real)
+        types = (r._vector(3), r._vector(4), r._vector(3), r.real, r.real, r.real)
         inputs = tuple(_shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
         image, ctx.adjoint = r.blend_with_adjoint(
             r.prepare(inputs[0], inputs[1], inputs[2], inputs[3], cam),
@@ -253,7 +253,7 @@ class _Colors(torch.autograd.Function):
     @_in_stream
     def forward(ctx: Any, cam: Camera, means: torch.Tensor, sh: torch.Tensor) -> Any:
         r = _raster(means)
-        inputs = (_shared(means, r.vector(3)), _shared(sh, r.real))
+        inputs = (_shared(means, r._vector(3)), _shared(sh, r.real))
         out = wp.zeros((len(means), sh.shape[2]), dtype=r.real, device=r.device)
         origin = r.colors_into(*inputs, cam, out)
         ctx.inputs, ctx.out = inputs, out
@@ -276,7 +276,7 @@ class _Rays(torch.autograd.Function):
     def forward(ctx: Any, query: tuple[str, tuple[Any, ...], Any, Any], *tensors: torch.Tensor) -> Any:
         method, arguments, options, blending = query
         r = _raster(tensors[0])
-        types = (r.vector(3), r.vector(4), r.vector(3), r.real)
+        types = (r._vector(3), r._vector(4), r._vector(3), r.real)
         ctx.inputs = tuple(_shared(t, dtype) for t, dtype in zip(tensors, types, strict=True))
         rays = GaussianRays(ctx.inputs, blending=blending)
         found, ctx.adjoint = getattr(rays, method)(*arguments, **options)

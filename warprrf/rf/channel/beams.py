@@ -48,6 +48,16 @@ class Codebook:
     array: PlanarArray
     factors: tuple[np.ndarray, ...] = field(repr=False)
 
+    def __post_init__(self) -> None:
+        """Check that the weights are of the array's elements; TypeError or ValueError names them."""
+        axes = (self.array.cols, self.array.rows) if len(self.factors) == 2 else (self.array.elements,)
+        if len(self.factors) != len(axes):
+            raise ValueError(f"factors: got {len(self.factors)}, expected weights, or those across and down")
+        found = [
+            check_array("factors", f, (None, n), complex) for f, n in zip(self.factors, axes, strict=True)
+        ]
+        object.__setattr__(self, "factors", tuple(found))
+
     def __len__(self) -> int:
         return int(np.prod([len(f) for f in self.factors]))
 

@@ -154,7 +154,7 @@ class PathArrays:
             index = index if index.size else index.astype(int)
         try:
             found = np.arange(len(self.gain))[index]
-        except IndexError as error:
+        except (IndexError, OverflowError) as error:
             raise ValueError(
                 f"chosen: {error}; expected indices of {len(self.gain)} paths, or a mask"
             ) from error

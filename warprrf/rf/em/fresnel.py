@@ -20,7 +20,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_alike, check_array, check_count, checked
+from warprrf.checks import LARGEST, check_alike, check_array, check_count, checked
 from warprrf.rf.em.materials import NARROWEST_LOBE, Material, check_known
 
 LAMBERTIAN = 0
@@ -73,7 +73,7 @@ def slab_reflection(
     """
     te, tm, once = _slab(cos_incidence, permittivity, thickness_m, wavelength_m)
     echo = once**2
-    return te * (1.0 - echo) / (1.0 - te**2 * echo), tm * (1.0 - echo) / (1.0 - tm**2 * echo)  # eq. (43a)
+    return _shared(te * (1.0 - echo), te, echo, 0.0), _shared(tm * (1.0 - echo), tm, echo, 0.0)  # eq. (43a)
 
 
 @checked
@@ -85,7 +85,14 @@ def slab_transmission(
     Source: ITU-R P.2040-4, eqs. (37a), (37b), (43b), (44).
     """
     te, tm, once = _slab(cos_incidence, permittivity, thickness_m, wavelength_m)
-    return (1.0 - te**2) * once / (1.0 - te**2 * once**2), (1.0 - tm**2) * once / (1.0 - tm**2 * once**2)
+    echo = once**2
+    return _shared((1.0 - te**2) * once, te, echo, once), _shared((1.0 - tm**2) * once, tm, echo, once)
+
+
+def _shared(wave: np.ndarray, face: np.ndarray, echo: np.ndarray, none: np.ndarray | float) -> np.ndarray:
+    """``wave`` over 1 - face^2 echo; ``none`` where that is 0, as at grazing of a slab without thickness."""
+    below = 1.0 - face**2 * echo
+    return np.where(below == 0.0, none, wave / np.where(below == 0.0, 1.0, below))
 
 
 def _slab(
@@ -101,7 +108,7 @@ def _slab(
         ("cos_incidence", cos, (cos >= 0) & (cos <= 1.0 + 1e-6)),
         ("permittivity", eta, (eta.real > 0) & (eta.imag <= 0) & (abs(eta) < 1e30)),
         ("thickness_m", thickness, thickness >= 0),
-        ("wavelength_m", wavelength, wavelength > 0),
+        ("wavelength_m", wavelength, wavelength >= 1 / LARGEST),
     ):
         if not fits.all():
             raise ValueError(

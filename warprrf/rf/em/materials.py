@@ -89,11 +89,13 @@ class Band:
 
     def relative_permittivity(self, frequency_hz: float) -> float:
         """a f^b, f in GHz."""
+        check_frequency(frequency_hz)
         with np.errstate(over="ignore"):
             return float(self.a * np.float64(frequency_hz / 1e9) ** self.b)
 
     def conductivity(self, frequency_hz: float) -> float:
         """c f^d [S/m], f in GHz."""
+        check_frequency(frequency_hz)
         with np.errstate(over="ignore"):
             return float(self.c * np.float64(frequency_hz / 1e9) ** self.d)
 
@@ -359,7 +361,7 @@ def _material(entry: object, where: str) -> Material:
             reciprocal=reciprocal,
             xpd=_number(parts["xpd"], "value", where) if "xpd" in parts else 0.0,
         )
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
 
 

@@ -128,7 +128,9 @@ def deembed(
     power = check_array("path_gain", path_gain, (None, None, None))
     if (power < 0).any():
         raise ValueError(f"path_gain: got {int((power < 0).sum())} negative values, expected linear power")
-    if callable(pattern) or np.ndim(pattern) != 2:
+    if not callable(pattern):
+        pattern = check_array("pattern", pattern, finite=False)
+    if callable(pattern) or pattern.ndim != 2:
         kernel = scanned_kernel(pattern, check_shape(power.shape[1:]), boresight_gain_dbi)
         return _deembed_scanned(power, kernel, beam_sigma_rad, Scan(noise=noise, **options), progress)  # type: ignore[misc]
     if noise != 0.0:

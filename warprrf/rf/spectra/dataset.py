@@ -129,6 +129,8 @@ class SpectrumDataset:
         gain = check_array("path_gain", path_gain, (None, None, None), dtype=np.float32)
         if len(gain) == 0:
             raise ValueError("path_gain: got no spectra, expected one receiver's or more")
+        if (gain < 0).any():
+            raise ValueError(f"path_gain: got {gain.min()}, expected gains of at least 0")
         noise = default_floor(gain) if floor is None else check_positive("floor", floor, "linear noise floor")
         return cls(
             receivers=receivers,

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
-from warprrf.checks import check_alike, check_array, checked
+from warprrf.checks import check_alike, check_array, check_number, checked
 from warprrf.device import Progress
 from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -34,6 +34,7 @@ from warprrf.rf.spectra.spectrum import (
 )
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
+NARROWEST_BEAM_RAD = 1e-4
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
@@ -48,6 +49,7 @@ def unit_image(path_gain: np.ndarray, floor: float, range_db: tuple[float, float
     path_gain = check_array("path_gain", path_gain, finite=False)
     if (path_gain < 0).any():
         raise ValueError(f"path_gain: got {path_gain.min()}, expected gains of at least 0")
+    check_number("floor", floor, 0.0)
     return np.clip((np.asarray(to_db(path_gain, floor), dtype=np.float64) - low) / (high - low), 0.0, 1.0)
 
 
@@ -120,9 +122,8 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 @checked
 def beam_kappa(width_rad: float) -> float:
     """Concentration of the von Mises-Fisher beam whose power falls to half at ``width_rad / 2`` off its axis."""
-    if not 0 < width_rad < 2 * np.pi:
-        raise ValueError(f"width_rad: got {width_rad}, expected a full width at half maximum in (0, 2 pi)")
-    return float(np.log(2.0) / (1.0 - np.cos(width_rad / 2)))
+    check_number("width_rad", width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
+    return float(np.log(2.0) / (2.0 * np.sin(width_rad / 4) ** 2))
 
 
 @checked
@@ -221,6 +222,7 @@ def evaluate(
             "no errors of prediction; score receivers that were held out (ds.split)",
             stacklevel=2,
         )
+    check_number("beam_width_rad", beam_width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
     floor, range_db = float(test.floor), test.range_db
     names = (
         "psnr_db",
@@ -274,9 +276,11 @@ def evaluate(
 
 
 def _pair(**given: np.ndarray) -> list[np.ndarray]:
-    """Two arrays of one shape, float64."""
+    """Two arrays of one shape with something in them, float64."""
     (name, one), (other, two) = given.items()
     found = check_array(name, one, finite=False)
+    if not found.size:
+        raise ValueError(f"{name}: got shape {found.shape}, expected numbers")
     return [found, check_array(other, two, found.shape, finite=False)]
 
 
@@ -306,8 +310,7 @@ def _fitted_on(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) -> i
 
 
 def _checked_gain(prediction: Spectrum | ArrayLike, shape: tuple[int, ...], index: int) -> np.ndarray:
-    value = getattr(prediction, "path_gain", prediction)
-    gain = np.asarray(value.numpy() if hasattr(value, "numpy") else value, dtype=np.float64)
+    gain = check_array("predict", getattr(prediction, "path_gain", prediction), finite=False)
     if gain.shape != shape:
         raise ValueError(f"predict: got shape {gain.shape} for receiver {index}, expected {shape}")
     if not np.isfinite(gain).all() or gain.min() < 0:

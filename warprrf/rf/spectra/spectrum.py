@@ -52,7 +52,7 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     """
     try:
         rows, columns = (int(n) for n in shape)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"shape: got {shape!r}, expected (rows, columns) such as (90, 180)") from error
     if rows < 2 or columns < 2 or (rows, columns) != tuple(shape):
         raise ValueError(f"shape: got {shape!r}, expected two whole numbers of at least 2, such as (90, 180)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -51,6 +51,7 @@ MOST_RAYS = 500_000_000
 RAY_BYTES = 40  # kept of each ray
 
 
+@runtime_checkable
 class TermChoice(Protocol):
     """What says beforehand which terms a scene needs, such as :class:`warprrf.Relevance`."""
 
