@@ -19,7 +19,7 @@ from benchmarks.report import Report, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress, require
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
+from warprrf.geometry.photos.config import SurfaceConfig
 from warprrf.geometry.photos.fusion import fuse_depth
 from warprrf.geometry.photos.sparse import fit_similarity
 

@@ -33,7 +33,7 @@ from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 2, "surface": 1}
+VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 2, "surface": 2}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 
@@ -157,9 +157,14 @@ def _steps(
         return files.of_gaussians(gaussians)
 
     def surface(attempt: Attempt) -> files.Arrays:
-        everywhere = list(sparse.cameras.values())
         patches = fuse_gaussians(
-            gaussians, everywhere, planes=planes, config=config, progress=attempt.progress, device=device
+            gaussians,
+            list(cameras.values()),
+            photos=PosedPhotos(photos(), list(cameras.values())),
+            planes=planes,
+            config=config,
+            progress=attempt.progress,
+            device=device,
         )
         return files.of_patches(patches)
 
@@ -167,8 +172,7 @@ def _steps(
     first = _kept(steps, "initial", initial, [sparse, list(fitted), list(fitted.values()), *settings])
     planes = files.to_planes(first)
     gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
-    photos.cache_clear()
-    inputs = [steps.key("refined"), config.surface, config.completion]
+    inputs = [steps.key("refined"), config.stereo, config.surface, config.completion]
     return gaussians, files.to_patches(_kept(steps, "surface", surface, inputs))
 
 
