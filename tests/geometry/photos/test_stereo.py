@@ -68,7 +68,10 @@ def patterned(room):
     """Pixels that show the pattern, a window's width from the plain wall and from the border."""
     cameras, true, _ = room
     shown = np.array(
-        [(c.position + t[..., None] * c.directions())[..., 0] < PLAIN_X - 0.3 for c, t in zip(cameras, true, strict=True)]
+        [
+            (c.position + t[..., None] * c.directions())[..., 0] < PLAIN_X - 0.3
+            for c, t in zip(cameras, true, strict=True)
+        ]
     )
     shown[:, :8] = shown[:, -8:] = False
     shown[:, :, :8] = shown[:, :, -8:] = False

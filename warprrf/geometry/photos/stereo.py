@@ -46,7 +46,7 @@ class _Map:
         """Euclidean ranges [m], 0 where nothing is proved."""
         return np.where(self.proved, 1 / (self.planes[..., 0] * ahead(self.camera)), 0.0)
 
-    def at(self, view: Camera) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    def at(self, view: Camera) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
         """Which pixels of the map the pixels of ``view``, the same photo in another size, fall into, and their ranges."""
         x = (np.arange(view.width) + 0.5) * self.camera.width / view.width
         y = (np.arange(view.height) + 0.5) * self.camera.height / view.height

@@ -1,0 +1,103 @@
+"""The film's reference and its score, on frames of a box drawn in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import views
+from PIL import Image
+
+from benchmarks.filmed import FAR_M, Film, score, score_cameras
+from warprrf.geometry.mesh import Mesh
+
+pytest.importorskip("open3d")
+LOW, HIGH = np.array([-1.2, -1.0, 0.0]), np.array([1.2, 1.0, 2.4])
+TILT = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the files' world has y down, as such sets do
+
+
+def box() -> Mesh:
+    corner = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]]
+    return Mesh(LOW + corner * (HIGH - LOW), [*faces, [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    angles = np.arange(24) * np.pi / 12
+    return [
+        views.look(
+            [0.4 * np.cos(a), 0.3 * np.sin(a), 1.2], [2 * np.cos(a), 2 * np.sin(a), 0.3 if k % 2 else 1.6],
+            width=96, height=72, f=60.0,
+        )
+        for k, a in enumerate(angles)
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def film(cameras, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("film")
+    camera = cameras[0]
+    np.savetxt(
+        folder / "camera-intrinsics.txt", [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    )
+    for k, c in enumerate(cameras):
+        pose = np.linalg.inv(c.world_to_camera)
+        pose[:3] = TILT.T @ pose[:3]
+        np.savetxt(folder / f"frame-{k:06d}.pose.txt", pose, fmt="%.7e")
+        d = c.directions()
+        with np.errstate(divide="ignore"):
+            t = np.where(d > 0, (HIGH - c.position) / d, (LOW - c.position) / d).min(axis=-1)
+        z = np.round(1e3 * t * (d @ c.rotation[2])).astype(np.uint16)
+        z[:2] = 65535
+        Image.fromarray(z).save(folder / f"frame-{k:06d}.depth.png")
+        Image.new("RGB", (c.width, c.height)).save(folder / f"frame-{k:06d}.color.jpg")
+    return Film.open(str(folder))
+
+
+@pytest.fixture(scope="module")
+def reference(film):
+    return film.levelled(film.surface(1, lambda stage, done, total: None))
+
+
+def test_the_reference_is_the_room_and_level(reference):
+    _, mesh = reference
+    size = np.sort(np.ptp(mesh.vertices, axis=0))
+    np.testing.assert_allclose(size[2], HIGH[0] - LOW[0], atol=0.03)
+    level = np.abs(mesh.face_normals[:, 2]) > 0.99
+    assert mesh.areas[level].sum() > 0.2 * mesh.areas.sum()
+
+
+def test_unknown_depths_are_no_rays(film):
+    depth, _ = film.depth(0)
+    assert (depth[:2] == 0).all() and (depth[2:] > 0).all() and depth.max() < 1.5 * FAR_M
+
+
+def test_the_true_cameras_and_mesh_score_zero_in_any_frame(film, reference, cameras):
+    levelled, surface = reference
+    figures, (scale, rotation, shift) = score_cameras(cameras, levelled.poses)
+    assert figures["camera_rms_m"] < 1e-5 and figures["camera_rotation_median_deg"] < 1e-3
+    assert scale == pytest.approx(1, abs=1e-6)
+    mesh = Mesh(scale * box().vertices @ rotation.T + shift, box().faces)
+    found = score(mesh, surface, levelled.rays(3))
+    assert found["covered"] == 1
+    for name in ("distance", "range", "back"):
+        assert found[f"{name}_median_m"] < 0.01 and found[f"{name}_within_5_cm"] > 0.97
+
+
+def test_a_mesh_that_is_off_scores_how_far(film, reference):
+    levelled, surface = reference
+    origins, directions, ranges = levelled.rays(3)
+    near = score(
+        Mesh(surface.vertices * 1.0 + [0, 0, 0.1], surface.faces), surface, (origins, directions, ranges)
+    )
+    assert 0.01 < near["range_median_m"] <= 0.15
+    assert near["back_p90_m"] == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_folder_without_frames_is_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="frames: .* holds 0 frames"):
+        Film.open(str(tmp_path))
+    with pytest.raises(ValueError, match="frames: None holds 0 frames"):
+        Film.open(None)
