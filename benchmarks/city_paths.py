@@ -1,9 +1,9 @@
-"""Paths of Sionna RT's own scenes beside its PathSolver's: found or not, right or not, and how fast.
+"""Paths of Sionna RT's own scenes beside its PathSolver's: found or not, right or not, and how fast; and what verbs take.
 
 Each scene is opened twice, by Sionna RT and by :meth:`Scene.load`, at the frequency that Sionna RT gives it. Sionna RT
 shoots rays to find which surfaces may mirror one after the other, then takes images; it may miss small facets. So every
 path of its must be among ours, of the same length and gain. Its float32 ends early where two mirror points lie
-centimetres apart and hundreds of metres from the origin: where gains differ by more than 0.05 dB it solves the scene
+less than a metre apart and hundreds of metres from the origin: where gains differ by more than 0.05 dB it solves the scene
 again with the origin at the mirror points. What only we have must pass a test of its own: each
 mirror point lies on the mesh, the law of reflection holds there, and nothing stands in the way of a leg (both by
 Open3D, not by the method itself).
@@ -11,12 +11,14 @@ Open3D, not by the method itself).
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from benchmarks.city_verbs import VERBS, measure
 from benchmarks.machine import machine
 from benchmarks.report import Report, table
 from benchmarks.runner import Benchmark, Job, option
@@ -32,6 +34,7 @@ POINT_M = 0.05
 GAIN_DB = 0.05
 ABOVE_GROUND_M = 1.5
 MOST_RECEIVERS = 100  # in streets
+PLACES = 3000  # at which roofs are looked for
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,25 @@ class Links:
         return np.column_stack([drawn[street], top - hit.t[street] + ABOVE_GROUND_M])
 
 
+def roofs(scene: Scene, links: Links) -> dict[str, int]:
+    """Of :data:`PLACES` places over the ground how many have a roof above, and how many of those, and of those under the
+    sky, the library takes for places in a building."""
+    drawn = np.random.default_rng(1).uniform(-links.around_m, links.around_m, (PLACES, 2))
+    drawn = np.clip(drawn + links.transmitter[:2], scene.bounds[0, :2], scene.bounds[1, :2])
+    top, down = scene.bounds[1, 2] + 1.0, np.tile([0.0, 0.0, -1.0], (PLACES, 1))
+    ground = Mesh(scene.mesh.vertices, scene.mesh.faces[scene.object_faces(links.ground)])
+    depth = ground.cast(np.column_stack([drawn, np.full(PLACES, top)]), down).t
+    places = np.column_stack([drawn, top - depth + ABOVE_GROUND_M])[np.isfinite(depth)]
+    roofed = scene.mesh.cast(places, -down[: len(places)]).face >= 0
+    refused = ~scene.is_free(places)
+    return {
+        "roofed": int(roofed.sum()),
+        "roofed_refused": int(refused[roofed].sum()),
+        "open": int((~roofed).sum()),
+        "open_refused": int(refused[~roofed].sum()),
+    }
+
+
 BOX = (0.5, -0.8, 1.9), ((2.1, 1.3, 3.3), (-1.7, 2.2, 4.1))
 LINKS = {
     links.scene: links
@@ -92,6 +114,13 @@ LINKS = {
         Links("san_francisco", (0.0, 0.0, 45.0), ground="Terrain"),
     )
 }
+
+
+def scene_path(name: str) -> str:
+    """File of one of Sionna RT's scenes."""
+    from warprrf.rf.sionna_package import sionna_rt
+
+    return str(getattr(sionna_rt().scene, name))
 
 
 def solve(scene: Any, transmitter: np.ndarray, receivers: np.ndarray, order: int) -> tuple[Paths, float]:
@@ -217,7 +246,7 @@ def compare(links: Links, order: int = 2) -> dict[str, Any]:
     from warprrf.rf.sionna_package import sionna_rt
 
     rt = sionna_rt()
-    path = getattr(rt.scene, links.scene)
+    path = scene_path(links.scene)
     begin = time.perf_counter()
     scene = Scene.load(path)
     load_s = time.perf_counter() - begin
@@ -260,6 +289,7 @@ def compare(links: Links, order: int = 2) -> dict[str, Any]:
         "gain_error_db": found["gain_error_db"],
         "gain_apart": len(again),
         "gain_apart_near_origin_db": max(again, default=0.0),
+        "roofs": roofs(scene, links) if links.ground else None,
         "only_ours": len(found["extra"]),
         "only_ours_wrong": wrong,
         "load_s": load_s,
@@ -278,10 +308,14 @@ class Options:
     Attributes:
         scenes: Sionna RT's built-in scenes.
         order: Most reflections on a path.
+        verbs: Scenes in which every verb is measured.
     """
 
     scenes: tuple[str, ...] = option(tuple(LINKS), "built-in scenes of Sionna RT", choices=tuple(LINKS))
     order: int = option(2, "most reflections on a path")
+    verbs: tuple[str, ...] = option(
+        tuple(VERBS), "cities in which every verb is measured", choices=tuple(VERBS)
+    )
 
 
 def run(options: Options, job: Job) -> Report:
@@ -291,6 +325,12 @@ def run(options: Options, job: Job) -> Report:
         job.progress("scenes", k, len(options.scenes))
         rows.append(compare(LINKS[name], options.order))
     job.progress("scenes", len(rows), len(rows))
+    verbs = []
+    for k, name in enumerate(options.verbs):
+        job.progress("verbs", k, len(options.verbs))
+        path, links = scene_path(name), LINKS[name]
+        verbs += measure(name, path, np.array(links.transmitter), links.places(Scene.load(path)))
+    job.progress("verbs", len(options.verbs), len(options.verbs))
     shown = (
         "scene", "faces", "receivers", "paths_of_sionna", "found", "delay_error_s", "gain_error_db", "gain_apart",
         "gain_apart_near_origin_db", "only_ours",
@@ -300,19 +340,37 @@ def run(options: Options, job: Job) -> Report:
     cells = [[f"{row[n]:.2g}" if isinstance(row[n], float) else str(row[n]) for n in shown] for row in rows]
     return Report(
         "city_paths",
-        {"machine": machine(job.device), "scenes": rows},
-        table([n.replace("_", " ") for n in shown], cells),
+        {"machine": machine(job.device), "load_average": os.getloadavg()[0], "scenes": rows, "verbs": verbs},
+        "\n\n".join([table([n.replace("_", " ") for n in shown], cells), verbs_table(verbs)]),
+    )
+
+
+def verbs_table(verbs: list[dict[str, Any]]) -> str:
+    """What verbs take, for the report."""
+    head = ("scene", "verb", "wall [s]", "again [s]", "core [s]", "peak [GB]")
+    return table(
+        head,
+        [
+            [
+                v["scene"],
+                v["verb"],
+                f"{v['wall_s']:.2g}",
+                "" if v["again_wall_s"] is None else f"{v['again_wall_s']:.2g}",
+            ]
+            + [f"{v['core_s']:.2g}", f"{v['peak_bytes'] / 1e9:.2f}"]
+            for v in verbs
+        ],
     )
 
 
 HELP = """\
 Line of sight and mirror paths to two reflections of Sionna RT's own scenes, opened by Scene.load, beside its
 PathSolver's: how many are found, errors of delay and gain, and how many that only we have fail a geometric test. Needs
-the extra sionna.
+the extra sionna. Then what every verb of the library takes in Munich and in San Francisco: time and memory.
 
 examples:
   python -m benchmarks city-paths
-  python -m benchmarks city-paths --scenes box simple_street_canyon
+  python -m benchmarks city-paths --scenes box simple_street_canyon --verbs munich
 """
 
 BENCHMARKS = {"city-paths": Benchmark("city-paths", Options, run, HELP)}

@@ -95,6 +95,15 @@ def test_a_header_of_another_kind_is_refused(header: str, tmp_path: Path) -> Non
         wr.RadioField.load(path)
 
 
+def test_a_field_has_all_its_layers(tmp_path: Path) -> None:
+    path = harmonic_field(tmp_path, "rf3dgs")
+    tensors, header = tensor_files.read(path)
+    del tensors["layer/aod_y"]
+    tensor_files.write(path, tensors, header)
+    with pytest.raises(ValueError, match=r"rf3dgs\.safetensors: .*layers: got no aod_y"):
+        wr.RadioField.load(path)
+
+
 def test_nan_in_a_report_is_unknown(tmp_path: Path) -> None:
     path = bistatic_field(tmp_path)
     _, header = tensor_files.read(path)

@@ -45,7 +45,7 @@ PUBLIC = {
     "Gaussians": ("save_ply", "load_ply"),
     "Mesh": ("cast", "visible"),
     "RadioField": ("fit", "save", "load", "spectrum", "paths"),
-    "Reconstruction": ("from_files", "save", "load"),
+    "Reconstruction": ("from_files", "save", "load", "report"),
     "Scene": ("load",),
     "SpectrumDataset": ("load", "save", "split", "export_exr"),
     "Relevance": ("table", "save", "load", "options"),

@@ -207,6 +207,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Reconstruction": lambda p: {"gaussians": p.gaussians, "mesh": p.mesh, "cameras": {"0.png": p.camera}},
     "Reconstruction.from_files": lambda p: {"ply": p.folder / "splats.ply", "mesh": p.mesh, "device": "cpu"},
     "Reconstruction.load": lambda p: {"folder": p.folder / "reconstruction"},
+    "Reconstruction.report": _on(lambda p: p.reconstruction, path="report.html", device="cpu"),
     "Reconstruction.save": _on(lambda p: p.reconstruction, folder="saved"),
     "Scene": lambda p: {
         "mesh": p.mesh, "materials": p.scene.materials, "face_material": p.scene.face_material,

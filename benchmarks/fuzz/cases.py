@@ -81,7 +81,7 @@ class Trial:
             ]
             return _refused(answer, [*given, *paths])
         values = {value for _, value in case.edits}
-        unknown = case.target in calls.SPREADS and not np.any(changed["power"])
+        unknown = case.target in calls.SPREADS and not np.asarray(changed["power"]).any()
         bad = "" if unknown or values & NOT_FINITE else judge.wrong(answer, usual or {})
         if not bad and values <= SAME.keys() and usual:
             bad = judge.differs(answer, usual, 1e-6)

@@ -128,6 +128,8 @@ def _work(
                 case = pipe.recv()
             except EOFError:
                 return
+            out.truncate(0)  # what earlier cases wrote says nothing of this one
+            out.seek(0)
             faulthandler.dump_traceback_later(0.9 * limit_s, file=out)
             answer = attempt(case)
             faulthandler.cancel_dump_traceback_later()

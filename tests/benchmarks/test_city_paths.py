@@ -37,6 +37,9 @@ def test_every_path_of_path_solver_is_found_and_others_obey_geometry(name, scene
     assert row["lost"] == [] and row["found"] == row["paths_of_sionna"]
     assert row["delay_error_s"] < row["delay_tolerance_s"] and row["gain_error_db"] < 0.05
     assert row["only_ours_wrong"] == 0
+    if row["roofs"]:
+        assert row["roofs"]["roofed_refused"] == row["roofs"]["roofed"] > 500
+        assert row["roofs"]["open_refused"] == 0 and row["roofs"]["open"] > 500
 
 
 def test_all_scenes_of_sionna_open(scenes):

@@ -44,6 +44,8 @@ def test_a_minute_of_fuzzing_finds_nothing(place):
 
 
 FOUND = [
+    ("Mesh.look_around", ("directions", "as bool"), ("points", "no rows")),
+    ("Paths.taps", ("center_hz", "huge")),
     ("Paths.select", ("chosen", "2^63")),
     ("RadioField.fit", ("relevance", "text")),
     ("RadioField.links", ("shape", "with inf")),
@@ -52,10 +54,14 @@ FOUND = [
     ("SpectrumDataset.deembed", ("pattern", "class")),
     ("SpectrumDataset.deembed", ("pattern", "ragged")),
     ("SpectrumDataset.from_spectra", ("path_gain", "negated"), ("aod", "with 1e20")),
+    ("SpectrumDataset.from_spectra", ("role", "ragged")),
     ("channel.Codebook", ("factors", "as objects")),
+    ("channel.angular_spread", ("power", "torch")),
     ("channel.coherence_bandwidth", ("power", "zeros")),
     ("channel.delay_spread", ("power", "as int8")),
     ("em.Band.conductivity", ("frequency_hz", "minus one")),
+    ("em.lobe", ("cos_incidence", "complex")),
+    ("em.lobe", ("cos_to_mirror", "with huge"), ("alpha_r", "2^31")),
     ("em.slab_reflection", ("thickness_m", "nested"), ("cos_incidence", "zero")),
     ("em.slab_reflection", ("wavelength_m", "tiny")),
     ("em.slab_transmission", ("thickness_m", "zero"), ("cos_incidence", "zero")),

@@ -5,6 +5,7 @@ import pytest
 from radio_scenes import box_mesh, joined
 
 import warprrf.rf.simulate as module
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Band, Material
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import sample_receivers, simulate
@@ -131,3 +132,12 @@ def test_receivers_are_drawn_from_the_air():
     assert west.mean() == pytest.approx(free, abs=0.07)
     with pytest.raises(ValueError, match="clearance"):
         sample_receivers(s, 5, seed=0, clearance=3.0)
+    with pytest.raises(ValueError, match="n: got"):
+        sample_receivers(s, 2**31 - 1, seed=0)
+
+
+def test_places_too_near_a_surface_are_ruled_out_before_solids(monkeypatch):
+    room = scene(solid_walls=True)
+    places = sample_receivers(room, 3, seed=0)
+    monkeypatch.delattr(Mesh, "winding_number")  # by far the slowest of the tests
+    assert not room.is_free(places, clearance_m=1e3).any()

@@ -597,7 +597,50 @@ def _city_paths() -> str:
             [r["scene"], str(r["faces"]), str(r["receivers"]), f"{r['found']} of {r['paths_of_sionna']}"]
             + [f"{r['delay_error_s']:.0e}", gain, str(r["only_ours"]), *(f"{t:.2g}" for t in times)]
         )
-    return markdown(head, lines)
+    apart = [
+        f"`{r['scene']}`: {r['gain_apart']} of {r['found']} gains differ by more than 0.05 dB, by {r['gain_error_db']:.3f} dB "
+        f"at most. It is PathSolver's single precision: solved near the origin they differ by "
+        f"{r['gain_apart_near_origin_db']:.4f} dB."
+        for r in found["scenes"]
+        if r["gain_apart"]
+    ]
+    return "\n\n".join(
+        [markdown(head, lines), *apart, *_roofs([r["roofs"] for r in found["scenes"] if r.get("roofs")])]
+    )
+
+
+def _roofs(cities: list[dict[str, int]]) -> list[str]:
+    """What share of places the library takes for places in a building; nothing without cities."""
+    if not cities:
+        return []
+    roofed, indoors, under_sky, wrong = (
+        sum(city[key] for city in cities) for key in ("roofed", "roofed_refused", "open", "open_refused")
+    )
+    return [
+        f"Of {roofed} places below a roof in {len(cities)} scenes with streets {100 * indoors / roofed:.1f} % are taken for "
+        f"places in a building (others are passages), of {under_sky} under the sky {100 * wrong / under_sky:.2f} %."
+    ]
+
+
+@entry("city-verbs")
+def _city_verbs() -> str:
+    found = measured("city_paths")
+    if found is None or "verbs" not in found:
+        return missing("python -m benchmarks city-paths")
+    lines = [
+        [
+            r["scene"],
+            f"{r['verb']}",
+            f"{r['wall_s']:.2g}",
+            show(r["again_wall_s"], "{:.2g}"),
+            f"{r['core_s']:.2g}",
+        ]
+        + [f"{r['peak_bytes'] / 1e9:.2f}"]
+        for r in found["verbs"]
+    ]
+    head = ("scene", "call", "first [s]", "again [s]", "core [s]", "peak memory [GB]")
+    busy = f"Load average of the machine when it ended: {found['load_average']:.1f} on {found['machine']['cores']} cores."
+    return "\n\n".join([markdown(head, lines), busy])
 
 
 @entry("map")

@@ -51,8 +51,9 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
     """Photos -> cameras, Gaussians, mesh and planar patches.
 
     The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
-    their depth is fused into a mesh. Photos know no scale: name the measured positions of at least three cameras, or the
-    distance between two. Without positions z is up by vertical edges and the floor is at 0.
+    their depth is fused into a mesh. OUT/report.html shows what came out and how far it can be trusted.
+    Photos know no scale: name the measured positions of at least three cameras, or the distance between two. Without
+    positions z is up by vertical edges and the floor is at 0.
 
     examples:
       warprrf reconstruct photos/ -o room --known-positions surveyed.json
@@ -74,9 +75,11 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
         device=args.device,
     )
     reconstruction.save(args.out)
+    report = Path(args.out) / "report.html"
+    reconstruction.report(report, progress=bars, device=args.device)
     print(
         f"{args.out}: {len(reconstruction.cameras)} cameras, {len(reconstruction.gaussians.means)} Gaussians, "
-        f"{len(reconstruction.mesh.faces)} triangles"
+        f"{len(reconstruction.mesh.faces)} triangles; see {report}"
     )
 
 

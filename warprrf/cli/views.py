@@ -101,6 +101,9 @@ def add_map(add: Add) -> None:
     plan.add_argument("field", help="field file (.safetensors)")
     add_out(plan, "NetCDF file (.nc), or the picture alone (.png)")
     plan.add_argument("--height", type=float, default=1.5, metavar="M", help="of receivers (default 1.5)")
+    plan.add_argument(
+        "--above-ground", action="store_true", help="heights count from the ground, not from z = 0"
+    )
     plan.add_argument("--cell", type=float, default=0.25, metavar="M", help="width of a cell (default 0.25)")
     add_point(plan, "--transmitter", "if another than the fitted one")
     plan.add_argument(
@@ -138,6 +141,7 @@ def _map(args: argparse.Namespace, bars: Bars) -> None:
         args.cell,
         transmitter=args.transmitter,
         bounds=args.bounds,
+        above_ground=args.above_ground,
         beam_sigma_rad=np.deg2rad(args.beam_sigma_deg),
         transmit_power_dbm=args.power_dbm,
         bandwidth_hz=args.bandwidth,

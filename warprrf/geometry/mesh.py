@@ -358,7 +358,7 @@ class Mesh:
         start, toward = (wp.array(x, dtype=wp.vec3d, device=where) for x in (p - self.center, d))
         inputs = [bvh.id, corners, start, toward, winding, side]
         _device.launch(look_around, len(p) * len(d), inputs, device=where)
-        return winding.numpy().reshape(len(p), -1), side.numpy().reshape(len(p), -1)
+        return winding.numpy().reshape(len(p), len(d)), side.numpy().reshape(len(p), len(d))
 
     @cached_property
     def _boxed(self) -> Cache:

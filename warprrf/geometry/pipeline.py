@@ -23,7 +23,14 @@ from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.initialise import initialise
-from warprrf.geometry.photos.photo_files import Photos, find_photos, match_names, read_photo
+from warprrf.geometry.photos.photo_files import (
+    Photos,
+    find_photos,
+    mask_beside,
+    match_names,
+    read_mask,
+    read_photo,
+)
 from warprrf.geometry.photos.refine import refine
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale, check_scale, scaled
 from warprrf.geometry.photos.targets import PosedPhotos
@@ -54,7 +61,8 @@ def reconstruct(
     """Geometry of a static place from photos of it.
 
     Args:
-        photos: a folder, or a sequence of image files: one size, one undistorted camera.
+        photos: a folder, or a sequence of image files, of any cameras and sizes. Lenses are estimated; EXIF's focal
+            length and orientation are used; where ``NAME.mask.png`` beside a photo ``NAME.jpg`` is black, it is ignored.
         workspace: folder of unfinished and finished steps; a stopped run continues from it.
         known_positions: photo name to surveyed camera position (3,) [m], three or more that are not on a line. Without
             them vertical edges, planes and the floor set z and its origin.
@@ -93,6 +101,8 @@ def reconstruct(
         photos,
         workspace=workspace,
         max_features=config.max_features,
+        lens=config.lens,
+        max_pixels=config.max_pixels,
         pairs=config.pairs,
         seed=seed,
         progress=progress,
@@ -101,8 +111,8 @@ def reconstruct(
         sparse = align_to_known(sparse, known_positions)
     else:
         sparse = assume_scale(sparse) if scale is None else scaled(sparse, scale)
-        sparse = upright(sparse, lambda name: read_photo(named[name]), seed=seed)
-    fitted = {name: named[name] for name in sparse.cameras if name not in skipped}
+        sparse = upright(sparse, lambda name: read_photo(sparse.photos[name]), seed=seed)
+    fitted = {name: photo for name, photo in sparse.photos.items() if name not in skipped}
     if not fitted:
         raise ValueError(
             f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to"
@@ -119,6 +129,9 @@ def reconstruct(
         unposed=sparse.unposed,
         held_out=sorted(skipped),
         guessed=sparse.guessed,
+        lenses=sparse.lenses,
+        causes=sparse.causes,
+        photos=sparse.photos,
     )
 
 
@@ -137,6 +150,7 @@ def _steps(
     """
     cameras = {name: sparse.cameras[name] for name in fitted}
     photos = cache(lambda: [read_photo(photo) for photo in fitted.values()])
+    masks = [mask_beside(photo) for photo in fitted.values()]
 
     def initial(attempt: Attempt) -> files.Arrays:
         planes, gaussians = initialise(
@@ -147,7 +161,7 @@ def _steps(
     def refined(attempt: Attempt) -> files.Arrays:
         gaussians = refine(
             files.to_gaussians(first),
-            PosedPhotos(photos(), list(cameras.values())),
+            PosedPhotos(photos(), list(cameras.values()), [read_mask(photo) for photo in fitted.values()]),
             config=config.refine,
             planes=planes,
             progress=attempt.progress,
@@ -169,7 +183,7 @@ def _steps(
         return files.of_patches(patches)
 
     settings = [config.max_reprojection_error, config.planes, config.sweep, config.gaussians, seed]
-    first = _kept(steps, "initial", initial, [sparse, list(fitted), list(fitted.values()), *settings])
+    first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
     planes = files.to_planes(first)
     gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
     inputs = [steps.key("refined"), config.stereo, config.surface, config.completion]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
+from warprrf.geometry.photos.report import Subject, write_report
 from warprrf.geometry.photos.sfm import read_colmap
+from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -36,8 +39,12 @@ class Reconstruction:
         scale_rms_m: rms distance left between surveyed and reconstructed camera positions [m]; NaN without survey.
         metric: whether lengths are metres (else they are an assumed scale).
         unposed: names of photos without a pose.
+        causes: why each of them has none, by name, where that is known.
+        photos: image files of the cameras, by name, as the Gaussians were fitted to them.
         held_out: names of photos that the Gaussians were not fitted to.
         guessed: what nobody measured and the photos do not show, a sentence each.
+        lenses: photo name to the :class:`~warprrf.geometry.photos.undistort.Lens` that took it; ``cameras`` are those of the
+            photos undistorted, turned upright and reduced.
     """
 
     def __init__(
@@ -52,6 +59,9 @@ class Reconstruction:
         unposed: Sequence[str] = (),
         held_out: Sequence[str] = (),
         guessed: Sequence[str] = (),
+        lenses: Mapping[str, Lens] | None = None,
+        causes: Mapping[str, str] | None = None,
+        photos: Mapping[str, Path] | None = None,
     ) -> None:
         if gaussians is None and mesh is None:
             raise ValueError("gaussians, mesh: got neither, expected Gaussians, a mesh or both")
@@ -64,6 +74,9 @@ class Reconstruction:
         self.unposed = tuple(unposed)
         self.held_out = tuple(held_out)
         self.guessed = tuple(guessed)
+        self.lenses = dict(lenses or {})
+        self.causes = dict(causes or {})
+        self.photos = {name: Path(file) for name, file in (photos or {}).items()}
 
     def __repr__(self) -> str:
         faces = f"{len(self._mesh.faces)} triangles" if self._mesh is not None else "no mesh"
@@ -121,7 +134,9 @@ class Reconstruction:
             },
             "scale_rms_m": None if np.isnan(self.scale_rms_m) else self.scale_rms_m,
             "metric": self.metric, "unposed": self.unposed, "held_out": self.held_out,
-            "guessed": self.guessed,
+            "guessed": self.guessed, "causes": self.causes,
+            "photos": {name: str(file) for name, file in self.photos.items()},
+            "lenses": [{**asdict(lens), "photos": names} for lens, names in lenses_in_use(self.lenses).items()],
             "labels": () if self._mesh is None else self._mesh.labels,
         }  # fmt: skip
         arrays = {} if self._gaussians is None else files.of_gaussians(self._gaussians)
@@ -130,6 +145,46 @@ class Reconstruction:
         elif self._mesh is not None:
             arrays |= files.of_mesh(self._mesh)
         files.write(Path(folder) / FILE, arrays, header)
+
+    def report(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        progress: Progress | None = None,
+        device: DeviceLike = None,
+    ) -> None:
+        """Write what went in, what came out and how far it can be trusted as one HTML page, pictures included.
+
+        Cameras from above, held-out photos beside their renderings, the mesh from four sides and coloured by how often
+        each surface was seen, lenses, photos without a pose, and what was guessed::
+
+            rec.report("room.html")
+
+        Args:
+            path: file to write.
+            progress: called as ``progress("report", done, total)``.
+            device: Warp device.
+
+        Raises:
+            OSError: if ``path`` cannot be written.
+            ImportError: if Pillow is not installed.
+        """
+        write_report(
+            path,
+            Subject(
+                self._gaussians,
+                self._mesh,
+                self.cameras,
+                photos=self.photos,
+                held_out=self.held_out,
+                unposed={name: self.causes.get(name, "") for name in self.unposed},
+                guessed=self.guessed,
+                metric=self.metric,
+                scale_rms_m=self.scale_rms_m,
+            ),
+            progress=progress,
+            device=device,
+        )
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Reconstruction:
@@ -159,8 +214,10 @@ class Reconstruction:
             rms = header["scale_rms_m"]
             check_type("metric", header["metric"], bool)
             guessed = header.get("guessed", ())
-            for name in (*header["unposed"], *header["held_out"], *guessed):
-                check_type("unposed, held_out, guessed", name, str)
+            causes, photos = header.get("causes", {}), header.get("photos", {})
+            words = (*causes.values(), *photos.values())
+            for name in (*header["unposed"], *header["held_out"], *guessed, *words):
+                check_type("unposed, held_out, guessed, causes, photos", name, str)
             return cls(
                 splats,
                 mesh,
@@ -171,6 +228,9 @@ class Reconstruction:
                 unposed=header["unposed"],
                 held_out=header["held_out"],
                 guessed=guessed,
+                lenses=_lenses(header.get("lenses", ())),
+                causes=causes,
+                photos=photos,
             )
 
     @classmethod
@@ -212,6 +272,16 @@ class Reconstruction:
             )
             mesh = patches.mesh
         return cls(gaussians, mesh, cameras, patches=patches)
+
+
+def _lenses(stored: Sequence[Mapping[str, Any]]) -> dict[str, Lens]:
+    """Lenses by photo, from a list of lenses with their photos."""
+    found: dict[str, Lens] = {}
+    for entry in stored:
+        values = dict(entry)
+        names = values.pop("photos")
+        found |= dict.fromkeys(names, Lens(**values))
+    return dict(sorted(found.items()))
 
 
 def _camera(stored: Mapping[str, Any]) -> Camera:

@@ -6,6 +6,7 @@ other is in the same air. Else rays in many directions are counted: of a closed 
 open one a place is taken for solid only if nearly all rays from it cross one surface more or fewer than those from the
 air, and most of them meet a surface from behind where those from the air meet one from the front (or the other way
 round): places behind a partition or under a table top do not, nor do those in rooms whose mesh has holes.
+Under the open sky buildings are told apart besides (:mod:`warprrf.rf.open_air`): they often have no floors.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.open_air import is_open_air, sees_sky, under_a_roof, warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
 WALL_CLEARANCE_M = 1e-4
@@ -93,20 +95,16 @@ def check_positions(
     reference = transmitter if known is None else known
     low, high = mesh.bounds
     outside = ((points < low) | (points > high)).any(axis=1)
-    if outside.any() and not mesh.is_closed:
+    if outside.any():
         within = np.concatenate([reference[None], points])
         within = within[((within >= low) & (within <= high)).all(axis=1)]
-        outside &= len(within) > 0 and _are_enclosed(mesh, within[:_DIRECTIONS], device)
+        outside &= _is_room(mesh, within[:_DIRECTIONS], device)
     _refuse(outside, "outside the scene", points, labels, mesh)
     if not on_surfaces:
         near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
         _refuse(near, "on a surface", points, labels, mesh)
     inside = in_another_solid(mesh, points, reference, device=device)
-    if (
-        known is None
-        and inside[1:].sum() > 0.5 * (len(points) - 1)
-        and _sees_backs(mesh, transmitter, device)
-    ):
+    if known is None and inside[1:].sum() > 0.5 * (len(points) - 1) and _is_within(mesh, transmitter, device):
         inside = np.arange(len(points)) == 0
     _refuse(inside, "inside a solid", points, labels, mesh)
 
@@ -116,7 +114,7 @@ def check_dataset(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Receivers (R, 3) and transmitter (3,) of ``ds`` [m], if a field of this mesh can be fitted to what they measured.
 
-    Raises, warns: as :func:`check_positions` and :func:`question_unit`.
+    Raises, warns: as :func:`check_positions` and :func:`question_unit`; and of what fields do not model.
     """
     receivers = check_array("ds.receivers", ds.receivers, (None, 3))
     transmitter, wavelength_m = (
@@ -128,6 +126,7 @@ def check_dataset(
     check_positions(
         mesh, transmitter, receivers, wavelength_m, names=("ds.transmitter", "ds.receivers"), device=device
     )
+    warn_of_unmodelled(mesh, transmitter, receivers, frequency_hz=ds.frequency_hz, device=device)
     return receivers, transmitter
 
 
@@ -157,6 +156,10 @@ def in_another_solid(
                 abs(front_of_known) > -_BEHIND
             )
         found[some] = parted
+    if not mesh.is_closed and sees_sky(mesh, known, points, device=device):
+        own = np.concatenate([known[None], points[blocked]])
+        indoors = under_a_roof(mesh, own, device=device)
+        found[blocked] |= indoors[1:] != indoors[0]
     return found
 
 
@@ -213,13 +216,24 @@ def _refuse(bad: np.ndarray, what: str, points: np.ndarray, labels: list[str], m
         )
 
 
-def _are_enclosed(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> bool:
-    """Whether nearly all ways from each of ``points`` (N, 3) end on a surface: no sky, no open side."""
+def _is_room(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> bool:
+    """Whether nearly all ways from each of ``points`` (N, 3) within its bounds end on a surface: no sky, no open side."""
+    if len(points) == 0:
+        return mesh.is_closed
+    if sees_sky(mesh, points, device=device) or is_open_air(mesh, device=device):
+        return False
+    if mesh.is_closed:
+        return True
     side = mesh.look_around(points, _fan(), device=device)[1]
     return bool(((side != 0).mean(axis=1) >= 0.95).all())
 
 
-def _sees_backs(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
+def _is_within(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
+    """Whether it looks as if a place (3,) were in a solid, itself: in a building, or amid surfaces seen from behind."""
+    if sees_sky(mesh, point, device=device):
+        return False
+    if is_open_air(mesh, device=device):
+        return bool(under_a_roof(mesh, point[None], device=device)[0])
     return bool(_mean_side(mesh.look_around(point[None], _fan(), device=device)[1])[0] < 0)
 
 

@@ -18,6 +18,7 @@ from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
+from warprrf.rf.open_air import ground_height, warn_of_unmodelled
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -81,6 +82,9 @@ def simulate(
             near field of the transmitter; on a frequency outside a material's band, or P.676's with ``gas``; on an
             unknown engine.
         ImportError: if ``engine="sionna"`` and Sionna RT is missing.
+
+    Warns:
+        UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
     """
     if not hasattr(scene, "materials"):
         raise TypeError(f"scene: got {type(scene).__name__}, expected a Scene (a mesh and its materials)")
@@ -95,6 +99,8 @@ def simulate(
     mesh, wavelength_m = as_mesh(scene, "scene"), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
     check_positions(mesh, source, points, wavelength_m, device=device)
+    through = engine == "sionna" and refraction
+    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, transmission=through, device=device)
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
     common |= {"shape": check_shape(shape), "beam_sigma_rad": beam_sigma_rad}
@@ -148,28 +154,30 @@ def sample_receivers(
     *,
     z: ArrayLike = (0.8, 2.2),
     clearance: float = 0.3,
+    above_ground: bool = False,
     seed: int,
     device: DeviceLike = None,
 ) -> np.ndarray:
     """``n`` places drawn uniformly from the scene's air, shape ``(n, 3)`` [m]; a longer draw starts with a shorter one.
 
     Args:
-        scene: Scene of closed solids or one closed room.
+        scene: Scene of closed solids, one closed room, or a city under the sky.
         z: Lowest and highest place [m].
         clearance: Least distance to any surface [m].
+        above_ground: Whether ``z`` counts from the ground, the lowest surface below each place, instead of 0.
         seed: Seed of the draw.
 
     Raises:
         ValueError: if there is no such place, or the range is empty.
     """
-    check_count("n", n)
+    check_count("n", n, most=_TRIES * _BATCH)
     check_number("clearance", clearance, 0.0)
     z = check_array("z", z, (2,))
     if z[0] > z[1]:
         raise ValueError(f"z: got {z.tolist()}, expected the lowest and the highest place")
     mesh = as_mesh(scene)
     low, high = mesh.bounds.copy()
-    low[2], high[2] = max(low[2], z[0]), min(high[2], z[1])
+    low[2], high[2] = z if above_ground else (max(low[2], z[0]), min(high[2], z[1]))
     if low[2] > high[2]:
         raise ValueError(
             f"z: got {z.tolist()}, but the scene lies between {mesh.bounds[0, 2]:g} and {mesh.bounds[1, 2]:g} m"
@@ -179,6 +187,9 @@ def sample_receivers(
     count = 0
     for _ in range(_TRIES):
         points = rng.uniform(low, high, (_BATCH, 3))
+        if above_ground:
+            points[:, 2] += ground_height(mesh, points[:, 0], points[:, 1], device=device)
+            points = points[np.isfinite(points[:, 2])]
         points = points[scene.is_free(points, clearance_m=clearance, device=device)]
         found.append(points)
         count += len(points)

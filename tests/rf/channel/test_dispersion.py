@@ -1,5 +1,7 @@
 """Spreads: hand-made channels, invariances, bounds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -90,3 +92,9 @@ def test_bad_input_is_named():
         delay_spread([1.0, -1.0], [0.0, 1e-9])
     with pytest.raises(ValueError, match="power"):
         delay_spread([1.0, 1.0], [0.0])
+
+
+def test_paths_without_an_angle_say_which():
+    paths = random_paths(4)
+    with pytest.raises(ValueError, match="paths: phi_t: got NaN"):
+        replace(paths, phi_t=np.full_like(paths.phi_t, np.nan)).dispersion()

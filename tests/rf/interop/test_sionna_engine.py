@@ -130,6 +130,15 @@ def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, scene):
     assert found == pytest.approx(usual, rel=2e-3)
 
 
+def test_a_place_that_no_path_reaches_has_an_empty_spectrum(scene):
+    sionna = sionna_or_skip()
+    engine = sionna(scene, transmitter=TX, frequency_hz=F, shape=SHAPE, sampling=Sampling(depth=0))
+    found = engine.receive(BLOCKED)
+    assert not found.path_gain.any() and not found.line_of_sight
+    assert np.isnan(found.delay_s).all() and sum(found.totals.values()) == 0.0
+    assert engine.receive(SEES).line_of_sight
+
+
 def test_reciprocal_materials_are_refused(scene):
     sionna = sionna_or_skip()
     materials = [replace(m, reciprocal=True) for m in scene.materials]

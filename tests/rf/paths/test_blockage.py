@@ -61,6 +61,24 @@ def test_a_pillar_is_passed_on_both_sides() -> None:
     assert found.power.max() == pytest.approx(found.power[found.arrival[:, 1] > 0].max(), rel=1e-3)
 
 
+def test_edges_diffract_however_faces_are_wound() -> None:
+    """A mast over a house's roof and a street in its shadow: one way, over the roof's edge."""
+    ground = (
+        np.array([[-60.0, -60, 0], [60, -60, 0], [60, 60, 0], [-60, 60, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    mast, street = np.array([-8.0, 0, 25.0]), np.array([[20.0, 1.0, 1.5]])
+    found = [
+        diffracted(
+            joined(ground, box_mesh([-10, -30, 0], [10, 30, 20], inward=inward))[0], mast, street, 0.0857
+        )
+        for inward in (False, True)
+    ]
+    assert len(found[0].power) == 1
+    assert found[1].power == pytest.approx(found[0].power, rel=1e-9)
+    assert found[0].arrival[0] @ [10.0 - 20.0, -0.6, 18.5] > 0.99 * np.linalg.norm([10.0, 0.6, 18.5])
+
+
 def test_what_a_lossless_slab_does_not_reflect_passes() -> None:
     cosine = np.linspace(0.05, 1, 40)
     reflected = slab_reflection(cosine, 5.0, 0.0123, WAVELENGTH)

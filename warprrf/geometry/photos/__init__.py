@@ -2,7 +2,8 @@
 
 In the order in which :func:`warprrf.reconstruct` runs them:
 
-- ``photo_files``, ``sfm``: image files to camera poses and sparse points; ``sparse`` brings both to metres.
+- ``photo_files``, ``sfm``: image files to lenses (``lens_choice``), camera poses, sparse points and undistorted photos
+  (``undistort``); ``sparse`` brings them to metres.
 - ``initialise``: the points cleaned (``points``), planes found among them (``planes``), the cells of each plane that
   hold a surface (``cells``), corrected and completed by comparing photos (``sweep``), covered with Gaussians
   (``initial_gaussians``).

@@ -297,6 +297,9 @@ class ReconstructionConfig:
 
     Attributes:
         max_features: SIFT features per photo.
+        lens: COLMAP's model of the lenses, or ``"auto"``: see
+            :func:`~warprrf.geometry.photos.sfm.structure_from_motion`.
+        max_pixels: photos are reduced to about so many pixels before Gaussians are fitted to them.
         pairs: which photos are matched, ``"auto"`` or ``"exhaustive"``.
         max_reprojection_error: sparse points above it are dropped [pixels].
         planes: how planes are found among sparse points.
@@ -309,6 +312,8 @@ class ReconstructionConfig:
     """
 
     max_features: int = 2400
+    lens: str = "auto"
+    max_pixels: int = 1_000_000
     pairs: str = "auto"
     max_reprojection_error: float = 1.0
     planes: PlaneConfig = field(default_factory=PlaneConfig)

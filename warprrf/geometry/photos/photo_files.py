@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warprrf.device import require
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
+MASK_SUFFIX = ".mask.png"
 MIN_PHOTOS = 3
+TURNS = {1: 0, 6: 1, 3: 2, 8: 3}
+"""Quarter turns clockwise that bring a photo upright, by EXIF's orientation; the other four are mirrored."""
+
+UNREADABLE = (OSError, SyntaxError, ValueError, KeyError, TypeError, struct.error)
+"""What Pillow raises for damaged files and damaged EXIF."""
 
 Photos = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """A folder of photos, or image files."""
@@ -21,10 +30,11 @@ def find_photos(photos: Photos) -> dict[str, Path]:
     """Photo name to file, sorted by name, for a folder or a sequence of image files.
 
     A name is the path below the folder (or below the files' common folder), with forward slashes. Hidden files of a
-    folder are left out: half-written ones, or another system's notes.
+    folder are left out: half-written ones, or another system's notes. ``NAME.mask.png`` is no photo but the mask of the
+    photo ``NAME`` beside it (:func:`mask_beside`).
 
     Raises:
-        ValueError: if the folder or files do not exist, or too few photos are there.
+        ValueError: if the folder or files do not exist, too few photos are there, or a mask is of no photo.
     """
     if isinstance(photos, str | os.PathLike):
         root = Path(photos).absolute()
@@ -33,11 +43,18 @@ def find_photos(photos: Photos) -> dict[str, Path]:
                 f"photos: {root} is not a folder; expected a folder of photos or a list of image files"
             )
         found = (p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
-        files = sorted(p for p in found if not p.name.startswith("."))
+        every = sorted(p for p in found if not p.name.startswith("."))
+        files = [p for p in every if not p.name.lower().endswith(MASK_SUFFIX)]
+        masked = {mask_name(p) for p in files}
+        stray = [p.relative_to(root).as_posix() for p in every if p not in masked and p not in set(files)]
+        if stray:
+            raise ValueError(
+                f"photos: {len(stray)} masks are of no photo: {some(stray)}; the mask of 0007.jpg is 0007.mask.png"
+            )
     else:
         if odd := [p for p in photos if not isinstance(p, str | os.PathLike)]:
             raise TypeError(f"photos: got {type(odd[0]).__name__} in a list, expected image files")
-        files = [Path(p) for p in photos]
+        files = [Path(p) for p in photos if not str(p).lower().endswith(MASK_SUFFIX)]
         missing = [str(p) for p in files if not p.is_file()]
         if missing:
             raise ValueError(f"photos: {len(missing)} of {len(files)} files do not exist: {some(missing)}")
@@ -53,30 +70,98 @@ def find_photos(photos: Photos) -> dict[str, Path]:
     return dict(sorted(named.items()))
 
 
+@dataclass(frozen=True)
+class PhotoFacts:
+    """What a photo's file says of it before its pixels are read.
+
+    Attributes:
+        width, height: as stored [pixels].
+        turns: quarter turns clockwise that bring it upright.
+        taken_with: EXIF's maker, model and focal length of the camera; empty where it says none.
+    """
+
+    width: int
+    height: int
+    turns: int
+    taken_with: tuple[str, ...]
+
+
+def photo_facts(path: Path) -> PhotoFacts:
+    """Size, orientation and camera of a photo, from its header.
+
+    Raises:
+        ValueError: if the header does not read, or the photo is stored mirrored.
+    """
+    image = require("PIL.Image", extra="photos")
+    try:
+        with image.open(path) as photo:
+            exif = photo.getexif()
+            width, height = photo.size
+            lens = exif.get_ifd(0x8769)
+            orientation = exif.get(0x0112, 1)
+            names = [str(exif.get(tag, "")).strip("\0 ") for tag in (0x010F, 0x0110)]
+            taken_with = (*names, str(lens.get(0x920A, ""))) if any(names) else ()
+    except (*UNREADABLE, image.DecompressionBombError) as error:
+        raise ValueError(f"photos: {path} does not read as an image: {error}") from error
+    if orientation not in TURNS:
+        raise ValueError(
+            f"photos: {path} has EXIF orientation {orientation}, expected 1, 3, 6 or 8: it is stored mirrored, or the "
+            "entry is damaged; save it as it is to be seen"
+        )
+    return PhotoFacts(width, height, TURNS[orientation], taken_with)
+
+
+def turns_of(path: Path) -> int:
+    """Quarter turns clockwise that bring the photo upright."""
+    return photo_facts(path).turns
+
+
+def cameras_of(named: Mapping[str, Path]) -> list[list[str]]:
+    """Names of the photos that each camera took.
+
+    Photos of one size whose EXIF names one camera at one focal length are of one camera, wherever they lie; without
+    EXIF those of one size in one folder are.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for name, path in named.items():
+        facts = photo_facts(path)
+        whose = facts.taken_with or name.rpartition("/")[0]
+        groups.setdefault((facts.width, facts.height, whose), []).append(name)
+    return list(groups.values())
+
+
+def mask_name(photo: Path) -> Path:
+    """Where the mask of ``photo`` lies, if it has one: ``0007.mask.png`` beside ``0007.jpg``."""
+    return photo.with_name(photo.stem + MASK_SUFFIX)
+
+
+def mask_beside(photo: Path) -> Path | None:
+    """The mask of ``photo``: a grey picture, upright and of its size, black where the photo is to be ignored."""
+    path = mask_name(photo)
+    return path if path.is_file() else None
+
+
 def check_photos(named: Mapping[str, Path]) -> None:
-    """Refuse photos that do not read as images, or differ in size.
+    """Refuse photos that do not read as images, and masks of another size than their photo.
 
     Raises:
         ValueError: naming the files.
     """
-    image = require("PIL.Image", extra="photos")
-    bad, sizes = [], {}
+    bad: list[str] = []
     for name, path in named.items():
         try:
-            with image.open(path) as photo:
-                photo.load()
-                sizes[name] = photo.size
-        except (OSError, SyntaxError, ValueError, image.DecompressionBombError) as error:
+            facts = photo_facts(path)
+            open_photo(path, "RGB")
+            mask = mask_beside(path)
+            size = None if mask is None else open_photo(mask, "L").size
+        except ValueError as error:
             bad.append(f"{name} ({error})")
+            continue
+        upright = (facts.width, facts.height)[:: -1 if facts.turns % 2 else 1]
+        if size is not None and size != upright:
+            bad.append(f"{name} (its mask is {size[0]} x {size[1]}, expected {upright[0]} x {upright[1]})")
     if bad:
         raise ValueError(f"photos: {len(bad)} of {len(named)} files do not read as images: {some(bad)}")
-    common = max(set(sizes.values()), key=list(sizes.values()).count)
-    odd = [f"{n} ({s[0]} x {s[1]})" for n, s in sizes.items() if s != common]
-    if odd:
-        raise ValueError(
-            f"photos: {len(odd)} photos are not {common[0]} x {common[1]} as the others are; one camera with one "
-            f"image size is expected: {some(odd)}"
-        )
 
 
 def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> list[str]:
@@ -110,8 +195,8 @@ def match_names(argument: str, wanted: Iterable[str], names: Sequence[str]) -> l
     return found
 
 
-def read_photo(path: str | os.PathLike[str]) -> np.ndarray:
-    """A photo as RGB in [0, 1], shape ``(H, W, 3)`` float32.
+def open_photo(path: str | os.PathLike[str], mode: str) -> Any:
+    """A photo as it is stored, as a Pillow image of ``mode`` (``"RGB"`` or ``"L"``).
 
     Raises:
         ValueError: if the file does not read as an image.
@@ -119,9 +204,30 @@ def read_photo(path: str | os.PathLike[str]) -> np.ndarray:
     image = require("PIL.Image", extra="photos")
     try:
         with image.open(path) as photo:
-            return np.asarray(photo.convert("RGB"), dtype=np.float32) / 255
-    except (OSError, SyntaxError, ValueError, image.DecompressionBombError) as error:
+            if photo.mode[0] in "IF":
+                raise ValueError(f"its pixels have more than 8 bits ({photo.mode}); save it with 8")
+            return photo.convert(mode)
+    except (*UNREADABLE, image.DecompressionBombError) as error:
         raise ValueError(f"photos: {path} does not read as an image: {error}") from error
+
+
+def read_photo(path: str | os.PathLike[str]) -> np.ndarray:
+    """A photo as it is stored, RGB in [0, 1], shape ``(H, W, 3)`` float32.
+
+    Raises:
+        ValueError: if the file does not read as an image.
+    """
+    return np.asarray(open_photo(path, "RGB"), dtype=np.float32) / 255
+
+
+def read_mask(photo: str | os.PathLike[str]) -> np.ndarray | None:
+    """Where ``photo`` is to be ignored, shape ``(H, W)`` bool, from the mask beside it; None without one.
+
+    Raises:
+        ValueError: if the mask does not read as an image.
+    """
+    path = mask_beside(Path(photo))
+    return None if path is None else np.asarray(open_photo(path, "L")) < 128
 
 
 def some(items: Sequence[str], limit: int = 5) -> str:

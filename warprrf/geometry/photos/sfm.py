@@ -1,9 +1,9 @@
 """Structure from motion: camera poses and a sparse point cloud from photo files.
 
 Wraps pycolmap (COLMAP: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016): SIFT on the image
-files, matching, incremental mapping with one shared pinhole camera whose focal length is estimated. Photos must be
-free of lens distortion. The model comes out in units and axes of its own; :mod:`warprrf.geometry.photos.sparse` brings it to
-metres. Everything runs on the CPU and repeats itself for a given seed.
+files, matching, incremental mapping with one lens for each camera, which is estimated. The photos are then undistorted
+(:mod:`warprrf.geometry.photos.undistort`); the model comes out with their pinhole cameras, in units and axes of its own;
+:mod:`warprrf.geometry.photos.sparse` brings it to metres. Everything runs on the CPU and repeats itself for a given seed.
 """
 
 from __future__ import annotations
@@ -21,22 +21,41 @@ from typing import Any
 
 import numpy as np
 
+from warprrf.checks import check_count
 from warprrf.device import Progress, require
-from warprrf.geometry.photos.photo_files import MIN_PHOTOS, Photos, check_photos, find_photos, some
+from warprrf.geometry.photos.lens_choice import FREE_MODEL, choose_lens, lens_of
+from warprrf.geometry.photos.photo_files import (
+    MIN_PHOTOS,
+    Photos,
+    cameras_of,
+    check_photos,
+    find_photos,
+    mask_beside,
+    open_photo,
+    photo_facts,
+    some,
+    turns_of,
+)
 from warprrf.geometry.photos.sparse import SparseModel
-from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.photos.undistort import Lens, load_colmap, pinhole_of, write_undistorted
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {"features": 1, "matches": 1, "model": 1}
+VERSIONS = {"features": 2, "matches": 1, "model": 2, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
-CAMERA_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+LEAST_PIXELS = 10_000  # of max_pixels
+FEATURE_SIDE = 1600  # features are found in photos reduced to this length of their longer side [pixels]
 
 # Above this many pairs matching them all takes minutes; a coarse comparison then picks the pairs worth matching.
 MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
 COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
+FEWEST_FEATURES, FEWEST_MATCHES = (
+    8,
+    15,
+)  # of a photo that can be matched, and of a pair that COLMAP counts as matched
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 
@@ -46,46 +65,53 @@ def structure_from_motion(
     *,
     workspace: str | os.PathLike[str],
     max_features: int = 2400,
-    camera_model: str = "SIMPLE_PINHOLE",
+    lens: str = "auto",
+    max_pixels: int = 1_000_000,
     pairs: str = "auto",
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SparseModel:
     """Camera poses and sparse points of ``photos``, in the model's own units (see :mod:`~warprrf.geometry.photos.sparse`).
 
+    The cameras are those of the undistorted, upright, reduced photos, which lie in ``sfm/photos`` of the workspace under
+    their own names. Photos of one size whose EXIF names the same camera share a lens; without EXIF those of one size in
+    one folder do. EXIF's focal length is where the estimate starts. Features are found in photos of 1600 pixels at most,
+    and not where a mask (``NAME.mask.png``) is black.
+
     Finished steps are kept in ``workspace`` and reused as long as photos, options and pycolmap stay the same, so that
     a stopped run goes on where it was.
 
     Args:
-        photos: a folder, or a sequence of image files, all of one size and from one undistorted camera.
-        workspace: folder for the feature database and the model; made if it is not there.
+        photos: a folder, or a sequence of image files.
+        workspace: folder for the feature database, the model and the undistorted photos; made if it is not there.
         max_features: SIFT features kept per photo (the largest ones).
-        camera_model: COLMAP camera model, ``"SIMPLE_PINHOLE"`` (one focal length) or ``"PINHOLE"`` (two).
+        lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
+            ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
+        max_pixels: undistorted photos are reduced to about so many pixels.
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
         seed: seed of every random draw.
-        progress: called as ``progress("features" | "comparing" | "matching" | "mapping", done, total)``.
+        progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
 
     Raises:
-        ValueError: for photos that are missing, unreadable, of different sizes or too few, an unknown camera model,
-            or when the photos overlap too little to be posed; the message names the files.
+        ValueError: for photos that are missing, unreadable or too few, an unknown lens, or when the photos overlap too
+            little to be posed; the message names the files.
         ImportError: if pycolmap is not installed.
     """
-    if camera_model not in CAMERA_MODELS:
-        raise ValueError(
-            f"camera_model: got {camera_model!r}, expected one of {CAMERA_MODELS}; photos with lens distortion have "
-            "to be undistorted first (for instance with COLMAP's image_undistorter)"
-        )
+    if lens not in LENSES:
+        raise ValueError(f"lens: got {lens!r}, expected one of {', '.join(LENSES)}")
     if pairs not in ("auto", "exhaustive"):
         raise ValueError(f'pairs: got {pairs!r}, expected "auto" or "exhaustive"')
     if max_features < 100:
         raise ValueError(f"max_features: got {max_features}, expected at least 100")
-    colmap = require("pycolmap", extra="photos")
+    check_count("max_pixels", max_pixels, LEAST_PIXELS)
     named = find_photos(photos)
-    check_photos(named)
+    colmap = load_colmap()
+    first_lens = FREE_MODEL if lens == "auto" else lens
 
     def features(attempt: Attempt) -> dict[str, Any]:
-        _extract(colmap, folder, named, (max_features, camera_model), attempt)
+        check_photos(named)
+        _extract(colmap, folder, named, (max_features, first_lens), attempt)
         return {}
 
     def matches(attempt: Attempt) -> dict[str, Any]:
@@ -93,19 +119,37 @@ def structure_from_motion(
         return {}
 
     def model(attempt: Attempt) -> dict[str, Any]:
-        return {"other_models": _map(colmap, folder, named, seed, attempt)}
+        return {"other_models": _map(colmap, folder, named, (lens, seed), attempt)}
 
-    folder = Path(workspace) / "sfm"
+    def straight(attempt: Attempt) -> dict[str, Any]:
+        for k, name in enumerate(lenses):
+            attempt.progress("undistorting", k, len(lenses))
+            write_undistorted(named[name], kept / name, lenses[name], max_pixels)
+        attempt.progress("undistorting", len(lenses), len(lenses))
+        return {}
+
+    folder = Path(workspace).absolute() / "sfm"
+    kept = folder / "photos"
     with Steps(folder, progress=progress) as steps, _quiet(colmap):
         colmap.set_random_seed(seed)
-        inputs = [list(named), list(named.values()), max_features, camera_model, colmap.__version__]
+        masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
+        inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
         steps.run("features", features, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
         inputs = [steps.key("features"), pairs, seed]
         steps.run("matches", matches, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
-        inputs = [steps.key("matches"), seed]
+        inputs = [steps.key("matches"), lens, seed]
         found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
-        result = _sparse_model(colmap.Reconstruction(str(folder / "model")), list(named))
-        return replace(result, other_models=tuple(found["other_models"]))
+        stored = colmap.Reconstruction(str(folder / "model"))
+        lenses = lenses_of(stored)
+        outputs = [f"photos/{name}" for name in lenses]
+        inputs = [steps.key("model"), max_pixels]
+        steps.run("photos", straight, version=VERSIONS["photos"], inputs=inputs, outputs=outputs)
+        turns = {name: turns_of(named[name]) for name in lenses}
+        result = _sparse_model(stored, list(named), turns, max_pixels)
+        photos_of = {name: kept / name for name in lenses}
+        causes = _causes(colmap, folder / "matches.db", result) if result.unposed else {}
+        others = tuple(found["other_models"])
+        return replace(result, other_models=others, causes=causes, photos=photos_of, lenses=lenses)
 
 
 def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
@@ -117,7 +161,7 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
         ValueError: if the folder holds no readable model, or a camera is not a pinhole.
         ImportError: if pycolmap is not installed.
     """
-    colmap = require("pycolmap", extra="photos")
+    colmap = load_colmap()
     root = Path(folder)
     if not any(
         all((root / f"{n}{ext}").is_file() for n in ("cameras", "images")) for ext in (".bin", ".txt")
@@ -135,6 +179,12 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
             raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
         try:
             names = sorted(i.name for i in model.images.values())
+            bent = [lens for lens in lenses_of(model).values() if not lens.straight]
+            if bent:
+                raise ValueError(
+                    f"colmap: a camera is a {bent[0].model}, expected SIMPLE_PINHOLE or PINHOLE; undistort the photos "
+                    "first (COLMAP's image_undistorter writes a pinhole model)"
+                )
             found = replace(_sparse_model(model, names), metric=True, upright=True)
         except (ValueError, TypeError) as error:  # cameras that are no pinholes, or damaged
             raise ValueError(f"colmap: {root}: {str(error).removeprefix('colmap: ')}") from error
@@ -206,17 +256,19 @@ def _extract(
     colmap: ModuleType, folder: Path, named: Mapping[str, Path], settings: tuple[int, str], attempt: Attempt
 ) -> None:
     """Features of the photos, into ``features.db``."""
-    max_features, camera_model = settings
+    max_features, model = settings
     names = list(named)
     images = _root(named)
     working = attempt.folder / "features.db"
     working.unlink(missing_ok=True)
     colmap.Database.open(str(working)).close()
-    reader = colmap.ImageReaderOptions(camera_model=camera_model)
+    reader = colmap.ImageReaderOptions(camera_model=model)
     # Importing first numbers the images by name; extraction alone numbers them as threads finish.
-    colmap.import_images(working, images, colmap.CameraMode.SINGLE, image_names=names, options=reader)
-    reader.existing_camera_id = 1
-    extraction = colmap.FeatureExtractionOptions(use_gpu=False)
+    for group in cameras_of(named):
+        colmap.import_images(working, images, colmap.CameraMode.SINGLE, image_names=group, options=reader)
+    if any(mask_beside(path) for path in named.values()):
+        reader.mask_path = _write_masks(named, attempt.folder / "masks")
+    extraction = colmap.FeatureExtractionOptions(use_gpu=False, max_image_size=FEATURE_SIDE)
     extraction.sift.max_num_features = max_features
     extraction.sift.peak_threshold = PEAK_THRESHOLD
     for start in range(0, len(names), EXTRACT_BATCH):
@@ -225,13 +277,27 @@ def _extract(
             working,
             images,
             image_names=names[start : start + EXTRACT_BATCH],
-            camera_mode=colmap.CameraMode.SINGLE,
+            camera_mode=colmap.CameraMode.AUTO,
             reader_options=reader,
             extraction_options=extraction,
             device=colmap.Device.cpu,
         )
     attempt.progress("features", len(names), len(names))
     _settle(working, folder / "features.db")
+
+
+def _write_masks(named: Mapping[str, Path], folder: Path) -> Path:
+    """Masks where COLMAP looks for them, turned as the photos are stored; white for a photo without one."""
+    image = require("PIL.Image", extra="photos")
+    for name, path in named.items():
+        facts, mask = photo_facts(path), mask_beside(path)
+        target = folder / f"{name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if mask is None:
+            image.new("L", (facts.width, facts.height), 255).save(target)
+        else:
+            open_photo(mask, "L").rotate(90 * facts.turns, expand=True).save(target)
+    return folder
 
 
 def _match(
@@ -244,11 +310,11 @@ def _match(
     )
     with colmap.Database.open(str(working)) as database:
         counts = {i.name: database.num_keypoints_for_image(i.image_id) for i in database.read_all_images()}
-        blank = [n for n in names if counts[n] < 8]
+        blank = [n for n in names if counts[n] < FEWEST_FEATURES]
         if len(names) - len(blank) < MIN_PHOTOS:
             raise ValueError(
-                f"photos: {len(blank)} of {len(names)} photos show fewer than 8 features (blank, dark or blurred?), "
-                f"too few remain to work with: {some(blank)}"
+                f"photos: {len(blank)} of {len(names)} photos show fewer than {FEWEST_FEATURES} features (blank, dark or "
+                f"blurred?), too few remain to work with: {some(blank)}"
             )
         chosen = list(itertools.combinations(names, 2))
         if pairs == "auto" and len(chosen) > MAX_EXHAUSTIVE_PAIRS:
@@ -316,9 +382,10 @@ def _promising_pairs(database: Any, names: list[str], report: Progress) -> list[
 
 
 def _map(
-    colmap: ModuleType, folder: Path, named: Mapping[str, Path], seed: int, attempt: Attempt
+    colmap: ModuleType, folder: Path, named: Mapping[str, Path], settings: tuple[str, int], attempt: Attempt
 ) -> list[int]:
     """Poses and points from the matches, into the folder ``model``; returns how many photos smaller models hold."""
+    lens, seed = settings
     working = _copied(folder / "matches.db", attempt.folder / "matches.db")
     images, report = _root(named), attempt.progress
     options = colmap.IncrementalPipelineOptions()
@@ -362,32 +429,61 @@ def _map(
     shutil.rmtree(whole, ignore_errors=True)
     whole.mkdir()
     largest.write_binary(str(whole))
+    choose_lens(colmap, whole, lens).write_binary(str(whole))
     shutil.rmtree(folder / "model", ignore_errors=True)
     os.replace(whole, folder / "model")
     report("mapping", len(named), len(named))
     return [m.num_reg_images() for m in others]
 
 
-def _sparse_model(model: Any, names: Sequence[str]) -> SparseModel:
-    images = {i.name: i for i in model.images.values() if i.has_pose}
-    cameras = {}
-    for name in sorted(images):
-        image = images[name]
-        lens = model.cameras[image.camera_id]
-        kind = lens.model.name
-        if kind not in CAMERA_MODELS:
-            raise ValueError(
-                f"colmap: camera {image.camera_id} is a {kind}, expected one of {CAMERA_MODELS}; undistort the photos "
-                "first (COLMAP's image_undistorter writes a pinhole model)"
+def lenses_of(model: Any) -> dict[str, Lens]:
+    """Lenses of the posed photos of a COLMAP model, by name."""
+    lenses = {key: lens_of(camera) for key, camera in model.cameras.items()}
+    posed = {i.name: lenses[i.camera_id] for i in model.images.values() if i.has_pose}
+    return dict(sorted(posed.items()))
+
+
+def _causes(colmap: ModuleType, matches: Path, sparse: SparseModel) -> dict[str, str]:
+    """Why photos have no pose, by name."""
+    with colmap.Database.open(str(matches)) as database:
+        names = {i.image_id: i.name for i in database.read_all_images()}
+        features = {name: database.num_keypoints_for_image(k) for k, name in names.items()}
+        pairs, inliers = database.read_two_view_geometry_num_inliers()
+    best: dict[str, tuple[int, str]] = {}
+    for pair, count in zip(pairs, inliers, strict=True):
+        ends = [names[k] for k in (pair if np.ndim(pair) else colmap.pair_id_to_image_pair(pair))]
+        for one, other in (ends, ends[::-1]):
+            if other in sparse.cameras:
+                best[one] = max(best.get(one, (0, "")), (int(count), other))
+    causes = {}
+    for name in sparse.unposed:
+        count, other = best.get(name, (0, ""))
+        if features.get(name, 0) < FEWEST_FEATURES:
+            causes[name] = f"shows {features.get(name, 0)} features: blank, dark or blurred"
+        elif count < FEWEST_MATCHES:
+            causes[name] = (
+                f"shares {count or 'no'} features with any photo that has a pose: too little overlap"
             )
-        k = lens.calibration_matrix()
+        else:
+            causes[name] = (
+                f"matches {other} in {count} features that do not fit the rest: too few, or of something alike"
+            )
+    return causes
+
+
+def _sparse_model(
+    model: Any, names: Sequence[str], turns: Mapping[str, int] | None = None, max_pixels: int = 2**62
+) -> SparseModel:
+    """A COLMAP model with the cameras of the undistorted, upright, reduced photos."""
+    images = {i.name: i for i in model.images.values() if i.has_pose}
+    cameras, share = {}, {}
+    for name, lens in lenses_of(model).items():
         pose = np.eye(4)
-        pose[:3] = image.cam_from_world().matrix()
+        pose[:3] = images[name].cam_from_world().matrix()
         u, _, vt = np.linalg.svd(pose[:3, :3])
         pose[:3, :3] = u @ vt
-        cameras[name] = Camera.pinhole(
-            lens.width, lens.height, fx=k[0, 0], fy=k[1, 1], cx=k[0, 2], cy=k[1, 2], world_to_camera=pose
-        )
+        cameras[name] = pinhole_of(lens, pose, (turns or {}).get(name, 0), max_pixels)
+        share[images[name].image_id] = (cameras[name].fx + cameras[name].fy) / (lens.fx + lens.fy)
     position = {images[n].image_id: i for i, n in enumerate(cameras)}
     points = [model.points3D[i] for i in sorted(model.points3D)]
     tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
@@ -396,7 +492,10 @@ def _sparse_model(model: Any, names: Sequence[str]) -> SparseModel:
         cameras=cameras,
         points=np.array([p.xyz for p in points], dtype=np.float64).reshape(-1, 3),
         colors=np.array([p.color for p in points], dtype=np.float64).reshape(-1, 3) / 255,
-        reprojection_error=np.array([p.error for p in points], dtype=np.float64),
+        reprojection_error=np.array(
+            [p.error * np.mean([share[e.image_id] for e in p.track.elements]) for p in points],
+            dtype=np.float64,
+        ),
         track_length=length,
         track_start=np.concatenate([[0], np.cumsum(length)]).astype(np.int64),
         track_camera=np.array([c for t in tracks for c in t], dtype=np.int64),

@@ -7,13 +7,15 @@ the world; without a survey a plausible one is assumed.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_positive
 from warprrf.geometry.photos.photo_files import match_names, some
+from warprrf.geometry.photos.undistort import Lens
 from warprrf.geometry.splats.camera import Camera
 
 # Without surveyed positions the scale is unknown: the median distance from a camera to a point it sees becomes this.
@@ -28,16 +30,19 @@ class SparseModel:
         cameras: photo name to :class:`Camera`, for the photos that were posed.
         points: 3D points, shape ``(P, 3)`` float64; metres once aligned, arbitrary units before.
         colors: colour of each point in [0, 1], shape ``(P, 3)``.
-        reprojection_error: mean reprojection error of each point [pixels], shape ``(P,)``.
+        reprojection_error: mean reprojection error of each point [pixels of ``cameras``], shape ``(P,)``.
         track_length: number of photos that see each point, shape ``(P,)`` int64.
         track_start: where each point's photos begin in ``track_camera``, shape ``(P + 1,)`` int64.
         track_camera: photos (position in ``list(cameras)``) that see the points, shape ``(sum of track lengths,)``.
         unposed: names of the photos that no pose was found for, or that lie in a smaller, separate model.
+        causes: why each of these has no pose, by name, where that is known.
         other_models: number of photos in each smaller model that was left out.
         metric: whether lengths are metres.
         upright: whether z is up.
         scale_rms_m: rms distance between surveyed and reconstructed camera positions after alignment [m], else NaN.
         guessed: what nobody measured and the photos do not show, a sentence each.
+        photos: the files that ``cameras`` show: undistorted, upright, reduced; by photo name.
+        lenses: of the photos as they were taken, by photo name.
     """
 
     cameras: dict[str, Camera]
@@ -48,11 +53,14 @@ class SparseModel:
     track_start: np.ndarray
     track_camera: np.ndarray
     unposed: tuple[str, ...] = ()
+    causes: Mapping[str, str] = field(default_factory=dict)
     other_models: tuple[int, ...] = ()
     metric: bool = False
     upright: bool = False
     scale_rms_m: float = float("nan")
     guessed: tuple[str, ...] = ()
+    photos: dict[str, Path] = field(default_factory=dict)
+    lenses: dict[str, Lens] = field(default_factory=dict)
 
     def viewpoints(self) -> np.ndarray:
         """Mean position of the cameras that see each point, shape ``(P, 3)``: normals are turned towards it."""

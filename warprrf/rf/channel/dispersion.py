@@ -56,7 +56,7 @@ def dispersion(paths: PathArrays) -> Dispersion:
     """All measures of ``paths``.
 
     Raises:
-        ValueError: if a path has no delay.
+        ValueError: if a path has no delay, or no angle.
     """
     paths.check_delays()
     mean, spread = delay_spread(paths.power, paths.tau)
@@ -69,10 +69,10 @@ def dispersion(paths: PathArrays) -> Dispersion:
         mean_delay_s=mean,
         delay_spread_s=spread,
         k_factor=k_factor,
-        azimuth_spread_arrival_rad=angular_spread(paths.power, paths.phi_r),
-        zenith_spread_arrival_rad=angular_spread(paths.power, paths.theta_r),
-        azimuth_spread_departure_rad=angular_spread(paths.power, paths.phi_t),
-        zenith_spread_departure_rad=angular_spread(paths.power, paths.theta_t),
+        azimuth_spread_arrival_rad=_angular(paths.power, paths.phi_r, "paths: phi_r"),
+        zenith_spread_arrival_rad=_angular(paths.power, paths.theta_r, "paths: theta_r"),
+        azimuth_spread_departure_rad=_angular(paths.power, paths.phi_t, "paths: phi_t"),
+        zenith_spread_departure_rad=_angular(paths.power, paths.theta_t, "paths: theta_t"),
         coherence_bandwidth_hz=coherence_bandwidth(paths.power, paths.tau),
     )
 
@@ -91,10 +91,7 @@ def delay_spread(power: ArrayLike, tau: ArrayLike) -> tuple[np.ndarray, np.ndarr
 @checked
 def angular_spread(power: ArrayLike, angle: ArrayLike) -> np.ndarray:
     """sqrt(-2 ln |sum P exp(j angle)| / sum P) [rad] over the last axis; 3GPP TR 38.901, eq. (A-1)."""
-    weight, angle = _weights(power, angle, "angle")
-    resultant = np.abs((weight * np.exp(1j * angle)).sum(axis=-1))
-    with np.errstate(divide="ignore"):
-        return np.sqrt(np.maximum(-2.0 * np.log(np.minimum(resultant, 1.0)), 0.0))
+    return _angular(power, angle, "angle")
 
 
 @checked
@@ -115,6 +112,13 @@ def coherence_bandwidth(power: ArrayLike, tau: ArrayLike, level: float = COHEREN
         for w, t in zip(weight.reshape(-1, weight.shape[-1]), delay.reshape(-1, delay.shape[-1]), strict=True)
     ]
     return np.array(found).reshape(shape)
+
+
+def _angular(power: ArrayLike, angle: ArrayLike, name: str) -> np.ndarray:
+    weight, value = _weights(power, angle, name)
+    resultant = np.abs((weight * np.exp(1j * value)).sum(axis=-1))
+    with np.errstate(divide="ignore"):
+        return np.sqrt(np.maximum(-2.0 * np.log(np.minimum(resultant, 1.0)), 0.0))
 
 
 def _first_fall(weight: np.ndarray, tau: np.ndarray, level: float) -> float:

@@ -149,6 +149,8 @@ def channel_taps(
     """
     check_positive("bandwidth_hz", bandwidth_hz)
     check_count("l_max", l_max, check_count("l_min", l_min, -(2**31)))
+    if center_hz is not None:
+        check_positive("center_hz", center_hz)
     lags = np.arange(l_min, l_max + 1)
 
     def taps(one: _Link) -> np.ndarray:

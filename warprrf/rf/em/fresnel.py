@@ -142,7 +142,11 @@ def lobe(
         reciprocal: The reciprocal lobe: cos(theta_s) b(theta_i) b(theta_s) ((1 + cos psi) / 2)^alpha_r, with b of
             :func:`reciprocal_factor`.
     """
-    check_alike(cos_incidence=cos_incidence, cos_scatter=cos_scatter, cos_to_mirror=cos_to_mirror)
+    cosines = {"cos_incidence": cos_incidence, "cos_scatter": cos_scatter, "cos_to_mirror": cos_to_mirror}
+    check_alike(**cosines)
+    for name, value in cosines.items():
+        if (np.abs(check_array(name, value, finite=False)) > 1.0 + 1e-6).any():
+            raise ValueError(f"{name}: got values beyond -1 to 1, expected cosines")
     if check_count("alpha_r", alpha_r, 0, NARROWEST_LOBE) == LAMBERTIAN:
         return np.asarray(cos_scatter) / np.pi
     shape = (0.5 * (1.0 + np.asarray(cos_to_mirror))) ** alpha_r

@@ -82,6 +82,9 @@ class RadioField(ABC):
 
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.
+
+        Warns:
+            UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
         """
         if not hasattr(ds, "path_gain"):
             raise TypeError(f"ds: got {type(ds).__name__}, expected a SpectrumDataset")

@@ -163,8 +163,8 @@ class SionnaEngine:
     def _read(self, paths: Any) -> dict[str, np.ndarray]:
         """Sionna's arrays of one receiver and transmitter; both antennas are two polarisations at one place."""
         real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
-        per_path = (real**2 + imag**2).reshape(-1, real.shape[-1])  # 2 receive x 2 transmit polarisations
-        valid = paths.valid.numpy().reshape(-1)
+        per_path = (real**2 + imag**2).reshape(4, real.shape[-1])  # 2 receive x 2 transmit polarisations
+        valid = paths.valid.numpy().reshape(-1).astype(bool)  # no paths come as an array of numbers
         if len(valid) >= self._path_cap:
             raise RuntimeError(f"Sionna filled its cap of {self._path_cap} paths: power would be missing")
         kinds = paths.interactions.numpy().reshape(-1, len(valid)) if len(valid) else np.zeros((1, 0), int)

@@ -4,7 +4,8 @@ A cell holds what a receiver at its centre gets, not the mean over the cell. Cel
 surface or in the transmitter's reactive near field hold NaN. Which are inside or outside is decided by the mesh alone,
 open and torn as a reconstructed one may be: rays from the centre over the whole sphere meet surfaces from their outer
 side in the air and from behind anywhere else, and three in four decide. Which side is the outer one is decided at the
-transmitter, which stands in the air.
+transmitter, which stands in the air. Under the open sky (a street, a city) cells in buildings and in the ground hold
+NaN.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions, Links
+from warprrf.rf.open_air import ground_height, is_open_air, sees_sky, under_a_roof
 from warprrf.rf.positions import NEAR_FIELD, WALL_CLEARANCE_M, check_positions
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
@@ -57,7 +59,7 @@ class RadioMap:
 
     Attributes:
         x, y: centres of the cells [m], shapes ``(X,)`` and ``(Y,)``.
-        height_m: of all of them.
+        height_m: of all of them; over ``ground_m`` where that is known.
         cell_m: width of a cell.
         transmitter: position [m], shape ``(3,)``.
         frequency_hz: carrier [Hz].
@@ -70,6 +72,8 @@ class RadioMap:
         transmit_power_dbm: of the transmitter, equally strong in all directions [dBm].
         noise_power_dbm: of the receiver, k T B F [dBm].
         outline: floor plan, line segments where the mesh meets this height [m], shape ``(S, 2, 2)``.
+        ground_m: height of the ground in each cell [m], shape ``(Y, X)``, NaN where there is none; None if heights are
+            coordinates.
     """
 
     x: np.ndarray = field(repr=False)
@@ -86,6 +90,7 @@ class RadioMap:
     transmit_power_dbm: float
     noise_power_dbm: float
     outline: np.ndarray = field(repr=False)
+    ground_m: np.ndarray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
@@ -109,6 +114,8 @@ class RadioMap:
                 raise ValueError(
                     f"{name}: got negative or infinite values, expected none, or NaN outside the air"
                 )
+        if self.ground_m is not None:
+            fields["ground_m"] = check_array("ground_m", self.ground_m, (len(y), len(x)), finite=False)
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -121,7 +128,8 @@ class RadioMap:
     def positions(self) -> np.ndarray:
         """Centres of the cells [m], shape ``(Y, X, 3)``."""
         x, y = np.meshgrid(self.x, self.y)
-        return np.stack([x, y, np.full_like(x, self.height_m)], axis=-1)
+        ground = 0.0 if self.ground_m is None else self.ground_m
+        return np.stack([x, y, np.full_like(x, self.height_m) + ground], axis=-1)
 
     @property
     def best_beam_snr_db(self) -> np.ndarray:
@@ -199,7 +207,7 @@ class RadioMap:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a NetCDF-4 file, whole or not at all: the four quantities over ``y`` and ``x``, and the outline."""
-        arrays = {name: getattr(self, name) for name in _VARIABLES}
+        arrays = {name: getattr(self, name) for name in _VARIABLES if getattr(self, name) is not None}
         attributes = {name: float(getattr(self, name)) for name in _PLAIN} | {"format": _FORMAT}
         netcdf_files.write(path, arrays, _VARIABLES, {}, attributes)
 
@@ -217,7 +225,7 @@ class RadioMap:
                 raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
             for axis, name in enumerate(("y", "x")):
                 order = np.argsort(arrays[name])  # as another tool may have turned it
-                for held in (name, *_LAYERS):
+                for held in {name, *_LAYERS, "ground_m"} & set(arrays):
                     arrays[held] = arrays[held].take(order, axis=min(axis, arrays[held].ndim - 1))
             fields: dict[str, Any] = {**arrays, **{name: attributes[name] for name in _PLAIN}}
             return cls(**fields)
@@ -230,6 +238,7 @@ _VARIABLES = {
     **{name: Variable(("y", "x"), unit, {"long_name": text}) for name, (unit, text) in _LAYERS.items()},
     **{name: Variable((name,), "m", {"long_name": "centre of the cell"}) for name in ("x", "y")},
     "outline": Variable(("segment", "end", "xy"), "m"),
+    "ground_m": Variable(("y", "x"), "m", {"long_name": "height of the ground"}, optional=True),
     "transmitter": Variable(("xyz",), "m"),
 }
 
@@ -241,12 +250,14 @@ class MapOptions(LinkOptions):
 
     Attributes:
         bounds: lowest x and y, highest x and y [m]; the mesh's by default. The grid starts at the lowest.
+        above_ground: whether heights count from the ground, the lowest surface of each cell, instead of z = 0.
         transmit_power_dbm: of the isotropic transmitter.
         bandwidth_hz: of the noise, k T B at 290 K; one channel of IEEE 802.15.3d by default.
         noise_figure_db: of the receiver.
     """
 
     bounds: Any = None
+    above_ground: bool = False
     transmit_power_dbm: float = 20.0
     bandwidth_hz: float = 2.16e9
     noise_figure_db: float = 10.0
@@ -292,10 +303,10 @@ def radio_map(
 
     Args:
         field: a fitted field with a mesh.
-        height: of the receivers [m].
+        height: of the receivers [m]: z, or over the ground if ``options`` say so.
         cell: width of a cell [m].
         transmitter: position (3,) [m] if another than the fitted one.
-        options: bounds, beam, budget and rays.
+        options: bounds, ground, beam, budget and rays.
 
     Raises:
         ValueError: for a height outside the mesh, a cell that is not positive or makes more than two million, a field
@@ -313,13 +324,16 @@ def radio_map(
     check_number("height", height)
     check_positive("cell", cell)
     low, high = mesh.bounds
-    if not low[2] < height < high[2]:
+    if not (0.0 if o.above_ground else low[2]) < height < high[2]:
         raise ValueError(
             f"height: got {height!r} m, expected one inside the scene, {low[2]:.3g} to {high[2]:.3g} m"
         )
     x, y = _centres(mesh, cell, o.bounds)
     across, along = np.meshgrid(x, y)
-    places = np.stack([across, along, np.full_like(across, float(height))], axis=-1)
+    ground = ground_height(mesh, across, along, device=field.device) if o.above_ground else None
+    places = np.stack(
+        [across, along, np.full_like(across, height) + (0.0 if ground is None else ground)], axis=-1
+    )
     free = in_the_air(mesh, places.reshape(-1, 3), source, device=field.device).reshape(across.shape)
     free &= np.linalg.norm(places - source, axis=-1) > NEAR_FIELD * wavelength_m
     if not free.any():
@@ -339,7 +353,8 @@ def radio_map(
         beam_sigma_rad=float(o.beam_sigma_rad),
         transmit_power_dbm=float(o.transmit_power_dbm),
         noise_power_dbm=o.noise_power_dbm,
-        outline=mesh.cross_section(float(height)),
+        outline=mesh.cross_section(float(np.median(places[free][:, 2]))),
+        ground_m=ground,
         **layers,
     )
 
@@ -347,10 +362,23 @@ def radio_map(
 def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any = None) -> np.ndarray:
     """Whether ``points`` (N, 3) [m] lie in the air like ``known`` (3,) does, shape ``(N,)``.
 
-    Three in four of 64 rays over the sphere must meet a surface from the side that most of those from ``known`` meet.
-    What lies on a surface does not count. This is the mesh's word: a solid whose back no photo shows may be air to it,
+    Three in four of 64 rays over the sphere must meet a surface from the side that most of those from ``known`` meet;
+    under the open sky places must not be in a building or in the ground. What lies
+    on a surface does not count. This is the mesh's word: a solid whose back no photo shows may be air to it,
     and air that no photo looked into (above a gallery, behind a desk) solid.
     """
+    free = (points >= mesh.bounds[0]).all(axis=1) & (points <= mesh.bounds[1]).all(axis=1)
+    own = points[free]
+    outdoors = sees_sky(mesh, known, device=device) or is_open_air(mesh, device=device)
+    if outdoors and not under_a_roof(mesh, known[None], device=device)[0]:
+        free[free] = ~under_a_roof(mesh, own, device=device)
+    else:
+        free[free] = _in_room(mesh, own, known, device)
+    free[free] = mesh.distance(points[free], device=device) > WALL_CLEARANCE_M
+    return free
+
+
+def _in_room(mesh: Mesh, points: np.ndarray, known: np.ndarray, device: Any) -> np.ndarray:
     k = np.arange(_SIDE_RAYS) + 0.5  # a Fibonacci lattice: no direction along a wall
     zenith, azimuth = np.arccos(1.0 - 2.0 * k / _SIDE_RAYS), np.pi * (1.0 + np.sqrt(5.0)) * k
     rays = np.column_stack(
@@ -362,10 +390,7 @@ def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any
     meets = hit.face >= 0
     slope = (mesh.face_normals[np.maximum(hit.face, 0)] * directions).sum(axis=1)
     outer = np.where(meets, -np.sign(slope), 0.0).reshape(len(places), -1).mean(axis=1)
-    inside = (points >= mesh.bounds[0]).all(axis=1) & (points <= mesh.bounds[1]).all(axis=1)
-    free = inside & (outer[1:] * np.sign(outer[0]) > _OUTER_SHARE)
-    free[free] = mesh.distance(points[free], device=device) > WALL_CLEARANCE_M
-    return free
+    return np.asarray(outer[1:] * np.sign(outer[0]) > _OUTER_SHARE)
 
 
 def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -379,7 +404,8 @@ def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarr
     counts = np.maximum(np.ceil((high - low) / cell - 1e-6), 1.0)
     if counts.prod() > MOST_CELLS:
         raise ValueError(
-            f"cell: got {cell!r} m, which makes {counts.prod():.0f} cells; expected at most {MOST_CELLS}"
+            f"cell: got {cell!r} m, which makes {counts.prod():.0f} cells; expected at most {MOST_CELLS}: give wider "
+            "cells, or bounds of a part"
         )
     x, y = (start + cell * (np.arange(int(n)) + 0.5) for start, n in zip(low, counts, strict=True))
     return x, y

@@ -133,7 +133,8 @@ def transmitted(
 
 
 def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Outer and open edges: start (E, 3), unit direction (E, 3), length (E,), unit vector off the solid (E, 3)."""
+    """Bent and open edges: start (E, 3), unit direction (E, 3), length (E,), unit vector off the surface (E, 3), on the
+    side where faces bend away, however they are wound."""
     corner = mesh.welded_faces
     sides = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     face = np.repeat(np.arange(len(corner)), 3)
@@ -150,12 +151,12 @@ def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     along = span / np.maximum(length, 1e-12)[:, None]
     alone = count == 1
     bent = (count == 2) & ((na * nb).sum(axis=1) < LEAST_TURN)
-    outer = bent & (((opposite[b] - start) * na).sum(axis=1) < 0)
+    outer = ((opposite[b] - start) * na).sum(axis=1) < 0
     inward = opposite[a] - start
     inward = inward - (inward * along).sum(axis=1, keepdims=True) * along
-    outward = np.where(alone[:, None], -inward, na + nb)
+    outward = np.where(alone[:, None], -inward, np.where(outer[:, None], na + nb, -na - nb))
     size = np.linalg.norm(outward, axis=1)
-    keep = (alone | outer) & (length > 0) & (size > 1e-9)
+    keep = (alone | bent) & (length > 0) & (size > 1e-9)
     return start[keep], along[keep], length[keep], outward[keep] / size[keep, None]
 
 

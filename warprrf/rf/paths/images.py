@@ -153,14 +153,30 @@ class MirrorImages:
         self._kept = kept
         return kept
 
+    def affordable(self, points: np.ndarray, order: int) -> int:
+        """The most reflections, up to ``order``, whose :meth:`search` is not refused."""
+        work, _ = self._estimated(np.asarray(points, float).reshape(-1, 3), order)
+        return int((np.cumsum(work) <= self.max_chains).sum())
+
     def _work(self, points: np.ndarray, order: int) -> list[float]:
         """Number of chains that each search of 1, 2 ... ``order`` reflections tries: estimated if they are many.
 
         Raises:
             ValueError: if it is more than ``max_chains``.
         """
+        work, seconds = self._estimated(points, order)
+        if sum(work) > self.max_chains:
+            raise ValueError(
+                f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
+                f"planar patches, some {_spoken(seconds)}; expected at most {self.max_chains:.3g}: lower mirror_order, "
+                "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
+            )
+        return work
+
+    def _estimated(self, points: np.ndarray, order: int) -> tuple[list[float], float]:
+        """What :meth:`_work` gives, and the seconds of what is estimated; nothing is refused."""
         if len(points) == 0 or len(self.patches) == 0:
-            return [0.0] * order
+            return [0.0] * order, 0.0
         kept, rng, ends = self._keep(order), np.random.default_rng(0), _Ends(points, self.device)
         work = [float(len(chains)) for chains in kept[1 : order + 1]]
         sample, many, shorter, seconds = kept[-1], float(len(kept[-1])), 0.0, 0.0
@@ -176,13 +192,7 @@ class MirrorImages:
                 sample, whole = self._some_longer(sample, rng)
                 many, shorter = each * whole, shorter + each * whole
                 seconds += (order - k) * each * (time.perf_counter() - begin)
-        if sum(work) > self.max_chains:
-            raise ValueError(
-                f"mirror_order: order {order} would try about {sum(work):.2g} chains of the mesh's {len(self.patches)} "
-                f"planar patches, some {_spoken(seconds)}; expected at most {self.max_chains:.3g}: lower mirror_order, "
-                "simplify the mesh (fewer, larger planar patches), or give more max_chains to MirrorTracer"
-            )
-        return work
+        return work, seconds
 
     def _some_longer(self, chains: Chains, rng: np.random.Generator) -> tuple[Chains, int]:
         """About ``_SAMPLE`` of the chains of one reflection more that follow ``chains``, and how many these are."""

@@ -16,6 +16,7 @@ from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.open_air import warn_of_unmodelled
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
@@ -61,12 +62,16 @@ def trace_paths(
             field of the transmitter; on a frequency that is not positive or outside a material's band, or
             another order; if more than :data:`~warprrf.rf.paths.images.MOST_CHAINS` chains of mirrors would be tried
             (:class:`MirrorTracer` takes another limit).
+
+    Warns:
+        UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
     """
     points = check_receivers("receivers", receivers)
     source, frequency = check_array("transmitter", transmitter, (3,)), check_frequency(frequency_hz)
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
     check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
+    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device)
     order = check_count("mirror_order", mirror_order, 0)
     tell: Progress = progress or (lambda stage, done, total: None)
     tell("patches", 0, 1)

@@ -158,8 +158,12 @@ def _beside(model: FullModel, name: str) -> str:
         else ""
     )
     if not reached.any():
-        return f"no such path to any blocked receiver{assumed}"
-    nearest = float(np.min(10.0 * np.log10(np.maximum(rest[reached], 1e-300) / power[reached])))
+        over = "over one edge (ways over two are not sought) " if name == "diffraction" else ""
+        return f"no such path {over}to any blocked receiver{assumed}"
+    dark = int((rest[reached] == 0).sum())
+    if dark:
+        return f"nothing else reaches {dark} of {len(rest)} blocked receivers{assumed}"
+    nearest = float(np.min(10.0 * np.log10(rest[reached] / power[reached])))
     where = f"{nearest:.0f} dB below" if nearest >= 0 else f"{-nearest:.0f} dB above"
     return f"at its strongest {where} the rest of a blocked receiver's power{assumed}"
 

@@ -145,7 +145,7 @@ class SpectrumDataset:
             engine=engine,
             polarisation=POLARISATION,
             seed=seed,
-            role=assign_roles(len(gain), seed=seed) if role is None else np.asarray(role),
+            role=assign_roles(len(gain), seed=seed) if role is None else role,  # type: ignore[arg-type]
             line_of_sight=line_of_sight,
             attributes={} if attributes is None else attributes,
         )

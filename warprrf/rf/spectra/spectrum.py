@@ -180,17 +180,16 @@ def to_db(path_gain: ArrayLike, floor: float) -> np.ndarray:
 
 
 def default_floor(path_gain: np.ndarray) -> float:
-    """N0 of a data set ``(R, H, W)``: median over views of the view's maximum, less 60 dB.
+    """N0 of a data set ``(R, H, W)``: median over views of the view's maximum, less 60 dB. Empty views (blocked, where
+    surfaces scatter nothing) do not count.
 
     Raises:
-        ValueError: if more than half of the views are empty.
+        ValueError: if all views are empty.
     """
-    peak = float(np.median(path_gain.reshape(len(path_gain), -1).max(axis=1)))
-    if not peak > 0.0:
-        raise ValueError(
-            "path_gain: more than half of the spectra are empty, expected power to set a floor from"
-        )
-    return peak * 10.0 ** (-FLOOR_BELOW_MEDIAN_DB / 10.0)
+    peak = path_gain.reshape(len(path_gain), -1).max(axis=1)
+    if not (peak > 0.0).any():
+        raise ValueError("path_gain: all spectra are empty, expected power to set a floor from")
+    return float(np.median(peak[peak > 0.0])) * 10.0 ** (-FLOOR_BELOW_MEDIAN_DB / 10.0)
 
 
 class SpreadPaths(NamedTuple):

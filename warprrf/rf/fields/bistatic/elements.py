@@ -1,6 +1,6 @@
 """How surfaces illuminate each other: what rays from every surface element hit, and how a transmitter lights that.
 
-Elements are half a metre wide, and light that comes to one over others is taken for even over it.
+Elements are half a metre wide in a room, and light that comes to one over others is taken for even over it.
 """
 
 from __future__ import annotations

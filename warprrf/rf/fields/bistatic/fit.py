@@ -218,6 +218,8 @@ def _normal_equations(
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     for reading in readings:
         power, table, index = jacobian(reading.response, p, layout)
+        if len(index) == 0:  # nothing that it sees is lit
+            continue
         error = NEPER * np.log1p(power) - reading.target_db
         root = np.sqrt(huber(error, options.huber_db)[1]) / options.noise_db
         table *= (root * NEPER / (1.0 + power)).astype(np.float32)

@@ -2,8 +2,8 @@
 
 A group holds faces that look alike and so share radio parameters: a Scene's materials where they are known, else
 patches gathered by the colour that photos gave them, or by shape. An element is a piece of one group, about half
-a metre wide, at which scale surfaces light each other; a cell is a piece of an element: what differs within a group is
-told apart at both scales.
+a metre wide in a room and wider in a street, at which scale surfaces light each other; a cell is a piece of an element:
+what differs within a group is told apart at both scales.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ from warprrf.rf.em.materials import is_name_alone
 from warprrf.rf.fields.bistatic.colours import Colours, colour_groups
 from warprrf.rf.fields.bistatic.shapes import SHAPES, shape_groups
 
-ELEMENT_M = 0.5  # width of an element
+ELEMENT_M = 0.5  # least width of an element
+LARGEST_ELEMENT_M = 25.0
+ELEMENTS = 30_000
+"""Larger scenes have wider elements, so that there are about so many: light between them takes up to 50 kB each. The
+least width holds up to 7500 m^2 of surfaces (a hall's), the largest up to 19 km^2 (a town's)."""
 CELLS = 3  # along an element
-MOST_ELEMENTS = 500_000
-"""More elements are refused: light between them takes 5 kB each. It is 125,000 m^2 of surfaces, a large hall's."""
-LARGEST_FACE_M = 0.6  # longer edges are split, so that elements can be small
+LARGEST_FACE = 1.2  # elements' widths; longer edges are split, so that elements can be small
 MIN_MIRROR_M2 = 0.05  # smaller patches reflect too little to search for
 SKIN_M = 0.02  # depth of a reconstructed surface's skin: shadow rays ignore it
 TRUE_SKIN_M = 1e-4
@@ -161,12 +163,12 @@ class Surface:
 
         Raises:
             TypeError: if it has no mesh.
-            ValueError: if it is so large that it would take more than :data:`MOST_ELEMENTS` elements.
+            ValueError: if it is so large that elements would be wider than :data:`LARGEST_ELEMENT_M`.
         """
         if isinstance(geometry, Surface):
             return geometry
         mesh = as_mesh(geometry, "geometry")
-        _check_size(mesh)
+        element_m = _element_width(mesh)
         material, names = _named_faces(geometry, mesh)
         found, colours = _patches_and_colours(geometry, mesh) if material is None else (None, None)
         if found is not None:
@@ -186,12 +188,12 @@ class Surface:
             group, sort, look = shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
             names = tuple(f"group_{k}" for k in range(len(sort)))
         sides = patches.two_sided
-        mesh, parent = _split_long(mesh, np.flatnonzero(patches.once))
+        mesh, parent = _split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=sort, look=look, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group),
+            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group, element_m),
         )  # fmt: skip
 
     def on_device(self, device: DeviceLike) -> Any:
@@ -252,10 +254,11 @@ def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None,
     return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
 
 
-def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray) -> dict[str, np.ndarray]:
-    """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice."""
+def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, np.ndarray]:
+    """Elements and cells of faces, by the names of :class:`Surface`: pieces of one group and patch on a lattice of
+    ``width_m``."""
     centre, area = mesh.triangles.mean(axis=1), mesh.areas
-    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / ELEMENT_M).astype(np.int64)
+    cells = np.floor(CELLS * (centre - mesh.bounds[0]) / width_m).astype(np.int64)
     key = np.column_stack([group, patch, cells // CELLS])
     element = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int32)
     pieces, cell = np.unique(np.column_stack([element, cells]), axis=0, return_inverse=True)
@@ -281,16 +284,18 @@ def _largest_groups(mesh: Mesh, patch: np.ndarray, group: np.ndarray, patches: i
     return area.argmax(axis=1).astype(np.int32)
 
 
-def _check_size(mesh: Mesh) -> None:
+def _element_width(mesh: Mesh) -> float:
+    """Width of elements [m]: as many as :data:`ELEMENTS` at most, pieces of small patches apart."""
     area = float(mesh.areas.sum())
-    elements = area / ELEMENT_M**2
-    if elements > MOST_ELEMENTS:
+    width_m = max(ELEMENT_M, float(np.sqrt(area / ELEMENTS)))
+    if width_m > LARGEST_ELEMENT_M:
         size = " x ".join(f"{e:.4g}" for e in np.ptp(mesh.bounds, axis=0))
         raise ValueError(
-            f"geometry: its {area:.3g} m^2 of surfaces make about {elements:.2g} elements of {ELEMENT_M} m, which take "
-            f"{5e-6 * elements:.2g} GB and more, expected at most {MOST_ELEMENTS}; its box is {size} m: if that is not in "
-            "metres but in millimetres, give Mesh(1e-3 * vertices, faces), else the part of it that was measured"
+            f"geometry: its {area:.3g} m^2 of surfaces would be cut into elements of {width_m:.3g} m, expected at most "
+            f"{LARGEST_ELEMENT_M:g} m; its box is {size} m: if that is not in metres but in millimetres, give "
+            "Mesh(1e-3 * vertices, faces), else the part of it that was measured"
         )
+    return width_m
 
 
 def _mirrors(patches: PlanarPatches) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -317,8 +322,9 @@ def _mirrors(patches: PlanarPatches) -> tuple[np.ndarray, tuple[np.ndarray, np.n
     return order[patches.face_patch].astype(np.int32), (patches.normal[own], patches.offset[own])
 
 
-def _split_long(mesh: Mesh, chosen: np.ndarray) -> tuple[Mesh, np.ndarray]:
-    """Faces ``chosen`` of ``mesh``, halved across their longest edge until none is long, and each face's parent.
+def _split_long(mesh: Mesh, chosen: np.ndarray, most_m: float) -> tuple[Mesh, np.ndarray]:
+    """Faces ``chosen`` of ``mesh``, halved across their longest edge until none is longer than ``most_m``, and each
+    face's parent.
 
     Both faces at an edge are split at its midpoint or not at all, because the edge's length alone decides: no cracks.
     """
@@ -328,7 +334,7 @@ def _split_long(mesh: Mesh, chosen: np.ndarray) -> tuple[Mesh, np.ndarray]:
     for _ in range(64):
         edge = np.linalg.norm(vertices[np.roll(faces, -1, axis=1)] - vertices[faces], axis=2)
         longest = edge.argmax(axis=1)
-        long = edge.max(axis=1) > LARGEST_FACE_M
+        long = edge.max(axis=1) > most_m
         done_faces.append(faces[~long])
         done_parent.append(parent[~long])
         if not long.any():

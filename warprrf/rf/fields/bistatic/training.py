@@ -107,7 +107,7 @@ class FitOptions:
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
-        mirror_order: mirror reflections on a path: 0 to 3.
+        mirror_order: mirror reflections on a path: 0 to 3; None also stops short of 3 where a search would be refused.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
             Degli-Esposti et al. (2007), Sionna RT's, which do not.
@@ -252,7 +252,7 @@ def trace(
     """What the receivers of ``ds`` see of ``geometry`` (a Reconstruction, Scene, Mesh or Surface).
 
     Args:
-        mirror_order: most mirror reflections on a path; 3 by default.
+        mirror_order: most mirror reflections on a path; 3 by default, or as many as can be searched (2 in a city).
         sub_pixels: square root of the rays per pixel; 3 by default.
         device: where rays are cast.
         progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
@@ -264,8 +264,10 @@ def trace(
     """
     started, tell = time.perf_counter(), progress or _silent
     receivers, transmitter = check_dataset(as_mesh(geometry, "geometry"), ds, device=device)
-    order = 3 if mirror_order is None else mirror_order
-    terms = Terms(mirror_order=order, sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels)
+    terms = Terms(
+        mirror_order=3 if mirror_order is None else mirror_order,
+        sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels,
+    )
     _check_rays(ds.path_gain.shape, terms.sub_pixels)
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
@@ -277,7 +279,9 @@ def trace(
         beam_sigma_rad=float(ds.beam_sigma_rad), loss_per_m=0.0 if air is None else air.loss_per_m(frequency_hz),
         device=device,
     )  # fmt: skip
-    found = transport.paths(receivers, order, progress)
+    if mirror_order is None:
+        terms = replace(terms, mirror_order=transport.images.affordable(receivers, terms.mirror_order))
+    found = transport.paths(receivers, terms.mirror_order, progress)
     views = []
     for r, receiver in enumerate(receivers):
         own = found.subset(np.flatnonzero(found.receiver == r))

@@ -113,6 +113,11 @@ class HarmonicField(RadioField):
             raise ValueError(
                 f"layers: got {', '.join(sorted(wanted))}, expected {', '.join(LAYERS[self.model])}"
             )
+        lacking = set(LAYERS[self.model]) - set(self.layers)
+        if lacking and len(self.layers) > 1:
+            raise ValueError(
+                f"layers: got no {', '.join(sorted(lacking))}, expected the gain alone or every layer"
+            )
         table = Expected(f"N {_kernels.COEFFICIENTS}", -MOST_COEFFICIENT, MOST_COEFFICIENT)
         check_arrays(self.layers, dict.fromkeys(self.layers, table), N=len(self.gaussians))
         check_positive("gain_unit", self.gain_unit)

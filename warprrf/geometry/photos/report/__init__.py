@@ -1,0 +1,272 @@
+"""A reconstruction on one HTML page: what went in, what came out, how far it can be trusted. Pictures are embedded."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from warprrf.device import DeviceLike, Progress, require
+from warprrf.files import write_text
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.photo_files import read_photo
+from warprrf.geometry.photos.report.plan import FITTED, HELD, plan
+from warprrf.geometry.photos.report.sight import (
+    CLASSES,
+    class_colours,
+    colours_of,
+    from_outside,
+    how_seen,
+    painted,
+)
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.render import render
+
+SHOWN = 6  # photos beside their renderings
+PICTURE_WIDTH = 420  # of one of them [pixels]
+SIDES = ((0.25, "from +x +y"), (0.75, "from -x +y"), (1.25, "from -x -y"), (1.75, "from +x -y"))  # [pi rad]
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; color: #1c1c1c; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.7rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
+p.note, figcaption { color: #555; font-size: .92rem; } figure { margin: .6rem 0; } img, svg { max-width: 100%; }
+.two img { width: 100%; }
+svg text { font-size: 11px; fill: #666; } .two { display: grid; grid-template-columns: 1fr 1fr; gap: .6rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .3rem .8rem .3rem 0; border-bottom: 1px solid #ddd; text-align: left; vertical-align: top; }
+.key { display: inline-block; width: .9em; height: .9em; margin: 0 .3em 0 1em; } .warn { color: #a8200d; }
+"""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a report is about: the parts of a reconstruction.
+
+    Attributes:
+        gaussians, mesh, cameras: as in :class:`~warprrf.geometry.reconstruction.Reconstruction`.
+        photos: image files of the cameras, by name, as the Gaussians were fitted to them.
+        held_out: names of photos that they were not fitted to.
+        unposed: photos without a pose, and why.
+        guessed: what nobody measured and the photos do not show.
+        metric, scale_rms_m: whether lengths are metres, and how well surveyed positions fit.
+    """
+
+    gaussians: Gaussians | None
+    mesh: Mesh | None
+    cameras: Mapping[str, Camera]
+    photos: Mapping[str, Path] = field(default_factory=dict)
+    held_out: Sequence[str] = ()
+    unposed: Mapping[str, str] = field(default_factory=dict)
+    guessed: Sequence[str] = ()
+    metric: bool = True
+    scale_rms_m: float = float("nan")
+
+    @property
+    def unit(self) -> str:
+        """Of lengths."""
+        return "m" if self.metric else "assumed m"
+
+
+def write_report(
+    path: str | os.PathLike[str],
+    subject: Subject,
+    *,
+    progress: Progress | None = None,
+    device: DeviceLike = None,
+) -> None:
+    """Write the page of ``subject`` to ``path``.
+
+    Raises:
+        OSError: if ``path`` cannot be written.
+        ImportError: if Pillow is not installed.
+    """
+    report = progress or (lambda stage, done, total: None)
+    report("report", 0, 3)
+    parts = [_head(subject), _warnings(subject)]
+    if subject.cameras:
+        parts.append(_from_above(subject))
+        parts.append(_beside(subject, device))
+    report("report", 1, 3)
+    if subject.mesh is not None:
+        parts.append(_surface(subject.mesh, subject, device))
+    report("report", 2, 3)
+    parts += [_lenses(subject), _unposed(subject)]
+    body = "\n".join(part for part in parts if part)
+    write_text(
+        path,
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>Reconstruction</title>'
+        f"<style>{STYLE}</style></head><body>\n{body}\n</body></html>\n",
+    )
+    report("report", 3, 3)
+
+
+def psnr_db(picture: np.ndarray, photo: np.ndarray) -> float:
+    """Peak signal to noise ratio [dB] of a picture in [0, 1]."""
+    error = float(np.mean((np.clip(picture, 0, 1) - photo) ** 2))
+    return -10 * np.log10(max(error, 1e-12))
+
+
+def colours_matched(picture: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """``picture`` after the affine change of its colours that brings it nearest to ``photo``, both ``(H, W, 3)``."""
+    given = np.column_stack([picture.reshape(-1, 3), np.ones(picture.shape[0] * picture.shape[1])])
+    change = np.linalg.lstsq(given, photo.reshape(-1, 3), rcond=None)[0]
+    return np.asarray((given @ change).reshape(picture.shape))
+
+
+def _head(subject: Subject) -> str:
+    total = len(subject.cameras) + len(subject.unposed)
+    rows = [
+        ("photos", f"{len(subject.cameras)} of {total} posed, {len(subject.held_out)} held out of the fit")
+    ]
+    if subject.gaussians is not None:
+        rows.append(("Gaussians", f"{len(subject.gaussians)}"))
+    if subject.mesh is not None:
+        low, high = subject.mesh.bounds
+        size = " x ".join(f"{length:.2f}" for length in high - low)
+        rows.append(
+            (
+                "mesh",
+                f"{len(subject.mesh.faces)} triangles, {subject.mesh.areas.sum():.1f} m², within {size} m",
+            )
+        )
+    if not np.isnan(subject.scale_rms_m):
+        rows.append(("surveyed positions", f"met within {100 * subject.scale_rms_m:.1f} cm rms"))
+    return f"<h1>Reconstruction</h1>{_table(rows)}"
+
+
+def _warnings(subject: Subject) -> str:
+    said = list(subject.guessed)
+    if not subject.metric and not any(text.startswith("scale") for text in said):
+        said.append("scale: lengths are not metres")
+    if not said:
+        return '<h2>What is guessed</h2><p class="note">Nothing: scale, up and the floor are measured or seen.</p>'
+    items = "".join(f'<li class="warn">{html.escape(text)}</li>' for text in said)
+    return f"<h2>What is guessed</h2><ul>{items}</ul>"
+
+
+def _from_above(subject: Subject) -> str:
+    keys = _key(FITTED, "photos that were fitted") + _key(HELD, "held out.")
+    return (
+        "<h2>Cameras from above</h2><figure>"
+        + plan(subject.mesh, subject.cameras, subject.held_out, subject.unit)
+        + f"<figcaption>{keys} Lines: where the mesh is at the cameras' median height.</figcaption></figure>"
+    )
+
+
+def _beside(subject: Subject, device: DeviceLike) -> str:
+    """Photos beside what the Gaussians show, those held out where there are some."""
+    if subject.gaussians is None:
+        return ""
+    held = [name for name in subject.held_out if name in subject.cameras]
+    names = held or list(subject.cameras)
+    there = [name for name in names if name in subject.photos and subject.photos[name].is_file()]
+    title = "Held-out photos" if held else "Photos"
+    text = "Photo on the left, Gaussians on the right"
+    text += "." if held else "; none was held out, and the PSNR of photos that were fitted flatters."
+    if not there:
+        return f'<h2>{title}</h2><p class="note">Their files are not there any more.</p>'
+    rows, scores = [], []
+    for name in (
+        there[k] for k in np.linspace(0, len(there) - 1, min(len(there), SHOWN)).round().astype(int)
+    ):
+        photo = read_photo(subject.photos[name])
+        camera = subject.cameras[name].resized(photo.shape[1], photo.shape[0])
+        picture = render(subject.gaussians, camera, device=device).features
+        plain, matched = psnr_db(picture, photo), psnr_db(colours_matched(picture, photo), photo)
+        scores.append((plain, matched))
+        caption = f"{html.escape(name)}: {plain:.1f} dB, {matched:.1f} dB with colours matched"
+        rows.append(
+            f'<figure><div class="two">{_jpeg(photo)}{_jpeg(picture)}</div><figcaption>{caption}</figcaption></figure>'
+        )
+    mean = np.mean(scores, axis=0)
+    text += f" Mean PSNR of those shown: {mean[0]:.1f} dB, {mean[1]:.1f} dB after an affine change of each one's colours."
+    return f'<h2>{title} beside renderings</h2><p class="note">{text}</p>{"".join(rows)}'
+
+
+def _surface(mesh: Mesh, subject: Subject, device: DeviceLike) -> str:
+    """The mesh from four sides, in its colours and by how often it was seen."""
+    views = [(from_outside(mesh, np.pi * turn, device=device), name) for turn, name in SIDES]
+    grey = np.zeros((1, 3)), np.full((1, 3), 0.8)
+    own = grey if subject.gaussians is None else (subject.gaussians.means, colours_of(subject.gaussians))
+    said = (
+        "Backs of surfaces are left out: walls and ceiling between the eye and the room are looked through."
+    )
+    parts = [f'<h2>Mesh from four sides</h2><p class="note">{said}</p>{_four(views, own)}']
+    if subject.cameras:
+        seen = how_seen(mesh, list(subject.cameras.values()), device=device)
+        keys = "".join(
+            _key(colour, f"{name}: {share:.0%}")
+            for (_, name, colour), share in zip(CLASSES, seen.shares, strict=True)
+        )
+        parts.append(
+            "<h2>How well each surface was seen</h2><p>Photos that show it, and the part of the area:"
+            f"{keys}</p>{_four(views, (seen.points, class_colours(seen)))}"
+            '<p class="note">What fewer than three photos show is inferred from what is round it.</p>'
+        )
+    return "".join(parts)
+
+
+def _four(
+    views: Sequence[tuple[tuple[np.ndarray, np.ndarray], str]], coloured: tuple[np.ndarray, np.ndarray]
+) -> str:
+    figures = "".join(
+        f"<figure>{_jpeg(painted(*view, *coloured))}<figcaption>{name}</figcaption></figure>"
+        for view, name in views
+    )
+    return f'<div class="two">{figures}</div>'
+
+
+def _lenses(subject: Subject) -> str:
+    groups: dict[tuple[float, ...], int] = {}
+    for c in subject.cameras.values():
+        lens = (c.width, c.height, round(c.fx, 2), round(c.fy, 2), round(c.cx, 2), round(c.cy, 2))
+        groups[lens] = groups.get(lens, 0) + 1
+    if not groups:
+        return ""
+    rows = [("photos", "pixels used", "focal length [pixels]", "principal point", "field of view")]
+    for (width, height, fx, fy, cx, cy), count in sorted(groups.items(), key=lambda item: -item[1])[:SHOWN]:
+        view = " x ".join(
+            f"{np.degrees(2 * np.arctan(n / 2 / f)):.0f}°" for n, f in ((width, fx), (height, fy))
+        )
+        focal = f"{fx:.1f}" if fx == fy else f"{fx:.1f}, {fy:.1f}"
+        rows.append((f"{count}", f"{width:.0f} x {height:.0f}", focal, f"{cx:.1f}, {cy:.1f}", view))
+    more = f'<p class="note">{len(groups) - SHOWN} more lenses.</p>' if len(groups) > SHOWN else ""
+    return f"<h2>Lenses</h2>{_table(rows)}{more}"
+
+
+def _unposed(subject: Subject) -> str:
+    if not subject.unposed:
+        return ""
+    rows = [(name, cause or "cause not known") for name, cause in subject.unposed.items()]
+    return f"<h2>Photos without a pose</h2>{_table(rows)}"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    lines = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f"<table>{lines}</table>"
+
+
+def _key(colour: str, text: str) -> str:
+    return f'<span class="key" style="background:{colour}"></span>{html.escape(text)}'
+
+
+def _jpeg(picture: np.ndarray) -> str:
+    """An embedded picture ``(H, W, 3)`` in [0, 1], made smaller where it is wide."""
+    image = require("PIL.Image", extra="photos")
+    shown = image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    if shown.width > PICTURE_WIDTH * 1.2:
+        size = PICTURE_WIDTH, max(1, round(shown.height * PICTURE_WIDTH / shown.width))
+        shown = shown.resize(size, image.Resampling.BOX)
+    data = io.BytesIO()
+    shown.save(data, "JPEG", quality=85)
+    code = base64.b64encode(data.getvalue()).decode()
+    return f'<img alt="" width="{shown.width}" src="data:image/jpeg;base64,{code}">'

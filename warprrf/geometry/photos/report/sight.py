@@ -1,0 +1,132 @@
+"""How often each piece of a surface was seen, and what the surface looks like from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from warprrf.device import DeviceLike
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+
+SAMPLES = 30_000  # points of the surface, spread by area
+FARTHEST_M, GRAZING = 15.0, 0.1  # a photo shows a point nearer than this, at a cosine of incidence above this
+CLASSES = ((0, "no photo", "#b2182b"), (1, "1 or 2", "#ef8a62"), (3, "3 to 5", "#f7d98b"),
+           (6, "6 to 11", "#92c5de"), (12, "12 or more", "#2166ac"))  # fmt: skip
+"""Least number of photos, its name and colour."""
+LAYERS = 8  # backs of surfaces that are looked through
+SUN = np.array([0.3, 0.2, 0.93])  # where light comes from in pictures of the mesh
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Points spread over a surface by area, and by how many photos each is seen.
+
+    Attributes:
+        points: [m], shape ``(S, 3)``.
+        photos: shape ``(S,)`` int64.
+    """
+
+    points: np.ndarray
+    photos: np.ndarray
+
+    @property
+    def classes(self) -> np.ndarray:
+        """Index in :data:`CLASSES` of each point, shape ``(S,)``."""
+        return np.searchsorted([least for least, _, _ in CLASSES], self.photos, side="right") - 1
+
+    @property
+    def shares(self) -> list[float]:
+        """Part of the surface in each of :data:`CLASSES`."""
+        return [
+            float(share) for share in np.bincount(self.classes, minlength=len(CLASSES)) / len(self.photos)
+        ]
+
+
+def how_seen(mesh: Mesh, cameras: Sequence[Camera], *, device: DeviceLike = None, seed: int = 0) -> Seen:
+    """By how many of ``cameras`` the fronts of a mesh are seen: in the frame, near, not grazing, not hidden."""
+    rng = np.random.default_rng(seed)
+    face = rng.choice(len(mesh.faces), SAMPLES, p=mesh.areas / mesh.areas.sum())
+    a, b = np.sort(rng.random((2, SAMPLES)), axis=0)
+    weights = np.stack([a, b - a, 1 - b], axis=1)
+    points = np.einsum("sk,ski->si", weights, mesh.triangles[face])
+    normals = mesh.face_normals[face]
+    photos = np.zeros(SAMPLES, dtype=np.int64)
+    for camera in cameras:
+        towards = camera.position - points
+        distance = np.linalg.norm(towards, axis=1)
+        uv, depth = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
+        facing = np.einsum("si,si->s", towards, normals) > GRAZING * distance
+        some = np.flatnonzero(inside & facing & (depth > 0) & (distance < FARTHEST_M))
+        photos[some] += mesh.visible(camera.position, points[some], clearance=1e-3, device=device)
+    return Seen(points, photos)
+
+
+def from_outside(
+    mesh: Mesh, azimuth: float, *, width: int = 480, device: DeviceLike = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What is seen of a mesh from outside and above, through the backs of what stands before it.
+
+    Args:
+        azimuth: where the eye stands [rad].
+
+    Returns:
+        Points met [m], shape ``(H, W, 3)``, NaN where nothing is, and how light they are, shape ``(H, W)``.
+    """
+    elevation = np.radians(38.0)
+    back = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+    )
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    up = np.cross(back, right)
+    low, high = np.percentile(mesh.triangles.reshape(-1, 3), [0.5, 99.5], axis=0)  # far debris stays out
+    corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
+    spans = (
+        [(corners @ axis).min() - 0.1 for axis in (right, up)],
+        [(corners @ axis).max() + 0.1 for axis in (right, up)],
+    )
+    step = (spans[1][0] - spans[0][0]) / width
+    height = int(np.clip((spans[1][1] - spans[0][1]) / step, 1, 2 * width))
+    u, v = np.meshgrid(
+        spans[0][0] + step * (np.arange(width) + 0.5), spans[1][1] - step * (np.arange(height) + 0.5)
+    )
+    reach = float(np.abs(mesh.bounds).sum())  # from where all of it lies ahead
+    origins = (u[..., None] * right + v[..., None] * up + reach * back).reshape(-1, 3)
+    points, light = np.full(origins.shape, np.nan), np.zeros(len(origins))
+    left = np.arange(len(origins))
+    for _ in range(LAYERS):
+        hit = mesh.cast(origins[left], -back, device=device)
+        front = hit.valid & (np.nan_to_num(hit.normal) @ back > 0)
+        points[left[front]] = hit.point[front]
+        light[left[front]] = 0.7 + 0.3 * np.clip(hit.normal[front] @ SUN, 0.0, 1.0)
+        behind = hit.valid & ~front
+        left = left[behind]
+        if not len(left):
+            break
+        origins[left] = hit.point[behind] - 1e-4 * back
+    return points.reshape(height, width, 3), light.reshape(height, width)
+
+
+def painted(points: np.ndarray, light: np.ndarray, places: np.ndarray, colours: np.ndarray) -> np.ndarray:
+    """A picture of :func:`from_outside` in the colours ``(N, 3)`` of the nearest of ``places``, shape ``(H, W, 3)``."""
+    picture = np.ones((*light.shape, 3))
+    met = np.isfinite(points[..., 0])
+    picture[met] = light[met][:, None] * colours[cKDTree(places).query(points[met])[1]]
+    return picture
+
+
+def colours_of(gaussians: Gaussians) -> np.ndarray:
+    """Mean colour of each Gaussian in [0, 1], shape ``(N, 3)``."""
+    return np.clip(0.28209479177387814 * gaussians.sh[:, 0] + 0.5, 0.0, 1.0)
+
+
+def class_colours(seen: Seen) -> np.ndarray:
+    """Colour of each point's class in [0, 1], shape ``(S, 3)``."""
+    table = np.array([[int(c[k : k + 2], 16) / 255 for k in (1, 3, 5)] for _, _, c in CLASSES])
+    return table[seen.classes]
