@@ -190,7 +190,7 @@ def test_a_killed_run_continues_to_the_same_result(whole):
     (workspace / "surface.safetensors.partial").write_bytes(b"half")
     stages = set()
     resumed = reconstruct(photos, config=SMALL, progress=lambda s, d, n: stages.add(s), **options)
-    assert stages == {"depth", "surface"}
+    assert stages == {"depth", "stereo", "surface"}
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
 

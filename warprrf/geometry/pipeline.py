@@ -149,19 +149,29 @@ def _steps(
         fitted: the photos that Gaussians are fitted to, by name.
     """
     cameras = {name: sparse.cameras[name] for name in fitted}
-    photos = cache(lambda: [read_photo(photo) for photo in fitted.values()])
     masks = [mask_beside(photo) for photo in fitted.values()]
+
+    @cache
+    def photos() -> PosedPhotos:
+        images = [read_photo(photo) for photo in fitted.values()]
+        return PosedPhotos(images, list(cameras.values()), [read_mask(photo) for photo in fitted.values()])
 
     def initial(attempt: Attempt) -> files.Arrays:
         planes, gaussians = initialise(
-            sparse, cameras, photos(), config=config, seed=seed, progress=attempt.progress, device=device
+            sparse,
+            cameras,
+            photos().images,
+            config=config,
+            seed=seed,
+            progress=attempt.progress,
+            device=device,
         )
         return files.of_planes(planes) | files.of_gaussians(gaussians)
 
     def refined(attempt: Attempt) -> files.Arrays:
         gaussians = refine(
             files.to_gaussians(first),
-            PosedPhotos(photos(), list(cameras.values()), [read_mask(photo) for photo in fitted.values()]),
+            photos(),
             config=config.refine,
             planes=planes,
             progress=attempt.progress,
@@ -174,7 +184,7 @@ def _steps(
         patches = fuse_gaussians(
             gaussians,
             list(cameras.values()),
-            photos=PosedPhotos(photos(), list(cameras.values())),
+            photos=photos(),
             planes=planes,
             config=config,
             progress=attempt.progress,
