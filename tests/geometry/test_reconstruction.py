@@ -198,9 +198,9 @@ def test_a_killed_run_continues_to_the_same_result(whole):
 @pytest.mark.parametrize(
     "changed, again",
     [
-        ("initial", {"planes", "refine", "depth", "surface"}),
-        ("refined", {"refine", "depth", "surface"}),
-        ("surface", {"depth", "surface"}),
+        ("initial", {"planes", "refine", "depth", "stereo", "surface"}),
+        ("refined", {"refine", "depth", "stereo", "surface"}),
+        ("surface", {"depth", "stereo", "surface"}),
     ],
 )
 def test_a_step_of_another_version_is_done_again_and_those_after_it(
