@@ -31,9 +31,14 @@ NAMES = {
     "relevance": ("benchmarks.relevance", "what each effect is worth, at two bands and roughnesses"),
     "newrf": ("benchmarks.newrf", "rays and channels of NeWRF's conference room"),
     "city-paths": ("benchmarks.city_paths", "mirror paths of Sionna RT's own scenes beside its solver's"),
+    "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
     "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
     "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
+    "measurements": (
+        "benchmarks.measurements",
+        "horns, power alone, delay profiles and one spectrum, beside ten spectra",
+    ),
     "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

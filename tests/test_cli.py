@@ -13,6 +13,7 @@ import pytest
 from places import ROOT
 
 from warprrf import cli
+from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.rf.maps.radio_map import RadioMap
@@ -395,3 +396,16 @@ def test_simulate_fit_evaluate_and_render_round_trip(
     np.testing.assert_allclose(found.best_beam_snr_db, expected.best_beam_snr_db - 13.0, atol=1e-6)
     assert f"{found.free.sum()} cells in the air" in capsys.readouterr().out
     assert (tmp_path / "m.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_bar_that_resumes_promises_what_its_own_speed_allows(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = [0.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    with Bars() as bars:
+        bars("refine", 900, 1000)  # where a stopped run was
+        clock[0] = 40.0
+        bars("refine", 910, 1000)
+    # Ten took 40 s: ninety take six minutes. From the count alone it would be four seconds.
+    assert "00:40<06:00" in capsys.readouterr().err

@@ -16,7 +16,7 @@ from golden import make
 from warprrf.steps import Steps
 
 HEAD = """
-import multiprocessing, os, sys, threading, time
+import faulthandler, multiprocessing, os, signal, sys, threading, time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 sys.path[:0] = {path!r}
 import numpy as np
@@ -62,17 +62,32 @@ def asked(field):
 
 
 def in_fork(use, wait_s=60):
-    \"\"\"What ``use`` returns in a forked child; an error if it is not done in time.\"\"\"
+    \"\"\"What ``use`` returns in a forked child; an error if it dies, or is not done in time: it then says where.\"\"\"
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
-    child = context.Process(target=lambda: theirs.send(use()))
+
+    def work():
+        ours.close()
+        theirs.send(use())
+
+    child = context.Process(target=work)
     child.start()
+    theirs.close()
     try:
-        assert ours.poll(wait_s), "the child hangs or died"
+        if not ours.poll(wait_s):
+            os.kill(child.pid, signal.SIGUSR1)
+            time.sleep(1)
+            raise TimeoutError("the child hangs")
         return ours.recv()
+    except EOFError:
+        child.join()
+        raise ChildProcessError("the child died with exit code " + str(child.exitcode)) from None
     finally:
         child.kill()
         child.join()
+
+
+faulthandler.register(signal.SIGUSR1)
 """
 
 

@@ -19,6 +19,7 @@ CHOICES = {
     "real": (wp.float32, wp.float64),
     "rule": (0, 1),
     "width": (1, 4),
+    "lanes": (1,),  # of a GPU
 }  # what builders of kernels are asked for
 FOR_A_CPU_ALONE = "warprrf.kernels.raster.blocks"  # a GPU blends by `reference`
 MODULES = sorted(

@@ -51,6 +51,12 @@ from warprrf.rf.spectra.spectrum import Spectrum as Spectrum
 # spectra of many receivers, with roles for training and test
 from warprrf.rf.spectra.dataset import SpectrumDataset as SpectrumDataset
 
+# received powers of horns, sounders and receivers, as they were measured
+from warprrf.rf.spectra.readings import Readings as Readings
+
+# the pattern of a horn antenna
+from warprrf.rf.spectra.readings import horn as horn
+
 # a model fitted to spectra, which answers for any receiver
 from warprrf.rf.fields.base import RadioField as RadioField
 

@@ -99,6 +99,19 @@ def _field_of(paths: wr.Paths) -> dict[str, Any]:
     return {name: getattr(paths, name) for name in paths.__dataclass_fields__}
 
 
+def _readings(p: Place) -> dict[str, Any]:
+    return {
+        "transmitters": TRANSMITTER,
+        "receivers": POINTS[0],
+        "power": np.array([1e-8, 1e-9, 1e-10]),
+        "frequency_hz": CARRIER,
+        "floor": 1e-14,
+        "arrival": np.array([[1.5, 0.0], [1.5, 1.0], [1.5, 2.0]]),
+        "receive_pattern": np.linspace(1.0, 0.0, 19),
+        "std_db": 1.0,
+    }
+
+
 def _spectra(p: Place) -> dict[str, Any]:
     ds = p.train.subset([0, 1, 2])
     return {name: getattr(ds, name) for name in ds.__dataclass_fields__}
@@ -238,6 +251,18 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         "range_db": (-140.0, -70.0),
     },
     "Spectrum.plot": _on(lambda p: p.spectra[0]),
+    "Readings": _readings,
+    "Readings.from_table": lambda p: {
+        "table": {
+            **{f"{end}_{axis}": np.full(3, float(v)) for end, at in (("tx", TRANSMITTER), ("rx", POINTS[0]))
+               for axis, v in zip("xyz", at, strict=True)},
+            "power_db": np.array([-80.0, -90.0, -100.0]),
+        },
+        "frequency_hz": CARRIER, "floor": 1e-14,
+    },
+    "Readings.load": lambda p: {"path": p.folder / "readings.csv", "frequency_hz": CARRIER, "floor": 1e-14},
+    "Readings.subset": lambda p: {"self": wr.Readings(**_readings(p)), "rows": np.array([0, 2])},
+    "horn": lambda p: {"width_rad": 0.2},
     "SpectrumDataset": _spectra,
     "SpectrumDataset.deembed": _on(
         lambda p: p.train.subset([0]), pattern=np.cos(np.linspace(0, np.pi / 2, 19)) ** 8, iterations=20, snapshots=1,

@@ -7,7 +7,9 @@ import shutil
 import traceback
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +58,8 @@ class Trial:
 
     def __init__(self, place: Place, scratch: Path) -> None:
         self.place, self.scratch = place, scratch
+        with suppress(ImportError):
+            import_module("torch")  # its tens of seconds on a busy machine are no case's
         self._usual: dict[str, judge.Leaves | None] = {}
 
     def __call__(self, case: Case) -> Outcome:

@@ -15,6 +15,7 @@ from benchmarks.fuzz.place import Place
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.photos.photo_files import check_photos, find_photos, read_photo
+from warprrf.geometry.photos.poses import DepthFile, read_depth, read_poses
 from warprrf.geometry.photos.sfm import read_colmap
 from warprrf.rf.spectra.exr import export_exr, import_exr
 from warprrf.steps import Steps
@@ -131,6 +132,25 @@ def _receivers(place: Place, folder: Path) -> Path:
 ROWS = "x,y,z\n1.0,2.0,1.5\n3.0,1.0,1.2\n"
 SURVEYED = '{"0.png": [1.0, 2.0, 1.5], "1.jpg": [3.0, 1.0, 1.2]}\n'
 
+TRANSFORMS = (
+    '{"fl_x": 60.0, "w": 32, "h": 24, "k1": 0.1, "frames": [{"file_path": "0.png", "transform_matrix": '
+    "[[1, 0, 0, 1.0], [0, 1, 0, 2.0], [0, 0, 1, 1.5], [0, 0, 0, 1]]}]}\n"
+)
+
+
+def _depth(place: Place, folder: Path) -> Path:
+    from PIL import Image
+
+    Image.fromarray(np.arange(600, dtype=np.uint16).reshape(20, 30)).save(folder / "depth.png")
+    return folder / "depth.png"
+
+
+def _frame(place: Place, folder: Path) -> Path:
+    np.savetxt(folder / "camera-intrinsics.txt", np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]))
+    np.savetxt(folder / "frame-0.pose.txt", np.eye(4))
+    return folder / "frame-0.pose.txt"
+
+
 FORMATS: dict[str, Format] = {
     "spectra": Format(_copy("spectra.nc"), wr.SpectrumDataset.load, "netcdf", True),
     "compact spectra": Format(_copy("compact.nc"), wr.SpectrumDataset.load, "netcdf", True),
@@ -159,6 +179,9 @@ FORMATS: dict[str, Format] = {
     "receivers NPY": Format(_receivers, lambda p: read_receivers([str(p)])),
     "positions JSON": Format(_text("surveyed.json", SURVEYED), read_positions, "json"),
     "positions CSV": Format(_text("surveyed.csv", "file,x,y,z\n0.png,1,2,1.5\n"), read_positions, "words"),
+    "transforms": Format(_text("transforms.json", TRANSFORMS), read_poses, "json"),
+    "pose of a frame": Format(_frame, lambda p: read_poses(p.parent), "words"),
+    "depth PNG": Format(_depth, lambda p: read_depth(DepthFile(p))),
     "EXR": Format(_exr, import_exr),
     "PNG": Format(_copy("photos/0.png"), _photo),
     "JPEG": Format(_copy("photos/1.jpg"), _photo),

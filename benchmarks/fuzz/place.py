@@ -45,6 +45,9 @@ class Place:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._make_scene()
         self.spectra.save(self.folder / "spectra.nc")
+        header = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,power_db\n"
+        at = ",".join(map(str, [*TRANSMITTER, *self.receivers[0]]))
+        (self.folder / "readings.csv").write_text(header + f"{at},-80.0\n{at},-81.5\n")
         self.spectra.save(self.folder / "compact.nc", compact=True)
         for name, model, options in (
             ("bistatic", "bistatic", {}),

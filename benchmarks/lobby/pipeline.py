@@ -272,7 +272,7 @@ class Lobby:
             raise ValueError("photos: no held-out photo has a pose, so stage 1 cannot be scored")
         views, renders, psnr = [], [], []
         for done, name in enumerate(names):
-            view = read_photo(self.data / "photos" / name)
+            view = read_photo(found.photos[name])
             image = wr.render(found.gaussians, found.cameras[name], device=self.job.device).features
             image = np.clip(image, 0, 1)
             psnr.append(float(-10.0 * np.log10(np.mean((image - view) ** 2, dtype=np.float64))))

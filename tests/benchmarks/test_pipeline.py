@@ -83,7 +83,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _true_geometry(lobby: pipeline.Lobby, attempt: Any) -> dict[str, Any]:
     out, mesh = lobby.job.out, lobby.place.scene.mesh
     cameras = pipeline.truth_scores.true_cameras(lobby.data / "poses_true.json")
-    reconstruction = wr.Reconstruction(discs_on_mesh(mesh), mesh, cameras)
+    photos = {name: lobby.data / "photos" / name for name in cameras}
+    reconstruction = wr.Reconstruction(discs_on_mesh(mesh), mesh, cameras, photos=photos)
     reconstruction.save(out / "reconstruction")
     reconstruction.gaussians.save_ply(out / "geometry.ply")
     for name in ("mesh.ply", "cameras.json"):

@@ -51,6 +51,7 @@ FOUND = [
     ("RadioField.links", ("shape", "with inf")),
     ("RadioField.load", ("path", "no text")),
     ("Spectrum", ("range_db", "as objects")),
+    ("Reconstruction", ("photos", "dictionary")),
     ("SpectrumDataset.deembed", ("pattern", "class")),
     ("SpectrumDataset.deembed", ("pattern", "ragged")),
     ("SpectrumDataset.from_spectra", ("path_gain", "negated"), ("aod", "with 1e20")),

@@ -166,7 +166,7 @@ def spectra() -> wr.SpectrumDataset:
 
 @cache
 def bistatic() -> wr.RadioField:
-    """A bistatic field fitted to three of them: single bounces, nothing held out."""
+    """A bistatic field fitted to three of them: nothing held out."""
     return wr.RadioField.fit(room(), spectra().subset([0, 3, 6]), model="bistatic")
 
 

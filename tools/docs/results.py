@@ -643,6 +643,20 @@ def _city_verbs() -> str:
     return "\n\n".join([markdown(head, lines), busy])
 
 
+@entry("bare-mesh")
+def _bare_mesh() -> str:
+    found = measured("bare_mesh")
+    if found is None:
+        return missing("python -m benchmarks bare-mesh")
+    meshes = {"named": "names", "bare": "no names, no colours", "scan": "the same, scanned"}
+    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "where blocked [dB]")
+    lines = []
+    for r in found["rows"]:
+        figures = (show(r["psnr_db"]), show(r["lost_db"], "{:.2f}"), show(r["psnr_db_blocked"]))
+        lines.append([r["room"], TRUTHS[r["truth"]], str(r["n_train"]), meshes[r["mesh"]], *figures])
+    return markdown(head, lines)
+
+
 @entry("map")
 def _map() -> str:
     found = read("map")

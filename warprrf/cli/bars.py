@@ -32,7 +32,9 @@ class Bars:
 
             self.close()
             # On a terminal the bar moves often; in a log every line stays, so a new one every half minute is enough.
-            self._bar = tqdm(total=total, desc=stage, mininterval=0.2 if sys.stderr.isatty() else 30.0)
+            # Work that goes on where a run was stopped begins at its count; what is left is promised from the mean speed.
+            interval = 0.2 if sys.stderr.isatty() else 30.0
+            self._bar = tqdm(total=total, initial=done, desc=stage, smoothing=0, mininterval=interval)
             self._stage = stage
         self._bar.total = total
         self._bar.update(done - self._bar.n)

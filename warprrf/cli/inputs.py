@@ -65,14 +65,43 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
         ) from error
 
 
-def read_scale(words: Sequence[str]) -> tuple[str, str, float]:
-    """Two photos and the distance between their cameras [m], from three words."""
+def add_readings_options(parser: argparse.ArgumentParser) -> None:
+    """Define what tables of received power do not say themselves."""
+    own = parser.add_argument_group("tables of received power (CSV)")
+    own.add_argument("--carrier", type=float, metavar="HZ", help="carrier frequency")
+    own.add_argument(
+        "--noise-floor-db", type=float, help="readings not above it only say that there was no more"
+    )
+    own.add_argument("--horn-deg", type=float, help="width of the receiver's horn at half maximum")
+    own.add_argument("--tx-horn-deg", type=float, help="width of the transmitter's horn")
+    own.add_argument("--bandwidth", type=float, metavar="HZ", help="of the sounder, for delays")
+
+
+def read_readings(path: Path, args: argparse.Namespace) -> wr.Readings:
+    """A table of received power."""
+    for flag in ("carrier", "noise_floor_db"):
+        if getattr(args, flag) is None:
+            raise ValueError(f"--{flag.replace('_', '-')}: {path} needs it, it is a table of received power")
+    horns = {
+        name: None if width is None else wr.horn(np.radians(width))
+        for name, width in (("receive_pattern", args.horn_deg), ("transmit_pattern", args.tx_horn_deg))
+    }
+    return wr.Readings.load(
+        path, frequency_hz=args.carrier, floor=10.0 ** (args.noise_floor_db / 10.0), bandwidth_hz=args.bandwidth,
+        name=path.stem, **horns,
+    )  # fmt: skip
+
+
+def read_scale(words: Sequence[str]) -> float | tuple[str, str, float]:
+    """Two photos and the distance between their cameras [m], or metres for each unit, from three words or one."""
     try:
-        return words[0], words[1], float(words[2])
+        *photos, number = words
+        length = float(number)
     except ValueError as error:
-        raise ValueError(
-            f"--scale: got {words[2]!r}, expected a distance in metres after two photos"
-        ) from error
+        raise ValueError(f"--scale: got {words[-1]!r}, expected a number of metres") from error
+    if len(photos) not in (0, 2):
+        raise ValueError(f"--scale: got {' '.join(words)!r}, expected two photos and metres, or one number")
+    return (photos[0], photos[1], length) if photos else length
 
 
 def read_receivers(values: Sequence[str]) -> np.ndarray:

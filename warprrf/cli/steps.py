@@ -18,16 +18,19 @@ from warprrf.cli.inputs import (
     add_mesh_options,
     add_out,
     add_point,
+    add_readings_options,
     add_scene_options,
     existing,
     load_geometry,
     load_scene,
     read_positions,
+    read_readings,
     read_receivers,
     read_scale,
 )
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
+from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 
 
 def add_reconstruct(add: Add) -> None:
@@ -40,11 +43,32 @@ def add_reconstruct(add: Add) -> None:
     )
     rec.add_argument(
         "--scale",
-        nargs=3,
-        metavar=("PHOTO", "PHOTO", "METRES"),
-        help="how far apart the cameras of two photos were: sets metres where nobody surveyed",
+        nargs="+",
+        metavar="WORD",
+        help="two photos and how far apart their cameras were, in metres; or metres for each unit of --poses",
+    )
+    rec.add_argument(
+        "--poses",
+        metavar="PATH",
+        help="known poses: a transforms.json, a COLMAP model, or RGB-D frames as of 7-Scenes",
+    )
+    rec.add_argument(
+        "--depth", metavar="FOLDER", help="depth images in mm, PNG of 16 bits named as the photos are"
+    )
+    rec.add_argument(
+        "--up", choices=("x", "y", "z"), help="axis of --poses that points up; default: found in the photos"
     )
     rec.add_argument("--workspace", help="where unfinished work lives (default OUT/workspace)")
+    rec.add_argument(
+        "--lens", default="auto", choices=LENSES, help="COLMAP's model of the lenses (default auto)"
+    )
+    rec.add_argument(
+        "--max-pixels",
+        type=int,
+        default=ReconstructionConfig.max_pixels,
+        metavar="N",
+        help="photos are reduced to about so many before the fit (default %(default)s)",
+    )
 
 
 def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
@@ -52,12 +76,14 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
 
     The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
     their depth is fused into a mesh. OUT/report.html shows what came out and how far it can be trusted.
+    Lenses are estimated, and photos are turned upright by EXIF; NAME.mask.png beside a photo is black where it is ignored.
     Photos know no scale: name the measured positions of at least three cameras, or the distance between two. Without
     positions z is up by vertical edges and the floor is at 0.
 
     examples:
       warprrf reconstruct photos/ -o room --known-positions surveyed.json
       warprrf reconstruct photos/ -o room --scale IMG_0001.jpg IMG_0040.jpg 3.25
+      warprrf reconstruct scan/ -o room --poses scan/transforms.json --scale 1 --up z
       where surveyed.json holds {"view_000.jpg": [1.20, 0.85, 1.60], ...} in metres
     Overlap matters most: every surface in five photos or more, loops that look across the room.
     """
@@ -68,8 +94,12 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
     reconstruction = wr.reconstruct(
         photos,
         workspace=workspace,
+        poses=None if args.poses is None else existing(args.poses),
+        depth=None if args.depth is None else existing(args.depth),
         known_positions=known,
         scale=scale,
+        up=args.up,
+        config=ReconstructionConfig(lens=args.lens, max_pixels=args.max_pixels),
         seed=args.seed,
         progress=bars,
         device=args.device,
@@ -152,8 +182,11 @@ def add_fit(add: Add) -> None:
     fit.add_argument(
         "geometry", help="a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh file"
     )
-    fit.add_argument("spectra", help="NetCDF file of spectra")
+    fit.add_argument(
+        "measurements", nargs="+", help="NetCDF files of spectra, CSV files of received power, of one carrier"
+    )
     add_out(fit, "field file (.safetensors)")
+    add_readings_options(fit)
     fit.add_argument(
         "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
     )
@@ -196,14 +229,10 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
       warprrf fit room.glb spectra.nc -o field.safetensors
       warprrf fit scan.stl spectra.nc -o field.safetensors --unit mm --simplify 200000
       warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
+      warprrf fit room.glb horn.csv -o field.safetensors --carrier 300e9 --noise-floor-db -120 --horn-deg 10
     """
     geometry = load_geometry(args.geometry, args.mesh, args)
-    dataset = wr.SpectrumDataset.load(existing(args.spectra))
-    training = dataset.role == "train"
-    if args.train is not None:
-        dataset = dataset.split(args.train, seed=args.seed)[0]
-    elif training.any():
-        dataset = dataset.subset(training)
+    data = [_training_set(path, args) for path in args.measurements]
     options: dict[str, Any] = {}
     if args.relevance is not None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
@@ -215,7 +244,7 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
         options["iterations"] = args.iterations
     field = wr.RadioField.fit(
         geometry,
-        dataset,
+        data[0] if len(data) == 1 else data,
         model=args.model,
         seed=args.seed,
         progress=bars,
@@ -223,7 +252,24 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
         **options,
     )
     field.save(args.out)
-    print(f"{args.out}: {args.model} fitted on {len(dataset.receivers)} receivers")
+    places = sum(len(np.unique(one.receivers, axis=0)) for one in data)
+    print(f"{args.out}: {args.model} fitted on {places} receivers")
+    for name, chain in field.report.get("chains", {}).items():
+        print(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
+    for name, rows in field.report.get("unexplained", {}).items():
+        print(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
+
+
+def _training_set(path: str, args: argparse.Namespace) -> wr.SpectrumDataset | wr.Readings:
+    """The training receivers of a file of spectra, or a table of received power."""
+    file = existing(path)
+    if file.suffix.lower() == ".csv":
+        return read_readings(file, args)
+    dataset = wr.SpectrumDataset.load(file)
+    training = dataset.role == "train"
+    if args.train is not None:
+        return dataset.split(args.train, seed=args.seed)[0]
+    return dataset.subset(training) if training.any() else dataset
 
 
 def add_evaluate(add: Add) -> None:

@@ -19,10 +19,12 @@ from numpy.typing import ArrayLike
 from warprrf.checks import checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
+from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
-from warprrf.geometry.photos.fusion import fuse_gaussians
+from warprrf.geometry.photos.fusion import fuse_gaussians, fuse_maps
 from warprrf.geometry.photos.initialise import initialise
+from warprrf.geometry.photos.measured_depth import range_maps, with_points
 from warprrf.geometry.photos.photo_files import (
     Photos,
     find_photos,
@@ -30,11 +32,13 @@ from warprrf.geometry.photos.photo_files import (
     match_names,
     read_mask,
     read_photo,
+    turns_of,
 )
+from warprrf.geometry.photos.poses import DepthFile, KnownPoses, find_depth, match_photos, read_poses
 from warprrf.geometry.photos.refine import refine
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_scale, check_scale, scaled
 from warprrf.geometry.photos.targets import PosedPhotos
-from warprrf.geometry.photos.upright import upright
+from warprrf.geometry.photos.upright import turned, upright
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -49,8 +53,11 @@ def reconstruct(
     photos: Photos,
     *,
     workspace: str | os.PathLike[str],
+    poses: str | os.PathLike[str] | None = None,
+    depth: str | os.PathLike[str] | None = None,
     known_positions: Mapping[str, ArrayLike] | None = None,
-    scale: tuple[str, str, float] | None = None,
+    scale: float | tuple[str, str, float] | None = None,
+    up: str | None = None,
     held_out: Sequence[str] = (),
     iterations: int | None = None,
     config: ReconstructionConfig | None = None,
@@ -64,10 +71,17 @@ def reconstruct(
         photos: a folder, or a sequence of image files, of any cameras and sizes. Lenses are estimated; EXIF's focal
             length and orientation are used; where ``NAME.mask.png`` beside a photo ``NAME.jpg`` is black, it is ignored.
         workspace: folder of unfinished and finished steps; a stopped run continues from it.
+        poses: poses and lenses that are known already: a ``transforms.json`` of nerfstudio or instant-ngp (Polycam, Record3D
+            and ARKit exports), the folder of a COLMAP model, or one of RGB-D frames as of 7-Scenes (``NAME.pose.txt``
+            and ``camera-intrinsics.txt``). They are kept as they are; no structure from motion is done.
+        depth: folder of depth images [mm], PNG of 16 bits named as the photos are, with ``poses``; by default those that
+            ``poses`` names or that lie beside it. Depth is fused; lengths of ``poses`` are then metres.
         known_positions: photo name to surveyed camera position (3,) [m], three or more that are not on a line. Without
             them vertical edges, planes and the floor set z and its origin.
         scale: ``("a.jpg", "b.jpg", 1.52)``: how far apart the cameras of two photos were [m], where nobody surveyed
-            positions. Without either, the median distance that photos look is taken for 3 m.
+            positions; or metres for each unit of ``poses``, 1 where it is in metres. With none of these, the median
+            distance that photos look is taken for 3 m.
+        up: axis of ``poses`` that points up, ``"x"``, ``"y"`` or ``"z"``; its origin then stays, and with ``"z"`` all its axes.
         held_out: names of photos that get a pose but that the Gaussians are not fitted to.
         iterations: of the photometric refinement; default: the configuration's.
         config: all other settings.
@@ -76,7 +90,8 @@ def reconstruct(
         device: Warp device of the refinement and the depth maps.
 
     Raises:
-        ValueError: for ``scale`` beside ``known_positions``, and for bad photos or positions (see
+        ValueError: for arguments that exclude or need one another, for files of poses or depth that are damaged, and for
+            bad photos or positions (see
             :func:`~warprrf.geometry.photos.sfm.structure_from_motion` and
             :func:`~warprrf.geometry.photos.sparse.align_to_known`).
         ImportError: if the extra ``photos`` is not installed.
@@ -90,12 +105,13 @@ def reconstruct(
     skipped = set(match_names("held_out", held_out, list(named)))
     if known_positions is not None:
         match_names("known_positions", known_positions, list(named))
-        if scale is not None:
-            raise ValueError(
-                "scale, known_positions: got both, expected one; surveyed positions set the scale"
-            )
+    _check_world(poses, depth, known_positions, scale, up)
     if scale is not None:
         check_scale(scale, list(named))
+    known = None
+    if poses is not None:
+        warn = isinstance(photos, str | os.PathLike)  # of a list, the rest was left out on purpose
+        known = _known_poses(Path(poses), None if depth is None else Path(depth), named, warn)
 
     sparse = sfm.structure_from_motion(
         photos,
@@ -104,21 +120,21 @@ def reconstruct(
         lens=config.lens,
         max_pixels=config.max_pixels,
         pairs=config.pairs,
+        poses=known,
         seed=seed,
         progress=progress,
     )
+    measured = {} if known is None else known.depth
     if known_positions is not None:
         sparse = align_to_known(sparse, known_positions)
-    else:
-        sparse = assume_scale(sparse) if scale is None else scaled(sparse, scale)
-        sparse = upright(sparse, lambda name: read_photo(sparse.photos[name]), seed=seed)
+    sparse = _placed(sparse, measured, scale, up, seed)
     fitted = {name: photo for name, photo in sparse.photos.items() if name not in skipped}
     if not fitted:
         raise ValueError(
             f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to"
         )
     with Steps(workspace, progress=progress) as steps:
-        gaussians, patches = _steps(steps, sparse, fitted, config, seed, device)
+        gaussians, patches = _steps(steps, sparse, fitted, measured, config, seed, device)
     return Reconstruction(
         gaussians,
         patches.mesh,
@@ -135,10 +151,66 @@ def reconstruct(
     )
 
 
+def _check_world(poses: object, depth: object, known_positions: object, scale: object, up: object) -> None:
+    """Refuse arguments that exclude or need one another."""
+    if known_positions is not None and (scale is not None or up is not None):
+        name = "up" if scale is None else "scale"
+        raise ValueError(
+            f"{name}, known_positions: got both, expected one; surveyed positions set axes and scale"
+        )
+    for name, value in (("depth", depth), ("up", up)):
+        if value is not None and poses is None:
+            raise ValueError(f"{name}: got {value!r} without poses, expected both")
+    if up is not None and up not in UP:
+        raise ValueError(f"up: got {up!r}, expected one of {', '.join(UP)}")
+    if isinstance(scale, float) and poses is None:
+        raise ValueError(
+            f'scale: got {scale}, expected ("a.jpg", "b.jpg", metres); a number of metres for each unit goes with poses'
+        )
+
+
+def _placed(
+    sparse: SparseModel,
+    measured: Mapping[str, DepthFile],
+    scale: float | tuple[str, str, float] | None,
+    up: str | None,
+    seed: int,
+) -> SparseModel:
+    """``sparse`` in metres, z up, unless surveyed positions have brought it there; with points of ``measured`` depth."""
+    if not sparse.metric and scale is None and not measured:
+        sparse = assume_scale(sparse)
+    elif not sparse.metric:
+        sparse = scaled(sparse, 1.0 if scale is None else scale)
+    if measured:
+        sparse = with_points(sparse, measured)
+    if up is not None:
+        return turned(sparse, up)
+    photos = sparse.photos
+    return sparse if sparse.upright else upright(sparse, lambda name: read_photo(photos[name]), seed=seed)
+
+
+def _known_poses(poses: Path, depth: Path | None, photos: Mapping[str, Path], warn: bool) -> KnownPoses:
+    """Poses of ``photos``, and their depth where it is known.
+
+    Args:
+        warn: whether every pose should have a photo.
+    """
+    model = poses if poses.is_dir() and sfm.is_colmap(poses) else None
+    cameras = sfm.read_known(poses) if model else read_poses(poses)
+    names = match_photos(cameras, photos, warn=warn)
+    found = {photo: cameras[name] for photo, name in names.items()}
+    files = {photo: camera.depth for photo, camera in found.items() if camera.depth is not None}
+    if depth is not None:
+        files = {photo: DepthFile(path) for photo, path in find_depth(depth, found).items()}
+    files = {photo: replace(file, turns=turns_of(photos[photo])) for photo, file in files.items()}
+    return KnownPoses(found, model, names, files)
+
+
 def _steps(
     steps: Steps,
     sparse: SparseModel,
     fitted: Mapping[str, Path],
+    measured: Mapping[str, DepthFile],
     config: ReconstructionConfig,
     seed: int,
     device: DeviceLike,
@@ -147,6 +219,7 @@ def _steps(
 
     Args:
         fitted: the photos that Gaussians are fitted to, by name.
+        measured: depth images by photo; with some, they make the surface.
     """
     cameras = {name: sparse.cameras[name] for name in fitted}
     masks = [mask_beside(photo) for photo in fitted.values()]
@@ -181,6 +254,12 @@ def _steps(
         return files.of_gaussians(gaussians)
 
     def surface(attempt: Attempt) -> files.Arrays:
+        if measured:
+            maps = range_maps(sparse, measured, most=config.surface.views).values()
+            views, ranges = (list(part) for part in zip(*maps, strict=True))
+            return files.of_patches(
+                fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
+            )
         patches = fuse_gaussians(
             gaussians,
             list(cameras.values()),
@@ -197,6 +276,8 @@ def _steps(
     planes = files.to_planes(first)
     gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
     inputs = [steps.key("refined"), config.stereo, config.surface, config.completion]
+    if measured:
+        inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     return gaussians, files.to_patches(_kept(steps, "surface", surface, inputs))
 
 

@@ -76,6 +76,9 @@ class Reconstruction:
         self.guessed = tuple(guessed)
         self.lenses = dict(lenses or {})
         self.causes = dict(causes or {})
+        for name, file in (photos or {}).items():
+            if not isinstance(file, str | os.PathLike):
+                raise TypeError(f"photos: got {type(file).__name__} for {name!r}, expected an image file")
         self.photos = {name: Path(file) for name, file in (photos or {}).items()}
 
     def __repr__(self) -> str:
@@ -178,6 +181,7 @@ class Reconstruction:
                 photos=self.photos,
                 held_out=self.held_out,
                 unposed={name: self.causes.get(name, "") for name in self.unposed},
+                lenses=self.lenses,
                 guessed=self.guessed,
                 metric=self.metric,
                 scale_rms_m=self.scale_rms_m,

@@ -1,6 +1,11 @@
-"""What a photo shows of a rendered image: its own gain for every colour, masked pixels left out, highlights clipped."""
+"""What a photo shows of a rendered image: its own gain for every colour, masked pixels left out, highlights clipped.
+
+Photos are planes (:mod:`.photo_ssim`), images are flat.
+"""
 
 import warp as wp
+
+from warprrf.kernels.photo_ssim import MARGIN
 
 CLIPPED = 1.0 - 0.5 / 255.0  # a photo's value from here on may stand for any brighter one
 
@@ -8,6 +13,8 @@ CLIPPED = 1.0 - 0.5 / 255.0  # a photo's value from here on may stand for any br
 @wp.kernel(enable_backward=False)
 def show(
     offset: int,
+    width: int,
+    stride: int,
     image: wp.array(dtype=float),
     photo: wp.array(dtype=float),
     kept: wp.array(dtype=float),
@@ -16,9 +23,10 @@ def show(
 ):
     """The image as the photo's camera would have taken it; ``kept`` is 0 at masked pixels, or empty."""
     p = offset + wp.tid()
+    first = (p / width) * stride + wp.static(MARGIN) + 3 * (p % width)
     for k in range(3):
-        e = 3 * p + k
-        value = gain[k] * image[e]
+        e = first + k
+        value = gain[k] * image[3 * p + k]
         if photo[e] >= wp.static(CLIPPED):
             value = wp.min(value, photo[e])
         if kept.shape[0] > 0:
@@ -29,6 +37,8 @@ def show(
 @wp.kernel(enable_backward=False)
 def show_adjoint(
     offset: int,
+    width: int,
+    stride: int,
     image: wp.array(dtype=float),
     photo: wp.array(dtype=float),
     kept: wp.array(dtype=float),
@@ -38,20 +48,22 @@ def show_adjoint(
 ):
     """Chain rule through :func:`show`, from the gradient ``slope`` of what it wrote."""
     p = offset + wp.tid()
+    first = (p / width) * stride + wp.static(MARGIN) + 3 * (p % width)
     for k in range(3):
-        e = 3 * p + k
+        e = first + k
         value = gain[k] * slope[e]
-        if photo[e] >= wp.static(CLIPPED) and gain[k] * image[e] > photo[e]:
+        if photo[e] >= wp.static(CLIPPED) and gain[k] * image[3 * p + k] > photo[e]:
             value = 0.0
         if kept.shape[0] > 0:
             value = value * kept[p]
-        out[e] = value
+        out[3 * p + k] = value
 
 
 @wp.kernel(enable_backward=False)
 def gain_sums(
     offset: int,
     width: int,
+    stride: int,
     image: wp.array(dtype=float),
     photo: wp.array(dtype=float),
     kept: wp.array(dtype=float),
@@ -72,7 +84,7 @@ def gain_sums(
             taken = kept[p]
         for k in range(3):
             x = image[3 * p + k]
-            t = photo[3 * p + k]
+            t = photo[row * stride + wp.static(MARGIN) + 3 * column + k]
             if taken > 0.0 and t < wp.static(CLIPPED):
                 w = knee / wp.max(wp.abs(gain[k] * x - t), knee)
                 products[k] += w * x * t

@@ -1,9 +1,9 @@
-"""Structural similarity and L1 of images in [0, 1], with derivatives, in Warp.
+"""Structural similarity and L1 of panoramas in [0, 1], with derivatives, in Warp; of photos: :mod:`.photo_ssim`.
 
 SSIM: Wang et al., "Image quality assessment: from error visibility to structural similarity", 2004, with a Gaussian
-window of 11 pixels and sigma 1.5; the window sees zeros beyond the border, or wraps in azimuth on a panorama. That
-filter is its own adjoint, so the derivative filters the slopes once more. Images are flat: element
-``(row * width + column) * channels + channel``, views one after another.
+window of 11 pixels and sigma 1.5; the window wraps in azimuth and sees zeros beyond the poles. That filter is its own
+adjoint, so the derivative filters the slopes once more. Images of one channel are flat: element
+``row * width + column``, views one after another.
 """
 
 from types import SimpleNamespace
@@ -30,14 +30,12 @@ def _filters(real: type) -> tuple[Any, Any]:
     def filter_rows(
         offset: int,
         width: int,
-        channels: int,
-        periodic: int,
         source: wp.array(dtype=vec3),
         out: wp.array(dtype=vec3),
     ):
-        """Window average along a row; beyond its ends zero, or the other end if ``periodic``."""
+        """Window average along a row; beyond one end comes the other."""
         p = offset + wp.tid()
-        column = (p // channels) % width
+        column = p % width
         total = vec3(real(0.0))
         for k in range(wp.static(2 * RADIUS + 1)):
             c = column + k - wp.static(RADIUS)
@@ -46,26 +44,25 @@ def _filters(real: type) -> tuple[Any, Any]:
                 shift += width
             if c >= width:
                 shift -= width
-            if periodic != 0 or (c >= 0 and c < width):
-                total += window[k] * source[p + shift * channels]
+            total += window[k] * source[p + shift]
         out[p] = total
 
     @wp.kernel(module="unique", enable_backward=False)
     def filter_columns(
         offset: int,
         height: int,
-        stride: int,
+        width: int,
         source: wp.array(dtype=vec3),
         out: wp.array(dtype=vec3),
     ):
-        """Window average along a column, zero beyond its ends; ``stride`` is width times channels."""
+        """Window average along a column, zero beyond its ends."""
         p = offset + wp.tid()
-        row = (p // stride) % height
+        row = (p // width) % height
         total = vec3(real(0.0))
         for k in range(wp.static(2 * RADIUS + 1)):
             r = row + k - wp.static(RADIUS)
             if r >= 0 and r < height:
-                total += window[k] * source[p + (k - wp.static(RADIUS)) * stride]
+                total += window[k] * source[p + (k - wp.static(RADIUS)) * width]
         out[p] = total
 
     return filter_rows, filter_columns
@@ -77,15 +74,6 @@ def build(real: type) -> SimpleNamespace:
     vec3 = wp.types.vector(3, real)
     c1 = wp.constant(real(C1))
     c2 = wp.constant(real(C2))
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def moments(
-        offset: int, image: wp.array(dtype=real), target: wp.array(dtype=real), out: wp.array(dtype=vec3)
-    ):
-        """The products (u, u^2, u t) whose window averages SSIM compares."""
-        p = offset + wp.tid()
-        u = image[p]
-        out[p] = vec3(u, u * u, u * target[p])
 
     @wp.kernel(module="unique", enable_backward=False)
     def slopes(
@@ -127,26 +115,10 @@ def build(real: type) -> SimpleNamespace:
             out -= absolute_share
         return out
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def adjoint(
-        offset: int,
-        image: wp.array(dtype=real),
-        target: wp.array(dtype=real),
-        filtered: wp.array(dtype=vec3),
-        absolute_share: real,
-        ssim_share: real,
-        out: wp.array(dtype=real),
-    ):
-        """Derivative of the loss; the shares already hold the division by the pixel count."""
-        p = offset + wp.tid()
-        out[p] = slope(image[p], target[p], filtered[p], absolute_share, ssim_share)
-
     filter_rows, filter_columns = _filters(real)
     return SimpleNamespace(
-        adjoint=adjoint,
         filter_columns=filter_columns,
         filter_rows=filter_rows,
-        moments=moments,
         slope=slope,
         slopes=slopes,
         vec3=vec3,

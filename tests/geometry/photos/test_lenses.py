@@ -209,6 +209,7 @@ def test_photos_of_two_sizes_are_posed_together(tmp_path):
         tmp_path, workspace=tmp_path / "work", max_features=1500, lens="SIMPLE_PINHOLE"
     )
     assert set(sparse.cameras) == set(names)
+    assert list(find_photos(tmp_path)) == names  # not those in the workspace beside them
     large, small = sparse.lenses[names[1]], sparse.lenses[names[0]]
     assert len(lenses_in_use(sparse.lenses)) == 2
     assert large.fx == pytest.approx(FOCAL, rel=0.03) and small.fx == pytest.approx(0.8 * FOCAL, rel=0.03)
@@ -254,3 +255,25 @@ def test_masks_that_fit_no_photo_are_named(tmp_path):
     save(tmp_path / "d.mask.png", smooth(40, 30))
     with pytest.raises(ValueError, match=r"1 masks are of no photo: d\.mask\.png"):
         find_photos(tmp_path)
+
+
+def test_photos_in_their_own_workspace_are_not_overwritten(through_a_lens):
+    work = through_a_lens[1]
+    with pytest.raises(ValueError, match="workspace: .* holds the photos and would be overwritten"):
+        sfm.structure_from_motion(work / "sfm" / "photos", workspace=work)
+
+
+def test_a_mask_that_is_gone_is_forgotten(tmp_path):
+    photos, work = tmp_path / "photos", tmp_path / "work"
+    photos.mkdir()
+    for name in BENT[:6]:
+        Image.open(LOBBY / "photos" / name).save(photos / name, quality=95)
+    mask = photos / "view_001.mask.png"
+    grey = np.full((480, 640), 255, np.uint8)
+    grey[:20] = 0
+    Image.fromarray(grey).save(mask)
+    found = sfm.structure_from_motion(photos, workspace=work, max_features=1000, lens="SIMPLE_PINHOLE")
+    np.testing.assert_array_equal(read_mask(found.photos["view_001.jpg"]), grey == 0)
+    mask.unlink()
+    again = sfm.structure_from_motion(photos, workspace=work, max_features=1000, lens="SIMPLE_PINHOLE")
+    assert read_mask(again.photos["view_001.jpg"]) is None

@@ -8,11 +8,12 @@ import warp as wp
 from skimage.metrics import structural_similarity
 
 from warprrf.geometry.photos.config import RefineConfig
+from warprrf.geometry.photos.densify import densified
 from warprrf.geometry.photos.exposure import Exposures
 from warprrf.geometry.photos.fill import filled
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.refine import refine
+from warprrf.geometry.photos.refine import OVERHEAD, _initial, refine
 from warprrf.geometry.photos.targets import PosedPhotos, Targets
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -80,6 +81,38 @@ def test_refinement_learns_the_photos_and_densifies(problem):
     assert len(end) > len(start)
 
 
+def test_few_gaussians_are_split_until_enough_are_there(problem):
+    arrays = {name: value.reshape(300, -1) for name, value in _initial(problem[0], CONFIG).items()}
+    for name in ("pull", "hits", "seen"):
+        arrays[name] += 1
+
+    def count(most, rounds_left):
+        config = replace(CONFIG, densify_to=most)
+        return len(densified(arrays, config, np.random.default_rng(0), rounds_left=rounds_left)["means"])
+
+    assert count(1, 3) == 300 + 24  # 8 %
+    assert count(600, 3) == 300 + 100 and count(600, 2) == 300 + 150
+    assert count(10_000, 3) == 300 + 150  # half of them at most
+
+
+def test_progress_counts_work_and_begins_where_a_run_was_stopped(problem, tmp_path):
+    start, photos, cameras = problem
+    told = []
+    config = replace(
+        CONFIG, iterations=40, downscale=2, coarse_pixels=200, full_from=0.5, checkpoint_every=20
+    )
+    file = tmp_path / "refine.safetensors"
+    for _ in range(2):
+        told.append([])
+        refine(start, PosedPhotos(photos, cameras), config=config, checkpoint=file, device="cpu",
+               progress=lambda stage, done, total: told[-1].append((done, total)))  # fmt: skip
+    pixels = photos[0].shape[0] * photos[0].shape[1]
+    # Squares of 4 pixels for a half (3072 pixels are 192 of them), then photos in full.
+    half = (pixels / 16 + OVERHEAD) / (pixels / 16 + pixels + 2 * OVERHEAD)
+    assert [done for done, total in told[0]] == [0, int(1000 * half), 1000]
+    assert told[1] == [(1000, 1000)]
+
+
 def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp_path):
     start, photos, cameras = problem
     whole = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
@@ -88,7 +121,7 @@ def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp
         pass
 
     def kill_after_the_second_checkpoint(stage, done, total):
-        if done >= 50:
+        if done >= 0.8 * total:
             raise Killed
 
     file = tmp_path / "refine.safetensors"
@@ -138,18 +171,19 @@ def test_gaussians_near_a_plane_are_pulled_flat_into_it():
 
 
 @pytest.mark.usefixtures("device")
-def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right():
+@pytest.mark.parametrize("lanes", [1, 16])  # of a GPU's threads and of a CPU's
+def test_photo_loss_is_l1_and_ssim_and_its_derivative_is_right(lanes):
     rng = np.random.default_rng(2)
     shape = (24, 20, 3)
     image, target = rng.random(shape), rng.random(shape)
-    loss = PhotoLoss("cpu", 0.2, real=wp.float64)
+    loss = PhotoLoss("cpu", 0.2, real=wp.float64, lanes=lanes)
 
     def evaluate(values):
-        x = wp.array(values, dtype=wp.float64, device="cpu")
-        t = wp.array(target.reshape(-1), dtype=wp.float64, device="cpu")
-        gradient = wp.zeros(shape, dtype=wp.float64, device="cpu")
-        score = loss(x, t, loss.moments(t, t, shape), gradient).numpy().reshape(shape)
-        return 0.8 * np.abs(values - target).mean() + 0.2 * (1 - score.mean()), gradient.numpy(), score
+        size = shape[:2]
+        t = loss.plane(target, size)
+        wp.copy(loss.canvas(size), loss.plane(values, size))
+        score, gradient = (loss.values(plane, size) for plane in loss(t, loss.moments(t, size), size))
+        return 0.8 * np.abs(values - target).mean() + 0.2 * (1 - score.mean()), gradient.copy(), score.copy()
 
     _, gradient, score = evaluate(image)
     _, published = structural_similarity(

@@ -222,11 +222,27 @@ def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
         assert list(read.cameras) == VIEWS
         for name, camera in posed[1].cameras.items():
             np.testing.assert_allclose(read.cameras[name].world_to_camera, camera.world_to_camera, atol=1e-12)
+    points = tmp_path / "text" / "points3D.txt"
+    whole = points.read_text()
+    row = next(line for line in whole.splitlines() if not line.startswith("#"))
+    points.write_text(whole.replace(row, " ".join(row.split()[:8])))  # a point that no photo shows
+    assert len(sfm.read_colmap(tmp_path / "text").points) == len(posed[1].points) - 1
+    points.write_text(whole)
     (tmp_path / "text" / "images.txt").write_text("1 2 three\n")
     with pytest.raises(ValueError, match="does not read as a COLMAP model"):
         sfm.read_colmap(tmp_path / "text")
     with pytest.raises(ValueError, match="holds no COLMAP model"):
         sfm.read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("at", [16, 43])  # x, and the reprojection error
+def test_colmap_points_that_are_nan_are_refused(at, posed, tmp_path):
+    folder = shutil.copytree(posed[0] / "sfm" / "model", tmp_path / "model")
+    data = bytearray((folder / "points3D.bin").read_bytes())
+    data[at : at + 8] = np.float64(np.nan).tobytes()
+    (folder / "points3D.bin").write_bytes(data)
+    with pytest.raises(ValueError, match=r"model holds points, or errors of theirs, that are NaN"):
+        sfm.read_colmap(folder)
 
 
 @pytest.mark.parametrize("name", ["rigs", "cameras", "frames", "images", "points3D"])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from places import LOBBY
+from views import lobby_cameras
 
 import warprrf as wr
 from warprrf.geometry.photos import sparse
@@ -16,12 +16,6 @@ from warprrf.geometry.photos.upright import held_up, upright, vertical_of_edges
 
 pytest.importorskip("skimage")
 EMPTY = np.zeros(0, dtype=np.int64)
-
-
-def lobby_cameras(names: list[str]) -> dict[str, wr.Camera]:
-    held = json.loads((LOBBY / "poses_true.json").read_text())
-    lens = {n: held[n] for n in ("width", "height", "fx", "fy", "cx", "cy")}
-    return {n: wr.Camera.pinhole(**lens, world_to_camera=held["views"][n]["world_to_camera"]) for n in names}
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,9 @@ import numpy as np
 from warprrf.checks import check_count, check_positive, check_seed
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
+LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+"""COLMAP's lens models that photos can be taken through; "auto": the simplest that explains them."""
+
 
 @dataclass(frozen=True)
 class PlaneConfig:
@@ -99,7 +102,10 @@ class RefineConfig:
     Attributes:
         iterations: steps, one photo each.
         downscale: photos are averaged over squares of this many pixels while training.
-        full_from: share of the iterations after which photos are taken as they are.
+        coarse_pixels, fine_from: until this share of the iterations squares are twice as wide, and twice again, as long
+            as photos would have more pixels than this.
+        full_from, full_pixels: share of the iterations after which photos are taken as they are; fewer iterations are if
+            photos have more pixels than this, so that they take as long.
         sh_degree: of the colours; rendered rooms are nearly matt, so 1.
         ssim_share: weight of 1 - SSIM; L1 has the rest.
         fit_exposure: whether every photo has a gain for each colour of its own.
@@ -109,6 +115,7 @@ class RefineConfig:
         densify_from, densify_until, densify_every: in iterations; ``until`` as a share of all.
         densify_share: at most this share of the Gaussians is split or cloned at a time, those with the largest mean
             gradient of the projected position.
+        densify_to: and more than that, up to half of them, where otherwise fewer than these would be there in the end.
         max_gaussians: densification stops here.
         split_above_m: larger ones are split, smaller ones cloned.
         prune_opacity: fainter ones are removed.
@@ -122,7 +129,10 @@ class RefineConfig:
 
     iterations: int = 2400
     downscale: int = 2
+    coarse_pixels: int = 100_000
+    fine_from: float = 0.8
     full_from: float = 0.9
+    full_pixels: int = 400_000
     sh_degree: int = 1
     ssim_share: float = 0.2
     fit_exposure: bool = True
@@ -136,6 +146,7 @@ class RefineConfig:
     densify_until: float = 0.65
     densify_every: int = 200
     densify_share: float = 0.08
+    densify_to: int = 30_000
     max_gaussians: int = 60_000
     split_above_m: float = 0.03
     prune_opacity: float = 0.02
@@ -148,7 +159,14 @@ class RefineConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "downscale", "densify_every", "max_gaussians", "checkpoint_every"):
+        for name in (
+            "iterations",
+            "downscale",
+            "coarse_pixels",
+            "densify_every",
+            "max_gaussians",
+            "checkpoint_every",
+        ):
             check_count(name, getattr(self, name))
         check_seed(self.seed)
         if self.sh_degree not in COEFFICIENTS:

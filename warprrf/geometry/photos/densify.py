@@ -19,6 +19,7 @@ PARAMETERS = ("means", "quaternions", "log_scales", "logits", "sh")
 STATISTICS = ("pull", "hits", "seen")
 APART = 0.7  # of its largest standard deviation: how far the halves of a split Gaussian lie from its centre
 SMALLER = 1.6  # the largest standard deviation of a split Gaussian is divided by this
+LARGEST_SHARE = 0.5  # of the Gaussians that is split or cloned at a time
 JITTER = 0.3  # standard deviation of a clone's place, in those of the Gaussian
 
 
@@ -28,8 +29,13 @@ def opacity_and_scales(arrays: Arrays) -> tuple[np.ndarray, np.ndarray]:
     return 1 / (1 + np.exp(-logits)), np.exp(log_scales)
 
 
-def densified(arrays: Arrays, config: RefineConfig, rng: np.random.Generator) -> Arrays:
+def densified(
+    arrays: Arrays, config: RefineConfig, rng: np.random.Generator, *, rounds_left: int = 1
+) -> Arrays:
     """``arrays`` with Gaussians split, cloned and pruned; statistics start anew.
+
+    Args:
+        rounds_left: how often this is done still, this time included.
 
     Raises:
         RuntimeError: if none would be left.
@@ -43,7 +49,9 @@ def densified(arrays: Arrays, config: RefineConfig, rng: np.random.Generator) ->
             "refine: every Gaussian would be pruned; do photos and camera poses belong together?"
         )
     pull = np.where(keep, arrays["pull"][:, 0] / np.maximum(hits, 1), 0.0)
-    room = min(config.max_gaussians - int(keep.sum()), int(config.densify_share * keep.sum()))
+    kept = int(keep.sum())
+    catching_up = min((config.densify_to - kept) / rounds_left, LARGEST_SHARE * kept)
+    room = min(config.max_gaussians - kept, int(max(config.densify_share * kept, catching_up)))
     chosen = np.argsort(-pull, kind="stable")[: max(room, 0)]
     chosen = np.sort(chosen[pull[chosen] > 0])
 

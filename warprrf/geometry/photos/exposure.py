@@ -13,6 +13,7 @@ import warp as wp
 from warprrf.device import launch
 from warprrf.geometry.photos.targets import Target
 from warprrf.kernels import exposure as kernels
+from warprrf.kernels.photo_ssim import stride_of
 
 KNEE = 0.03  # of the Huber loss, in display values: what differs more is no matter of exposure
 PRIOR = 1e-3  # weight of a gain of one, in squared display values per pixel
@@ -35,18 +36,20 @@ class Exposures:
         """Of a photo, red, green and blue."""
         return wp.vec3(*np.exp(self.log_gains[view] - self.log_gains.mean(axis=0)))
 
-    def shown(self, image: wp.array, target: Target) -> wp.array:
-        """A rendered image ``(H, W, 3)`` as the photo would show it, with room for a gradient."""
-        out = wp.empty_like(image, requires_grad=True)
-        inputs = [image.flatten(), target.pixels, target.kept, self.gain(target.view), out.flatten()]
-        launch(kernels.show, out.size // 3, inputs, device=out.device)
-        return out
+    def show(self, image: wp.array, target: Target, out: wp.array) -> None:
+        """Write a rendered image ``(H, W, 3)`` as the photo would show it to the plane ``out``."""
+        launch(kernels.show, image.size // 3, [*self._inputs(image, target), out], device=image.device)
 
     def adjoint(self, image: wp.array, target: Target, slope: wp.array) -> None:
-        """Write the gradient of ``image``, given that of what is shown."""
-        inputs = [image.flatten(), target.pixels, target.kept, self.gain(target.view)]
-        slopes = [slope.flatten(), image.grad.flatten()]
-        launch(kernels.show_adjoint, image.size // 3, inputs + slopes, device=image.device)
+        """Write the gradient of ``image``, given that of what is shown, a plane."""
+        inputs = [*self._inputs(image, target), slope, image.grad.flatten()]
+        launch(kernels.show_adjoint, image.size // 3, inputs, device=image.device)
+
+    def _inputs(self, image: wp.array, target: Target) -> list[object]:
+        """What the kernels take first."""
+        width = image.shape[1]
+        layout = [width, stride_of(width)]
+        return [*layout, image.flatten(), target.pixels, target.kept, self.gain(target.view)]
 
     def fit(self, image: wp.array, target: Target, visits: int) -> None:
         """Move a photo's gain towards what its rendered image asks for; ``visits``: how often that was done before."""
@@ -54,7 +57,7 @@ class Exposures:
             return
         height, width, _ = image.shape
         sums = [wp.empty(height, dtype=wp.vec3, device=image.device) for _ in range(2)]
-        inputs = [width, image.flatten(), target.pixels, target.kept, self.gain(target.view), KNEE, *sums]
+        inputs = [*self._inputs(image, target), KNEE, *sums]
         launch(kernels.gain_sums, height, inputs, device=image.device, grain=16)
         of_photo, of_image = (array.numpy().sum(axis=0, dtype=np.float64) for array in sums)
         prior = PRIOR * height * width

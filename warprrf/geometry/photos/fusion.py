@@ -56,6 +56,20 @@ def fuse_gaussians(
     if photos is not None and config.stereo is not None:
         seen = photos.subset(chosen)
         depths = mended(depths, views, seen, config=config.stereo, progress=report, device=device)
+    return fuse_maps(views, depths, planes=planes, config=config, progress=report)
+
+
+def fuse_maps(
+    views: Sequence[Camera],
+    depths: Sequence[np.ndarray],
+    *,
+    planes: Sequence[Plane] = (),
+    config: ReconstructionConfig | None = None,
+    progress: Progress | None = None,
+) -> PlanarPatches:
+    """As :func:`fuse_gaussians`, from ranges [m], 0 where unknown, that are there already, each of one of ``views``."""
+    config = config or ReconstructionConfig()
+    report = progress or (lambda stage, done, total: None)
     report("surface", 0, 4)
     mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
     report("surface", 1, 4)

@@ -16,6 +16,7 @@ from warprrf.device import require
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 MASK_SUFFIX = ".mask.png"
 MIN_PHOTOS = 3
+STEPS_FOLDER = ".steps"  # of a workspace (see warprrf.steps): pictures beside it are its own
 TURNS = {1: 0, 6: 1, 3: 2, 8: 3}
 """Quarter turns clockwise that bring a photo upright, by EXIF's orientation; the other four are mirrored."""
 
@@ -30,8 +31,8 @@ def find_photos(photos: Photos) -> dict[str, Path]:
     """Photo name to file, sorted by name, for a folder or a sequence of image files.
 
     A name is the path below the folder (or below the files' common folder), with forward slashes. Hidden files of a
-    folder are left out: half-written ones, or another system's notes. ``NAME.mask.png`` is no photo but the mask of the
-    photo ``NAME`` beside it (:func:`mask_beside`).
+    folder are left out: half-written ones, or another system's notes; and so are those that a workspace in it holds.
+    ``NAME.mask.png`` is no photo but the mask of the photo ``NAME`` beside it (:func:`mask_beside`).
 
     Raises:
         ValueError: if the folder or files do not exist, too few photos are there, or a mask is of no photo.
@@ -43,7 +44,7 @@ def find_photos(photos: Photos) -> dict[str, Path]:
                 f"photos: {root} is not a folder; expected a folder of photos or a list of image files"
             )
         found = (p for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES and p.is_file())
-        every = sorted(p for p in found if not p.name.startswith("."))
+        every = sorted(p for p in found if not p.name.startswith(".") and not _of_workspace(p, root))
         files = [p for p in every if not p.name.lower().endswith(MASK_SUFFIX)]
         masked = {mask_name(p) for p in files}
         stray = [p.relative_to(root).as_posix() for p in every if p not in masked and p not in set(files)]
@@ -68,6 +69,15 @@ def find_photos(photos: Photos) -> dict[str, Path]:
             f"({', '.join(PHOTO_SUFFIXES)}); a room wants 60 or more that overlap"
         )
     return dict(sorted(named.items()))
+
+
+def _of_workspace(file: Path, root: Path) -> bool:
+    """Whether ``file`` lies in a folder of finished steps below ``root``."""
+    return any(
+        (folder / STEPS_FOLDER).is_dir()
+        for folder in file.parents
+        if folder != root and folder.is_relative_to(root)
+    )
 
 
 @dataclass(frozen=True)

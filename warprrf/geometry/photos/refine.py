@@ -31,7 +31,12 @@ from warprrf.kernels import adam as optimize
 from warprrf.kernels.raster.sh import COEFFICIENTS
 from warprrf.steps import digest
 
+ENOUGH_TO_FILL = 100
+"""Iterations from which on holes are filled: new Gaussians stand at a guessed depth until photos have moved them."""
 CHECKPOINT = "warprrf refinement 2"
+
+PARTS = 1000  # of the work: what progress counts, as iterations become slower when photos are compared larger
+OVERHEAD = 30_000  # pixels that would take as long as what every iteration does besides
 
 FIRST_DECAY, SECOND_DECAY = 0.9, 0.999  # of Adam's moments
 
@@ -64,12 +69,14 @@ def refine(
         run.restore(Path(checkpoint), key)
     else:
         run.start(gaussians)
+    report = progress or (lambda stage, done, total: None)
+    report("refine", run.done(), PARTS)
     while run.iteration < config.iterations:
         run.step()
         if checkpoint is not None and run.iteration % config.checkpoint_every == 0:
             run.store(Path(checkpoint), key)
-        if progress is not None and (run.iteration % 20 == 0 or run.iteration == config.iterations):
-            progress("refine", run.iteration, config.iterations)
+        if run.iteration % 20 == 0 or run.iteration == config.iterations:
+            report("refine", run.done(), PARTS)
     return run.result()
 
 
@@ -89,8 +96,9 @@ class _Refinement:
         self.plane_table = wp.array(table, dtype=wp.vec4, device=self.device)
 
     def start(self, gaussians: Gaussians) -> None:
-        """Begin with ``gaussians``, and others where they leave holes in the photos."""
-        gaussians = filled(gaussians, self.targets.photos, device=self.device)
+        """Begin with ``gaussians``, and others where they leave holes in the photos, if there is time to move those."""
+        if self.config.iterations >= ENOUGH_TO_FILL:
+            gaussians = filled(gaussians, self.targets.photos, device=self.device)
         self.load(self.on_planes(_initial(gaussians, self.config)))
 
     def on_planes(self, arrays: Arrays) -> Arrays:
@@ -144,8 +152,7 @@ class _Refinement:
         c, count = self.config, len(self.targets)
         epoch, position = divmod(self.iteration, count)
         view = int(np.random.default_rng([c.seed, 1, epoch]).permutation(count)[position])
-        scale = c.downscale if self.iteration < c.full_from * c.iterations else 1
-        score = self.differentiate(self.targets.at(view, scale))
+        score = self.differentiate(self.targets.at(view, self.scale(self.iteration)))
         self.iteration += 1
         self.move()
         if self.iteration % 100 == 0 and not np.isfinite(score.numpy()).all():
@@ -153,10 +160,28 @@ class _Refinement:
         until = c.densify_until * c.iterations
         if c.densify_from <= self.iteration <= until and self.iteration % c.densify_every == 0:
             rng = np.random.default_rng([c.seed, 2, self.iteration])
-            self.load(self.on_planes(densified(self.arrays(), c, rng)))
+            left = 1 + int((until - self.iteration) // c.densify_every)
+            self.load(self.on_planes(densified(self.arrays(), c, rng, rounds_left=left)))
+
+    def scale(self, iteration: int) -> int:
+        """Side in pixels of the squares that photos are averaged over."""
+        c, scale = self.config, self.config.downscale
+        in_full = (1 - c.full_from) * min(1.0, c.full_pixels / self.targets.pixels)
+        if iteration >= c.iterations - round(in_full * c.iterations):
+            return 1
+        if iteration < c.fine_from * c.iterations:
+            while self.targets.pixels > c.coarse_pixels * scale**2:
+                scale *= 2
+        return scale
+
+    def done(self) -> int:
+        """Parts of the work that are behind."""
+        sizes = np.array([self.scale(k) for k in range(self.config.iterations)])
+        work = np.cumsum(self.targets.pixels / sizes**2 + OVERHEAD)
+        return int(PARTS * work[self.iteration - 1] / work[-1]) if self.iteration else 0
 
     def differentiate(self, target: Target) -> wp.array:
-        """Render one photo and leave the loss's gradients in ``self.gradients``; returns the SSIM of every element."""
+        """Render one photo and leave the loss's gradients in ``self.gradients``; returns the SSIM of every number."""
         camera = target.camera
         n, device, state = self.count, self.device, self.state
         logits, logits_grad = state["logits"], self.gradients["logits"]
@@ -165,9 +190,10 @@ class _Refinement:
         origin = self.raster.colors_into(self.means, self.sh, camera, colors)
         prepared = self.raster.prepare(self.means, self.quaternions, self.scales, self.opacities, camera)
         image, adjoint = self.raster.blend_with_adjoint(prepared, colors)
-        shown = self.exposures.shown(image.features, target)
-        score = self.loss(shown, target.pixels, target.moments, shown.grad)
-        self.exposures.adjoint(image.features, target, shown.grad)
+        shape = camera.height, camera.width
+        self.exposures.show(image.features, target, self.loss.canvas(shape))
+        score, slope = self.loss(target.pixels, target.moments, shape)
+        self.exposures.adjoint(image.features, target, slope)
         self.exposures.fit(image.features, target, self.iteration // len(self.targets))
         weight = adjoint()
         self.raster.colors_adjoint(self.means, self.sh, origin, colors)

@@ -17,12 +17,13 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from warprrf.checks import check_count
 from warprrf.device import Progress, require
+from warprrf.geometry.photos.config import LENSES
 from warprrf.geometry.photos.lens_choice import FREE_MODEL, choose_lens, lens_of
 from warprrf.geometry.photos.photo_files import (
     MIN_PHOTOS,
@@ -36,14 +37,22 @@ from warprrf.geometry.photos.photo_files import (
     some,
     turns_of,
 )
+from warprrf.geometry.photos.poses import KnownCamera, KnownPoses
 from warprrf.geometry.photos.sparse import SparseModel
-from warprrf.geometry.photos.undistort import Lens, load_colmap, pinhole_of, write_undistorted
+from warprrf.geometry.photos.undistort import (
+    Lens,
+    colmap_camera,
+    lenses_in_use,
+    load_colmap,
+    pinhole_of,
+    write_undistorted,
+)
 from warprrf.steps import Attempt, Steps
+from warprrf.tensor_files import named as naming
 
 VERSIONS = {"features": 2, "matches": 1, "model": 2, "photos": 1}
 """Of the steps: counted up by whoever changes what a step computes."""
 
-LENSES = ("auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 LEAST_PIXELS = 10_000  # of max_pixels
 FEATURE_SIDE = 1600  # features are found in photos reduced to this length of their longer side [pixels]
 
@@ -68,6 +77,7 @@ def structure_from_motion(
     lens: str = "auto",
     max_pixels: int = 1_000_000,
     pairs: str = "auto",
+    poses: KnownPoses | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> SparseModel:
@@ -85,11 +95,13 @@ def structure_from_motion(
         photos: a folder, or a sequence of image files.
         workspace: folder for the feature database, the model and the undistorted photos; made if it is not there.
         max_features: SIFT features kept per photo (the largest ones).
-        lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
-            ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
+        lens: COLMAP's model of the lenses, one of :data:`~warprrf.geometry.photos.config.LENSES`; ``"auto"`` takes the
+            simplest of pinhole, ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has
+            to be named.
         max_pixels: undistorted photos are reduced to about so many pixels.
         pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
             largest features finds promising, once there are more than 2000 pairs.
+        poses: poses and lenses that are known; points are triangulated, where they and depth are not known too.
         seed: seed of every random draw.
         progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
 
@@ -102,12 +114,18 @@ def structure_from_motion(
         raise ValueError(f"lens: got {lens!r}, expected one of {', '.join(LENSES)}")
     if pairs not in ("auto", "exhaustive"):
         raise ValueError(f'pairs: got {pairs!r}, expected "auto" or "exhaustive"')
-    if max_features < 100:
-        raise ValueError(f"max_features: got {max_features}, expected at least 100")
+    check_count("max_features", max_features, 100)
     check_count("max_pixels", max_pixels, LEAST_PIXELS)
-    named = find_photos(photos)
+    everything = named = find_photos(photos)
     colmap = load_colmap()
-    first_lens = FREE_MODEL if lens == "auto" else lens
+    known: Any = None
+    match, first_lens = True, cast(str | dict[str, Lens], FREE_MODEL if lens == "auto" else lens)
+    if poses is not None:
+        named = {name: named[name] for name in poses.cameras}
+        first_lens = _known_lenses(poses, named)
+        with _quiet(colmap):
+            known = _known_model(colmap, poses, first_lens)
+        match = not poses.depth and not known.num_points3D()
 
     def features(attempt: Attempt) -> dict[str, Any]:
         check_photos(named)
@@ -119,37 +137,63 @@ def structure_from_motion(
         return {}
 
     def model(attempt: Attempt) -> dict[str, Any]:
-        return {"other_models": _map(colmap, folder, named, (lens, seed), attempt)}
+        if known is None:
+            return {"other_models": _map(colmap, folder, named, (lens, seed), attempt)}
+        _keep_known(colmap, folder, named, (known, match, seed), attempt)
+        return {"other_models": []}
+
+    folder = Path(workspace).absolute() / "sfm"
+    kept = folder / "photos"
+    if any(path.resolve().is_relative_to(kept.resolve()) for path in named.values()):
+        raise ValueError(f"workspace: {kept} holds the photos and would be overwritten; name another folder")
+    with Steps(folder, progress=progress) as steps, _quiet(colmap):
+        colmap.set_random_seed(seed)
+        inputs: list[Any] = []
+        if match:
+            masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
+            inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
+            steps.run(
+                "features", features, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"]
+            )
+            inputs = [steps.key("features"), pairs, seed]
+            steps.run("matches", matches, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
+            inputs = [steps.key("matches"), lens, seed]
+        if known is not None:
+            inputs += [list(named.values()), *_content(known)]
+        found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
+        result = _straightened(colmap, steps, named, max_pixels)
+        unposed = [name for name in named if name not in result.cameras]
+        if poses is not None:
+            unposed += poses.unposed(everything)
+            causes = dict.fromkeys(unposed, "the poses given have none of it")
+        else:
+            causes = _causes(colmap, folder / "matches.db", result) if unposed else {}
+        return replace(
+            result, unposed=tuple(unposed), causes=causes, other_models=tuple(found["other_models"])
+        )
+
+
+def _straightened(
+    colmap: ModuleType, steps: Steps, named: Mapping[str, Path], max_pixels: int
+) -> SparseModel:
+    """The model in the folder of ``steps``, with undistorted photos beside it."""
+    model, kept = colmap.Reconstruction(str(steps.folder / "model")), steps.folder / "photos"
+    lenses = lenses_of(model)
 
     def straight(attempt: Attempt) -> dict[str, Any]:
+        shutil.rmtree(kept, ignore_errors=True)  # of other photos, or with masks that are gone
         for k, name in enumerate(lenses):
             attempt.progress("undistorting", k, len(lenses))
             write_undistorted(named[name], kept / name, lenses[name], max_pixels)
         attempt.progress("undistorting", len(lenses), len(lenses))
         return {}
 
-    folder = Path(workspace).absolute() / "sfm"
-    kept = folder / "photos"
-    with Steps(folder, progress=progress) as steps, _quiet(colmap):
-        colmap.set_random_seed(seed)
-        masks = {name: mask for name, path in named.items() if (mask := mask_beside(path))}
-        inputs = [list(named), list(named.values()), masks, max_features, first_lens, colmap.__version__]
-        steps.run("features", features, version=VERSIONS["features"], inputs=inputs, outputs=["features.db"])
-        inputs = [steps.key("features"), pairs, seed]
-        steps.run("matches", matches, version=VERSIONS["matches"], inputs=inputs, outputs=["matches.db"])
-        inputs = [steps.key("matches"), lens, seed]
-        found = steps.run("model", model, version=VERSIONS["model"], inputs=inputs, outputs=["model"])
-        stored = colmap.Reconstruction(str(folder / "model"))
-        lenses = lenses_of(stored)
-        outputs = [f"photos/{name}" for name in lenses]
-        inputs = [steps.key("model"), max_pixels]
-        steps.run("photos", straight, version=VERSIONS["photos"], inputs=inputs, outputs=outputs)
-        turns = {name: turns_of(named[name]) for name in lenses}
-        result = _sparse_model(stored, list(named), turns, max_pixels)
-        photos_of = {name: kept / name for name in lenses}
-        causes = _causes(colmap, folder / "matches.db", result) if result.unposed else {}
-        others = tuple(found["other_models"])
-        return replace(result, other_models=others, causes=causes, photos=photos_of, lenses=lenses)
+    outputs = [f"photos/{name}" for name in lenses]
+    inputs = [steps.key("model"), max_pixels]
+    steps.run("photos", straight, version=VERSIONS["photos"], inputs=inputs, outputs=outputs)
+    turns = {name: turns_of(named[name]) for name in lenses}
+    result = _sparse_model(model, list(named), turns, max_pixels)
+    return replace(result, photos={name: kept / name for name in lenses}, lenses=lenses)
 
 
 def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
@@ -163,20 +207,8 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
     """
     colmap = load_colmap()
     root = Path(folder)
-    if not any(
-        all((root / f"{n}{ext}").is_file() for n in ("cameras", "images")) for ext in (".bin", ".txt")
-    ):
-        raise ValueError(
-            f"colmap: {root} holds no COLMAP model; expected cameras, images and points3D (.bin or .txt)"
-        )
     with _quiet(colmap):
-        try:
-            for name, walk in _RECORDS.items():
-                if (root / name).is_file():
-                    _check_whole(root / name, walk)
-            model = colmap.Reconstruction(str(root))
-        except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
-            raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
+        model = _open_model(colmap, root)
         try:
             names = sorted(i.name for i in model.images.values())
             bent = [lens for lens in lenses_of(model).values() if not lens.straight]
@@ -188,9 +220,31 @@ def read_colmap(folder: str | os.PathLike[str]) -> SparseModel:
             found = replace(_sparse_model(model, names), metric=True, upright=True)
         except (ValueError, TypeError) as error:  # cameras that are no pinholes, or damaged
             raise ValueError(f"colmap: {root}: {str(error).removeprefix('colmap: ')}") from error
-    if not np.isfinite(found.points).all():
-        raise ValueError(f"colmap: {root} holds points that are NaN or infinite")
+    if not (np.isfinite(found.points).all() and np.isfinite(found.reprojection_error).all()):
+        raise ValueError(f"colmap: {root} holds points, or errors of theirs, that are NaN or infinite")
     return found
+
+
+def _open_model(colmap: ModuleType, root: Path) -> Any:
+    """A COLMAP model folder, whose files are looked through first."""
+    if not is_colmap(root):
+        raise ValueError(
+            f"colmap: {root} holds no COLMAP model; expected cameras, images and points3D (.bin or .txt)"
+        )
+    try:
+        for name, walk in _RECORDS.items():
+            if (root / name).is_file():
+                _check_whole(root / name, walk)
+        return colmap.Reconstruction(str(root))
+    except Exception as error:  # pycolmap raises RuntimeError, ValueError or IndexError on a damaged file
+        raise ValueError(f"colmap: {root} does not read as a COLMAP model: {error}") from error
+
+
+def is_colmap(folder: Path) -> bool:
+    """Whether a folder holds files named as those of a COLMAP model."""
+    return any(
+        all((folder / f"{n}{ext}").is_file() for n in ("cameras", "images")) for ext in (".bin", ".txt")
+    )
 
 
 _RECORDS: dict[str, Callable[[bytes, int], int]] = {
@@ -253,18 +307,27 @@ def _settle(working: Path, final: Path) -> None:
 
 
 def _extract(
-    colmap: ModuleType, folder: Path, named: Mapping[str, Path], settings: tuple[int, str], attempt: Attempt
+    colmap: ModuleType,
+    folder: Path,
+    named: Mapping[str, Path],
+    settings: tuple[int, str | dict[str, Lens]],
+    attempt: Attempt,
 ) -> None:
-    """Features of the photos, into ``features.db``."""
-    max_features, model = settings
+    """Features of the photos, into ``features.db``; settings are their number, and lenses or the model of all lenses."""
+    max_features, lens = settings
     names = list(named)
     images = _root(named)
     working = attempt.folder / "features.db"
     working.unlink(missing_ok=True)
     colmap.Database.open(str(working)).close()
-    reader = colmap.ImageReaderOptions(camera_model=model)
+    reader = colmap.ImageReaderOptions()
     # Importing first numbers the images by name; extraction alone numbers them as threads finish.
-    for group in cameras_of(named):
+    if isinstance(lens, str):
+        groups = [(group, lens, "") for group in cameras_of(named)]
+    else:
+        known = [(colmap_camera(own), group) for own, group in lenses_in_use(lens).items()]
+        groups = [(list(group), camera.model.name, camera.params_to_string()) for camera, group in known]
+    for group, reader.camera_model, reader.camera_params in groups:
         colmap.import_images(working, images, colmap.CameraMode.SINGLE, image_names=group, options=reader)
     if any(mask_beside(path) for path in named.values()):
         reader.mask_path = _write_masks(named, attempt.folder / "masks")
@@ -425,15 +488,109 @@ def _map(
             f"place that overlap by half or more: {some(list(named))}"
         )
     largest, *others = sorted(models, key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
-    whole = attempt.folder / "model"
-    shutil.rmtree(whole, ignore_errors=True)
-    whole.mkdir()
+    whole = _fresh(attempt.folder / "model")
     largest.write_binary(str(whole))
     choose_lens(colmap, whole, lens).write_binary(str(whole))
     shutil.rmtree(folder / "model", ignore_errors=True)
     os.replace(whole, folder / "model")
     report("mapping", len(named), len(named))
     return [m.num_reg_images() for m in others]
+
+
+def _fresh(folder: Path) -> Path:
+    """``folder``, empty."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
+def read_known(folder: Path) -> dict[str, KnownCamera]:
+    """Lenses and poses of the photos of a COLMAP model, by name.
+
+    Raises:
+        ValueError: if the folder holds no readable model.
+    """
+    colmap = load_colmap()
+    with _quiet(colmap), naming(folder, "expected a COLMAP model"):
+        model = _open_model(colmap, folder)
+        lenses = lenses_of(model)
+        poses = {i.name: _pose(i) for i in model.images.values() if i.name in lenses}
+    return {
+        name: KnownCamera(
+            lens.model,
+            (lens.width, lens.height),
+            (lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients),
+            0.0,
+            poses[name],
+        )
+        for name, lens in lenses.items()
+    }
+
+
+def _known_lenses(poses: KnownPoses, photos: Mapping[str, Path]) -> dict[str, Lens]:
+    """Lenses of photos whose poses are known, for the photos as stored."""
+    facts = {name: photo_facts(path) for name, path in photos.items()}
+    return {n: c.of_size(n, facts[n].width, facts[n].height) for n, c in poses.cameras.items()}
+
+
+def _known_model(colmap: ModuleType, poses: KnownPoses, lenses: Mapping[str, Lens]) -> Any:
+    """A COLMAP model of known poses, with its points where they come from one that has some."""
+    if poses.model is not None:
+        model = _open_model(colmap, poses.model)
+        if model.num_points3D():
+            _renamed(model, {name: photo for photo, name in poses.names.items()}, lenses)
+            return model
+    model = colmap.Reconstruction()
+    for k, (lens, names) in enumerate(lenses_in_use(lenses).items()):
+        model.add_camera_with_trivial_rig(colmap_camera(lens, k + 1))
+        for name in names:
+            image = colmap.Image(name=name, camera_id=k + 1, image_id=model.num_images() + 1)
+            pose = poses.cameras[name].world_to_camera
+            rigid = colmap.Rigid3d(colmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
+            model.add_image_with_trivial_frame(image, rigid)
+    return model
+
+
+def _renamed(model: Any, photo_of: Mapping[str, str], lenses: Mapping[str, Lens]) -> None:
+    """Give the images of a COLMAP model the names and sizes of photos; those without a photo lose their pose."""
+    for image in list(model.images.values()):
+        if photo_of.get(image.name) in lenses:
+            image.name = photo_of[image.name]
+            lens = lenses[image.name]
+            model.cameras[image.camera_id].rescale(lens.width, lens.height)
+        elif image.has_pose:
+            model.deregister_frame(image.frame_id)
+
+
+def _content(model: Any) -> list[Any]:
+    """What a COLMAP model is made of, for a step's key."""
+    posed = sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name)
+    rows = [[i.name, lens_of(model.cameras[i.camera_id]), i.cam_from_world().matrix()] for i in posed]
+    points = sorted(model.points3D)
+    return [rows, np.array([model.points3D[k].xyz for k in points]).reshape(-1, 3)]
+
+
+def _keep_known(
+    colmap: ModuleType,
+    folder: Path,
+    photos: Mapping[str, Path],
+    settings: tuple[Any, bool, int],
+    attempt: Attempt,
+) -> None:
+    """A model of known poses into the folder ``model``, its points triangulated from the matches where asked."""
+    model, match, seed = settings
+    whole = _fresh(attempt.folder / "model")
+    if match:
+        attempt.progress("triangulating", 0, 1)
+        options = colmap.IncrementalPipelineOptions(random_seed=seed, num_threads=1)
+        working = _copied(folder / "matches.db", attempt.folder / "matches.db")
+        root = _root(photos)
+        model = colmap.triangulate_points(model, working, root, whole, options=options)
+        model.extract_colors_for_all_images(str(root))
+        attempt.progress("triangulating", 1, 1)
+    model.write_binary(str(whole))
+    shutil.rmtree(folder / "model", ignore_errors=True)
+    os.replace(whole, folder / "model")
 
 
 def lenses_of(model: Any) -> dict[str, Lens]:
@@ -471,6 +628,15 @@ def _causes(colmap: ModuleType, matches: Path, sparse: SparseModel) -> dict[str,
     return causes
 
 
+def _pose(image: Any) -> np.ndarray:
+    """World to camera of a posed image of COLMAP's, shape ``(4, 4)``."""
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().matrix()
+    u, _, vt = np.linalg.svd(pose[:3, :3])
+    pose[:3, :3] = u @ vt
+    return pose
+
+
 def _sparse_model(
     model: Any, names: Sequence[str], turns: Mapping[str, int] | None = None, max_pixels: int = 2**62
 ) -> SparseModel:
@@ -478,14 +644,12 @@ def _sparse_model(
     images = {i.name: i for i in model.images.values() if i.has_pose}
     cameras, share = {}, {}
     for name, lens in lenses_of(model).items():
-        pose = np.eye(4)
-        pose[:3] = images[name].cam_from_world().matrix()
-        u, _, vt = np.linalg.svd(pose[:3, :3])
-        pose[:3, :3] = u @ vt
-        cameras[name] = pinhole_of(lens, pose, (turns or {}).get(name, 0), max_pixels)
+        cameras[name] = pinhole_of(lens, _pose(images[name]), (turns or {}).get(name, 0), max_pixels)
         share[images[name].image_id] = (cameras[name].fx + cameras[name].fy) / (lens.fx + lens.fy)
     position = {images[n].image_id: i for i, n in enumerate(cameras)}
-    points = [model.points3D[i] for i in sorted(model.points3D)]
+    points = [
+        p for _, p in sorted(model.points3D.items()) if p.track.elements
+    ]  # what no photo shows is no use
     tracks = [sorted({position[e.image_id] for e in p.track.elements}) for p in points]
     length = np.array([len(t) for t in tracks], dtype=np.int64)
     return SparseModel(

@@ -12,6 +12,8 @@ from warprrf.checks import check_array
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.splats.camera import Camera
 
+MOST_KEPT = 60_000_000  # numbers of photos kept on the device: with their moments 720 MB
+
 
 @dataclass(frozen=True)
 class PosedPhotos:
@@ -59,25 +61,26 @@ class Target:
     Attributes:
         view: number of the photo.
         camera: of this size.
-        pixels: in [0, 1], masked ones 0, flat.
+        pixels: in [0, 1], masked ones 0, a plane.
         kept: 0 at masked pixels, 1 at others, shape ``(H * W,)``; empty without a mask.
-        moments: window averages of ``pixels`` (see :meth:`~warprrf.geometry.photos.photo_loss.PhotoLoss.moments`).
+        moments: window averages of ``pixels`` and their squares, planes.
     """
 
     view: int
     camera: Camera
     pixels: wp.array
     kept: wp.array
-    moments: wp.array
+    moments: tuple[wp.array, wp.array]
 
 
 class Targets:
-    """Photos at one size after another, made when first asked for."""
+    """Photos at one size after another, made when first asked for; ``pixels`` is how many they have in the mean."""
 
     def __init__(self, photos: PosedPhotos, loss: PhotoLoss) -> None:
         self.photos, self.loss = photos, loss
         self.scale = 1
         self.made: dict[int, Target] = {}
+        self.pixels = sum(c.width * c.height for c in photos.cameras) / len(photos.cameras)
 
     def __len__(self) -> int:
         return len(self.photos.images)
@@ -90,7 +93,7 @@ class Targets:
         if view in self.made:
             return self.made[view]
         made = self.make(view, scale)
-        if scale > 1:  # in full they are asked for a few times and take much memory
+        if len(self.made) * made.pixels.size < MOST_KEPT:
             self.made[view] = made
         return made
 
@@ -101,7 +104,7 @@ class Targets:
         height, width = image.shape[0] // scale, image.shape[1] // scale
         rows, columns = height * scale, width * scale
         blocks = image[:rows, :columns].reshape(height, scale, width, scale, 3)
-        small = blocks.mean(axis=(1, 3), dtype=np.float32)
+        small = image if scale == 1 else blocks.mean(axis=(1, 3), dtype=np.float32)
         kept = np.zeros(0, np.float32)
         if mask is not None:
             masked = np.asarray(mask)[:rows, :columns].reshape(height, scale, width, scale) != 0
@@ -109,7 +112,6 @@ class Targets:
             small = small * kept[..., None]
         lens = {name: getattr(camera, name) / scale for name in ("fx", "fy", "cx", "cy")}
         smaller = Camera.pinhole(width, height, world_to_camera=camera.world_to_camera, **lens)
-        pixels, weights = (
-            wp.array(a.reshape(-1), dtype=float, device=self.loss.device) for a in (small, kept)
-        )
-        return Target(view, smaller, pixels, weights, self.loss.moments(pixels, pixels, small.shape))
+        pixels = self.loss.plane(small, (height, width))
+        weights = wp.array(kept.reshape(-1), dtype=float, device=self.loss.device)
+        return Target(view, smaller, pixels, weights, self.loss.moments(pixels, (height, width)))

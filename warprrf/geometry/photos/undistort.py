@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,21 @@ def pinhole_of(lens: Lens, world_to_camera: ArrayLike, turns: int, max_pixels: i
     return camera
 
 
+def stored_pixels(lens: Lens, slopes: np.ndarray, turns: int) -> np.ndarray:
+    """Where a photo as stored shows directions of the upright camera, shape ``(N, 2)`` [pixels].
+
+    Args:
+        slopes: x / z and y / z of the directions, shape ``(N, 2)``.
+        turns: quarter turns clockwise that bring the stored photo upright.
+    """
+    for _ in range(turns % 4):
+        slopes = np.column_stack([slopes[:, 1], -slopes[:, 0]])
+    if lens.straight:
+        return slopes * [lens.fx, lens.fy] + [lens.cx, lens.cy]
+    rays = np.column_stack([slopes, np.ones(len(slopes))])
+    return np.asarray(colmap_camera(lens).img_from_cam(rays))
+
+
 def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -> None:
     """``source`` as the camera of :func:`pinhole_of` shows it, written to ``target``, its mask beside it.
 
@@ -107,23 +123,22 @@ def write_undistorted(source: Path, target: Path, lens: Lens, max_pixels: int) -
     if lens.straight and turns == 0 and small == lens:
         shutil.copyfile(source, target)
     else:
-        _save(
-            _resampled(open_photo(source, "RGB"), source, lens, small).rotate(-90 * turns, expand=True),
-            target,
-        )
+        straight = _resampled(open_photo(source, "RGB"), source, lens, small)
+        _save(straight.rotate(-90 * turns, expand=True), target)
     if mask is not None:
         image = require("PIL.Image", extra="photos")
         stored = open_photo(mask, "L").rotate(
             90 * turns, expand=True
         )  # a mask is upright, as its photo is seen
-        straight = np.asarray(_resampled(stored, mask, lens, small))
-        whole = np.where(straight > 254, 255, 0).astype(np.uint8)
-        _save(image.fromarray(whole).rotate(-90 * turns, expand=True), mask_name(target))
+        counts = np.asarray(_resampled(stored, mask, lens, small)) > 254
+        whole = image.fromarray(np.where(counts, 255, 0).astype(np.uint8))
+        _save(whole.rotate(-90 * turns, expand=True), mask_name(target))
 
 
 def load_colmap() -> Any:
     """The package pycolmap. Pillow is loaded before it: the other way round its PNG files hang or crash the process."""
-    require("PIL.Image", extra="photos")
+    if find_spec("pycolmap") is not None:
+        require("PIL.Image", extra="photos")
     return require("pycolmap", extra="photos")
 
 
@@ -132,12 +147,13 @@ def _save(picture: Any, target: Path) -> None:
     picture.save(target, **({"quality": JPEG_QUALITY, "subsampling": 0} if jpeg else {}))
 
 
-def _camera(colmap: Any, lens: Lens) -> Any:
+def colmap_camera(lens: Lens, number: int = 1) -> Any:
     """``lens`` as COLMAP's camera, in a model with two focal lengths, so that it scales without rounding."""
+    colmap = load_colmap()
     model = lens.model if lens.model in ("OPENCV_FISHEYE", "FULL_OPENCV") else "OPENCV"
     bends = [*lens.coefficients, 0.0, 0.0, 0.0, 0.0][: COEFFICIENTS[model]]
     params = [lens.fx, lens.fy, lens.cx, lens.cy, *bends]
-    return colmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=1)
+    return colmap.Camera(model=model, width=lens.width, height=lens.height, params=params, camera_id=number)
 
 
 def _reduced(lens: Lens, max_pixels: int) -> Lens:
@@ -155,7 +171,7 @@ def _reduced(lens: Lens, max_pixels: int) -> Lens:
 def _undistorted(lens: Lens) -> Any:
     """COLMAP's pinhole camera of photos of ``lens``, undistorted."""
     colmap = load_colmap()
-    return colmap.undistort_camera(colmap.UndistortCameraOptions(), _camera(colmap, lens))
+    return colmap.undistort_camera(colmap.UndistortCameraOptions(), colmap_camera(lens))
 
 
 def _resampled(picture: Any, path: Path, lens: Lens, small: Lens) -> Any:
@@ -170,7 +186,7 @@ def _resampled(picture: Any, path: Path, lens: Lens, small: Lens) -> Any:
         return picture
     colmap, image = load_colmap(), require("PIL.Image", extra="photos")
     bitmap = colmap.Bitmap.from_array(np.asarray(picture))
-    flat, _ = colmap.undistort_image(colmap.UndistortCameraOptions(), bitmap, _camera(colmap, small))
+    flat, _ = colmap.undistort_image(colmap.UndistortCameraOptions(), bitmap, colmap_camera(small))
     return image.fromarray(flat.to_array().squeeze())
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from warprrf.device import require
+from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.config import PlaneConfig
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
@@ -71,6 +72,13 @@ def upright(sparse: SparseModel, photo: Callable[[str], np.ndarray], *, seed: in
     shift = -rotation @ np.mean([c.position for c in cameras], axis=0)
     shift[2] = -height
     return replace(transformed(sparse, 1.0, rotation, shift), upright=True, guessed=tuple(guessed))
+
+
+def turned(sparse: SparseModel, up: str) -> SparseModel:
+    """``sparse`` with the axis ``up`` of its own, ``"x"``, ``"y"`` or ``"z"``, as z; its origin stays."""
+    axes, signs = UP[up]
+    rotation = np.eye(3)[axes] * np.array(signs)[:, None]
+    return replace(transformed(sparse, 1.0, rotation, np.zeros(3)), upright=True)
 
 
 def held_up(cameras: Sequence[Camera]) -> np.ndarray:

@@ -24,6 +24,7 @@ from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
+from warprrf.rf.spectra.readings import Data
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
@@ -68,14 +69,12 @@ class RadioField(ABC):
         """Name of the model."""
 
     @classmethod
-    def fit(
-        cls, geometry: GeometryLike, ds: SpectrumDataset, model: str = "bistatic", **options: Any
-    ) -> RadioField:
-        """Fit a radio field to the spectra of ``ds``.
+    def fit(cls, geometry: GeometryLike, ds: Data, model: str = "bistatic", **options: Any) -> RadioField:
+        """Fit a radio field to what was measured.
 
         Args:
             geometry: a Reconstruction (anything with ``.gaussians`` and ``.mesh``), a Scene or a Mesh.
-            ds: training set.
+            ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, or a list of both.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
             options: keyword arguments of :meth:`BistaticField.fit` or :meth:`HarmonicField.fit`, which name and check
                 them.
@@ -86,8 +85,6 @@ class RadioField(ABC):
         Warns:
             UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
         """
-        if not hasattr(ds, "path_gain"):
-            raise TypeError(f"ds: got {type(ds).__name__}, expected a SpectrumDataset")
         if not isinstance(model, str) or model not in cls.models:
             raise ValueError(f"model: got {model!r}, expected one of {', '.join(cls.models)}")
         return cls.models[model].fit(geometry, ds, model, **options)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_positive, check_seed, checked
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.spectra import dataset_files, exr
 from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
 from warprrf.rf.spectra.spectrum import (
@@ -22,7 +22,9 @@ from warprrf.rf.spectra.spectrum import (
     check_pixels,
     check_range_db,
     check_shape,
+    check_whole,
     default_floor,
+    pixel_directions,
     to_db,
 )
 
@@ -42,7 +44,7 @@ class SpectrumDataset:
         receivers: Positions [m], shape ``(R, 3)``, float64.
         transmitter: Position [m], shape ``(3,)``, float64.
         frequency_hz: Carrier frequency [Hz].
-        path_gain: Path gain per pixel [linear], shape ``(R, H, W)``, float32.
+        path_gain: Path gain per pixel [linear], shape ``(R, H, W)``, float32; NaN where not measured.
         delay_s: Delay of the pixel's strongest path [s], shape ``(R, H, W)``, float64; NaN where empty.
         aod: Its zenith and azimuth of departure [rad], shape ``(R, H, W, 2)``, float32; NaN where empty.
         floor: Noise floor N0 that dB images add [linear].
@@ -77,7 +79,11 @@ class SpectrumDataset:
         """Check shapes and values; ValueError or TypeError names the field."""
         receivers = check_array("receivers", self.receivers, (None, 3))
         count = len(receivers)
-        gain = check_array("path_gain", self.path_gain, (count, None, None), dtype=np.float32)
+        gain = check_array("path_gain", self.path_gain, (count, None, None), dtype=np.float32, finite=False)
+        if np.isinf(gain).any():
+            raise ValueError(
+                "path_gain: got infinite values, expected linear path gain, or NaN where not measured"
+            )
         shape = check_shape(gain.shape[1:])
         fields: dict[str, Any] = {
             "receivers": receivers,
@@ -115,20 +121,40 @@ class SpectrumDataset:
         transmitter: np.ndarray,
         frequency_hz: float,
         path_gain: np.ndarray,
-        delay_s: np.ndarray,
-        aod: np.ndarray,
-        line_of_sight: np.ndarray,
+        delay_s: np.ndarray | None = None,
+        aod: np.ndarray | None = None,
+        line_of_sight: np.ndarray | None = None,
         beam_sigma_rad: float,
-        engine: str,
+        engine: str = "measured",
         seed: int = 0,
         role: Sequence[str] | NDArray[np.str_] | None = None,
         floor: float | None = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> SpectrumDataset:
-        """A data set with N0, its dB range and, if none are given, roles chosen for it."""
-        gain = check_array("path_gain", path_gain, (None, None, None), dtype=np.float32)
-        if len(gain) == 0:
+        """A data set with N0, its dB range and, if none are given, roles chosen for it.
+
+        Args:
+            path_gain: NaN where nothing was measured.
+            delay_s, aod: None where they were not measured.
+            line_of_sight: if None, receivers are taken to see the transmitter where half the power of free space or more
+                comes from its direction.
+            floor: if None, 60 dB below the median spectrum's strongest pixel.
+
+        The other arguments are the attributes of those names.
+
+        Raises:
+            TypeError, ValueError: naming the argument.
+        """
+        gain = check_array("path_gain", path_gain, (None, None, None), dtype=np.float32, finite=False)
+        if len(gain) == 0 or np.isnan(gain).all():
             raise ValueError("path_gain: got no spectra, expected one receiver's or more")
+        places = check_array("receivers", receivers, (len(gain), 3))
+        source = check_array("transmitter", transmitter, (3,))
+        if line_of_sight is None:
+            wavelength = SPEED_OF_LIGHT / check_frequency(frequency_hz)
+            line_of_sight = _sees(
+                places, source, gain, wavelength, check_positive("beam_sigma_rad", beam_sigma_rad)
+            )
         if (gain < 0).any():
             raise ValueError(f"path_gain: got {gain.min()}, expected gains of at least 0")
         noise = default_floor(gain) if floor is None else check_positive("floor", floor, "linear noise floor")
@@ -137,10 +163,10 @@ class SpectrumDataset:
             transmitter=transmitter,
             frequency_hz=frequency_hz,
             path_gain=gain,
-            delay_s=delay_s,
-            aod=aod,
+            delay_s=np.full(gain.shape, np.nan) if delay_s is None else delay_s,
+            aod=np.full((*gain.shape, 2), np.nan) if aod is None else aod,
             floor=noise,
-            range_db=(10.0 * float(np.log10(noise)), float(to_db(gain.max(), noise))),
+            range_db=(10.0 * float(np.log10(noise)), float(to_db(np.nanmax(gain), noise))),
             beam_sigma_rad=beam_sigma_rad,
             engine=engine,
             polarisation=POLARISATION,
@@ -269,6 +295,7 @@ class SpectrumDataset:
             TypeError: on a pattern that does not read as numbers, or an option of the other kind of antenna.
             ValueError: on negative, NaN or infinite gains, a scanned antenna without directivity, another shape.
         """
+        check_whole("path_gain", self.path_gain)
         done = deembed(
             self.path_gain,
             pattern,
@@ -354,6 +381,18 @@ def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.nd
     role = np.full(count, "train", dtype="<U5")
     role[np.random.default_rng(seed).choice(count, wanted, replace=False)] = "test"
     return role
+
+
+def _sees(
+    receivers: np.ndarray, transmitter: np.ndarray, gain: np.ndarray, wavelength_m: float, sigma_rad: float
+) -> np.ndarray:
+    """Whether half the power of free space or more comes from the transmitter's direction, shape ``(R,)``."""
+    way = transmitter - receivers
+    length = np.maximum(np.linalg.norm(way, axis=1), 1e-9)
+    cosine = np.einsum("hwc,rc->rhw", pixel_directions(gain.shape[1:]), way / length[:, None])
+    near = cosine > np.cos(max(3.0 * sigma_rad, 2.0 * np.pi / gain.shape[1]))
+    received = np.where(near, np.nan_to_num(gain), 0.0).sum(axis=(1, 2))
+    return np.asarray(received >= 0.5 * (wavelength_m / (4.0 * np.pi * length)) ** 2)
 
 
 def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:

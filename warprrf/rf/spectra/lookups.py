@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from warprrf.checks import check_array, check_positive, checked
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.metrics import psnr, unit_image
-from warprrf.rf.spectra.spectrum import Spectrum, to_db
+from warprrf.rf.spectra.spectrum import Spectrum, check_whole, to_db
 
 SAME_PLACE_M = 1e-9  # a receiver nearer than this to a training one is that one
 
@@ -140,6 +140,7 @@ def _receivers(train: SpectrumDataset) -> np.ndarray:
     receivers = np.asarray(train.receivers, dtype=np.float64)
     if len(receivers) == 0:
         raise ValueError("train: got no receivers, expected at least one")
+    check_whole("train.path_gain", train.path_gain)
     return receivers
 
 

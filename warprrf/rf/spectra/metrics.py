@@ -27,6 +27,7 @@ from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import (
     Spectrum,
+    check_whole,
     directions_from_angles,
     pixel_directions,
     pixel_solid_angles,
@@ -215,6 +216,7 @@ def evaluate(
     count = len(test.receivers)
     if count == 0:
         raise ValueError("test: got no receivers, expected at least one")
+    check_whole("test.path_gain", test.path_gain)
     fitted_on = _fitted_on(predict, test)
     if fitted_on:
         warnings.warn(

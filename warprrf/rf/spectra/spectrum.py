@@ -94,6 +94,15 @@ def check_pixels(path_gain: np.ndarray, delay_s: np.ndarray | None, aod: np.ndar
             )
 
 
+def check_whole(name: str, path_gain: ArrayLike) -> None:
+    """Raise ValueError, naming the argument, if pixels of spectra were not measured."""
+    missing = int(np.isnan(path_gain).sum())
+    if missing:
+        raise ValueError(
+            f"{name}: {missing} of {np.size(path_gain)} pixels were not measured (NaN), expected whole spectra"
+        )
+
+
 def pixel_angles(shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Zenith of the rows, shape ``(H,)``, and azimuth of the columns, shape ``(W,)`` [rad], at pixel centres."""
     rows, columns = check_shape(shape)
@@ -186,7 +195,7 @@ def default_floor(path_gain: np.ndarray) -> float:
     Raises:
         ValueError: if all views are empty.
     """
-    peak = path_gain.reshape(len(path_gain), -1).max(axis=1)
+    peak = np.nan_to_num(path_gain).reshape(len(path_gain), -1).max(axis=1)
     if not (peak > 0.0).any():
         raise ValueError("path_gain: all spectra are empty, expected power to set a floor from")
     return float(np.median(peak[peak > 0.0])) * 10.0 ** (-FLOOR_BELOW_MEDIAN_DB / 10.0)

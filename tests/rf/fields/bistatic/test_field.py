@@ -16,8 +16,9 @@ from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.rays import RayGrid
-from warprrf.rf.fields.bistatic.response import Response, SpectrumPixels, jacobian, predict, respond
+from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.scattering import scatter
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -389,7 +390,7 @@ def test_a_fit_goes_on_after_steps_that_were_cut_short() -> None:
     )  # fmt: skip
     target = np.full(count, 40.0)
     target[:lit] = fitting.NEPER * np.log1p(predict(response, true)[0])
-    reading = fitting.Reading(response, target)
+    reading = fitting.Reading(response, fitting.Target(target))
     start = replace(true, log_weight=true.log_weight - 9.0)
     loose = fitting.Deviations(weight=1e3, excess=1e-3, mirror=1e3, energy=1e6)
     found = fitting.fit_groups([reading], start, np.ones(1), fitting.GroupFit(deviations=loose))

@@ -11,8 +11,9 @@ from scipy import sparse
 from warprrf import tensor_files as files
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import NEPER
+from warprrf.rf.fields.bistatic.fit import NEPER, Target
 from warprrf.rf.fields.bistatic.links import LinkTracer
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, Shares, fit_residual, gather_shares
 from warprrf.rf.fields.bistatic.surface import CELLS, ELEMENT_M, Surface
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -25,7 +26,7 @@ TX = np.array([0.8, 0.9, 2.2])
 RECEIVERS = np.array([[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9]])
 
 
-BEAM = BeamOperator(SHAPE, np.radians(5.0))
+MEASURED = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)))
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +59,12 @@ def shares_of(field: BistaticField, planted: np.ndarray) -> list[Shares]:
         powers = bare.render(view).powers
         per_pixel = len(powers.single) // pixels
         pixel, face = np.arange(len(powers.single)) // per_pixel, view.hits.face.numpy()
-        single = gather_shares(pixel, face, powers.single / field.floor, pixels, surface)
+        single = gather_shares(pixel, pixels, face, powers.single / field.floor, surface)
         sent = powers.further.sent
-        further = gather_shares(sent.ray // per_pixel, sent.face, sent.power / field.floor, pixels, surface)
+        further = gather_shares(sent.ray // per_pixel, pixels, sent.face, sent.power / field.floor, surface)
         image = replace(field, residual=planted).render(view).image / field.floor
         specular = np.tensordot(powers.mirror, view.beams, axes=1).ravel() / field.floor
-        found.append(Shares(single, further, specular, NEPER * np.log1p(image.ravel())))
+        found.append(Shares(single, further, specular, MEASURED, Target(NEPER * np.log1p(image.ravel()))))
     return found
 
 
@@ -84,12 +85,12 @@ def test_planted_gains_come_back(field: BistaticField) -> None:
         rng = np.random.default_rng(seed)
         smooth = rng.normal(0.0, 0.3, (2, len(field.surface.element_area)))[:, field.surface.cell_element]
         shares = shares_of(field, smooth)
-        found = fit_residual(shares, BEAM, field.surface, ResidualFit(noise_db=0.1))
+        found = fit_residual(shares, field.surface, ResidualFit(noise_db=0.1))
         assert found.shape == (2, field.surface.cells)
         known, gaps = replace(field, residual=found), []
         for receiver, share in zip(RECEIVERS, shares, strict=True):
             image = known.render(known.view(receiver)).image.ravel() / field.floor
-            gaps.append(NEPER * np.log1p(image) - share.target_db)
+            gaps.append(NEPER * np.log1p(image) - share.target.db)
         assert np.sqrt(np.mean(np.square(gaps))) < 0.1
         power = sum(np.asarray(s.single.sum(axis=0)).ravel() for s in shares)
         element = field.surface.cell_element
@@ -104,7 +105,7 @@ def test_planted_gains_come_back(field: BistaticField) -> None:
 def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
     """Spectra that the field explains already, and surfaces that no spectrum shows, have gains of 1."""
     shares = shares_of(field, np.zeros_like(field.residual))
-    assert np.abs(fit_residual(shares, BEAM, field.surface)).max() < 1e-4
+    assert np.abs(fit_residual(shares, field.surface)).max() < 1e-4
     surface = field.surface
     shown = np.isin(
         np.arange(surface.cells), np.unique(surface.cell_element, return_index=True)[1], invert=True
@@ -117,7 +118,7 @@ def test_nothing_seen_is_nothing_learned(field: BistaticField) -> None:
         replace(s, single=s.single @ hide, further=s.further @ hide)
         for s in shares_of(field, np.full_like(field.residual, np.log(2.0)))
     ]
-    found = fit_residual(doubled, BEAM, surface)
+    found = fit_residual(doubled, surface)
     dark = np.bincount(surface.cell_element, shown)[surface.cell_element] == 0
     assert dark.any() and np.array_equal(found[:, dark], np.zeros((2, dark.sum())))
     # a cell that nobody saw, of an element that somebody did, has the element's

@@ -3,7 +3,7 @@
 import copy
 import pickle
 import weakref
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
+from warprrf.rf.fields.bistatic.measured import WeighedPaths, read
 from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -22,24 +23,14 @@ F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
 TX, RX = np.array([0.8, 0.9, 2.2]), np.array([4.2, 3.1, 1.2])
 
 
-@dataclass(frozen=True)
-class DelayProfile:
-    """Power by delay, summed over all directions."""
+def delay_profile(view: ReceiverView) -> WeighedPaths:
+    """Power in windows of 2 ns, summed over all directions."""
+    start = np.arange(0.0, 50e-9, 2e-9)
 
-    edges_s: np.ndarray
+    def weigh(arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray) -> np.ndarray:
+        return (delay_s >= start[:, None]) & (delay_s < start[:, None] + 2e-9)
 
-    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
-        ray = np.arange(len(view.hits.face))
-        length = np.linalg.norm(view.hits.points(ray) - view.transport.transmitter, axis=1)
-        tap = np.digitize((length + view.hits.range_m.numpy()) / SPEED_OF_LIGHT, self.edges_s) - 1
-        return np.where((tap >= 0) & (tap < len(self.edges_s) - 1), tap, -1), len(self.edges_s) - 1
-
-    def of_bins(self, power: np.ndarray) -> np.ndarray:
-        return power.astype(np.float32)
-
-    def of_paths(self, view: ReceiverView) -> np.ndarray:
-        tap = np.digitize(view.paths.length_m / SPEED_OF_LIGHT, self.edges_s) - 1
-        return (tap[:, None] == np.arange(len(self.edges_s) - 1)).astype(np.float32)
+    return WeighedPaths.of(view, weigh, departure=False, delay_step_s=2e-9)
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +44,17 @@ def field() -> BistaticField:
 
 
 def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
-    view, profile = field.view(RX), DelayProfile(np.arange(0.0, 50e-9, 2e-9))
+    view = field.view(RX)
+    profile = delay_profile(view)
     response = respond(view, profile, field.terms, field.floor)
     found = predict(response, field.parameters) * field.floor
     powers = path_powers(view, field.materials, None)
-    tap, count = profile.bins(view)
-    expected = np.bincount(tap[tap >= 0], powers.single[tap >= 0], minlength=count)
-    expected += powers.mirror @ profile.of_paths(view)
+    ray = np.flatnonzero(view.hits.face.numpy() >= 0)
+    length = np.linalg.norm(view.hits.points(ray) - TX, axis=1) + view.hits.range_m.numpy()[ray]
+    edges = SPEED_OF_LIGHT * np.arange(0.0, 51e-9, 2e-9)
+    expected = np.histogram(length, edges, weights=powers.single[ray])[0]
+    expected += np.histogram(view.paths.length_m, edges, weights=powers.mirror)[0]
+    np.testing.assert_allclose(read(view, profile, powers), expected, rtol=1e-4)  # rays at a window's edge
     assert (expected > 0).sum() >= 5
     # three components resolve the Fresnel curves to a few parts in a thousand
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-3 * expected.max())
@@ -67,7 +62,8 @@ def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
 
 
 def test_its_jacobian_is_that_of_differences(field: BistaticField) -> None:
-    view, profile = field.view(RX), DelayProfile(np.arange(0.0, 50e-9, 2e-9))
+    view = field.view(RX)
+    profile = delay_profile(view)
     response = respond(view, profile, field.terms, field.floor)
     layout = Layout(*field.parameters.log_weight.shape, indirect=False, gain=True)
     x = layout.pack(replace(field.parameters, log_gain=0.1))

@@ -9,12 +9,12 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Reading, fit_groups
+from warprrf.rf.fields.bistatic.fit import Reading, Target, fit_groups
 from warprrf.rf.fields.bistatic.grouping import regroup
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.response import (
     Response,
-    SpectrumPixels,
     jacobian,
     predict,
     respond,
@@ -156,7 +156,7 @@ def readings(scene: RadioScene) -> list[Reading]:
     target = to_db(ds.path_gain, ds.floor) - 10 * np.log10(ds.floor)
     measured = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)), np.arange(SHAPE[0] * SHAPE[1]))
     return [
-        Reading(respond(view, measured, Terms(), ds.floor), t.ravel())
+        Reading(respond(view, measured, Terms(), ds.floor), Target(t.ravel()))
         for view, t in zip(trace(scene, ds).views, target, strict=True)
     ]
 
@@ -181,7 +181,7 @@ def test_looks_that_differ_keep_apart_what_spectra_cannot_tell(
     readings: list[Reading], scene: RadioScene
 ) -> None:
     dark = [
-        Reading(replace(r.response, bounce=0 * r.response.bounce), np.zeros_like(r.target_db))
+        Reading(replace(r.response, bounce=0 * r.response.bounce), Target(np.zeros_like(r.target.db)))
         for r in readings
     ]
     area = np.bincount(scene.face_material, scene.mesh.areas)

@@ -80,6 +80,17 @@ def test_crumbs_join_the_nearest_piece_of_their_part():
     assert material.max() + 1 == 6  # too small for a material of its own
 
 
+def test_tops_of_one_height_mirror_for_the_thing_they_are_of():
+    other = box_mesh([0.4, 0.4, 0.0], [1.2, 1.2, 2.2])  # as high as the cupboard
+    mesh, part = joined(ROOM, CUPBOARD, other)
+    surface = Surface.of(mesh)
+    middle = surface.mesh.triangles.mean(axis=1)
+    top = np.abs(middle[:, 2] - 2.2) < 1e-6
+    first, second = (np.unique(surface.patch[top & side]) for side in (middle[:, 0] > 2, middle[:, 0] < 2))
+    assert len(first) == len(second) == 1 and first != second
+    assert surface.patch_group[first] != surface.patch_group[second]
+
+
 def scan(edge_m: float = 0.07, error_m: float = 0.02) -> Mesh:
     """The furnished room as a scanner gives it: small faces, vertices with errors, holes."""
     r = np.random.default_rng(3)

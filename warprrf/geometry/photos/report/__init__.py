@@ -25,6 +25,7 @@ from warprrf.geometry.photos.report.sight import (
     how_seen,
     painted,
 )
+from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -54,6 +55,7 @@ class Subject:
         photos: image files of the cameras, by name, as the Gaussians were fitted to them.
         held_out: names of photos that they were not fitted to.
         unposed: photos without a pose, and why.
+        lenses: that took the photos, by name.
         guessed: what nobody measured and the photos do not show.
         metric, scale_rms_m: whether lengths are metres, and how well surveyed positions fit.
     """
@@ -64,6 +66,7 @@ class Subject:
     photos: Mapping[str, Path] = field(default_factory=dict)
     held_out: Sequence[str] = ()
     unposed: Mapping[str, str] = field(default_factory=dict)
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
     guessed: Sequence[str] = ()
     metric: bool = True
     scale_rms_m: float = float("nan")
@@ -238,7 +241,19 @@ def _lenses(subject: Subject) -> str:
         focal = f"{fx:.1f}" if fx == fy else f"{fx:.1f}, {fy:.1f}"
         rows.append((f"{count}", f"{width:.0f} x {height:.0f}", focal, f"{cx:.1f}, {cy:.1f}", view))
     more = f'<p class="note">{len(groups) - SHOWN} more lenses.</p>' if len(groups) > SHOWN else ""
-    return f"<h2>Lenses</h2>{_table(rows)}{more}"
+    return f"<h2>Lenses</h2>{_table(rows)}{more}{_taken_with(subject)}"
+
+
+def _taken_with(subject: Subject) -> str:
+    """Lenses before photos were undistorted and reduced."""
+    used = sorted(lenses_in_use(subject.lenses).items(), key=lambda item: -len(item[1]))[:SHOWN]
+    if not used:
+        return ""
+    rows = [("photos", "pixels as stored", "lens model", "distortion")]
+    for lens, names in used:
+        bends = ", ".join(f"{c:.4g}" for c in lens.coefficients) if not lens.straight else "none"
+        rows.append((f"{len(names)}", f"{lens.width} x {lens.height}", lens.model, bends))
+    return f"<p>They were taken with:</p>{_table(rows)}"
 
 
 def _unposed(subject: Subject) -> str:

@@ -32,6 +32,7 @@ from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
+from warprrf.rf.fields.bistatic.observations import Frame, as_list, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.render import Rendered, render, sent_radiance
 from warprrf.rf.fields.bistatic.surface import Surface
@@ -42,7 +43,8 @@ from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import Spectrum
+from warprrf.rf.spectra.readings import Data
+from warprrf.rf.spectra.spectrum import Spectrum, default_floor, to_db
 
 
 @checked
@@ -132,7 +134,7 @@ class BistaticField(RadioField):
     def fit(  # type: ignore[override]
         cls,
         geometry: GeometryLike,
-        ds: SpectrumDataset,
+        ds: Data,
         model: str = "bistatic",
         *,
         options: FitOptions | None = None,
@@ -145,7 +147,7 @@ class BistaticField(RadioField):
 
         Args:
             geometry: Reconstruction, Scene (its materials name the groups, nothing else is taken from them) or Mesh.
-            ds: training set.
+            ds: training set: spectra, readings, or a list of them, of one carrier. The field's own transmitter is the first.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
             transport: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
@@ -159,19 +161,32 @@ class BistaticField(RadioField):
                 empty, or a ``transport`` of others.
             TypeError: for a geometry without a mesh, or an unknown option.
         """
-        chosen = FitOptions.of(options, settings)
-        found = train(geometry, ds, chosen, transport=transport, device=device, progress=progress)
-        return replace(
-            cls.prior(found.surface, ds, terms=found.materials.terms, device=device),
+        chosen, data = FitOptions.of(options, settings), as_list(ds)
+        found = train(geometry, data, chosen, transport=transport, device=device, progress=progress)
+        frame = Frame.of(data)
+        under = np.concatenate([np.atleast_2d(transmitters_of(one)) for one in data])
+        own = (under == frame.transmitter).all(axis=1)
+        receivers = np.concatenate([one.receivers for one in data])[own]
+        receivers = receivers[np.sort(np.unique(receivers, axis=0, return_index=True)[1])]
+        fitted = replace(
+            cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report, fitted_on=np.array(ds.receivers, np.float64),
+            errors=found.errors, report=found.report, fitted_on=receivers,
         )  # fmt: skip
+        if any(isinstance(one, SpectrumDataset) for one in data):
+            return fitted
+        places = receivers[np.linspace(0, len(receivers) - 1, min(len(receivers), 8)).astype(int)]
+        gains = np.stack([fitted.spectrum(place).path_gain for place in places])
+        floor = default_floor(gains)
+        return replace(
+            fitted, floor=floor, range_db=(10.0 * float(np.log10(floor)), float(to_db(gains.max(), floor)))
+        )
 
     @classmethod
     def prior(
         cls,
         geometry: GeometryLike,
-        ds: SpectrumDataset,
+        ds: SpectrumDataset | Frame,
         *,
         terms: Terms | None = None,
         device: DeviceLike = None,
@@ -190,11 +205,12 @@ class BistaticField(RadioField):
             TypeError: for a geometry without a mesh.
         """
         modelled, surface = terms or Terms(), Surface.of(geometry)
+        rows, columns = ds.shape if isinstance(ds, Frame) else ds.path_gain.shape[1:]
         return cls(
             surface=surface,
             transmitter=check_array("ds.transmitter", ds.transmitter, (3,)),
             frequency_hz=float(ds.frequency_hz),
-            shape=(int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])),
+            shape=(int(rows), int(columns)),
             floor=float(ds.floor),
             range_db=(float(ds.range_db[0]), float(ds.range_db[1])),
             beam_sigma_rad=float(ds.beam_sigma_rad),

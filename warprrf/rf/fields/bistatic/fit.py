@@ -23,24 +23,89 @@ NEPER = 10.0 / np.log(10.0)
 
 
 @dataclass(frozen=True)
+class Target:
+    """What was read at one receiver, and how errors of it count.
+
+    Attributes:
+        db: readings, 10 log10(P / N0 + 1), shape ``(N,)``.
+        trust: by which errors are multiplied: 1 but for readings with noise of their own, 0 for those left out, shape
+            ``(N,)``; None for 1.
+        censored: readings that only say that there was no more, shape ``(N,)`` bool; None for none.
+    """
+
+    db: np.ndarray
+    trust: np.ndarray | None = None
+    censored: np.ndarray | None = None
+
+    @classmethod
+    def joined(cls, targets: Sequence[Target]) -> Target:
+        """All readings of ``targets``, one after another."""
+        trust = [np.ones(len(t.db)) if t.trust is None else t.trust for t in targets]
+        censored = [np.zeros(len(t.db), bool) if t.censored is None else t.censored for t in targets]
+        return cls(
+            np.concatenate([t.db for t in targets]),
+            np.concatenate(trust) if any(t.trust is not None for t in targets) else None,
+            np.concatenate(censored) if any(t.censored is not None for t in targets) else None,
+        )
+
+    def part(self, index: np.ndarray) -> Target:
+        """Some of the readings."""
+        return Target(*(None if a is None else a[index] for a in (self.db, self.trust, self.censored)))  # type: ignore[arg-type]
+
+    def trusted(self, trust: np.ndarray) -> Target:
+        """The same with errors multiplied by ``trust`` (N,)."""
+        return replace(self, trust=trust * (1.0 if self.trust is None else self.trust))
+
+    def error(self, power: np.ndarray) -> np.ndarray:
+        """Error of predicted powers ``(..., N)`` in units of the floor, as it counts [dB]."""
+        error = NEPER * np.log1p(power) - self.db
+        if self.censored is not None:
+            error = np.where(self.censored, np.maximum(error, 0.0), error)
+        return np.asarray(error if self.trust is None else self.trust * error)
+
+    def slope(self, power: np.ndarray) -> np.ndarray:
+        """Derivative of :meth:`error` to the power ``(N,)``."""
+        slope = NEPER / (1.0 + power)
+        if self.censored is not None:
+            slope = np.where(self.censored & (NEPER * np.log1p(power) <= self.db), 0.0, slope)
+        return np.asarray(slope if self.trust is None else self.trust * slope)
+
+
+@dataclass(frozen=True)
 class Reading:
     """What was read at one receiver, and how that answers to the parameters.
 
     Attributes:
-        response: of the readings, N of them, in units of the floor N0.
-        target_db: what was read, 10 log10(P / N0 + 1), shape ``(N,)``.
+        response: of the N readings, in units of the floor N0.
+        target: what was read.
+        chain: measuring chain whose unknown gain they hold, -1 where the gain is known.
     """
 
     response: Response
-    target_db: np.ndarray
+    target: Target
+    chain: int = -1
 
     def tied(self, material: np.ndarray) -> Reading:
         """The same by materials instead of groups; ``material`` (G,) is that of each group."""
         return replace(self, response=self.response.tied(material))
 
+    def gain(self, p: Parameters) -> float:
+        """Of the measuring chain."""
+        return float(np.exp(p.log_gains[self.chain])) if self.chain >= 0 else 1.0
+
     def error_db(self, p: Parameters) -> np.ndarray:
-        """Prediction less what was read [dB], shape ``(N,)``."""
-        return np.asarray(NEPER * np.log1p(predict(self.response, p)) - self.target_db)
+        """Prediction less what was read, as it counts [dB], shape ``(N,)``."""
+        return self.target.error(self.gain(p) * predict(self.response, p))
+
+    def linearised(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """:meth:`error_db` ``(N,)``, its derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
+        power, table, index = jacobian(self.response, p, layout)
+        if self.chain >= 0:
+            power = self.gain(p) * power
+            table = np.concatenate([np.float32(self.gain(p)) * table, power[None].astype(np.float32)])
+            index = np.append(index, layout.first_chain + self.chain)
+        table *= self.target.slope(power).astype(np.float32)
+        return self.target.error(power), table, index
 
 
 @dataclass(frozen=True)
@@ -50,6 +115,7 @@ class Deviations:
     Attributes:
         weight, excess, mirror: of lobe weights, permittivity less one, and mirror share from where the fit starts.
         gain: of the common gain from one.
+        chain: of a measuring chain's unknown gain from one.
         energy: of scattered and mirrored shares from a sum of one.
         together: of a group's indirect radiance from the mean group's.
     """
@@ -58,6 +124,7 @@ class Deviations:
     excess: float = 0.8
     mirror: float = 1.5
     gain: float = 1.0
+    chain: float = 10.0
     energy: float = 0.25
     together: float = 1.0
 
@@ -127,7 +194,9 @@ def priors(
         mean = np.average(p.log_indirect, weights=area)
         add((p.log_indirect - mean) / sd.together, layout.radiance(own), 1.0 / sd.together)
     if layout.gain:
-        add(np.array([p.log_gain / sd.gain]), np.array([layout.size - 1]), 1.0 / sd.gain)
+        add(np.array([p.log_gain / sd.gain]), np.array([layout.common_gain]), 1.0 / sd.gain)
+    if layout.chains:
+        add(p.log_gains / sd.chain, layout.first_chain + np.arange(layout.chains), 1.0 / sd.chain)
     shares = np.column_stack([p.weight, np.exp(p.log_mirror)])  # S^2 by lobes, and 1 - S^2
     places = np.column_stack([layout.weight(own), layout.mirror(own)])
     add((shares.sum(axis=1) - 1.0) / sd.energy, places, shares / sd.energy)
@@ -149,7 +218,10 @@ def objective(readings: Sequence[Reading], p: Parameters, threshold_db: float) -
 
 def start_of(readings: Sequence[Reading], start: Parameters, options: GroupFit) -> tuple[Parameters, Layout]:
     """Where a fit starts, with an indirect radiance where one is wanted and none is known, and what is free."""
-    layout = Layout(*start.log_weight.shape, indirect=options.indirect, gain=options.gain)
+    chains = max((r.chain + 1 for r in readings), default=0)
+    if len(start.log_gains) != chains:
+        start = replace(start, log_gains=np.array([_first_gain(readings, start, c) for c in range(chains)]))
+    layout = Layout(*start.log_weight.shape, indirect=options.indirect, gain=options.gain, chains=chains)
     if options.indirect and not np.isfinite(start.log_indirect).all():
         start = replace(start, log_indirect=np.full(layout.groups, _dark_level(readings)))
     return start, layout
@@ -172,7 +244,7 @@ def fit_groups(
     o = options or GroupFit()
     start, layout = start_of(readings, start, o)
     vector, damping, weight = layout.pack(start), 1e-3, 1.0 / o.noise_db**2
-    count = max(sum(len(r.target_db) for r in readings), 1)
+    count = max(sum(len(r.target.db) for r in readings), 1)
     hessian, losses, taken = np.eye(layout.size), [], 0
 
     def total(x: np.ndarray) -> float:
@@ -217,22 +289,33 @@ def _normal_equations(
     """Gauss-Newton matrix and gradient of the data term."""
     hessian, gradient = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     for reading in readings:
-        power, table, index = jacobian(reading.response, p, layout)
+        error, table, index = reading.linearised(p, layout)
         if len(index) == 0:  # nothing that it sees is lit
             continue
-        error = NEPER * np.log1p(power) - reading.target_db
         root = np.sqrt(huber(error, options.huber_db)[1]) / options.noise_db
-        table *= (root * NEPER / (1.0 + power)).astype(np.float32)
+        table *= root.astype(np.float32)
         hessian[np.ix_(index, index)] += ssyrk(1.0, table.T, trans=1)  # its upper triangle
         gradient[index] += table @ (root * error).astype(np.float32)
     return np.triu(hessian) + np.triu(hessian, 1).T, gradient
+
+
+def _first_gain(readings: Sequence[Reading], start: Parameters, chain: int) -> float:
+    """ln of the gain that makes the chain's readings agree with what ``start`` predicts, in the median of their power."""
+    ratio = [np.zeros(0)]
+    for r in readings:
+        read, expected = np.expm1(r.target.db / NEPER), predict(r.response, start)
+        known = (read > 0) & (expected > 0) & (True if r.target.censored is None else ~r.target.censored)
+        if r.chain == chain:
+            ratio.append(np.log(read[known] / expected[known]))
+    every = np.concatenate(ratio)
+    return float(np.median(every)) if len(every) else 0.0
 
 
 def _dark_level(readings: Sequence[Reading]) -> float:
     """ln of a radiance that explains what the darkest illuminated pixels hold [1/m^2]."""
     found = []
     for reading in readings:
-        base, power = reading.response.indirect.sum(axis=0), np.expm1(reading.target_db / NEPER)
+        base, power = reading.response.indirect.sum(axis=0), np.expm1(reading.target.db / NEPER)
         illuminated = (base > 0) & (power > 0)
         if illuminated.any():
             found.append(np.percentile(np.log(power[illuminated] / base[illuminated]), 20))

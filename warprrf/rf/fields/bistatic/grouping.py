@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warprrf.rf.em.half_spaces import fresnel_curves
-from warprrf.rf.fields.bistatic.fit import NEPER, GroupFit, Reading, huber
+from warprrf.rf.fields.bistatic.fit import GroupFit, Reading, huber
 from warprrf.rf.fields.bistatic.materials import Parameters, mirror_power
 from warprrf.rf.fields.bistatic.response import Response, predict
 
@@ -115,9 +115,9 @@ def _costs(readings: Sequence[Reading], p: Parameters, owner: np.ndarray) -> np.
     share = p.scattered_share.astype(np.float32)
     out = np.zeros((len(owner), count))
     for reading in readings:
-        r, target = reading.response, reading.target_db
-        power = predict(r.tied(owner), p)
-        loss = huber(NEPER * np.log1p(power) - target, fit.huber_db)[0].sum()
+        r, gain = reading.response, p.gain * reading.gain(p)
+        power = reading.gain(p) * predict(r.tied(owner), p)
+        loss = huber(reading.target.error(power), fit.huber_db)[0].sum()
         reflects = r.path_group >= 0
         now = np.where(reflects, owner[np.where(reflects, r.path_group, 0)], -1)
         for unit in np.unique(np.concatenate([r.group, r.sender, r.path_group[reflects]])):
@@ -126,8 +126,8 @@ def _costs(readings: Sequence[Reading], p: Parameters, owner: np.ndarray) -> np.
                 change += (mix - mix[owner[unit]]) @ r.bounce[a].reshape(-1, len(power))
             for c in np.flatnonzero(r.sender == unit):
                 change += (share - share[owner[unit]])[:, None] * r.sent[c]
-            trial_db = NEPER * np.log1p(np.maximum(power + p.gain * change, 0.0))
-            rise = huber(trial_db - target, fit.huber_db)[0].sum(axis=1) - loss
+            error = reading.target.error(np.maximum(power + gain * change, 0.0))
+            rise = huber(error, fit.huber_db)[0].sum(axis=1) - loss
             out[unit] += rise / fit.noise_db**2
     return out
 

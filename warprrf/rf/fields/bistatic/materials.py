@@ -7,7 +7,7 @@ does not spoil both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,6 +36,7 @@ class Parameters:
         log_mirror: ln of the share of |Gamma|^2 that is reflected as by a mirror, shape ``(G,)``; 1 - S^2.
         log_indirect: ln of the indirect radiance [1/m^2], shape ``(G,)``; -inf where there is none.
         log_gain: ln of a gain common to all paths (an uncalibrated receiver).
+        log_gains: ln of the unknown gains of measuring chains, shape ``(C,)``; only while a fit lasts.
 
     Raises:
         TypeError, ValueError: for arrays that do not fit each other, or are out of range.
@@ -46,6 +47,7 @@ class Parameters:
     log_mirror: np.ndarray
     log_indirect: np.ndarray
     log_gain: float = 0.0
+    log_gains: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         check_arrays(vars(self), ARRAYS)
@@ -112,19 +114,28 @@ class Materials:
 
 
 class Layout:
-    """Order of the free parameters in a vector: per group lobes, excess, mirror, indirect; then the common gain.
+    """Order of the free parameters in a vector: per group lobes, excess, mirror, indirect; then the common gain, then those
+    of measuring chains.
 
     Attributes:
         groups, lobes: how many.
         indirect, gain: whether indirect radiance and the common gain are free.
+        chains: how many gains of measuring chains are free.
         stride: parameters of a group.
+        first_chain: place of the first chain's gain.
         size: of the vector.
     """
 
-    def __init__(self, groups: int, lobes: int, *, indirect: bool, gain: bool) -> None:
-        self.groups, self.lobes, self.indirect, self.gain = groups, lobes, indirect, gain
+    def __init__(self, groups: int, lobes: int, *, indirect: bool, gain: bool, chains: int = 0) -> None:
+        self.groups, self.lobes, self.indirect, self.gain, self.chains = groups, lobes, indirect, gain, chains
         self.stride = lobes + 2 + int(indirect)
-        self.size = groups * self.stride + int(gain)
+        self.first_chain = groups * self.stride + int(gain)
+        self.size = self.first_chain + chains
+
+    @property
+    def common_gain(self) -> int:
+        """Place of the common gain."""
+        return self.groups * self.stride
 
     def weight(self, group: np.ndarray) -> np.ndarray:
         """Places of the lobe weights of each of ``group`` (K,), shape ``(K, L)``."""
@@ -148,7 +159,7 @@ class Layout:
         if self.indirect:
             columns.append(p.log_indirect[:, None])
         vector = np.concatenate(columns, axis=1).ravel()
-        return np.append(vector, p.log_gain) if self.gain else vector
+        return np.concatenate([vector, [p.log_gain] if self.gain else [], p.log_gains])
 
     def unpack(self, vector: np.ndarray) -> Parameters:
         """Parameters of a vector."""
@@ -157,7 +168,7 @@ class Layout:
         return Parameters(
             table[:, :n].copy(), table[:, n].copy(), table[:, n + 1].copy(),
             table[:, n + 2].copy() if self.indirect else np.full(self.groups, -np.inf),
-            float(vector[-1]) if self.gain else 0.0,
+            float(vector[self.common_gain]) if self.gain else 0.0, vector[self.first_chain :].copy(),
         )  # fmt: skip
 
 

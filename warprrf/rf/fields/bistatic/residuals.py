@@ -5,24 +5,25 @@ that surfaces send on to each other has a gain of its own, because it is known l
 wide, and of further bounces some are left out. (Sionna RT's rays scatter at the same points whatever the receiver, so
 its dark corners have a texture that can be learned.)
 
-Both are fitted by Gauss-Newton with conjugate gradients: the Jacobian is the receiver beam after a sparse matrix.
+Both are fitted by Gauss-Newton with conjugate gradients: the Jacobian is the measurement after a sparse matrix.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from scipy.sparse import block_diag, csr_matrix, hstack, identity, vstack
 from scipy.sparse.linalg import LinearOperator, cg
 
-from warprrf.rf.fields.bistatic.fit import NEPER, huber
+from warprrf.rf.fields.bistatic.fit import Target, huber
 from warprrf.rf.fields.bistatic.materials import Materials
-from warprrf.rf.fields.bistatic.render import render
+from warprrf.rf.fields.bistatic.measured import Measurement, read
+from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.transport import ReceiverView
-from warprrf.rf.spectra.beam import BeamOperator
 
 
 @dataclass(frozen=True)
@@ -54,60 +55,62 @@ QUICK = ResidualFit(rounds=2, conjugate_steps=8)
 
 @dataclass(frozen=True)
 class Shares:
-    """What cells give the pixels of one receiver before the beam, the rest of its spectrum after the beam, and the
-    target, in units of N0.
+    """What cells give the bins that a measurement of one receiver sums rays in, and the rest of what it reads, in units
+    of N0.
 
     Attributes:
-        single: single bounces, sparse, shape ``(N, X)``.
+        single: single bounces, sparse, shape ``(B, X)``.
         further: light that is sent on, likewise.
-        rest: shape ``(N,)``.
-        target_db: 10 log10(P / N0 + 1), shape ``(N,)``.
+        rest: readings of everything else, shape ``(N,)``.
+        measured: how readings come from bins.
+        target: what was read.
     """
 
     single: csr_matrix
     further: csr_matrix
     rest: np.ndarray
-    target_db: np.ndarray
+    measured: Measurement
+    target: Target
 
 
 def gather_shares(
-    pixel: np.ndarray, face: np.ndarray, power: np.ndarray, pixels: int, surface: Surface
+    bins: np.ndarray, count: int, face: np.ndarray, power: np.ndarray, surface: Surface
 ) -> csr_matrix:
-    """Power of rays (K,) gathered by pixel and surface cell, shape ``(pixels, X)`` float32."""
-    k = np.flatnonzero(power > 0)
-    triples = power[k].astype(np.float32), (pixel[k], surface.cell[face[k]])
-    return csr_matrix(triples, shape=(pixels, surface.cells))
+    """Power of rays (K,) gathered by their bin, -1 for none, and surface cell, shape ``(count, X)`` float32."""
+    k = np.flatnonzero((power > 0) & (bins >= 0))
+    triples = power[k].astype(np.float32), (bins[k], surface.cell[face[k]])
+    return csr_matrix(triples, shape=(count, surface.cells))
 
 
 def shares_of(
     view: ReceiverView,
     materials: Materials,
     sent: np.ndarray | None,
-    beam: BeamOperator,
-    floor: float,
-    target_db: np.ndarray,
+    measured: Measurement,
+    unit: float,
+    target: Target,
 ) -> Shares:
-    """What cells give the pixels of one receiver under ``materials``, whose residual does not count.
+    """What cells give the readings of one receiver under ``materials``, whose residual does not count.
 
     Args:
         sent: see :func:`warprrf.rf.fields.bistatic.render.sent_radiance`.
-        target_db: what was measured, 10 log10(P / N0 + 1), shape ``(H, W)``.
+        unit: path gain that the readings are in units of.
+        target: what was read.
     """
-    bare = replace(materials, terms=replace(materials.terms, residual=False))
-    found, surface = render(view, bare, beam, sent), view.transport.surface
-    per_pixel, pixels = view.transport.grid.sub_pixels**2, target_db.size
-    single, on = found.powers.single, found.powers.further.sent
-    own = gather_shares(
-        np.arange(len(single)) // per_pixel, view.hits.face.numpy(), single / floor, pixels, surface
-    )
-    further = gather_shares(on.ray // per_pixel, on.face, on.power / floor, pixels, surface)
-    known = np.asarray((own + further).sum(axis=1)).reshape(target_db.shape)
-    rest = np.maximum(found.image / floor - beam(known), 0.0)
-    return Shares(own, further, rest.ravel(), target_db.ravel())
+    bare, surface = replace(materials, terms=replace(materials.terms, residual=False)), view.transport.surface
+    powers, (bins, count) = path_powers(view, bare, sent), measured.bins(view)
+    on = powers.further.sent
+    own = gather_shares(bins, count, view.hits.face.numpy(), powers.single / unit, surface)
+    # Gains of light sent on are learned under one transmitter alone.
+    learned = on.power / unit * np.array_equal(view.transport.transmitter, materials.transmitter)
+    further = gather_shares(bins[on.ray], count, on.face, learned, surface)
+    known = np.asarray((own + further).sum(axis=1)).reshape(-1, 1)
+    rest = np.maximum(read(view, measured, powers) / unit - measured.of_bins(known)[:, 0], 0.0)
+    return Shares(own, further, rest, measured, target)
 
 
 def fit_residual(
-    shares: Sequence[Shares], beam: BeamOperator, surface: Surface, options: ResidualFit | None = None
+    shares: Sequence[Shares], surface: Surface, options: ResidualFit | None = None
 ) -> np.ndarray:
     """ln of each cell's gains over its group's, shape ``(2, X)``; zero where nothing is seen of it.
 
@@ -116,25 +119,32 @@ def fit_residual(
 
     Args:
         shares: one for each training receiver.
-        beam: the receiver beam.
         surface: whose cells they are.
         options: priors and steps.
     """
     o = options or ResidualFit()
-    pixels, count = len(shares[0].target_db), len(shares)
     power = vstack([hstack([s.single, s.further]) for s in shares], format="csr")
-    rest = np.stack([s.rest for s in shares], axis=1)
-    target = np.stack([s.target_db for s in shares], axis=1)
-    rows, columns = beam.shape
+    rest = np.concatenate([s.rest for s in shares])
+    target = Target.joined([s.target for s in shares])
+    # Receivers that are measured alike go through the measurement together.
+    batches = [list(own) for _, own in groupby(shares, key=lambda s: id(s.measured))]
+    bins = np.cumsum([0, *(len(b) * b[0].single.shape[0] for b in batches)])
+    rows = np.cumsum([0, *(len(b) * len(b[0].rest) for b in batches)])
 
     def spread(values: np.ndarray, quick: bool = True) -> np.ndarray:
-        image = (power @ values.astype(np.float32)).reshape(count, pixels).T
-        return beam(image.reshape(rows, columns, count), quick=quick).reshape(pixels, count)
-
-    def gather(image: np.ndarray) -> np.ndarray:
-        back = beam.adjoint(image.astype(np.float32).reshape(rows, columns, count), quick=True)
-        found: np.ndarray = power.T @ back.reshape(pixels, count).T.ravel()
+        power_of = power @ values.astype(np.float32)
+        found = np.empty(rows[-1])
+        for k, batch in enumerate(batches):
+            table = power_of[bins[k] : bins[k + 1]].reshape(len(batch), -1).T
+            found[rows[k] : rows[k + 1]] = batch[0].measured.of_bins(table, quick=quick).T.ravel()
         return found
+
+    def gather(readings: np.ndarray) -> np.ndarray:
+        back = np.empty(bins[-1], np.float32)
+        for k, batch in enumerate(batches):
+            table = readings[rows[k] : rows[k + 1]].reshape(len(batch), -1).T
+            back[bins[k] : bins[k + 1]] = batch[0].measured.to_bins(table).T.ravel()
+        return np.asarray(power.T @ back)
 
     # Unknowns have unit variance a priori: elements and cells of single bounces, then of light that is sent on.
     cell = np.arange(surface.cells)
@@ -146,9 +156,8 @@ def fit_residual(
     for _ in range(o.rounds):
         gain = np.exp(np.clip(gains @ unknown, -o.largest, o.largest))
         total = np.maximum(spread(gain, quick=False), 0.0) + rest
-        error = NEPER * np.log1p(total) - target
+        error, slope = target.error(total), target.slope(total)
         robust = huber(error, o.huber_db)[1] / o.noise_db**2
-        slope = NEPER / (1.0 + total)
 
         def curvature(
             v: np.ndarray, gain: np.ndarray = gain, weight: np.ndarray = slope**2 * robust

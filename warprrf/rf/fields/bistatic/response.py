@@ -9,62 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from warprrf.rf.em.half_spaces import fresnel_curves
 from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters, mirror_power
+from warprrf.rf.fields.bistatic.measured import Measurement
 from warprrf.rf.fields.bistatic.render import mirror_shown, sent_on
 from warprrf.rf.fields.bistatic.scattering import resolve
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView
-from warprrf.rf.spectra.beam import BeamOperator
 
 NEGLIGIBLE = 1e-3
 """Groups that bring a reading less than this share of the floor at unit weight are left out."""
-
-
-class Measurement(Protocol):
-    """What is read of a receiver's path powers: rays are summed in bins, and N readings are linear in those."""
-
-    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
-        """Bin of each ray, shape ``(K,)``, -1 for none, and how many bins there are."""
-
-    def of_bins(self, power: np.ndarray) -> np.ndarray:
-        """Readings of powers in the bins ``(B, C)``, shape ``(N, C)`` float32."""
-
-    def of_paths(self, view: ReceiverView) -> np.ndarray:
-        """Readings of unit power on each line-of-sight and mirror path, shape ``(L, N)`` float32."""
-
-
-@dataclass(frozen=True)
-class SpectrumPixels:
-    """Pixels of a receiver's spectrum.
-
-    Attributes:
-        beam: of the receiver.
-        pixels: which ones, shape ``(N,)``.
-    """
-
-    beam: BeamOperator
-    pixels: np.ndarray
-
-    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
-        """A bin for each pixel."""
-        grid = view.transport.grid
-        return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
-
-    def of_bins(self, power: np.ndarray) -> np.ndarray:
-        """Seen through the beam."""
-        return self.beam.at(self.pixels, power)
-
-    def of_paths(self, view: ReceiverView) -> np.ndarray:
-        """Each path's beam."""
-        if view.beams is None:
-            raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
-        return view.beams.reshape(len(view.beams), self.bins(view)[1])[:, self.pixels]
 
 
 @dataclass(frozen=True)
@@ -141,7 +99,7 @@ def respond(view: ReceiverView, measurement: Measurement, terms: Terms, floor: f
     t = view.transport
     bins, count = measurement.bins(view)
     group, images = resolve(t.surface, view.hits.face, view.light, terms, t.wavelength_m, bins, count)
-    read = measurement.of_bins(images.reshape(count, -1)) / np.float32(floor)
+    read = measurement.of_bins(images.reshape(count, -1), quick=True) / np.float32(floor)
     bounce = np.ascontiguousarray(read.T).reshape(*images.shape[1:], len(read))
     strong = np.abs(bounce).max(axis=(1, 2, 3), initial=0.0) > NEGLIGIBLE
     ray, face, unit = view.seen()
@@ -194,7 +152,7 @@ def _read_by_group(
     found, column = np.unique(group, return_inverse=True)
     cell = bins * len(found) + column.reshape(-1)
     table = np.bincount(cell, power, minlength=count * len(found)).reshape(count, len(found))
-    return found, np.ascontiguousarray(measurement.of_bins(table).T)
+    return found, np.ascontiguousarray(measurement.of_bins(table).T, np.float32)
 
 
 # Columns (C, N), their coefficients (C,), and of those the derivatives: places in a parameter vector and values (C,).
@@ -226,7 +184,7 @@ def jacobian(response: Response, p: Parameters, layout: Layout) -> tuple[np.ndar
         )
         tables.append((used, derivative @ columns))
     if layout.gain:
-        tables.append((np.array([layout.size - 1]), values[None].astype(np.float32)))
+        tables.append((np.array([layout.common_gain]), values[None].astype(np.float32)))
     index = np.unique(np.concatenate([used for used, _ in tables]))
     table = np.zeros((len(index), len(values)), np.float32)
     for used, rows in tables:

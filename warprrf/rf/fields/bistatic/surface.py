@@ -170,16 +170,8 @@ class Surface:
         mesh = as_mesh(geometry, "geometry")
         element_m = _element_width(mesh)
         material, names = _named_faces(geometry, mesh)
-        found, colours = _patches_and_colours(geometry, mesh) if material is None else (None, None)
-        if found is not None:
-            patches, mesh, patch = found, found.mesh, found.face_patch
-            planes, skin = (found.normal, found.offset), SKIN_M
-            normal = _on_patches(found, smoothed_normals(mesh, 3))
-        else:
-            patches = planar_patches(mesh, material)
-            patch, planes = _mirrors(patches)
-            # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
-            normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
+        patches, colours, measured = _patches_and_colours(geometry, mesh, material)
+        mesh = patches.mesh
         if material is not None:
             group, sort = material, np.arange(len(names), dtype=np.int32)
             look = np.full((len(names), 4), np.nan)
@@ -187,6 +179,14 @@ class Surface:
             pieces = mesh, patches.face_patch
             group, sort, look = shape_groups(*pieces) if colours is None else colour_groups(*pieces, colours)
             names = tuple(f"group_{k}" for k in range(len(sort)))
+        if measured:
+            normal, skin = _on_patches(patches, smoothed_normals(mesh, 3)), SKIN_M
+        else:
+            # A mesh's error is not roughness: faces of a patch have its normal, and rays end so far before it.
+            normal, skin = _on_patches(patches, mesh.face_normals), max(TRUE_SKIN_M, patches.tolerance_m)
+        patch, planes = patches.face_patch, (patches.normal, patches.offset)
+        if patches.two_sided:
+            patch, planes = _mirrors(_apart(patches, sort[group]))
         sides = patches.two_sided
         mesh, parent = _split_long(mesh, np.flatnonzero(patches.once), LARGEST_FACE * element_m)
         group, patch = group[parent].astype(np.int32), patch[parent].astype(np.int32)
@@ -222,20 +222,40 @@ class Surface:
         return transmitter - 2.0 * height[:, None] * self.plane_normal, height
 
 
-def _patches_and_colours(geometry: GeometryLike, mesh: Mesh) -> tuple[PlanarPatches | None, Colours | None]:
-    """Patches that photos gave, or of a scan, with their mesh; None for a mesh without noise. And colours on it, None
-    where there are none."""
+def _patches_and_colours(
+    geometry: GeometryLike, mesh: Mesh, material: np.ndarray | None
+) -> tuple[PlanarPatches, Colours | None, bool]:
+    """Patches, with their mesh, which is another one if ``mesh`` is a scan; colours on it, None where there are none or
+    ``material`` (F,) is known; and whether photos or a scanner measured them."""
+    if material is not None:
+        return planar_patches(mesh, material), None, False
     found, gaussians = getattr(geometry, "patches", None), gaussians_of(geometry)
     if isinstance(found, PlanarPatches) and gaussians is not None:
-        return found, Colours.of_gaussians(mesh, gaussians)
+        return found, Colours.of_gaussians(mesh, gaussians), True
     colours = Colours.of_faces(mesh)
     if not is_scan(mesh):
-        return None, colours
+        return planar_patches(mesh), colours, False
     flat = scanned_patches(mesh)
     if colours is not None:
         places = mesh.triangles[colours.face].mean(axis=1)
         colours = replace(colours, face=flat.mesh.closest(places).face)
-    return flat, colours
+    return flat, colours, True
+
+
+def _apart(patches: PlanarPatches, material: np.ndarray) -> PlanarPatches:
+    """``patches`` split where their faces are taken for different materials (F,): what lies in one plane need not mirror
+    alike."""
+    own = patches.face_patch >= 0
+    key = np.column_stack([patches.face_patch, material])[own]
+    pair, index = np.unique(key, axis=0, return_inverse=True)
+    label = np.full(len(own), -1, np.int32)
+    label[own] = index.reshape(-1)
+    once = own & patches.once
+    area = np.bincount(label[once], patches.mesh.areas[once], minlength=len(pair))
+    normal, offset = patches.normal[pair[:, 0]], patches.offset[pair[:, 0]]
+    return replace(
+        patches, face_patch=label, normal=normal, offset=offset, area=area, group=pair[:, 1].astype(np.int32)
+    )
 
 
 def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None, tuple[str, ...]]:

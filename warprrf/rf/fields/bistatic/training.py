@@ -3,32 +3,31 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.checks import check_array, check_count, check_seed, checked
+from warprrf.checks import check_count, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
-from warprrf.rf.em.absorption import Air
-from warprrf.rf.fields.bistatic.fit import Fitted, GroupFit, Reading, fit_groups
+from warprrf.rf.fields.bistatic.fit import NEPER, Fitted, GroupFit, Reading, fit_groups, huber
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
-from warprrf.rf.fields.bistatic.render import render, sent_radiance
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
+from warprrf.rf.fields.bistatic.observations import Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
-from warprrf.rf.fields.bistatic.response import SpectrumPixels, respond, with_further_bounces
+from warprrf.rf.fields.bistatic.response import Response, predict, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
-from warprrf.rf.positions import check_dataset
-from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import to_db
+from warprrf.rf.spectra.readings import Data, Readings
 
 MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_scatter", True),
@@ -44,8 +43,20 @@ QUICK: dict[str, Any] = {
     "residual": True, "sub_pixels": 1,
 }  # fmt: skip
 """What a quick fit takes for given: light of more than one bounce is even but for the residual, one ray a pixel."""
+FEW: dict[str, Any] = {
+    "mirror_order": 2, "mirror_scatter": True, "scatter_mirror": False, "diffuse_order": 3, "indirect": False,
+    "residual": True,
+}  # fmt: skip
+"""What a fit tries first on receivers too few to hold any out: bounces that rooms have, which bring no parameters."""
+SINGLE: dict[str, Any] = {
+    "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False,
+    "residual": True,
+}  # fmt: skip
+"""What it takes where that fits much worse."""
 TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "indirect", "residual")
 """Terms that a fit decides on where they are None."""
+KNOWN_BETTER = 2.0
+"""By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
 MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
 RAY_BYTES = 40  # kept of each ray
@@ -65,18 +76,20 @@ class Selection:
     """How a fit decides about terms, on receivers that it holds out.
 
     Attributes:
-        least_receivers: training receivers below which nothing is held out, so no term is chosen.
+        least_receivers: training receivers below which nothing is held out.
         held_out: share of the receivers that are held out.
         most_held_out: receivers held out at most.
         few_receivers: up to which errors are learned from every receiver, held out in turn.
         most_to_choose: receivers that fits which only decide about a term learn from.
         short_steps: of such a fit.
         better: share to which a term must lower the held-out mean square error.
-        clearly_better: and the residual: it has thousands of unknowns and blurs the strongest paths.
+        much_better: share to which single bounces alone must lower the mean square error where receivers are few.
+        clearly_worse: share to which the residual may raise it: one that is learned from all receivers gains more.
         not_much_worse: share to which it may rise where fewer materials fit the training receivers better.
         few_materials: up to which light that is sent on follows the parameters of its group.
         regrouped: rounds of deciding what is of one material, and fitting.
-        rounds: of further bounces and groups in turn, where no choice came before.
+        rounds: of further bounces and groups in turn in a first fit.
+        unexplained: standard deviations beyond which a reading of a table is taken to be wrong: it is named, and left out.
         readings: pixels that groups are fitted to, spread over the training receivers.
         regrouping: what it takes to be of one material; None for :data:`BY_SHAPE` where only shapes tell groups apart.
     """
@@ -88,11 +101,13 @@ class Selection:
     most_to_choose: int = 12
     short_steps: int = 10
     better: float = 0.995
-    clearly_better: float = 0.95
+    much_better: float = 0.5
+    clearly_worse: float = 1.05
     not_much_worse: float = 1.5
     few_materials: int = 30
     regrouped: int = 3
     rounds: int = 2
+    unexplained: float = 5.0
     readings: int = 12_000
     regrouping: Regrouping | None = None
 
@@ -103,7 +118,8 @@ class FitOptions:
     """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
 
     A term given as None is kept only if it lowers the error on receivers held out of the data set (a quarter, ten at
-    most); with fewer than four receivers nothing is held out and only single bounces are modelled.
+    most); with fewer than four receivers nothing is held out: :data:`FEW` is modelled, or
+    :data:`SINGLE` if it fits much better.
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
@@ -175,12 +191,12 @@ class FitOptions:
         if self.relevance is not None and frequency_hz is not None:
             ruled = self.relevance.options(frequency_hz)
             both = {name: getattr(self, name) and ruled[name] for name in ("line_of_sight", "diffuse")}
-            found = replace(found, **both, relevance=None, **found._given(ruled, (*TERMS, "lobes")))
+            found = replace(found, **both, relevance=None, **found.given(ruled, (*TERMS, "lobes")))
         if self.quick:
-            found = replace(found, quick=False, **found._given(QUICK, QUICK))
+            found = replace(found, quick=False, **found.given(QUICK, QUICK))
         return found
 
-    def _given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    def given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         """Of ``values`` those of ``names`` that are None here."""
         return {name: values[name] for name in names if getattr(self, name) is None}
 
@@ -196,20 +212,23 @@ class FitOptions:
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """What training receivers see of the geometry, whatever the materials: traced once, reused by every fit.
+    """What is seen of the geometry at the places that were measured, whatever the materials: traced once, reused by every
+    fit.
 
     Attributes:
-        transport: surface, transmitter and grid.
-        views: one for each receiver.
-        frequency_hz, air: what it was traced for.
+        places: receivers under their transmitters.
+        views: one for each place.
         seconds: what it took.
     """
 
-    transport: Transport
+    places: list[Place] = field(repr=False)
     views: list[ReceiverView] = field(repr=False)
-    frequency_hz: float
-    air: Air | None
     seconds: float
+
+    @property
+    def transport(self) -> Transport:
+        """Surface, transmitter and grid of the first place."""
+        return self.views[0].transport
 
     @property
     def surface(self) -> Surface:
@@ -217,32 +236,26 @@ class TrainingViews:
         return self.transport.surface
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> TrainingViews:
-        """Some of its receivers."""
-        return replace(self, views=[self.views[int(i)] for i in indices])
+        """Some of its places."""
+        chosen = [int(i) for i in indices]
+        return replace(self, places=[self.places[i] for i in chosen], views=[self.views[i] for i in chosen])
 
-    def check(self, ds: SpectrumDataset, sub_pixels: int | None) -> None:
-        """Raise ValueError if they are not those of exactly the receivers of ``ds``."""
-        t = self.transport
-        same = (
-            len(self.views) == len(ds.receivers)
-            and t.grid.shape == tuple(ds.path_gain.shape[1:])
-            and all(np.array_equal(v.receivers[0], r) for v, r in zip(self.views, ds.receivers, strict=True))
-            and np.array_equal(t.transmitter, ds.transmitter)
-            and self.frequency_hz == ds.frequency_hz
-            and t.beam_sigma_rad == ds.beam_sigma_rad
-            and self.air == getattr(ds, "air", None)
-            and sub_pixels in (None, t.grid.sub_pixels)
+    def check(self, places: Sequence[Place], sub_pixels: int | None) -> None:
+        """Raise ValueError if they are not those of exactly ``places``."""
+        same = len(self.places) == len(places) and all(
+            a.seen_from == b.seen_from for a, b in zip(self.places, places, strict=True)
         )
-        if not same:
+        if not same or sub_pixels not in (None, self.transport.grid.sub_pixels):
             raise ValueError(
-                f"transport: got what {len(self.views)} receivers see with {t.grid.sub_pixels**2} rays a pixel; expected "
-                f"exactly the {len(ds.receivers)} receivers, transmitter, carrier, grid, beam, air and rays of this fit"
+                f"transport: got what {len(self.views)} receivers see with {self.transport.grid.sub_pixels**2} rays a "
+                f"pixel; expected exactly the {len(places)} receivers, transmitter, carrier, grid, beam, air and rays of "
+                "this fit"
             )
 
 
 def trace(
     geometry: GeometryLike,
-    ds: SpectrumDataset,
+    ds: Data,
     *,
     mirror_order: int | None = None,
     sub_pixels: int | None = None,
@@ -263,40 +276,46 @@ def trace(
         TypeError: for a geometry without a mesh.
     """
     started, tell = time.perf_counter(), progress or _silent
-    receivers, transmitter = check_dataset(as_mesh(geometry, "geometry"), ds, device=device)
+    places = places_of(as_list(ds), as_mesh(geometry, "geometry"), device)
     terms = Terms(
         mirror_order=3 if mirror_order is None else mirror_order,
         sub_pixels=Terms().sub_pixels if sub_pixels is None else sub_pixels,
     )
-    _check_rays(ds.path_gain.shape, terms.sub_pixels)
+    _check_rays(places, terms.sub_pixels)
     tell("patches", 0, 1)
     surface = Surface.of(geometry)
     tell("patches", 1, 1)
-    frequency_hz, air = float(ds.frequency_hz), getattr(ds, "air", None)
-    transport = Transport.of(
-        surface, transmitter, frequency_hz,
-        (int(ds.path_gain.shape[1]), int(ds.path_gain.shape[2])), terms.sub_pixels,
-        beam_sigma_rad=float(ds.beam_sigma_rad), loss_per_m=0.0 if air is None else air.loss_per_m(frequency_hz),
-        device=device,
-    )  # fmt: skip
-    if mirror_order is None:
-        terms = replace(terms, mirror_order=transport.images.affordable(receivers, terms.mirror_order))
-    found = transport.paths(receivers, terms.mirror_order, progress)
-    views = []
-    for r, receiver in enumerate(receivers):
-        own = found.subset(np.flatnonzero(found.receiver == r))
-        views.append(transport.view(receiver, terms, paths=own))
-        tell("transport", r + 1, len(receivers))
-    return TrainingViews(transport, views, frequency_hz, air, time.perf_counter() - started)
+    together: dict[tuple[object, ...], list[int]] = {}  # places under one transmitter
+    for k, place in enumerate(places):
+        together.setdefault((place.transmitter.tobytes(), *place.seen_from[2:]), []).append(k)
+    views: dict[int, ReceiverView] = {}
+    for own in together.values():
+        first = places[own[0]]
+        loss_per_m = 0.0 if first.air is None else first.air.loss_per_m(first.frequency_hz)
+        transport = Transport.of(
+            surface, first.transmitter, first.frequency_hz, first.shape, terms.sub_pixels,
+            beam_sigma_rad=first.beam_sigma_rad, loss_per_m=loss_per_m, device=device,
+        )  # fmt: skip
+        receivers = np.stack([places[k].receiver for k in own])
+        if mirror_order is None:
+            most = transport.images.affordable(receivers, terms.mirror_order)
+            terms = replace(terms, mirror_order=most)
+        found = transport.paths(receivers, terms.mirror_order, progress)
+        for r, k in enumerate(own):
+            mine = found.subset(np.flatnonzero(found.receiver == r))
+            views[k] = transport.view(receivers[r], terms, paths=mine)
+            tell("transport", len(views), len(places))
+    return TrainingViews(places, [views[k] for k in range(len(places))], time.perf_counter() - started)
 
 
-def _check_rays(shape: tuple[int, ...], sub_pixels: int) -> None:
-    """Refuse spectra of ``shape`` (R, H, W) whose rays would not fit into memory."""
-    rays = int(np.prod(shape, dtype=np.int64)) * sub_pixels**2
+def _check_rays(places: Sequence[Place], sub_pixels: int) -> None:
+    """Refuse places whose rays would not fit into memory."""
+    rays = sum(place.shape[0] * place.shape[1] for place in places) * sub_pixels**2
     if rays > MOST_RAYS:
         raise ValueError(
-            f"ds: {shape[0]} spectra of {shape[1]} x {shape[2]} pixels take {rays:.2g} rays, {rays * RAY_BYTES / 1e9:.0f} "
-            f"GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, ds.subset) or sub_pixels=1"
+            f"ds: {len(places)} spectra of {places[0].shape[0]} x {places[0].shape[1]} pixels take {rays:.2g} rays, "
+            f"{rays * RAY_BYTES / 1e9:.0f} GB and more, expected at most {MOST_RAYS:.2g}: give fewer receivers (ds.split, "
+            "ds.subset) or sub_pixels=1"
         )
 
 
@@ -317,30 +336,39 @@ class Trained:
 
 def train(
     geometry: GeometryLike,
-    ds: SpectrumDataset,
+    ds: Data,
     options: FitOptions,
     *,
     transport: TrainingViews | None = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Trained:
-    """Fit materials to the spectra of ``ds``; arguments and errors as for :meth:`BistaticField.fit`."""
-    o = options.decided(float(ds.frequency_hz))
+    """Fit materials to what ``ds`` holds; arguments and errors as for :meth:`BistaticField.fit`."""
+    data = as_list(ds)
+    o = options.decided(float(data[0].frequency_hz))
     if transport is not None and options.sub_pixels is None:
         o = replace(o, sub_pixels=None)  # it is what the rays were traced with, quick or not
-    check_array("ds.path_gain", ds.path_gain, (len(ds.receivers), None, None), np.float32)
-    if len(ds.receivers) == 0 or not (ds.path_gain > ds.floor).any():
-        raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
+    for one in data:
+        if isinstance(one, SpectrumDataset) and not (one.path_gain > one.floor).any():
+            raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
+    if transport is not None:
+        transport.check(places_of(data, as_mesh(geometry, "geometry"), device), o.sub_pixels)
     seen = transport or trace(
-        geometry, ds, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
+        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
-    seen.check(ds, o.sub_pixels)
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
     if o.residuals is None:
         o = replace(o, residuals=QUICK_RESIDUAL if options.quick else ResidualFit())
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        return _Training(seen, ds, o, progress).run()
+        return _Training(seen, data, o, progress).run()
+
+
+def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
+    """Share of readings (N,) that comes straight from the transmitter."""
+    direct = (response.path_group < 0).all(axis=1)
+    power = response.path_power[direct] @ response.path[direct]
+    return np.asarray(power / np.maximum(predict(response, p), np.maximum(power, 1e-300)))
 
 
 @dataclass(frozen=True)
@@ -356,17 +384,21 @@ class _Training:
     """One fit: the state that its steps share."""
 
     def __init__(
-        self, seen: TrainingViews, ds: SpectrumDataset, options: FitOptions, progress: Progress | None
+        self,
+        seen: TrainingViews,
+        data: Sequence[SpectrumDataset | Readings],
+        options: FitOptions,
+        progress: Progress | None,
     ) -> None:
-        self.seen, self.ds, self.options, self.choose = seen, ds, options, options.selection
+        self.seen, self.options, self.choose = seen, options, options.selection
         self.started = time.perf_counter()
-        self.surface, self.count, self.floor = seen.surface, len(ds.receivers), float(ds.floor)
-        self.views = list(seen.views)
+        self.surface, self.count, self.views = seen.surface, len(seen.places), list(seen.views)
         self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
         self.material = self.surface.material
-        self.target = to_db(ds.path_gain, ds.floor) - 10.0 * np.log10(ds.floor)
-        grid = seen.transport.grid
-        self.beam = beam_operator(grid.shape, float(ds.beam_sigma_rad), grid.device)
+        self.observed, self.chains = observe(data, seen.places, self.views, options.groups.noise_db)
+        sources = {place.transmitter.tobytes() for place in seen.places}
+        # Light that surfaces send on falls elsewhere under each transmitter: of several, no gains of it are learned.
+        self.transmitter = seen.places[0].transmitter if len(sources) == 1 else np.full(3, np.nan)
         rng = np.random.default_rng(options.seed)
         self.held = np.zeros(0, int)
         if self.count >= self.choose.least_receivers:
@@ -375,15 +407,21 @@ class _Training:
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
         self.progress: Progress = progress or _silent
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
-        pixels = self.target[0].size
-        most = min(pixels, max(200, self.choose.readings // self.count))
-        self.measured, self.readings = [], []
-        terms = options.terms()
-        for r in range(self.count):
-            chosen = np.sort(rng.choice(pixels, most, replace=False))
-            self.measured.append(SpectrumPixels(self.beam, chosen))
-            response = respond(self.views[r], self.measured[r], terms, self.floor)
-            self.readings.append(Reading(response, self.target[r].ravel()[chosen]))
+        self.names = [getattr(one, "name", "") for one in data]
+        self.measured, self.readings, self.chosen = [], [], []
+        start = Parameters.prior(self.surface.groups, len(options.terms().lobes))
+        terms, most = options.terms(), max(200, self.choose.readings // self.count)
+        for r, observed in enumerate(self.observed):
+            target = observed.target
+            known = np.arange(len(target.db)) if target.trust is None else np.flatnonzero(target.trust)
+            chosen = known[np.sort(rng.choice(len(known), min(len(known), most), replace=False))]
+            self.chosen.append(chosen)
+            self.measured.append(observed.measured.part(chosen))
+            response = respond(self.views[r], self.measured[r], terms, observed.floor)
+            part = target.part(chosen)
+            if not isinstance(observed.measured, SpectrumPixels):
+                part = part.trusted(1.0 + KNOWN_BETTER * _line_of_sight_share(response, start))
+            self.readings.append(Reading(response, part, observed.chain))
             self.progress("fit", r, (1 + self.steps) * self.count)
         self.log: list[dict[str, Any]] = []
 
@@ -395,22 +433,28 @@ class _Training:
         if len(self.held):
             first = self._fit_groups(terms, start, self._few(1), self.choose.short_steps * 2)
             best = self._choose(_Candidate(terms, first, self._held_error(terms, first)))
-            residual = self._choose_residual(best)
+            residual, errors = self._held_in_turn(best)
+            terms, start = replace(best.terms, residual=residual), best.fit.parameters
+        else:
+            best = self._choose_of_few()
             terms, start = best.terms, best.fit.parameters
-            if residual is not None:
-                terms = replace(terms, residual=True)
-            errors = self._errors(terms, best.fit, residual)
         # Chosen terms come with a fit to most receivers, under which light that goes on is settled: one round is left.
-        rounds = 1 if len(self.held) else self.choose.rounds
-        fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=rounds)
+        fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=1)
         materials = self._materials(terms, fit)
         if terms.residual:
             materials = replace(materials, residual=self._residual(materials, everyone))
+        wrong = self._unexplained(materials)
+        if any(len(rows) for rows in wrong):
+            self._leave_out(wrong)
+            fit = self._fit_groups(terms, fit.parameters, everyone, o.iterations, rounds=1)
+            materials = self._materials(terms, fit)
+            if terms.residual:
+                materials = replace(materials, residual=self._residual(materials, everyone))
         if errors is not None:
-            errors = replace(errors, covariance=fit.covariance)
+            errors = replace(errors, covariance=self._covariance(fit))
         total = (1 + self.steps) * self.count
         self.progress("fit", total, total)
-        return Trained(self.surface, materials, self.material, errors, self._report(fit))
+        return Trained(self.surface, materials, self.material, errors, self._report(fit, wrong))
 
     def _planned(self) -> int:
         """Most fits of groups and residuals, each of which is a step of the progress that is told."""
@@ -426,8 +470,31 @@ class _Training:
         self.behind += 1
         self.progress("fit", (1 + min(self.behind, self.steps)) * self.count, (1 + self.steps) * self.count)
 
-    def _report(self, fit: Fitted) -> dict[str, Any]:
-        report = {
+    def _unexplained(self, materials: Materials) -> list[np.ndarray]:
+        """Of each place the readings of tables that the fit misses by more than :attr:`Selection.unexplained` of their
+        standard deviations."""
+        sent, sd, found = self._sent(materials), self.options.groups.noise_db, []
+        for k, observed in enumerate(self.observed):
+            rows = np.zeros(0, int)
+            if not isinstance(observed.measured, SpectrumPixels):
+                error = observed.target.error(self._predicted(materials, sent, k)) / sd
+                rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
+            found.append(rows)
+        return found
+
+    def _leave_out(self, wrong: Sequence[np.ndarray]) -> None:
+        """Readings that count no longer."""
+        for k, rows in enumerate(wrong):
+            if len(rows) == 0:
+                continue
+            observed, reading = self.observed[k], self.readings[k]
+            left = ~np.isin(np.arange(len(observed.target.db)), rows)
+            self.observed[k] = replace(observed, target=observed.target.trusted(left))
+            chosen = self.chosen[k]
+            self.readings[k] = replace(reading, target=reading.target.trusted(left[chosen]))
+
+    def _report(self, fit: Fitted, wrong: Sequence[np.ndarray]) -> dict[str, Any]:
+        report: dict[str, Any] = {
             "receivers": self.count,
             "held_out": len(self.held),
             "transport_time_s": self.seen.seconds,
@@ -440,9 +507,19 @@ class _Training:
             "choices": self.log,
         }
         if self.options.gain_offset:
-            to_db_ = 10.0 / np.log(10.0)
-            report["gain_offset_db"] = to_db_ * fit.parameters.log_gain
-            report["gain_offset_std_db"] = to_db_ * float(np.sqrt(fit.covariance[-1, -1]))
+            report["gain_offset_db"] = NEPER * fit.parameters.log_gain
+            place = len(fit.covariance) - len(self.chains) - 1
+            report["gain_offset_std_db"] = NEPER * float(np.sqrt(fit.covariance[place, place]))
+        variance = np.diag(fit.covariance)[len(fit.covariance) - len(self.chains) :]
+        report["chains"] = {
+            name: {"gain_db": NEPER * float(gain), "std_db": NEPER * float(np.sqrt(v))}
+            for name, gain, v in zip(self.chains, fit.parameters.log_gains, variance, strict=True)
+        }
+        report["unexplained"] = {}
+        for observed, rows in zip(self.observed, wrong, strict=True):
+            if len(rows):
+                listed = report["unexplained"].setdefault(self.names[observed.place.data], [])
+                listed += observed.place.rows[rows].tolist()
         return report
 
     # ------------------------------------------------------------------------------------------ choosing
@@ -453,6 +530,21 @@ class _Training:
 
     def _note(self, term: str, kept: bool, error: float) -> None:
         self.log.append({"term": term, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(error))})
+
+    def _choose_of_few(self) -> _Candidate:
+        """With too few receivers to hold any out: further bounces as rooms have them, unless none fit much better."""
+        found = []
+        for given in (FEW, SINGLE):
+            terms = replace(self.options, **self.options.given(given, TERMS)).terms()
+            start = Parameters.prior(int(self.material.max()) + 1, len(terms.lobes))
+            fit = self._fit_groups(terms, start, np.arange(self.count), self.options.iterations)
+            bare = self._materials(replace(terms, residual=False), fit)
+            found.append(_Candidate(terms, fit, self._image_error(bare, np.arange(self.count))))
+        further, single = found
+        fewer = single.error < self.choose.much_better * further.error
+        self._note("further bounces", not fewer, further.error)
+        self._note("single bounces", fewer, single.error)
+        return single if fewer else further
 
     def _choose(self, best: _Candidate) -> _Candidate:
         """Terms that lower the held-out error, one after another, each with a short fit of its own."""
@@ -473,17 +565,6 @@ class _Training:
         if "indirect" in free and best.terms.diffuse:
             best = self._tried("indirect", True, best)
         return best
-
-    def _choose_residual(self, best: _Candidate) -> np.ndarray | None:
-        """The residual (2, X) on the receivers kept, if it is wanted or lowers the held-out error clearly."""
-        if not (best.terms.residual or self.options.residual is None):
-            return None
-        bare = self._materials(replace(best.terms, residual=False), best.fit)
-        found = self._residual(bare, self.kept)
-        error = self._image_error(replace(bare, terms=replace(best.terms, residual=True), residual=found))
-        keep = best.terms.residual or error < self.choose.clearly_better * self._image_error(bare)
-        self._note("residual", keep, error)
-        return found if keep else None
 
     def _tried(self, name: str, value: Any, best: _Candidate) -> _Candidate:
         """The candidate with one term more, if its error is lower; else as it was."""
@@ -525,42 +606,92 @@ class _Training:
         """Mean square error of the held-out receivers without residual [dB^2]: of whole images where they are few,
         else at the chosen pixels."""
         if len(self.held) <= self.choose.least_receivers:
-            return self._image_error(self._materials(replace(terms, residual=False), fit))
+            return self._image_error(self._materials(replace(terms, residual=False), fit), self.held)
         readings = self._readings(terms, fit, self.held, follow=False)
         errors = [r.tied(self.material).error_db(fit.parameters) for r in readings]
-        return float(np.mean(np.concatenate(errors) ** 2))
-
-    def _image_error(self, materials: Materials) -> float:
-        """Mean square error of the dB images of the held-out receivers [dB^2]."""
-        sent = sent_radiance(self.seen.transport, materials)
         return float(
-            np.mean([np.mean((self._image(materials, sent, r) - self.target[r]) ** 2) for r in self.held])
+            np.mean(np.concatenate([self._losses(r, e) for r, e in zip(self.held, errors, strict=True)]))
         )
 
-    def _image(self, materials: Materials, sent: np.ndarray | None, receiver: int) -> np.ndarray:
-        """Predicted image of a training receiver, dB above the floor, shape ``(H, W)``."""
-        image = render(self._view(receiver, materials.terms), materials, self.beam, sent).image
-        return to_db(image, self.floor) - 10.0 * np.log10(self.floor)
+    def _image_error(self, materials: Materials, places: np.ndarray) -> float:
+        """Mean loss of all readings of ``places`` [dB^2]."""
+        sent = self._sent(materials)
+        errors = [self.observed[r].target.error(self._predicted(materials, sent, r)) for r in places]
+        return float(np.mean([self._losses(r, e).mean() for r, e in zip(places, errors, strict=True)]))
 
-    def _errors(self, terms: Terms, fit: Fitted, residual: np.ndarray | None) -> ErrorModel:
-        """Learned from the receivers held out; where they are few, from all, held out in turn."""
-        receivers = np.asarray(self.ds.receivers, float)
-        images, errors, gaps = [], [], []
+    def _losses(self, place: int, error: np.ndarray) -> np.ndarray:
+        """Squares of errors (N,) at a place [dB^2]; of tables robust ones: some readings may be wrong."""
+        if isinstance(self.observed[place].measured, SpectrumPixels):
+            return error**2
+        return huber(error, self.options.groups.huber_db)[0]
+
+    def _predicted(
+        self, materials: Materials, sent: Callable[[ReceiverView], np.ndarray | None], place: int
+    ) -> np.ndarray:
+        """All that is read at a place, in units of its floor, shape ``(N,)``."""
+        observed, view = self.observed[place], self._view(place, materials.terms)
+        gains = materials.parameters.log_gains
+        gain = float(np.exp(gains[observed.chain])) if observed.chain >= 0 else 1.0
+        power = read(view, observed.measured, path_powers(view, materials, sent(view)))
+        return np.asarray(np.maximum(power, 0.0) * gain / observed.floor)
+
+    def _sent(self, materials: Materials) -> Callable[[ReceiverView], np.ndarray | None]:
+        """What elements send on under the transmitter of a view; computed once for each."""
+        known: dict[int, np.ndarray | None] = {}
+
+        def of(view: ReceiverView) -> np.ndarray | None:
+            key = id(view.transport)
+            if key not in known:
+                known[key] = sent_radiance(view.transport, materials)
+            return known[key]
+
+        return of
+
+    def _held_in_turn(self, best: _Candidate) -> tuple[bool, ErrorModel | None]:
+        """Whether the residual is wanted, or does not clearly raise the held-out error, and the errors that then remain:
+        of the receivers held out; where they are few, of all, held out in turn. No errors where no whole spectra were
+        measured."""
+        wanted, places = self.options.residual, np.stack([o.place.receiver for o in self.observed])
+        power: dict[bool, list[np.ndarray]] = {one: [] for one in (False, True) if wanted in (None, one)}
+        order: list[int] = []
+        gaps = []
         for held in self._folds():
             kept = np.setdiff1d(np.arange(self.count), held)
-            if held is self.held:
-                materials = self._materials(terms, fit, residual)
-            else:
-                own = self._fit_groups(terms, fit.parameters, kept, self.choose.short_steps, rounds=1)
-                materials = self._materials(terms, own)
-                if terms.residual:
-                    materials = replace(materials, residual=self._residual(materials, kept))
-            sent = sent_radiance(self.seen.transport, materials)
-            for r in held:
-                images.append(self._image(materials, sent, r))
-                errors.append(images[-1] - self.target[r])
-                gaps.append(np.linalg.norm(receivers[kept] - receivers[r], axis=1).min())
-        return learn_errors(images, errors, np.array(gaps), receivers, fit.covariance)
+            fit = best.fit
+            if held is not self.held:
+                fit = self._fit_groups(best.terms, fit.parameters, kept, self.choose.short_steps, rounds=1)
+            order += held.tolist()
+            gaps += [np.linalg.norm(places[kept] - places[r], axis=1).min() for r in held]
+            bare = self._materials(replace(best.terms, residual=False), fit)
+            for residual, found in power.items():
+                materials = bare
+                if residual:
+                    terms = replace(best.terms, residual=True)
+                    materials = replace(bare, terms=terms, residual=self._residual(bare, kept))
+                sent = self._sent(materials)
+                found += [self._predicted(materials, sent, r) for r in held]
+        errors = {
+            one: [self.observed[r].target.error(x) for r, x in zip(order, found, strict=True)]
+            for one, found in power.items()
+        }
+        loss = {
+            one: float(np.mean([self._losses(r, e).mean() for r, e in zip(order, own, strict=True)]))
+            for one, own in errors.items()
+        }
+        keep = wanted if wanted is not None else loss[True] < self.choose.clearly_worse * loss[False]
+        for one, error in loss.items():
+            self._note("residual" if one else "no residual", one == keep, error)
+        if not all(isinstance(o.measured, SpectrumPixels) and o.target.trust is None for o in self.observed):
+            return keep, None
+        shapes = [self.observed[r].place.shape for r in order]
+        images = [(NEPER * np.log1p(x)).reshape(shape) for x, shape in zip(power[keep], shapes, strict=True)]
+        missed = [e.reshape(shape) for e, shape in zip(errors[keep], shapes, strict=True)]
+        return keep, learn_errors(images, missed, np.array(gaps), places, self._covariance(best.fit))
+
+    def _covariance(self, fit: Fitted) -> np.ndarray:
+        """Of what a field keeps: without the gains of chains."""
+        kept = len(fit.covariance) - len(fit.parameters.log_gains)
+        return fit.covariance[:kept, :kept]
 
     def _folds(self) -> list[np.ndarray]:
         """Receivers that are held out in turn to learn errors."""
@@ -606,7 +737,7 @@ class _Training:
             return limited
         # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
         known = self._materials(replace(terms, indirect=False, residual=False), fit)
-        sent = sent_radiance(self.seen.transport, known)
+        sent = self._sent(known)
         return [
             replace(
                 reading,
@@ -615,8 +746,8 @@ class _Training:
                     self._view(r, terms),
                     self.measured[r],
                     known,
-                    sent,
-                    self.floor,
+                    sent(self.views[r]),
+                    self.observed[r].floor,
                     follow=follow,
                 ),
             )
@@ -625,26 +756,27 @@ class _Training:
 
     def _view(self, receiver: int, terms: Terms) -> ReceiverView:
         """What a training receiver sees, as far as ``terms`` want it; kept for the next time."""
-        self.views[receiver] = self.seen.transport.complete(self.views[receiver], terms)
+        self.views[receiver] = self.views[receiver].transport.complete(self.views[receiver], terms)
         return self.views[receiver]
 
     def _residual(self, materials: Materials, chosen: np.ndarray) -> np.ndarray:
         """Gains of surface cells over ``materials``, shape ``(2, X)``."""
-        sent = sent_radiance(self.seen.transport, materials)
-        shares = [
-            shares_of(self._view(r, materials.terms), materials, sent, self.beam, self.floor, self.target[r])
-            for r in chosen
-        ]
-        found = fit_residual(shares, self.beam, self.surface, self.options.residuals)
+        sent = self._sent(materials)
+        shares = []
+        for r in chosen:
+            view, observed, gain = self._view(r, materials.terms), self.observed[r], 1.0
+            if observed.chain >= 0:
+                gain = float(np.exp(materials.parameters.log_gains[observed.chain]))
+            shares.append(
+                shares_of(
+                    view, materials, sent(view), observed.measured, observed.floor / gain, observed.target
+                )
+            )
+        found = fit_residual(shares, self.surface, self.options.residuals)
         self._stepped()
         return found
 
-    def _materials(self, terms: Terms, fit: Fitted, residual: np.ndarray | None = None) -> Materials:
-        """What ``fit`` found, by groups."""
+    def _materials(self, terms: Terms, fit: Fitted) -> Materials:
+        """What ``fit`` found, by groups, without a residual."""
         none = np.zeros((2, self.surface.cells))
-        return Materials(
-            terms,
-            fit.parameters.take(self.material),
-            none if residual is None else residual,
-            self.ds.transmitter,
-        )
+        return Materials(terms, fit.parameters.take(self.material), none, self.transmitter)

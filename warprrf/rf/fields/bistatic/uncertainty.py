@@ -19,8 +19,9 @@ import numpy as np
 from warprrf.checks import Expected, check_arrays, lengths
 from warprrf.rf.fields.bistatic.fit import NEPER
 from warprrf.rf.fields.bistatic.materials import Layout, Materials
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.render import Rendered
-from warprrf.rf.fields.bistatic.response import SpectrumPixels, jacobian, respond
+from warprrf.rf.fields.bistatic.response import jacobian, respond
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.spectra.beam import BeamOperator
 

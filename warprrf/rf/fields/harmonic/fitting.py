@@ -180,7 +180,7 @@ class Layer:
 
     def _smoothed(self, source: wp.array, between: wp.array, out: wp.array, count: int) -> wp.array:
         p, (height, width) = self.problem, self.problem.transport.shape
-        p.launch(p.ssim.filter_rows, count, width, 1, 1, source, between)
+        p.launch(p.ssim.filter_rows, count, width, source, between)
         p.launch(p.ssim.filter_columns, count, height, width, between, out)
         return out
 

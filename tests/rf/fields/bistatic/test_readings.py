@@ -1,0 +1,220 @@
+"""Tables of received power: what a reading is, and fits to horns, powers and delays whose chain's gain is not known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+
+from warprrf.rf.exact import ExactEngine
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.fit import Target
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.metrics import evaluate
+from warprrf.rf.spectra.readings import Readings, horn, path_weights
+from warprrf.rf.spectra.spectrum import directions_from_angles
+
+F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
+TX = np.array([0.8, 0.9, 2.2])
+RECEIVERS = np.array(
+    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
+     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0], [1.8, 1.1, 1.1], [2.6, 3.5, 1.4]]
+)  # fmt: skip
+CHAIN_DB = -23.7
+WIDTH = np.radians(20.0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> RadioScene:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+    )
+    walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4)
+    return RadioScene(mesh, part, [walls, SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)])
+
+
+@pytest.fixture(scope="module")
+def test(scene: RadioScene) -> SpectrumDataset:
+    held = RECEIVERS[6:] + np.array([0.1, 0.1, 0.05])
+    return exact_spectra(scene, held, transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+
+
+@pytest.fixture(scope="module")
+def turned(scene: RadioScene) -> Readings:
+    """A horn at six receivers, turned through 18 azimuths at two elevations: read off narrow beams of the exact engine."""
+    engine = ExactEngine(
+        scene, transmitter=TX, frequency_hz=F, shape=(60, 120), beam_sigma_rad=np.radians(1.5), sub_pixels=2
+    )
+    zenith, azimuth = np.meshgrid(
+        (np.arange(60) + 0.5) * np.pi / 60, -np.pi + (np.arange(120) + 0.5) * np.pi / 60, indexing="ij"
+    )
+    seen = directions_from_angles(zenith.ravel(), azimuth.ravel())
+    pointing = np.array([(z, a) for z in (np.pi / 2, 2.0) for a in np.radians(np.arange(-180, 180, 20))])
+    angle = np.arccos(np.clip(directions_from_angles(*pointing.T) @ seen.T, -1.0, 1.0))
+    gain = horn(WIDTH)(angle)
+    power = np.stack([gain @ engine.receive(r).path_gain.ravel() for r in RECEIVERS[:6]])
+    floor = np.repeat(power.max(axis=1) * 1e-3, len(pointing)) * 10 ** (CHAIN_DB / 10)
+    return Readings(
+        TX, np.repeat(RECEIVERS[:6], len(pointing), axis=0),
+        np.maximum(power.ravel() * 10 ** (CHAIN_DB / 10), floor), F, floor,
+        arrival=np.tile(pointing, (6, 1)), receive_pattern=horn(WIDTH), chain=["horn"] * power.size,
+    )  # fmt: skip
+
+
+def score(field: RadioField, test: SpectrumDataset) -> float:
+    """PSNR on the grid of ``test``."""
+    return evaluate(test, replace(field, shape=SHAPE, beam_sigma_rad=SIGMA).spectrum)["psnr_db"]
+
+
+def test_a_horn_of_unknown_gain_is_fitted_and_its_gain_found(
+    scene: RadioScene, turned: Readings, test: SpectrumDataset
+) -> None:
+    field = RadioField.fit(scene, turned, quick=True)
+    assert field.report["chains"]["horn"]["gain_db"] == pytest.approx(CHAIN_DB, abs=0.5)
+    assert score(field, test) > score(type(field).prior(scene, test), test) + 3.0
+    total = [
+        10 * np.log10(field.spectrum(r).total_path_gain / test[k].total_path_gain)
+        for k, r in enumerate(test.receivers)
+    ]
+    assert np.sqrt(np.mean(np.square(total))) < 1.0
+
+
+def test_wrong_readings_are_named_and_hardly_count(
+    scene: RadioScene, turned: Readings, test: SpectrumDataset
+) -> None:
+    rng = np.random.default_rng(1)
+    above = np.flatnonzero(turned.power > 3.0 * turned.floor)
+    wrong = np.sort(rng.choice(above, len(above) // 10, replace=False))
+    power = turned.power.copy()
+    power[wrong] *= 100.0
+    clean, spoilt = (RadioField.fit(scene, r, quick=True) for r in (turned, replace(turned, power=power)))
+    named = spoilt.report["unexplained"]["readings"]
+    assert np.isin(wrong, named).mean() >= 0.9
+    assert len(named) < 2 * len(wrong) + 3
+    assert score(spoilt, test) > score(clean, test) - 1.0
+
+
+def test_several_transmitters_are_fitted_together(scene: RadioScene) -> None:
+    second, third = np.array([4.3, 0.7, 2.0]), np.array([4.2, 3.4, 2.3])
+    sets = [
+        exact_spectra(scene, RECEIVERS[k : k + 3], transmitter=t, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+        for k, t in ((0, TX), (3, second))
+    ]
+    field = RadioField.fit(scene, sets, quick=True)
+    np.testing.assert_array_equal(field.transmitter, TX)
+    np.testing.assert_array_equal(field.fitted_on, RECEIVERS[:3])
+    truth = exact_spectra(scene, RECEIVERS[6:8], transmitter=third, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    both = evaluate(truth, lambda r: field.spectrum(r, third))["psnr_db"]
+    one = RadioField.fit(scene, sets[0], quick=True)
+    assert both > evaluate(truth, lambda r: one.spectrum(r, third))["psnr_db"] - 0.5
+    assert both > 25.0
+
+
+def test_directions_that_nobody_measured_do_not_count(scene: RadioScene, test: SpectrumDataset) -> None:
+    whole = exact_spectra(scene, RECEIVERS[:5], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    gain = whole.path_gain.copy()
+    gain[:, :6] = np.nan
+    part = SpectrumDataset.from_spectra(
+        receivers=whole.receivers,
+        transmitter=TX,
+        frequency_hz=F,
+        path_gain=gain,
+        beam_sigma_rad=SIGMA,
+        floor=whole.floor,
+    )
+    np.testing.assert_array_equal(part.line_of_sight, whole.line_of_sight)
+    field = RadioField.fit(scene, part, quick=True)
+    spoilt = replace(part, path_gain=np.where(np.isnan(gain), 0.0, gain))
+    worse = RadioField.fit(scene, spoilt, quick=True)
+    found, other = (evaluate(test, f.spectrum)["psnr_db"] for f in (field, worse))
+    assert found > evaluate(test, RadioField.fit(scene, whole, quick=True).spectrum)["psnr_db"] - 3.0
+    assert found > other
+    with pytest.raises(ValueError, match="test.path_gain: .* not measured"):
+        evaluate(part, field.spectrum)
+    with pytest.raises(ValueError, match="path_gain"):
+        RadioField.fit(scene, part, "rf3dgs+")
+
+
+def test_a_censored_reading_says_only_that_there_was_no_more() -> None:
+    target = Target(np.array([3.0, 3.0]), censored=np.array([True, False]))
+    quiet, loud = np.full(2, 0.01), np.full(2, 100.0)
+    assert target.error(quiet)[0] == 0 and target.slope(quiet)[0] == 0
+    assert target.error(quiet)[1] < -2
+    assert target.error(loud)[0] == target.error(loud)[1] > 10
+
+
+def test_a_reading_weighs_paths_by_directions_and_delay() -> None:
+    east, north = directions_from_angles([np.pi / 2] * 2, [0.0, np.pi / 2])
+    one = Readings(
+        TX, RECEIVERS[0], [1e-9, 1e-9], F, 1e-15, arrival=[[np.pi / 2, 0.0], [np.pi / 2, np.pi / 2]],
+        receive_pattern=horn(0.2), delay_s=[10e-9, 10e-9], bandwidth_hz=2e9, window="hann",
+    )  # fmt: skip
+    arrival = np.stack([east, north])
+    on_tap = path_weights(one, np.arange(2), arrival, arrival, np.array([10e-9, 10e-9]))
+    assert on_tap[0, 0] == pytest.approx(on_tap[1, 1]) and on_tap[0, 1] < 1e-5 * on_tap[0, 0]
+    taps = np.arange(40) / 2e9
+    many = replace(
+        one, arrival=None, receive_pattern=None, receivers=np.tile(RECEIVERS[0], (40, 1)), transmitters=TX,
+        power=np.full(40, 1e-9), floor=1e-15, delay_s=taps, chain=None, std_db=0.0,
+    )  # fmt: skip
+    shares = path_weights(many, np.arange(40), arrival[:1], arrival[:1], np.array([9.83e-9]))
+    assert shares.sum() == pytest.approx(1.0, abs=1e-3)  # all taps share the path's power
+
+
+def test_a_horn_of_a_width_is_lossless() -> None:
+    angle = np.linspace(0, np.pi, 100_001)
+    for width in (0.05, 0.5, 2.0):
+        gain = horn(width)(angle)
+        assert 0.5 * np.trapezoid(gain * np.sin(angle), angle) == pytest.approx(1.0, rel=1e-3)
+        assert horn(width)(np.array([width / 2]))[0] == pytest.approx(0.5 * gain[0], rel=1e-3)
+
+
+def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
+    path = tmp_path / "horn.csv"
+    zenith, azimuth = np.degrees(turned.arrival).T
+    rows = ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain,note"]
+    for k in range(len(turned)):
+        cells = [
+            *turned.transmitters[k],
+            *turned.receivers[k],
+            azimuth[k],
+            90 - zenith[k],
+            10 * np.log10(turned.power[k]),
+        ]
+        rows.append(",".join(map(repr, map(float, cells))) + ",horn,any")
+    path.write_text("\n".join(rows))
+    read = Readings.load(path, frequency_hz=F, floor=turned.floor, receive_pattern=horn(WIDTH))
+    np.testing.assert_allclose(read.power, turned.power, rtol=1e-9)
+    np.testing.assert_allclose(read.arrival, turned.arrival, atol=1e-9)
+    assert set(read.chain) == {"horn"} and "6 receivers" in repr(read)
+    path.write_text("\n".join(r.replace("power_db", "power") for r in rows))
+    with pytest.raises(ValueError, match=r"horn.csv: table: lacks the columns power_db"):
+        Readings.load(path, frequency_hz=F, floor=1e-12)
+    with pytest.raises(FileNotFoundError, match="nothing.csv"):
+        Readings.load(tmp_path / "nothing.csv", frequency_hz=F, floor=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"power": [1e-9, -1e-9]}, "power"),
+        ({"power": [1e-16, 1e-16]}, "power: got no value above the floor"),
+        ({"floor": 0.0}, "floor"),
+        ({"receivers": np.zeros((3, 3))}, "receivers"),
+        ({"receive_pattern": None}, "receive_pattern"),
+        ({"bandwidth_hz": 2e9}, "bandwidth_hz"),
+        ({"chain": ["a"]}, "chain"),
+        ({"std_db": -1.0}, "std_db"),
+        ({"window": "triangle"}, "window"),
+        ({"samples": 0}, "samples"),
+    ],
+)
+def test_bad_readings_are_named(changed: dict, told: str) -> None:
+    good = {
+        "transmitters": TX, "receivers": RECEIVERS[0], "power": [1e-9, 1e-9], "frequency_hz": F, "floor": 1e-15,
+        "arrival": [[1.0, 0.0], [1.0, 1.0]], "receive_pattern": horn(0.2),
+    }  # fmt: skip
+    Readings(**good)
+    with pytest.raises(ValueError, match=told):
+        Readings(**{**good, **changed})

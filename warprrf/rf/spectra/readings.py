@@ -1,0 +1,325 @@
+"""Received powers as sounders deliver them: horns that turn, power alone, profiles of delay, of any transmitter.
+
+A reading is linear in the powers of the paths between a transmitter and a receiver: each counts with the gain of the
+antennas where it arrives and departs, and with what a window of delays lets through of it. All readings are one table,
+one row each; what a column is missing does not weigh.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import digamma, polygamma
+
+from warprrf.checks import check_array, check_count, check_number, check_positive, checked
+from warprrf.rf.em.absorption import Air
+from warprrf.rf.em.waves import check_frequency
+from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import directions_from_angles
+
+NEPER = 10.0 / np.log(10.0)
+COLUMNS = {
+    "transmitter": ("tx_x", "tx_y", "tx_z"),
+    "receiver": ("rx_x", "rx_y", "rx_z"),
+    "arrival": ("azimuth_deg", "elevation_deg"),
+    "departure": ("tx_azimuth_deg", "tx_elevation_deg"),
+}
+"""Columns of a table of readings; beside them ``power_db``, ``delay_ns``, ``std_db`` and ``chain``."""
+WINDOWS = ("rectangular", "hann")
+
+
+@runtime_checkable
+class Table(Protocol):
+    """Columns by name: a dictionary of arrays, a pandas data frame, an xarray data set."""
+
+    def __iter__(self) -> Iterator[Any]: ...
+
+    def __getitem__(self, name: str, /) -> Any: ...
+
+
+@checked
+@dataclass(frozen=True, repr=False)
+class Readings:
+    """N received powers over transmitted power.
+
+    Attributes:
+        transmitters: positions [m], shape ``(N, 3)``, or ``(3,)`` for one.
+        receivers: positions [m], shape ``(N, 3)``, or ``(3,)``.
+        power: received over transmitted power [linear], shape ``(N,)``; NaN where nothing was measured.
+        frequency_hz: carrier [Hz].
+        floor: noise floor [linear], one number or shape ``(N,)``: readings not above it only say that there was no more.
+        arrival: zenith and azimuth [rad] that the receiving antenna is turned to, shape ``(N, 2)``; None for an isotropic
+            one.
+        departure: those of the transmitting antenna.
+        receive_pattern, transmit_pattern: gain of those antennas [linear] over the angle off boresight: a function of
+            angles [rad], or samples from 0 to pi. :func:`horn` makes one.
+        delay_s: delay of the tap that a reading is [s], shape ``(N,)``; None where all delays are received together.
+        bandwidth_hz: of the sounder, for taps.
+        window: of its frequency response: ``"rectangular"`` or ``"hann"``.
+        chain: name of the measuring chain of each reading whose gain is not known, "" where it is known, shape ``(N,)``.
+        std_db: standard deviation of the noise of each reading [dB], shape ``(N,)`` or one number.
+        samples: independent samples of fading that each reading is the mean of: 1 for narrowband power at one place,
+            None where fading is averaged out. Fading is taken for Rayleigh's.
+        air: whose absorption is in the powers; None for none.
+        name: by which a report tells these readings from others.
+
+    Raises:
+        TypeError, ValueError: naming the argument.
+
+    Example::
+
+        horn = wr.Readings.load("horn.csv", frequency_hz=300e9, floor=1e-12, receive_pattern=wr.horn(np.radians(10)))
+        field = wr.RadioField.fit(rec, horn)
+    """
+
+    transmitters: np.ndarray
+    receivers: np.ndarray
+    power: np.ndarray
+    frequency_hz: float
+    floor: ArrayLike
+    arrival: np.ndarray | None = None
+    departure: np.ndarray | None = None
+    receive_pattern: Pattern | None = None
+    transmit_pattern: Pattern | None = None
+    delay_s: np.ndarray | None = None
+    bandwidth_hz: float | None = None
+    window: str = "rectangular"
+    chain: Sequence[str] | NDArray[np.str_] | None = None
+    std_db: ArrayLike = 0.0
+    samples: int | None = None
+    air: Air | None = None
+    name: str = "readings"
+
+    def __post_init__(self) -> None:
+        power = check_array("power", self.power, (None,), finite=False)
+        count = len(power)
+        if count == 0 or not (np.isnan(power) | (np.isfinite(power) & (power >= 0))).all():
+            raise ValueError(
+                f"power: got {count} values, expected one or more, each a linear power or NaN where not measured"
+            )
+        floor = check_array("floor", self.floor)
+        if floor.shape not in ((), (count,)) or not (floor > 0).all():
+            raise ValueError(
+                f"floor: got {self.floor!r}, expected one linear noise floor above 0, or {count}"
+            )
+        floor = np.broadcast_to(floor, (count,)).copy()
+        if not (power > floor).any():
+            raise ValueError(f"power: got no value above the floor of {floor.min():g}")
+        fields: dict[str, Any] = {
+            "power": power,
+            "floor": floor,
+            "frequency_hz": check_frequency(self.frequency_hz),
+        }
+        for name in ("transmitters", "receivers"):
+            value = check_array(name, getattr(self, name))
+            if value.shape not in ((3,), (count, 3)):
+                raise ValueError(f"{name}: got shape {value.shape}, expected (3,) or ({count}, 3)")
+            fields[name] = np.broadcast_to(value, (count, 3)).copy()
+        for turned, pattern in (("arrival", "receive_pattern"), ("departure", "transmit_pattern")):
+            value, gain = getattr(self, turned), getattr(self, pattern)
+            if (value is None) != (gain is None):
+                raise ValueError(
+                    f"{pattern}: it goes with {turned}, got one of the two; expected both or neither"
+                )
+            if value is not None:
+                fields[turned] = check_array(turned, value, (count, 2))
+                check_gains(pattern, gain)
+        if (self.delay_s is None) != (self.bandwidth_hz is None):
+            raise ValueError(
+                "bandwidth_hz: it goes with delay_s, got one of the two; expected both or neither"
+            )
+        if self.delay_s is not None:
+            fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
+            fields["bandwidth_hz"] = check_positive("bandwidth_hz", self.bandwidth_hz)
+        if self.samples is not None:
+            check_count("samples", self.samples)
+        if self.window not in WINDOWS:
+            raise ValueError(f"window: got {self.window!r}, expected one of {', '.join(WINDOWS)}")
+        chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=str)
+        if chain.shape != (count,):
+            raise ValueError(f"chain: got shape {chain.shape}, expected a name for each of {count} readings")
+        std = check_array("std_db", self.std_db)
+        if std.shape not in ((), (count,)) or (std < 0).any():
+            raise ValueError(f"std_db: got {self.std_db!r}, expected one number or {count}, at least 0")
+        fields |= {"chain": chain, "std_db": np.broadcast_to(std, (count,)).copy()}
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.power)
+
+    def __repr__(self) -> str:
+        places = len(np.unique(self.receivers, axis=0))
+        return (
+            f"Readings({len(self)} of {places} receivers and {len(np.unique(self.transmitters, axis=0))} transmitters at "
+            f"{self.frequency_hz / 1e9:g} GHz, {int((self.power <= self.floor).sum())} at the floor)"
+        )
+
+    def subset(self, rows: ArrayLike) -> Readings:
+        """Some of the readings, by index or mask."""
+        chosen = np.asarray(rows)
+        if chosen.ndim != 1 or not (
+            (chosen.dtype == bool and len(chosen) == len(self))
+            or (chosen.dtype.kind in "iu" and len(chosen) and (np.abs(chosen + 0.5) < len(self)).all())
+        ):
+            raise ValueError(
+                f"rows: got {rows!r}, expected whole numbers from 0 to {len(self) - 1}, or a mask ({len(self)},)"
+            )
+        index = np.arange(len(self))[chosen]
+        own = (
+            "transmitters",
+            "receivers",
+            "power",
+            "floor",
+            "arrival",
+            "departure",
+            "delay_s",
+            "chain",
+            "std_db",
+        )
+        columns = {name: getattr(self, name) for name in own}
+        taken: dict[str, Any] = {name: value[index] for name, value in columns.items() if value is not None}
+        return replace(self, **taken)
+
+    @property
+    def expected_db(self) -> np.ndarray:
+        """Readings less what fading takes off the mean of their decibels [dB], shape ``(N,)``."""
+        bias = 0.0 if self.samples is None else NEPER * (digamma(self.samples) - np.log(self.samples))
+        with np.errstate(divide="ignore"):
+            return np.asarray(10.0 * np.log10(self.power) - bias)
+
+    @property
+    def noise_db(self) -> np.ndarray:
+        """Standard deviation of each reading, fading included [dB], shape ``(N,)``."""
+        fading = 0.0 if self.samples is None else NEPER * np.sqrt(polygamma(1, self.samples))
+        return np.asarray(np.hypot(self.std_db, fading))
+
+    @classmethod
+    def from_table(cls, table: Table, **settings: Any) -> Readings:
+        """Readings of a table by the names of its columns: a pandas data frame, an xarray data set, a dictionary.
+
+        Args:
+            table: :data:`COLUMNS` as far as they count, and ``power_db`` [dB], received over transmitted power; by choice
+                ``delay_ns``, ``std_db`` and ``chain``. Azimuth counts from x to y, elevation from the horizon up.
+            settings: other arguments of :class:`Readings`.
+
+        Raises:
+            KeyError: naming columns that are missing.
+        """
+        names = set(map(str, table))
+        missing = sorted({*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db"} - names)
+        if missing:
+            raise KeyError(
+                f"table: lacks the columns {', '.join(missing)}; it has {', '.join(sorted(names))}"
+            )
+
+        def column(name: str) -> np.ndarray:
+            return check_array(
+                f"table[{name!r}]", np.asarray(table[name]), (None,), finite=name != "power_db"
+            )
+
+        found: dict[str, Any] = {
+            "transmitters": np.column_stack([column(c) for c in COLUMNS["transmitter"]]),
+            "receivers": np.column_stack([column(c) for c in COLUMNS["receiver"]]),
+            "power": 10.0 ** (column("power_db") / 10.0),
+        }
+        for end in ("arrival", "departure"):
+            azimuth, elevation = COLUMNS[end]
+            if azimuth in names:
+                up = column(elevation) if elevation in names else np.zeros(len(found["power"]))
+                found[end] = np.radians(np.column_stack([90.0 - up, column(azimuth)]))
+        if "delay_ns" in names:
+            found["delay_s"] = 1e-9 * column("delay_ns")
+        if "std_db" in names:
+            found["std_db"] = column("std_db")
+        if "chain" in names:
+            found["chain"] = np.asarray(table["chain"]).astype(str)
+        return cls(**found, **settings)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], **settings: Any) -> Readings:
+        """Readings of a CSV file with a header line; see :meth:`from_table`.
+
+        Raises:
+            OSError: naming the file, if it cannot be read.
+            ValueError: naming it, if it is no such table.
+        """
+        import pandas
+
+        file = Path(path)
+        if not file.is_file():
+            raise FileNotFoundError(f"path: there is no file {file}")
+        try:
+            table = pandas.read_csv(file, keep_default_na=True, dtype={"chain": str})
+            if "chain" in table:
+                table["chain"] = table["chain"].fillna("")
+            return cls.from_table(table, **settings)
+        except (KeyError, TypeError, ValueError, UnicodeError) as error:
+            raise ValueError(f"path: {file}: {error.args[0] if error.args else error}") from error
+
+
+Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readings]
+"""What fields are fitted to: a set of spectra, a table of readings, or several of them."""
+
+
+def path_weights(
+    readings: Readings, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
+) -> np.ndarray:
+    """What ``rows`` (M,) of ``readings`` take of unit power on paths, shape ``(M, K)``.
+
+    Args:
+        arrival: unit vectors from the receiver, shape ``(K, 3)``.
+        departure: unit vectors from the transmitter, shape ``(K, 3)``.
+        delay_s: delays [s], shape ``(K,)``.
+    """
+    r, weight = readings, np.ones((len(rows), len(delay_s)))
+    for turned, pattern, path in (
+        (r.arrival, r.receive_pattern, arrival),
+        (r.departure, r.transmit_pattern, departure),
+    ):
+        if turned is not None and pattern is not None:
+            cosine = directions_from_angles(*turned[rows].T) @ path.T
+            weight *= sample_pattern(pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
+    if r.delay_s is not None and r.bandwidth_hz is not None:
+        weight *= _tap(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
+    return weight
+
+
+def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
+    """Gain of a horn over the angle off boresight: Gaussian in the angle, lossless.
+
+    Args:
+        width_rad: full width at half maximum [rad].
+        floor_db: of the side lobes below the peak [dB].
+    """
+    width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
+
+    def shape(angle: np.ndarray) -> np.ndarray:
+        return np.maximum(np.exp(-4.0 * np.log(2.0) * (angle / width) ** 2), 10.0 ** (low / 10.0))
+
+    angle = np.linspace(0.0, np.pi, 20_001)
+    mean = 0.5 * np.trapezoid(shape(angle) * np.sin(angle), angle)
+    return lambda off: shape(np.asarray(off)) / mean
+
+
+def check_gains(name: str, pattern: Pattern) -> None:
+    """Raise ValueError, naming the argument, unless a pattern holds gains, some above zero."""
+    gain = sample_pattern(pattern, np.linspace(0.0, np.pi, 721))
+    if not np.isfinite(gain).all() or (gain < 0).any() or not gain.max() > 0:
+        raise ValueError(
+            f"{name}: got negative, NaN or infinite gains, or none above zero; expected linear power gains"
+        )
+
+
+def _tap(place: np.ndarray, window: str) -> np.ndarray:
+    """Share of a path's power in a tap ``place`` (in units of 1 / bandwidth) from it; over all taps they add up to 1."""
+    if window == "rectangular":
+        return np.asarray(np.sinc(place) ** 2)
+    return np.asarray((np.sinc(place) + 0.5 * (np.sinc(place - 1.0) + np.sinc(place + 1.0))) ** 2 / 1.5)
