@@ -226,7 +226,7 @@ def test_a_changed_setting_is_not_served_from_the_old_run(whole):
         photos, workspace=workspace, known_positions=known, held_out=VIEWS[4:6], config=SMALL, iterations=2,
         device="cpu", progress=lambda s, d, n: stages.add(s),
     )  # fmt: skip
-    assert stages == {"planes", "refine", "depth", "surface"}  # the photos' poses stay
+    assert stages == {"planes", "refine", "depth", "stereo", "surface"}  # the photos' poses stay
     assert other.held_out == tuple(VIEWS[4:6])
 
 

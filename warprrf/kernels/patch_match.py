@@ -16,6 +16,8 @@ wp.set_module_options({"enable_backward": False})
 SIDE = 5  # pixels along a window's side
 SAMPLES = wp.constant(SIDE * SIDE)
 UNKNOWN = wp.constant(2.0)  # cost of what no two photos show: that of opposite textures
+BLANK = wp.constant(3.0)  # cost of a window that shows nothing
+SAME = wp.constant(1.0e-3)  # planes whose inverse depths differ by this part of them in a window are one
 SIMILAR = wp.constant(0.06)  # grey values this far from the middle's count 1/e: a window ends at an edge
 FLAT = wp.constant(1.0e-5)  # variance of a window that shows nothing
 TRIALS = wp.constant(6)  # planes near its best that a pixel tries in a turn, the first at any depth
@@ -135,6 +137,9 @@ def match(
     u = float(j) + 0.5
     v = float(i) + 0.5
     here = i * width + j
+    cost = costs[here]
+    if turn >= 0 and (cost < settled or cost > UNKNOWN):
+        return
     middle = images[size[0] + here]
     grey = window()
     weight = window()
@@ -153,12 +158,11 @@ def match(
         square = square + weight[k] * grey[k] * grey[k]
     variance = square - mean * mean
     if variance < FLAT:
-        costs[here] = UNKNOWN
+        costs[here] = BLANK
         return
     best = planes[here]
-    cost = disagreement(best, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
-    if turn < 0 or cost < settled:
-        costs[here] = cost
+    if turn < 0:
+        costs[here] = disagreement(best, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
         return
     for k in range(8):
         far = 1 + 4 * (k // 4)
@@ -167,7 +171,9 @@ def match(
         if x >= 0 and y >= 0 and x < width and y < height:
             other = planes[y * width + x]
             w = other[0] + other[1] * float(j - x) + other[2] * float(i - y)
-            if w > bounds[0] and w < bounds[1]:
+            bend = wp.abs(other[1] - best[1]) + wp.abs(other[2] - best[2])
+            new = wp.abs(w - best[0]) + wp.static(0.5 * SIDE) * bend > SAME * best[0]
+            if new and w > bounds[0] and w < bounds[1]:
                 trial = wp.vec3(w, other[1], other[2])
                 c = disagreement(trial, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
                 if c < cost:
