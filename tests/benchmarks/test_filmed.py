@@ -11,7 +11,7 @@ import views
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from benchmarks.filmed import FAR_M, Film, score, score_cameras
+from benchmarks.filmed import FAR_M, Film, laid_on, score, score_cameras
 from warprrf.geometry.mesh import Mesh
 
 pytest.importorskip("open3d")
@@ -103,6 +103,18 @@ def test_a_mesh_that_is_off_scores_how_far(reference, cameras):
     assert found["back_median_m"] == pytest.approx(0.1, abs=0.01)
     assert 0.1 < found["range_median_m"] < 0.15  # along slanted rays
     assert found["back_within_5_cm"] < 0.01
+
+
+def test_a_moved_mesh_is_laid_on_the_reference(reference, cameras):
+    levelled, surface = reference
+    _, (_, rotation, shift) = score_cameras(cameras, levelled.poses)
+    turn = Rotation.from_euler("zx", [2, -1], degrees=True).as_matrix()
+    true = box().vertices @ rotation.T + shift
+    mesh, scale = laid_on(
+        Mesh((true @ turn.T + [0.03, -0.02, 0.04]) / 1.04, box().faces), surface, levelled.rays(3)
+    )
+    assert scale == pytest.approx(1.04, abs=0.004)
+    np.testing.assert_allclose(mesh.vertices, true, atol=0.012)
 
 
 def test_a_folder_without_frames_is_refused(tmp_path: Path):
