@@ -40,16 +40,16 @@ $(VENV)/.made:
 # One stamp for what the main job needs, one for everything (torch is only in the second).
 $(VENV)/.lobby: $(VENV)/.made pyproject.toml constraints.txt
 	bash tools/system_packages.sh
-	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots]'
+	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,view]'
 	touch $@
 
 $(VENV)/.sionna: $(VENV)/.lobby
 	bash tools/system_packages.sh llvm
-	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,sionna,exr]'
+	$(RUN) -m pip install -q -c constraints.txt -e '.[photos,plots,view,sionna,exr]'
 	touch $@
 
 $(VENV)/.test: $(VENV)/.made pyproject.toml constraints.txt
-	bash tools/system_packages.sh llvm
+	bash tools/system_packages.sh llvm browser
 	$(RUN) -m pip install -q -c constraints.txt -e '.[all,docs,test]'
 	# Its wheel asks for an older NumPy than it needs, so it is no extra: only its scenario reader is tested against.
 	$(RUN) -m pip install -q --no-deps 'DeepMIMO==4.0.5' && $(RUN) -m pip install -q requests

@@ -39,6 +39,11 @@ NAMES = {
         "benchmarks.measurements",
         "horns, power alone, delay profiles and one spectrum, beside ten spectra",
     ),
+    "suggest": (
+        "benchmarks.suggest",
+        "receivers that the field suggests beside random ones, from none to ten",
+    ),
+    "view": ("benchmarks.viewer", "the viewer: from a drag to its answer, and whether anything grows"),
     "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

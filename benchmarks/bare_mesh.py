@@ -80,7 +80,7 @@ class Options:
 
 def scanned(mesh: wr.Mesh, places: np.ndarray, options: Options, seed: int) -> wr.Mesh:
     """``mesh`` as a scanner gives it that stood at each of ``places`` (N, 3)."""
-    r, remesh = np.random.default_rng(seed), require("trimesh.remesh", extra="mesh")
+    r, remesh = np.random.default_rng(seed), require("trimesh.remesh", extra="test")
     vertices, faces = remesh.subdivide_to_size(mesh.vertices, mesh.faces, options.edge_m, max_iter=20)
     place, index = np.unique(np.round(vertices, 6), axis=0, return_inverse=True)
     fine = wr.Mesh(place, index.reshape(-1)[faces])

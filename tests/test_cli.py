@@ -11,17 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import ROOT
+from radio_scenes import box_mesh
 
 from warprrf import cli
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
+from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.positions import check_positions
 
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
 COMMANDS = (
-    "reconstruct", "simulate", "fit", "relevance", "render", "evaluate", "map", "twin",
+    "reconstruct", "simulate", "fit", "suggest", "relevance", "render", "evaluate", "map", "twin", "view",
 )  # fmt: skip
 
 
@@ -201,6 +203,26 @@ BAD = {
         ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
         ".ply",
     ),
+    "suggest without a carrier": (
+        ["suggest", "{scene}", "2,2,1", "--transmitter", "13.6", "11.2", "2.5"],
+        "--carrier",
+    ),
+    "more suggested than there are": (
+        [
+            "suggest",
+            "{scene}",
+            "2,2,1",
+            "-n",
+            "2",
+            "--transmitter",
+            "13.6",
+            "11.2",
+            "2.5",
+            "--carrier",
+            "300e9",
+        ],
+        "n: got 2",
+    ),
     "nowhere to look": (["relevance", "{scene}"], "--receivers"),
     "relevance of nothing": (["relevance", "{tmp}/none.xml", "--receivers", "2,2,1"], "none.xml"),
     "carrier of no material": (
@@ -319,6 +341,21 @@ def test_receivers_from_file_and_words_agree(tmp_path: Path) -> None:
 def test_a_file_without_receivers_holds_none(tmp_path: Path, text: str) -> None:
     (tmp_path / "r.csv").write_text(text)
     assert read_receivers([str(tmp_path / "r.csv")]).shape == (0, 3)
+
+
+def test_suggest_writes_the_places_that_it_chooses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_mesh(tmp_path / "room.ply", *box_mesh([0, 0, 0], [5, 4, 3], inward=True))
+    (tmp_path / "candidates.csv").write_text("x,y,z\n1,1,1.5\n4,3,1.5\n-0.0,9,1\n")
+    words = ["suggest", f"{tmp_path}/room.ply", f"{tmp_path}/candidates.csv", "-n", "2", "--quiet"]
+    words += ["--transmitter", "0.8", "0.9", "2.2", "--carrier", "300e9", "-o", f"{tmp_path}/next.csv"]
+    assert cli.main(words) == 2 and "outside the scene" in capsys.readouterr().err
+    (tmp_path / "candidates.csv").write_text("x,y,z\n1,1,1.5\n4,3,1.5\n2.5,3.5,1\n")
+    assert cli.main(words) == 0
+    chosen = read_receivers([f"{tmp_path}/next.csv"])
+    assert chosen.shape == (2, 3) and len(np.unique(chosen, axis=0)) == 2
+    assert {tuple(place) for place in chosen} <= {(1, 1, 1.5), (4, 3, 1.5), (2.5, 3.5, 1)}
 
 
 def test_look_at_puts_the_target_in_the_middle_with_z_up() -> None:

@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from model_files import room_glb
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from places import ROOT
@@ -24,9 +25,10 @@ EXTRAS = PROJECT["optional-dependencies"]
 CORE = {canonicalize_name(Requirement(line).name) for line in PROJECT["dependencies"]}
 
 # Each of these lives inside one module of ours, which imports it when called.
-WRAPPED = ("open3d", "pycolmap", "trimesh", "sionna", "mitsuba")
+WRAPPED = ("open3d", "pycolmap", "sionna", "mitsuba")
 HEAVY = (
     *WRAPPED,
+    "trimesh",
     "torch",
     "drjit",
     "matplotlib",
@@ -37,6 +39,7 @@ HEAVY = (
     "PIL",
     "skimage",
     "tqdm",
+    "viser",
 )
 
 # The public names that notebooks and outside checks rely on, and the members that they use.
@@ -315,9 +318,9 @@ def test_wheel_works_in_a_fresh_environment_without_extras(wheel: Path, tmp_path
     )
     assert done.returncode != 0
     assert 'ImportError: pycolmap is not installed: pip install "warprrf[photos]"' in done.stderr
-    (tmp_path / "room.glb").write_bytes(b"glTF")
+    room_glb(tmp_path)  # with a texture
     done = python("import warprrf as wr; wr.Mesh.load('room.glb')", interpreter, cwd=tmp_path)
-    assert 'ImportError: trimesh is not installed: pip install "warprrf[mesh]"' in done.stderr
+    assert 'ImportError: PIL.Image is not installed: pip install "warprrf[mesh]"' in done.stderr
     done = subprocess.run(
         [str(fresh / "bin" / "warprrf"), "--version"],
         capture_output=True,

@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 from places import ROOT
 
-from warprrf import runtime
+from warprrf import device
 
 
 def _started(cache: Path) -> subprocess.CompletedProcess[str]:
@@ -49,7 +49,7 @@ def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(runtime, "_temporary", [])
+    monkeypatch.setattr(device, "_temporary", [])
 
     class Module:
         folders: tuple[str, ...] = ()
@@ -61,14 +61,14 @@ def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(
 
     module = Module()
     with pytest.warns(UserWarning, match=rf"kernel cache: .*{tmp_path}.*WARP_CACHE_PATH"):
-        runtime.load(module, "cpu", 1)
+        device.load_module(module, "cpu", 1)
     assert module.folders[0] == str(tmp_path)
     assert Path(module.folders[1]).is_dir()
     assert "warprrf-kernels-" in module.folders[1]
 
 
 def test_other_words_on_standard_error_are_kept(capfd: pytest.CaptureFixture[str]) -> None:
-    with runtime._without_cuda_warning():
+    with device._without_cuda_warning():
         os.write(
             2, b"before\nWarp CUDA warning: Could not find or load the NVIDIA CUDA driver. None.\nafter\n"
         )

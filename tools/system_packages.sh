@@ -2,7 +2,9 @@
 # Install the shared libraries that Python wheels do not bring, or say which one command does.
 #   Open3D (meshing)                 libusb-1.0.so.0  libGL.so.1  libgomp.so.1     needed
 #   Dr.Jit (Mitsuba, Sionna: data)   libLLVM 17 or newer; 15 and 16 abort the process, 14 is too old
-# `system_packages.sh llvm` also stops when LLVM is missing (making data and the whole test suite need it).
+#   Chromium and its driver (tests of the viewer)                                  wanted by tests alone
+# `system_packages.sh llvm` also stops when LLVM is missing (making data and the whole test suite need it);
+# `system_packages.sh llvm browser` wants Chromium too.
 set -euo pipefail
 
 libraries=$(PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null || true)
@@ -15,8 +17,10 @@ has 'libgomp\.so\.1' || needed+=(libgomp1)
 if [[ -z "${DRJIT_LIBLLVM_PATH:-}" ]] && ! has 'libLLVM(-|\.so\.)(1[7-9]|2[0-9])'; then
   if [[ "${1:-}" == llvm ]]; then needed+=(libllvm19); else wanted+=(libllvm19); fi
 fi
-missing=("${needed[@]}" "${wanted[@]}")
-[[ ${#missing[@]} -eq 0 ]] && exit 0
+if [[ "${2:-}" == browser ]] && ! { command -v chromium && command -v chromedriver; } >/dev/null; then
+  wanted+=(chromium chromium-driver)
+fi
+[[ ${#needed[@]} -eq 0 && ${#wanted[@]} -eq 0 ]] && exit 0
 
 as_root=""
 if command -v apt-get >/dev/null; then
@@ -26,17 +30,20 @@ if command -v apt-get >/dev/null; then
     as_root="sudo -n env"
   fi
 fi
-install="apt-get install -y --no-install-recommends ${missing[*]}"
-if [[ -n "$as_root" ]]; then
-  echo "Installing ${missing[*]}"
-  if $as_root DEBIAN_FRONTEND=noninteractive apt-get update -qq &&
-    $as_root DEBIAN_FRONTEND=noninteractive $install -qq >/dev/null; then
-    exit 0
-  fi
-fi
-echo "Shared libraries are missing. This command installs them (Debian 12, Ubuntu 24.04):" >&2
-echo "    sudo $install" >&2
-if [[ ${#needed[@]} -gt 0 ]]; then
+install="apt-get install -y --no-install-recommends"
+try() {
+  [[ $# -eq 0 ]] && return 0
+  [[ -n "$as_root" ]] || return 1
+  echo "Installing $*"
+  $as_root DEBIAN_FRONTEND=noninteractive $install -qq "$@" >/dev/null
+}
+[[ -n "$as_root" ]] && { $as_root apt-get update -qq || true; }
+if ! try "${needed[@]}"; then
+  echo "Shared libraries are missing. This command installs them (Debian 12, Ubuntu 24.04):" >&2
+  echo "    sudo $install ${needed[*]}" >&2
   exit 1
 fi
-echo "Going on without: only making data with Mitsuba and Sionna needs ${wanted[*]}." >&2
+if ! try "${wanted[@]}"; then
+  echo "Going on without ${wanted[*]}: making data with Mitsuba and Sionna needs LLVM, tests of the viewer Chromium." >&2
+  echo "    sudo $install ${wanted[*]}" >&2
+fi

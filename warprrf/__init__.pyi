@@ -14,14 +14,14 @@ from warprrf.rf.simulate import sample_receivers as sample_receivers
 # line of sight and mirror reflections by the image method
 from warprrf.rf.paths.trace import trace_paths as trace_paths
 
-# complex reflection coefficients of surfaces from a few measured channels
-from warprrf.rf.paths.reflections import fit_reflections as fit_reflections
-
 # what each effect is worth in a scene, and the smallest model within a tolerance
 from warprrf.rf.relevance.search import relevance as relevance
 
 # errors of predicted spectra at held-out receivers
 from warprrf.rf.spectra.metrics import evaluate as evaluate
+
+# what any of them holds, in the browser: drag a receiver
+from warprrf.viewer import view as view
 
 # == nouns ==
 # pinhole and spherical cameras

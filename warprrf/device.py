@@ -3,15 +3,21 @@
 Warp runs a CPU launch on one thread. :func:`launch` splits the index range over a thread pool (Warp releases the
 interpreter lock), so every kernel of ours takes ``offset`` first and works on index ``offset + wp.tid()``; an index
 owns what it writes, and the result does not depend on the number of threads.
+
+Warp announces on standard error that there is no CUDA driver, from its C library, whatever its log level; and it fails
+where its cache of kernels (``WARP_CACHE_PATH``, a folder below the home folder by default) cannot be written. Both are
+mended where it is started.
 """
 
 from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Callable, Sequence
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from copy import copy
 from functools import cache
 from itertools import pairwise
@@ -20,8 +26,7 @@ from typing import Any, TypeAlias
 
 import warp as wp
 
-from warprrf import runtime
-from warprrf.cache import loading
+from warprrf.cache import loading, once
 
 if wp.config.log_level == wp.LOG_INFO:  # Warp's default: it would announce devices and every compiled module
     wp.config.log_level = wp.LOG_ERROR
@@ -45,7 +50,7 @@ def resolve(device: DeviceLike = None) -> wp.Device:
         ValueError: if Warp has no such device.
     """
     try:
-        runtime.start()
+        start()
         return wp.get_device(device)
     except (ValueError, RuntimeError, TypeError) as error:
         known = ", ".join(str(d) for d in wp.get_devices())
@@ -106,7 +111,7 @@ def launch(
         bounds = [dim * k // count for k in range(count + 1)]
     arguments = [bounds[0], *inputs]
     with loading:
-        runtime.load(kernel.module, where, block_dim=256 if where.is_cuda else 1)
+        load_module(kernel.module, where, block_dim=256 if where.is_cuda else 1)
     extra = {"adjoint": True, "adj_inputs": [None] * len(arguments)} if adjoint else {}
     size = bounds[-1] - bounds[0]
     if len(bounds) == 2:
@@ -166,3 +171,66 @@ def require(module: str, extra: str) -> ModuleType:
         if error.name is None or error.name.split(".")[0] != module.split(".")[0]:
             raise
         raise ImportError(f'{module} is not installed: pip install "warprrf[{extra}]"') from error
+
+
+_NO_CUDA = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
+
+_temporary: list[tempfile.TemporaryDirectory[str]] = []  # removed when the process ends
+
+
+@once
+def start() -> None:
+    """Start Warp; a CPU is all it needs.
+
+    Raises:
+        OSError: if neither its cache nor a temporary folder can be written.
+    """
+    with _without_cuda_warning():
+        try:
+            wp.init()
+        except OSError as error:
+            _use_temporary_cache(error)
+            wp.init()
+
+
+def load_module(module: wp.Module, device: wp.Device, block_dim: int) -> None:
+    """Load a module of kernels, which is compiled if the cache lacks it."""
+    try:
+        module.load(device, block_dim=block_dim)
+    except OSError as error:
+        _use_temporary_cache(error)
+        module.load(device, block_dim=block_dim)
+
+
+def _use_temporary_cache(error: OSError) -> None:
+    """Keep kernels in a temporary folder from now on, because of ``error``."""
+    folder = tempfile.TemporaryDirectory(prefix="warprrf-kernels-")
+    _temporary.append(folder)
+    warnings.warn(
+        f"kernel cache: {error}; kernels are compiled anew by this process, into {folder.name}. Set WARP_CACHE_PATH to "
+        "a folder that can be written",
+        UserWarning,
+        stacklevel=2,
+    )
+    wp.config.kernel_cache_dir = folder.name
+
+
+@contextmanager
+def _without_cuda_warning() -> Iterator[None]:
+    """Hold standard error back, and give it out without the line about a missing CUDA driver."""
+    try:
+        held, shown = tempfile.TemporaryFile(), os.dup(2)
+    except OSError:  # no temporary folder, or no standard error
+        yield
+        return
+    with held:
+        os.dup2(held.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(shown, 2)
+            os.close(shown)
+            held.seek(0)
+            for line in held:
+                if not line.startswith(_NO_CUDA):
+                    os.write(2, line)

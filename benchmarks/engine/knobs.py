@@ -29,8 +29,12 @@ from warprrf.geometry.splats.gaussian_rays import GaussianRays
 from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
 from warprrf.geometry.splats.render import blend_weights
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.harmonic.interaction import INTERACTION_POINTS, interaction_points, path_lengths
-from warprrf.rf.fields.harmonic.transport import transport
+from warprrf.rf.fields.harmonic.transport import (
+    INTERACTION_POINTS,
+    interaction_points,
+    path_lengths,
+    transport,
+)
 from warprrf.rf.spectra.spectrum import pixel_directions, to_db
 
 DEPTH_DB = 60.0

@@ -26,6 +26,8 @@ IGNORED = ("self", "progress", "ax", "args", "kwargs")
 MISSING = inspect.Parameter.empty
 UNCHECKED = ("RadioField.trace_links",)
 """What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
+SERVERS = ("view",)
+"""What starts a server for each call: tests/viewer has its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
 ABSTRACT = ("RadioField",)
@@ -37,7 +39,7 @@ def public() -> dict[str, Callable[..., Any]]:
     found: dict[str, Callable[..., Any]] = {}
     homes: dict[Any, str] = {}
     for name, value in _names(wr, ""):
-        if not callable(value) or value in homes:
+        if not callable(value) or value in homes or name in SERVERS:
             continue
         homes[value] = name
         if not inspect.isclass(value):
@@ -190,7 +192,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "sample_receivers": lambda p: {"scene": p.scene, "n": 3, "seed": 0},
     "trace_paths": lambda p: {**TRACE, "mesh_or_scene": p.scene, "receivers": p.receivers[:3], "device": "cpu"},
-    "fit_reflections": lambda p: {
+    "interop.fit_reflections": lambda p: {
         **TRACE, "mesh": p.mesh, "receivers": p.receivers[:4], "csi": np.full(4, 1e-6 + 1e-6j), "order": 1,
     },
     "relevance": lambda p: {**TRACE, "geometry": p.field, "receivers": p.receivers[:2], "device": "cpu"},
@@ -268,6 +270,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         lambda p: p.train.subset([0]), pattern=np.cos(np.linspace(0, np.pi / 2, 19)) ** 8, iterations=20, snapshots=1,
         tolerance=1e-2,
     ),
+    "SpectrumDataset.empty": lambda p: {
+        "transmitter": TRANSMITTER, "frequency_hz": CARRIER, "shape": (12, 24), "beam_sigma_rad": 0.1, "floor": 1e-15,
+    },
     "SpectrumDataset.export_exr": _on(lambda p: p.train, path="one.exr", index=0),
     "SpectrumDataset.from_spectra": lambda p: {
         k: v for k, v in _spectra(p).items() if k not in ("range_db", "polarisation")
@@ -287,6 +292,10 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "RadioField.radio_map": _on(lambda p: p.field, height=1.2, cell=1.0),
     "RadioField.save": _on(lambda p: p.field, path="field.safetensors"),
     "RadioField.spectrum": _on(lambda p: p.field, rx=POINTS[0], transmitter=TRANSMITTER + 0.1),
+    "RadioField.suggest": _on(
+        lambda p: p.field, candidates=POINTS, n=1, arrival=np.full((len(POINTS), 2), 1.5),
+        receive_pattern=np.linspace(1.0, 0.1, 19),
+    ),
     "RadioField.was_fitted_on": lambda p: {"self": p.field, "ds": p.spectra},
     "RadioField.with_gas": _on(lambda p: p.field),
     "Paths": lambda p: _field_of(p.paths),

@@ -121,7 +121,8 @@ def run(options: Options, job: Job) -> Report:
     with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
         figures = lobby.figures(steps)
     figures |= {"seed": job.seed, "reduced": options.reduced, "machine": machine(job.device)}
-    return Report("report", figures, summary(figures), html=partial(page.draw, job.out))
+    look = f"in the browser: warprrf view {job.out} {Path(options.data) / TRUTHS['exact']}"
+    return Report("report", figures, f"{summary(figures)}\n\n{look}", html=partial(page.draw, job.out))
 
 
 def summary(report: dict[str, Any]) -> str:

@@ -68,7 +68,7 @@ FOUND = [
     ("em.slab_transmission", ("thickness_m", "zero"), ("cos_incidence", "zero")),
     ("evaluate", ("beam_width_rad", "tiny")),
     ("evaluate", ("predict", "class")),
-    ("fit_reflections", ("csi", "as list")),
+    ("interop.fit_reflections", ("csi", "as list")),
     ("metrics.beam_gain_loss_db", ("width_rad", "tiny")),
     ("metrics.beam_response", ("width_rad", "tiny")),
     ("metrics.psnr", ("truth", "empty"), ("prediction", "no list")),

@@ -472,7 +472,7 @@ def reflections() -> Values:
         room(), transmitter=TRANSMITTER, receivers=receivers, frequency_hz=3e9, mirror_order=1
     )
     csi = np.where(paths.valid, paths.gain, 0).sum(axis=1)
-    fitted = wr.fit_reflections(mesh, TRANSMITTER, receivers, csi, 3e9, order=1)
+    fitted = wr.interop.fit_reflections(mesh, TRANSMITTER, receivers, csi, 3e9, order=1)
     return {
         "csi": (csi, Check(rtol=1e-6)),
         "predicted": (fitted.predict(receivers), Check(rtol=1e-4, atol=1e-7)),

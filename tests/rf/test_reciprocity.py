@@ -10,8 +10,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from twin_fields import known_field
 
 from warprrf.rf import exact
-from warprrf.rf.em.fresnel import lobe, slab_reflection
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection
 from warprrf.rf.em.materials import Material, load_materials, table_entry
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine

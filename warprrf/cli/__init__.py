@@ -16,17 +16,19 @@ from typing import Any
 import warprrf as wr
 from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add
-from warprrf.cli.steps import add_evaluate, add_fit, add_reconstruct, add_relevance, add_simulate
-from warprrf.cli.views import add_map, add_render, add_twin
+from warprrf.cli.steps import add_evaluate, add_fit, add_reconstruct, add_relevance, add_simulate, add_suggest
+from warprrf.cli.views import add_map, add_render, add_twin, add_view
 
 EPILOG = """\
 a walk through:
   warprrf reconstruct photos/ -o room --known-positions surveyed.json
   warprrf simulate data/lobby/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv
   warprrf fit room spectra.nc -o field.safetensors --model rf3dgs+
+  warprrf suggest field.safetensors candidates.csv -n 3
   warprrf evaluate field.safetensors spectra.nc --train 50
   warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
   warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
+  warprrf view room field.safetensors              in the browser: drag a receiver
   warprrf twin field.safetensors -o twin           scene.xml and materials.json for Sionna RT
 
 Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
@@ -70,7 +72,18 @@ def _parser() -> argparse.ArgumentParser:
         "warprrf",
         "Radio radiance fields from photos and a few radio measurements.",
         EPILOG,
-        (add_reconstruct, add_simulate, add_fit, add_relevance, add_render, add_evaluate, add_map, add_twin),
+        (
+            add_reconstruct,
+            add_simulate,
+            add_fit,
+            add_suggest,
+            add_relevance,
+            add_render,
+            add_evaluate,
+            add_map,
+            add_twin,
+            add_view,
+        ),
     )
 
 

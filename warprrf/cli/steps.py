@@ -272,6 +272,49 @@ def _training_set(path: str, args: argparse.Namespace) -> wr.SpectrumDataset | w
     return dataset.subset(training) if training.any() else dataset
 
 
+def add_suggest(add: Add) -> None:
+    """Define `suggest`."""
+    sug = add("suggest", _suggest)
+    sug.add_argument(
+        "source", help="a field (.safetensors), or geometry as of `warprrf fit` before any measurement"
+    )
+    sug.add_argument("candidates", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")
+    sug.add_argument("-n", type=int, default=1, help="how many (default 1)")
+    add_out(sug, "CSV file of the places chosen, best first", required=False)
+    add_point(sug, "--transmitter", "metres; of geometry")
+    sug.add_argument("--carrier", type=float, metavar="HZ", help="carrier frequency; of geometry")
+    sug.add_argument("--mesh", help="mesh for line of sight, where SOURCE is splats")
+    add_mesh_options(sug)
+    add_scene_options(sug)
+
+
+def _suggest(args: argparse.Namespace, bars: Bars) -> None:
+    """Where to measure next: the candidates whose spectra lower the expected error most.
+
+    A field knows where it was fitted. Before any measurement surfaces are taken for what ITU-R P.2040 says of building
+    materials; give the transmitter and the carrier then.
+
+    examples:
+      warprrf suggest room.glb candidates.csv -n 3 --transmitter 13.6 11.2 2.5 --carrier 300e9
+      warprrf suggest field.safetensors candidates.csv -n 3 -o next.csv
+    """
+    places, source = read_receivers(args.candidates), existing(args.source)
+    if source.suffix == ".safetensors":
+        field = wr.RadioField.load(source, device=args.device)
+    else:
+        for flag in ("transmitter", "carrier"):
+            if getattr(args, flag) is None:
+                raise ValueError(f"--{flag}: {source} needs it, it is no field")
+        nothing = wr.SpectrumDataset.empty(transmitter=args.transmitter, frequency_hz=args.carrier)
+        field = wr.RadioField.fit(load_geometry(args.source, args.mesh, args), nothing, device=args.device)
+    chosen = places[field.suggest(places, args.n, progress=bars)]
+    bars.close()
+    rows = "\n".join(",".join(f"{x:g}" for x in place) for place in chosen)
+    print(rows)
+    if args.out:
+        write_text(args.out, f"x,y,z\n{rows}\n")
+
+
 def add_evaluate(add: Add) -> None:
     """Define `evaluate`."""
     eva = add("evaluate", _evaluate)

@@ -1,8 +1,9 @@
-"""`warprrf render`, `map`, `twin`: what a field or a reconstruction gives to look at and to take elsewhere."""
+"""`warprrf view`, `render`, `map`, `twin`: what a field or a reconstruction gives to look at and to take elsewhere."""
 
 from __future__ import annotations
 
 import argparse
+import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,42 @@ def _look_at(
     return wr.Camera.pinhole(
         *size, fx=focal, fy=focal, cx=0.5 * size[0], cy=0.5 * size[1], world_to_camera=world_to_camera
     )
+
+
+def add_view(add: Add) -> None:
+    """Define `view`."""
+    viewer = add("view", _view)
+    viewer.add_argument(
+        "things",
+        nargs="+",
+        help="folder of a reconstruction or of `make lobby`, mesh, scene, field or spectra",
+    )
+    viewer.add_argument(
+        "--port", type=int, default=8080, help="of the page; the next free one if taken (default 8080)"
+    )
+    viewer.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default 127.0.0.1: this machine alone)"
+    )
+    viewer.add_argument("--no-browser", action="store_true", help="only say where the page is")
+
+
+def _view(args: argparse.Namespace, bars: Bars) -> None:
+    """Everything in the browser: drag a receiver, see its spectrum, paths, delays and errors.
+
+    Ctrl-C ends it.
+
+    examples:
+      warprrf view runs/lobby data/lobby/spectra.nc      what `make lobby` made, the truth beside it
+      warprrf view room.glb field.safetensors
+    """
+    viewer = wr.view(*args.things, host=args.host, port=args.port)
+    print(f"{viewer.url}   (Ctrl-C ends it)", flush=True)
+    if not args.no_browser:
+        webbrowser.open(viewer.url)
+    try:
+        viewer.serve()
+    finally:
+        viewer.close()
 
 
 def add_map(add: Add) -> None:

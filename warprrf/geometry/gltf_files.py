@@ -1,31 +1,39 @@
-"""glTF 2.0 files, text or binary (GLB), by trimesh, which no other module touches.
+"""glTF 2.0 files, text or binary (GLB): the triangles of the default scene in their places, with names and colours.
 
-A file's tables are held against what is there before trimesh reads them, and what it would pass over is an error: parts
-outside their buffers, compressed or sparse data, nodes in circles. Files are found by us: names don't leave the folder.
+What a file's tables state is held against what is there before it is read; what is not read is an error: compressed or
+sparse data, fans, nodes in circles. Files that it names are found by us: they don't leave the folder.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
-import io
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from warprrf.device import require
-from warprrf.geometry.mesh_colours import read_picture, sampled, to_srgb
-from warprrf.geometry.mesh_content import LARGEST_FACES, Folder, MeshContent, material_name, numbered
+from warprrf.geometry.mesh_content import (
+    LARGEST_FACES,
+    Folder,
+    MeshContent,
+    material_name,
+    numbered,
+    read_picture,
+    sampled,
+    to_srgb,
+)
 
-_SIZES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}  # bytes of a component
-_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_FLOAT = 5126
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_JSON = 0x4E4F534A  # kind of the chunk that holds the header
 _HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_texture_transform", "EXT_texture_webp", "KHR_xmp")
 """Beginnings of the names of extensions that do not change where surfaces are."""
 
@@ -40,190 +48,211 @@ def read_gltf(folder: Folder) -> MeshContent:
     Warns:
         UserWarning: if a texture is missing: those colours stay unknown.
     """
-    path = folder.path
-    trimesh = require("trimesh", extra="mesh")
     try:
-        header, binary = _split(path)
-        buffers = _buffers(header, binary, folder)
-        _check(header, buffers)
-        colours = [_base_colour(header, k, buffers, folder) for k in range(len(header.get("materials", [])))]
-        text = json.dumps(_prepared(header)).encode()
-        held = {f"buffer-{k}": data for k, data in enumerate(buffers)}
-        scene = trimesh.load(io.BytesIO(text), file_type="gltf", resolver=held, process=False, force="scene")
-        return _joined(scene, [*colours, _Colour(None, np.ones(3))])
+        return _joined(_File(folder))
     except (ImportError, OSError, MemoryError):
         raise
-    except Exception as error:  # trimesh raises whatever its parsers trip over
+    except Exception as error:  # a header may hold anything in place of anything
         told = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        told = str(told).removeprefix(f"path: {path} ")
-        raise ValueError(f"path: {path} is not a readable mesh: {told}") from error
+        told = str(told).removeprefix(f"path: {folder.path} ")
+        raise ValueError(f"path: {folder.path} is not a readable mesh: {told}") from error
 
 
 @dataclass(frozen=True)
-class _Colour:
-    """A material's name, its linear colour (3,), and the picture that it is multiplied with."""
+class _Material:
+    """A name, a linear colour (3,), and the picture that it is multiplied with."""
 
     name: str | None
     factor: np.ndarray
     picture: np.ndarray | None = None
 
 
+_Part = tuple[str | None, np.ndarray, np.ndarray, np.ndarray]
+"""Of a mesh: a material's name, positions (V, 3), corners (F, 3) and linear colours (F, 3) of its triangles."""
+
+
+class _File:
+    """The header and the buffers of a file; its rows are read when they are asked for."""
+
+    def __init__(self, folder: Folder) -> None:
+        self.folder = folder
+        self.header, binary = _split(folder.path)
+        unread = [x for x in self.header.get("extensionsRequired", []) if not str(x).startswith(_HARMLESS)]
+        if unread:
+            raise ValueError(f"it needs the extension {', '.join(unread)}; export it without compression")
+        self.buffers = []
+        for k, buffer in enumerate(self.header.get("buffers", [])):
+            data = self.file(buffer["uri"]) if "uri" in buffer else binary if k == 0 else None
+            if data is None or len(data) < buffer["byteLength"]:
+                raise ValueError(
+                    f"buffer {k} is not there, or shorter than the {buffer['byteLength']} bytes stated"
+                )
+            self.buffers.append(data)
+        self.material = lru_cache(None)(self._material)
+        self.parts = lru_cache(None)(self._parts)
+
+    def file(self, uri: str) -> bytes:
+        """What a URI gives: data in itself, or a file's content."""
+        if not uri.startswith("data:"):
+            return self.folder.find(unquote(uri)).read_bytes()
+        return base64.b64decode(uri.partition("base64,")[2], validate=True)
+
+    def row(self, table: str, index: object) -> dict[str, Any]:
+        """One row of a table of the header."""
+        rows = self.header.get(table, [])
+        if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(rows):
+            raise ValueError(f"it names {table} {index!r} of {len(rows)}")
+        return dict(rows[index])
+
+    def view(self, index: object) -> bytes:
+        """The bytes of a buffer view."""
+        row = self.row("bufferViews", index)
+        self.row("buffers", row["buffer"])
+        data, start = self.buffers[row["buffer"]], row.get("byteOffset", 0)
+        _check_span(f"buffer view {index}", start, row["byteLength"], len(data))
+        return data[start : start + row["byteLength"]]
+
+    def numbers(self, index: object) -> np.ndarray:
+        """The numbers of an accessor, shape ``(count, width)``."""
+        row = self.row("accessors", index)
+        if "sparse" in row or "bufferView" not in row:
+            raise ValueError(f"accessor {index} is sparse or without data; export it without compression")
+        data, given = self.view(row["bufferView"]), self.row("bufferViews", row["bufferView"])
+        kind, width = np.dtype(_TYPES[row["componentType"]]), _WIDTHS[row["type"]]
+        item = kind.itemsize * width
+        stride = given.get("byteStride", item)
+        if not isinstance(stride, int) or not item <= stride <= max(item, 252):
+            raise ValueError(f"accessor {index} has items of {item} bytes every {stride!r} bytes")
+        start, length = row.get("byteOffset", 0), stride * (row["count"] - 1) + item
+        _check_span(f"accessor {index}", start, length, len(data))
+        return np.ndarray((row["count"], width), kind, data, start, (stride, kind.itemsize))
+
+    def _parts(self, mesh: int) -> list[_Part]:
+        """The triangles of a mesh; points and lines are left out."""
+        kinds, found = (_TRIANGLES, _STRIP, _FAN), []
+        for primitive in self.row("meshes", mesh)["primitives"]:
+            if primitive.get("mode", _TRIANGLES) in kinds:
+                try:
+                    found.append(self._part(primitive))
+                except ValueError as error:
+                    raise ValueError(f"mesh {mesh}: {error}") from error
+        return found
+
+    def _part(self, primitive: Mapping[str, Any]) -> _Part:
+        of_vertices = {name: self.numbers(index) for name, index in primitive["attributes"].items()}
+        positions = of_vertices["POSITION"]
+        for name, values in of_vertices.items():
+            if len(values) != len(positions):
+                raise ValueError(f"{len(values)} of {name} for {len(positions)} vertices")
+        if positions.shape[1] != 3 or positions.dtype.kind != "f":
+            raise ValueError("positions are no triples of numbers, or compressed")
+        index = np.arange(len(positions))[:, None]
+        if "indices" in primitive:
+            index = self.numbers(primitive["indices"])
+        if index.shape[1] != 1 or index.dtype.kind == "f":
+            raise ValueError("indices are no whole numbers")
+        corners = _corners(index[:, 0].astype(np.int64), primitive.get("mode", _TRIANGLES))
+        if corners.max(initial=-1) >= len(positions) or corners.min(initial=0) < 0:
+            raise ValueError(f"indices reach {corners.max()}, of {len(positions)} vertices")
+        material, channel = _Material(None, np.ones(3)), 0
+        if "material" in primitive:
+            material = self.material(primitive["material"])
+            channel = _texture(self.row("materials", primitive["material"])).get("texCoord", 0)
+        uv, own = of_vertices.get(f"TEXCOORD_{channel}"), of_vertices.get("COLOR_0")
+        colours = np.tile(material.factor, (len(corners), 1))
+        if uv is not None and material.picture is not None:
+            if uv.dtype.kind != "f" or not np.isfinite(uv).all():
+                raise ValueError("texture coordinates are compressed, or not finite")
+            upward = np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]).astype(np.float64)
+            colours *= sampled(material.picture, upward[corners])
+        elif own is None and material.name is None and (material.factor == 1.0).all():
+            colours[:] = np.nan  # white is what a file says that says nothing
+        if own is not None:
+            most = np.iinfo(own.dtype).max if own.dtype.kind in "iu" else 1
+            colours *= (own[:, :3].astype(np.float64) / most)[corners].mean(axis=1).clip(0.0, 1.0)
+        return material.name, positions.astype(np.float64), corners, colours
+
+    def _material(self, index: int) -> _Material:
+        material, path = self.row("materials", index), self.folder.path
+        factor = np.array(
+            material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0] * 4), dtype=np.float64
+        )
+        if factor.shape != (4,) or not np.isfinite(factor).all():
+            raise ValueError(f"material {index} has the colour {factor}, expected four numbers")
+        name, entry, picture = material.get("name"), _texture(material), None
+        if entry and self.folder.colours:
+            texture = self.row("textures", entry["index"])
+            webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
+            image = self.row("images", texture.get("source", webp))
+            try:
+                data = self.file(image["uri"]) if "uri" in image else self.view(image.get("bufferView"))
+                picture = read_picture(data, f"texture of material {name or index}")
+            except FileNotFoundError as error:
+                warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=8)
+                factor = np.full(4, np.nan)
+        if "KHR_texture_transform" in entry.get("extensions", {}):
+            warnings.warn(
+                f"path: {path}: material {name or index} turns or repeats its texture by KHR_texture_transform, "
+                "which is not read: colours of its faces may be off",
+                UserWarning,
+                stacklevel=8,
+            )
+        return _Material(material_name(name, picture is not None), factor[:3], picture)
+
+    def instances(self) -> Iterator[tuple[str, np.ndarray, list[_Part]]]:
+        """Name, place (4, 4) and parts of every node of the default scene that has a mesh."""
+        roots = self.row("scenes", self.header.get("scene", 0)).get("nodes", [])
+        todo, met = [(index, np.eye(4)) for index in reversed(roots)], set[int]()
+        while todo:
+            index, above = todo.pop()
+            node = self.row("nodes", index)
+            if index in met:
+                raise ValueError("a node has two parents, or its own children above it")
+            met.add(index)
+            place = above @ _transform(node)
+            todo += [(child, place) for child in reversed(node.get("children", []))]
+            if "mesh" in node:
+                self.row("meshes", node["mesh"])
+                yield str(node.get("name", "node")), place, self.parts(node["mesh"])
+
+
 def _split(path: Path) -> tuple[dict[str, Any], bytes | None]:
     """The header, and the binary chunk of a GLB file."""
     data, binary = path.read_bytes(), None
     if data[:4] == b"glTF":
-        version, length = np.frombuffer(data[4:12], "<u4")
-        if version != 2 or length != len(data):
-            raise ValueError(f"it states version {version} and {length} bytes, expected 2 and {len(data)}")
-        text, place = b"", 12
-        while place < len(data):
-            size, kind = (int(x) for x in np.frombuffer(data[place : place + 8], "<u4"))
-            chunk = data[place + 8 : place + 8 + size]
-            if len(chunk) != size:
-                raise ValueError("it is cut short within a chunk")
-            if kind == 0x4E4F534A and not text:
-                text = chunk
-            elif kind == 0x004E4942 and binary is None:
-                binary = chunk
-            place += 8 + size
-        data = text
+        version, whole, size, kind = np.frombuffer(data[4:20], "<u4").tolist()
+        if version != 2 or whole != len(data):
+            raise ValueError(f"it states version {version} and {whole} bytes, expected 2 and {len(data)}")
+        rest = data[20 + size :]
+        if (
+            kind != _JSON
+            or 20 + size > len(data)
+            or rest
+            and 8 + int.from_bytes(rest[:4], "little") > len(rest)
+        ):
+            raise ValueError("it is cut short within a chunk, or does not begin with its header")
+        data, binary = data[20 : 20 + size], rest[8:]
     header = json.loads(data.decode("utf-8"))
     if not isinstance(header, dict) or not str(header.get("asset", {}).get("version", "")).startswith("2."):
         raise ValueError("it states no glTF version 2 (asset.version)")
     return header, binary
 
 
-def _content(uri: str, folder: Folder) -> bytes:
-    """What a URI gives: data in itself, or a file's content."""
-    if not uri.startswith("data:"):
-        return folder.read(uri)
-    try:
-        return base64.b64decode(uri.partition("base64,")[2], validate=True)
-    except binascii.Error as error:
-        raise ValueError(f"data in a URI: {error}") from error
-
-
-def _buffers(header: Mapping[str, Any], binary: bytes | None, folder: Folder) -> list[bytes]:
-    found = []
-    for k, buffer in enumerate(header.get("buffers", [])):
-        data = _content(buffer["uri"], folder) if "uri" in buffer else binary if k == 0 else None
-        if data is None or len(data) < buffer["byteLength"]:
-            raise ValueError(
-                f"buffer {k} is not there, or shorter than the {buffer['byteLength']} bytes stated"
-            )
-        found.append(data)
-    return found
-
-
-def _row(table: Mapping[str, Any], name: str, index: object) -> dict[str, Any]:
-    """One row of a table of the header."""
-    rows = table.get(name, [])
-    if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(rows):
-        raise ValueError(f"it names {name} {index!r} of {len(rows)}")
-    return dict(rows[index])
-
-
-def _span(what: str, start: object, length: object, whole: int) -> None:
+def _check_span(what: str, start: object, length: object, whole: int) -> None:
     numbers = [x for x in (start, length) if isinstance(x, int) and not isinstance(x, bool) and x >= 0]
     if len(numbers) < 2 or sum(numbers) > whole:
         raise ValueError(f"{what} states {length!r} bytes from {start!r} on, of {whole}")
 
 
-def _check(header: Mapping[str, Any], buffers: list[bytes]) -> None:
-    """Hold the header's tables against each other and the buffers."""
-    unread = [x for x in header.get("extensionsRequired", []) if not str(x).startswith(_HARMLESS)]
-    if unread:
-        raise ValueError(f"it needs the extension {', '.join(unread)}; export it without compression")
-    for k, view in enumerate(header.get("bufferViews", [])):
-        _row(header, "buffers", view["buffer"])
-        _span(f"buffer view {k}", view.get("byteOffset", 0), view["byteLength"], len(buffers[view["buffer"]]))
-    for k, accessor in enumerate(header.get("accessors", [])):
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError(f"accessor {k} is sparse or without data; export it without compression")
-        view = _row(header, "bufferViews", accessor["bufferView"])
-        item = _SIZES[accessor["componentType"]] * _COMPONENTS[accessor["type"]]
-        stride = view.get("byteStride", item)
-        if not isinstance(stride, int) or not item <= stride <= 252 and "byteStride" in view:
-            raise ValueError(f"accessor {k} has items of {item} bytes every {stride!r} bytes")
-        length = stride * (accessor["count"] - 1) + item
-        _span(f"accessor {k}", accessor.get("byteOffset", 0), length, view["byteLength"])
-    for k, mesh in enumerate(header.get("meshes", [])):
-        for primitive in mesh["primitives"]:
-            _check_primitive(header, k, primitive)
-    _check_nodes(header)
-
-
-def _check_primitive(header: Mapping[str, Any], mesh: int, primitive: Mapping[str, Any]) -> None:
-    if primitive.get("mode", _TRIANGLES) == _FAN:
-        raise ValueError(f"mesh {mesh} is of fans of triangles; export it as triangles")
-    rows = {name: _row(header, "accessors", index) for name, index in primitive["attributes"].items()}
-    position = rows["POSITION"]
-    if position["type"] != "VEC3" or position.get("normalized"):
-        raise ValueError(f"positions of mesh {mesh} are {position['type']}, or compressed")
-    for name, row in rows.items():
-        if name.startswith("TEXCOORD") and row["componentType"] != _FLOAT:
-            raise ValueError(f"texture coordinates of mesh {mesh} are compressed; export them as numbers")
-        if row["count"] != position["count"]:
-            raise ValueError(f"mesh {mesh} has {row['count']} of {name} for {position['count']} vertices")
-    if "indices" in primitive:
-        row = _row(header, "accessors", primitive["indices"])
-        if row["type"] != "SCALAR" or row["componentType"] not in (5121, 5123, 5125):
-            raise ValueError(f"indices of mesh {mesh} are no whole numbers")
-    if "material" in primitive:
-        _row(header, "materials", primitive["material"])
-
-
-def _check_nodes(header: Mapping[str, Any]) -> None:
-    """Each node has one parent at most, and the instances are not too many."""
-    nodes = header.get("nodes", [])
-    children = [child for node in nodes for child in node.get("children", [])]
-    roots = _row(header, "scenes", header.get("scene", 0)).get("nodes", [])
-    for index in (*children, *roots):
-        _row(header, "nodes", index)
-    if len({*children, *roots}) < len(children) + len(set(roots)):
-        raise ValueError("a node has two parents, or its own children above it")
-    total = 0
-    for node in nodes:
-        mesh = _row(header, "meshes", node["mesh"]) if "mesh" in node else {"primitives": []}
-        for primitive in mesh["primitives"]:
-            corners = primitive.get("indices", primitive["attributes"]["POSITION"])
-            total += header["accessors"][corners]["count"] // 3
-    if total > LARGEST_FACES:
-        raise ValueError(f"it makes {total} triangles, expected at most {LARGEST_FACES}")
-
-
-def _prepared(header: Mapping[str, Any]) -> dict[str, Any]:
-    """What trimesh is given: geometry alone, each material a number in its name, the last for what has none."""
-    materials = header.get("materials", [])
-    keep = {
-        name: header[name]
-        for name in ("asset", "bufferViews", "accessors", "scenes", "scene")
-        if name in header
-    }
-    meshes = []
-    for k, mesh in enumerate(header.get("meshes", [])):
-        primitives = []
-        for primitive in mesh["primitives"]:
-            own = primitive.get("material", len(materials))
-            channel = _texture(materials[own] if own < len(materials) else {}).get("texCoord", 0)
-            attributes = primitive["attributes"]
-            taken = {"POSITION": "POSITION", "COLOR_0": "COLOR_0", "TEXCOORD_0": f"TEXCOORD_{channel}"}
-            part = {name: primitive[name] for name in ("indices", "mode") if name in primitive}
-            part["attributes"] = {name: attributes[of] for name, of in taken.items() if of in attributes}
-            primitives.append(part | {"material": own})
-        meshes.append({"name": f"mesh {k}", "primitives": primitives})
-    nodes = []
-    for k, node in enumerate(header.get("nodes", [])):
-        part = {name: node[name] for name in node if name in _NODE}
-        nodes.append(part | {"name": f"{node.get('name', 'node')}#{k}"})
-    return keep | {
-        "buffers": [{**b, "uri": f"buffer-{k}"} for k, b in enumerate(header.get("buffers", []))],
-        "materials": [{"name": str(k)} for k in range(len(materials) + 1)],
-        "meshes": meshes, "nodes": nodes,
-    }  # fmt: skip
-
-
-_NODE = ("mesh", "children", "matrix", "translation", "rotation", "scale")
+def _corners(index: np.ndarray, mode: int) -> np.ndarray:
+    """Triangles (F, 3) of a list or a strip."""
+    if mode == _FAN:
+        raise ValueError("it is of fans of triangles; export it as triangles")
+    if mode == _TRIANGLES:
+        return index.reshape(-1, 3)
+    strip = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
+    strip[1::2, :2] = strip[1::2, 1::-1]
+    return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
 
 
 def _texture(material: Mapping[str, Any]) -> dict[str, Any]:
@@ -231,92 +260,39 @@ def _texture(material: Mapping[str, Any]) -> dict[str, Any]:
     return dict(material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}))
 
 
-def _base_colour(header: Mapping[str, Any], index: int, buffers: list[bytes], folder: Folder) -> _Colour:
-    """A material's name and colour."""
-    material = header["materials"][index]
-    factor = np.array(
-        material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0] * 4), dtype=np.float64
-    )
-    if factor.shape != (4,) or not np.isfinite(factor).all():
-        raise ValueError(f"material {index} has the colour {factor}, expected four numbers")
-    name, entry = material.get("name"), _texture(material)
-    picture = None
-    if entry and folder.colours:
-        texture = _row(header, "textures", entry["index"])
-        webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
-        image = _row(header, "images", texture.get("source", webp))
-        try:
-            picture = read_picture(
-                _image(header, image, buffers, folder), f"texture of material {name or index}"
-            )
-        except FileNotFoundError as error:
-            warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=5)
-            factor = np.full(4, np.nan)
-    if "KHR_texture_transform" in entry.get("extensions", {}):
-        warnings.warn(
-            f"path: {folder.path}: material {name or index} turns or repeats its texture by KHR_texture_transform, "
-            "which is not read: colours of its faces may be off",
-            UserWarning,
-            stacklevel=5,
-        )
-    return _Colour(material_name(name, picture is not None), factor[:3], picture)
+def _transform(node: Mapping[str, Any]) -> np.ndarray:
+    """A node's place in the one above it, shape ``(4, 4)``."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    place = np.eye(4)
+    scale = np.array(node.get("scale", (1.0, 1.0, 1.0)), dtype=np.float64).reshape(3)
+    place[:3, :3] = Rotation.from_quat(node.get("rotation", (0.0, 0.0, 0.0, 1.0))).as_matrix() * scale
+    place[:3, 3] = np.array(node.get("translation", (0.0, 0.0, 0.0)), dtype=np.float64).reshape(3)
+    return place
 
 
-def _image(
-    header: Mapping[str, Any], image: Mapping[str, Any], buffers: list[bytes], folder: Folder
-) -> bytes:
-    if "uri" in image:
-        return _content(image["uri"], folder)
-    view = _row(header, "bufferViews", image.get("bufferView"))
-    start = view.get("byteOffset", 0)
-    return buffers[view["buffer"]][start : start + view["byteLength"]]
-
-
-def _joined(scene: Any, colours: list[_Colour]) -> MeshContent:
+def _joined(file: _File) -> MeshContent:
     """All instances as one mesh."""
-    vertices, faces, linear, materials, objects, counts = [], [], [], [], [], []
-    start = 0
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        part = scene.geometry[name]
-        if not hasattr(part, "faces"):  # lines and points
-            continue
-        corner = np.asarray(part.faces, dtype=np.int64).reshape(-1, 3)
-        if corner.max(initial=-1) >= len(part.vertices) or corner.min(initial=0) < 0:
-            raise ValueError(f"indices of {name} reach {corner.max()}, of {len(part.vertices)} vertices")
-        material = colours[int(part.visual.material.name)]
-        linear.append(_face_colours(part, corner, material))
-        turned = corner[:, ::-1] if np.linalg.det(transform[:3, :3]) < 0 else corner
-        vertices.append(np.asarray(part.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3])
-        faces.append(turned + start)
-        start += len(part.vertices)
-        materials.append(material.name)
-        objects.append(str(node).rpartition("#")[0] or str(node))
-        counts.append(len(corner))
+    vertices, faces, colours, materials, objects, counts = [], [], [], [], [], []
+    start = total = 0
+    for name, place, parts in file.instances():
+        for material, positions, corners, colour in parts:
+            total += len(corners)
+            if total > LARGEST_FACES:
+                raise ValueError(f"it makes more than {LARGEST_FACES} triangles")
+            vertices.append(positions @ place[:3, :3].T + place[:3, 3])
+            faces.append((corners[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else corners) + start)
+            start += len(positions)
+            colours.append(colour)
+            materials.append(material)
+            objects.append(name)
+            counts.append(len(corners))
     if not faces:
         raise ValueError("its default scene holds no triangles")
-    colour = np.concatenate(linear)
-    names, parts = numbered(materials, counts), numbered(objects, counts)
+    colour = np.concatenate(colours)
+    names, things = numbered(materials, counts), numbered(objects, counts)
     return MeshContent(
         np.concatenate(vertices), np.concatenate(faces).astype(np.int32),
         face_colours=None if np.isnan(colour).all() else to_srgb(colour).astype(np.float32),
-        face_material=names[0], material_names=names[1], face_object=parts[0], object_names=parts[1],
+        face_material=names[0], material_names=names[1], face_object=things[0], object_names=things[1],
     )  # fmt: skip
-
-
-def _face_colours(part: Any, corner: np.ndarray, material: _Colour) -> np.ndarray:
-    """Linear colours (F, 3): the factor, times the texture and the vertices' where there are any; NaN where nothing is."""
-    colour = np.broadcast_to(material.factor, (len(corner), 3)).copy()
-    uv, vertex = part.visual.uv, part.visual.vertex_attributes.get("color")
-    plain = material.picture is None or uv is None
-    if material.picture is not None and uv is not None:
-        if not np.isfinite(uv).all():
-            raise ValueError("texture coordinates that are not finite")
-        colour *= sampled(material.picture, np.asarray(uv, dtype=np.float64)[corner])
-    if vertex is not None:
-        held = np.asarray(vertex)
-        most = np.iinfo(held.dtype).max if held.dtype.kind in "iu" else 1
-        colour *= (held[:, :3].astype(np.float64) / most)[corner].mean(axis=1).clip(0.0, 1.0)
-    elif plain and material.name is None and (material.factor == 1.0).all():
-        colour[:] = np.nan  # white is what a file says that says nothing
-    return colour

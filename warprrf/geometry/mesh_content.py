@@ -1,18 +1,24 @@
-"""What a mesh file holds, whatever its format, and the files beside it that it names."""
+"""What a mesh file holds, whatever its format, the files beside it that it names, and colours of its faces.
+
+Colours are those of a photo, sRGB with its transfer curve (IEC 61966-2-1) in [0, 1], averaged in linear light.
+"""
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
+from warprrf.device import require
+
 LARGEST_BYTES = 4 << 30
 LARGEST_FACES = 50_000_000
+PARTS = 4  # along a triangle's edge, where its texture is sampled
 _PAGE = re.compile(
     r"(default|material|mat|texture|tex|atlas|page|mesh|scan)?[ ._-]*(mat|material)?[ ._-]*\d*", re.I
 )
@@ -77,31 +83,31 @@ class Folder:
     allow_outside: bool = False
     colours: bool = True
 
-    def read(self, name: str) -> bytes:
+    def find(self, name: str | None) -> Path:
         """The file that the model names.
 
         Raises:
             FileNotFoundError: if it is missing.
-            ValueError: if it lies outside the model's folder, or is too large.
+            ValueError: if there is no such name, it lies outside the model's folder, or is too large.
         """
-        base, place = self.path.parent, self.path.parent / unquote(name).replace("\\", "/")
+        base, place = self.path.parent, self.path.parent / (name or "").replace("\\", "/")
         try:
             outside = not place.resolve().is_relative_to(base.resolve())
             there = place.is_file()
         except (OSError, ValueError) as error:  # a name of bytes that no file can have
-            raise ValueError(f"path: {self.path} names a file {name[:200]!r}: {error}") from error
+            raise ValueError(f"path: {self.path} names a file {name!r:.200}: {error}") from error
         if outside and not self.allow_outside:
             raise ValueError(
-                f"path: {self.path} names the file {name[:200]!r}, which lies outside its folder; move it there, or "
+                f"path: {self.path} names the file {name!r:.200}, which lies outside its folder; move it there, or "
                 "trust the model and load it with allow_outside=True"
             )
         if not there:
             raise FileNotFoundError(
-                f"path: {self.path} needs the file {name[:200]!r} beside it, which is missing"
+                f"path: {self.path} needs the file {name!r:.200} beside it, which is missing"
             )
         if place.stat().st_size > LARGEST_BYTES:
             raise ValueError(f"path: {self.path} names {place} of more than {LARGEST_BYTES} bytes")
-        return place.read_bytes()
+        return place
 
 
 def numbered(names: Sequence[str | None], counts: Sequence[int]) -> tuple[np.ndarray | None, tuple[str, ...]]:
@@ -115,3 +121,49 @@ def numbered(names: Sequence[str | None], counts: Sequence[int]) -> tuple[np.nda
 def material_name(name: str | None, textured: bool) -> str | None:
     """The name of a material, None where it says nothing: scanners number the pages of their texture ``material_3``."""
     return None if not name or (textured and _PAGE.fullmatch(name)) else name
+
+
+def read_picture(data: bytes, what: str) -> np.ndarray:
+    """A picture's pixels, ``(H, W, 3)`` uint8, first row on top.
+
+    Raises:
+        ValueError: naming it by ``what``, if it cannot be read.
+    """
+    pillow = require("PIL.Image", extra="mesh")
+    try:
+        with pillow.open(io.BytesIO(data)) as picture:
+            return np.asarray(picture.convert("RGB"))
+    except (OSError, ValueError, SyntaxError, EOFError, pillow.DecompressionBombError) as error:
+        raise ValueError(f"{what}: no picture that can be read: {error}") from error
+
+
+def to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values (IEC 61966-2-1)."""
+    x = np.asarray(srgb, dtype=np.float64).clip(0.0, 1.0)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def to_srgb(linear: np.ndarray) -> np.ndarray:
+    """sRGB values of linear light, NaN where that is unknown."""
+    x = np.asarray(linear, dtype=np.float64).clip(0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
+
+
+def sampled(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Mean linear colour of triangles ``uv`` (F, 3, 2) of a picture that repeats, v upward, shape ``(F, 3)``.
+
+    It is taken at the centres of sixteen equal parts of each triangle.
+    """
+    height, width = picture.shape[:2]
+    curve = to_linear(np.arange(256) / 255.0)
+    place = np.array([(i, j) for i in range(PARTS) for j in range(PARTS - i)], dtype=np.float64)
+    up = (place + 1 / 3) / PARTS  # centres of the parts that point as the triangle does, and of the others
+    down = (place[place.sum(axis=1) < PARTS - 1] + 2 / 3) / PARTS
+    centres = np.concatenate([up, down])
+    total = np.zeros((len(uv), 3))
+    for weight in np.column_stack([centres, 1.0 - centres.sum(axis=1)]):
+        at = np.einsum("k,fkc->fc", weight, uv) % 1.0
+        column = np.minimum((at[:, 0] * width).astype(np.int64), width - 1)
+        row = np.minimum(((1.0 - at[:, 1]) * height).astype(np.int64), height - 1)
+        total += curve[picture[row, column]]
+    return total / len(centres)

@@ -19,8 +19,7 @@ from warprrf.checks import LARGEST_M, check_array, check_count
 from warprrf.files import write_bytes
 from warprrf.geometry import o3d
 from warprrf.geometry.gltf_files import read_gltf
-from warprrf.geometry.mesh_colours import to_linear, to_srgb
-from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent
+from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent, to_linear, to_srgb
 from warprrf.geometry.obj_files import obj_bytes, read_obj
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
 

@@ -13,8 +13,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from warprrf.geometry.mesh_colours import read_picture, sampled, to_linear, to_srgb
-from warprrf.geometry.mesh_content import Folder, MeshContent, material_name, numbered
+from warprrf.geometry.mesh_content import (
+    Folder,
+    MeshContent,
+    material_name,
+    numbered,
+    read_picture,
+    sampled,
+    to_linear,
+    to_srgb,
+)
 
 _CHECKSUM = b"# warprrf sha256 "  # the comment that begins an OBJ file of ours: a letter there may be a face
 _STATEMENTS = {
@@ -172,7 +180,7 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
     """The materials of an MTL file by name."""
     known: dict[str, _Material] = {}
     name: str | None = None
-    for number, words in _statements(folder.read(library).decode("utf-8", "replace")):
+    for number, words in _statements(folder.find(library).read_bytes().decode("utf-8", "replace")):
         try:
             match words:
                 case ["newmtl", *parts]:
@@ -183,7 +191,9 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
                     known[name] = _Material(colour, known[name].picture)
                 case ["map_Kd", *parts] if name is not None and parts:
                     file = parts[-1] if parts[0].startswith("-") else " ".join(parts)
-                    picture = read_picture(folder.read(file), f"path: {folder.path}, texture {file}")
+                    picture = read_picture(
+                        folder.find(file).read_bytes(), f"path: {folder.path}, texture {file}"
+                    )
                     known[name] = _Material(known[name].colour, picture)
         except FileNotFoundError as error:
             warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=5)

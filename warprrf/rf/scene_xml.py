@@ -15,11 +15,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from warprrf.checks import LARGEST_M
+from warprrf.geometry.mesh_content import Folder
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.rf.em.itu import DEFAULT_THICKNESS_M, ITU_BANDS, itu_material, itu_name
 from warprrf.rf.em.materials import Material
@@ -54,7 +55,6 @@ class _SceneFile:
 
     def __init__(self, path: Path, choice: MaterialChoice, allow_outside: bool) -> None:
         self.path, self.choice, self.allow_outside = path, choice, allow_outside
-        self.folder = path.parent.resolve()
         self.top = list(self._included(path, 0))
         self._replace_names()
         self.bsdfs = {e.get("id"): e for e in self.top if e.tag == "bsdf" and e.get("id") is not None}
@@ -97,17 +97,12 @@ class _SceneFile:
 
     def _file(self, filename: str | None, what: str) -> Path:
         """The file of this name, relative to the scene's folder."""
-        if not filename or "\0" in filename:
+        if not filename:
             raise ValueError(f"path: {self.path} gives no name of {what}")
-        found = self.path.parent / filename
-        if not self.allow_outside and not found.resolve().is_relative_to(self.folder):
-            raise ValueError(
-                f"path: {self.path}: {what} is {filename}, which lies outside the scene's folder; move it there, or "
-                "trust the scene and load it with allow_outside=True"
-            )
-        if not found.is_file():
-            raise FileNotFoundError(f"path: {self.path}: {what} is {found}, which is missing")
-        return found
+        try:
+            return Folder(self.path, self.allow_outside).find(filename)
+        except (ValueError, FileNotFoundError) as error:
+            raise type(error)(f"path: {what}: {str(error).removeprefix('path: ')}") from error
 
     def _replace_names(self) -> None:
         """Put the values of ``default`` elements where attributes hold their ``$names``."""
@@ -221,31 +216,32 @@ def read_xml(path: Path) -> Element:
     """
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"path: {path} has {path.stat().st_size} bytes, expected at most {MOST_BYTES}")
-    builder, depth = ElementTree.TreeBuilder(), 0
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > MOST_NESTED:
-            raise ValueError(f"path: {path} is nested more than {MOST_NESTED} deep")
-        builder.start(tag, attributes)
-
-    def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
-        builder.end(tag)
-
-    def document_type(*_: object) -> None:
-        raise ValueError(f"path: {path} declares a document type, which a scene has no use for")
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = document_type
+    parser = ElementTree.XMLParser(target=_Builder())
     try:
-        parser.Parse(path.read_bytes(), True)
-    except (expat.ExpatError, LookupError) as error:  # the latter: of its encoding
-        raise ValueError(f"path: {path} is not well-formed: {error}") from error
-    return builder.close()
+        parser.feed(path.read_bytes())
+        root: Element = parser.close()
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the second: of its encoding
+        raise ValueError(f"path: {path} is not well-formed, or no scene: {error}") from error
+    return root
+
+
+class _Builder(ElementTree.TreeBuilder):
+    """Elements of a file that is not trusted."""
+
+    depth = 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> Element:  # type: ignore[override]
+        self.depth += 1
+        if self.depth > MOST_NESTED:
+            raise ValueError(f"it is nested more than {MOST_NESTED} deep")
+        return super().start(tag, attributes)
+
+    def end(self, tag: str) -> Element:
+        self.depth -= 1
+        return super().end(tag)
+
+    def doctype(self, *_: object) -> None:
+        raise ValueError("it declares a document type, which a scene has no use for")
 
 
 def _single_shapes(element: Element) -> list[Element]:
@@ -358,22 +354,19 @@ def _rotate(part: Element) -> np.ndarray:
     if not np.isclose(np.linalg.norm(axis), 1.0, rtol=1e-4):  # Mitsuba takes it as it is, and bends the shape
         raise ValueError(f"has a rotation about {axis.tolist()}, expected an axis of length 1")
     angle = np.deg2rad(_numbers(part.get("angle", "0"), "the rotation angle", 1)[0])
-    cross = np.cross(np.eye(3), axis)  # cross @ v is axis x v; Rodrigues' formula
-    return _affine(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+    return _affine(Rotation.from_rotvec(angle * _unit(axis, "an axis")).as_matrix())
 
 
 def _look_at(part: Element) -> np.ndarray:
-    origin, target, up = (_vector_of(part, name) for name in ("origin", "target", "up"))
+    given = {"up": "0, 0, 1", **part.attrib}
+    if not {"origin", "target"} <= given.keys():
+        raise ValueError("has a lookat without 'origin' or 'target'")
+    origin, target, up = (
+        np.array(_numbers(given[name], f"the lookat {name}", 3)) for name in ("origin", "target", "up")
+    )
     forward = _unit(target - origin, "a lookat from origin to target")
     left = _unit(np.cross(up, forward), "a lookat whose 'up' lies along it,")
     return _affine(np.column_stack([left, np.cross(forward, left), forward]), origin)
-
-
-def _vector_of(part: Element, name: str) -> np.ndarray:
-    text = part.get(name, "0, 0, 1" if name == "up" else None)
-    if text is None:
-        raise ValueError(f"has a lookat without {name!r}")
-    return np.array(_numbers(text, f"the lookat {name}", 3))
 
 
 def _matrix(part: Element) -> np.ndarray:
@@ -399,21 +392,13 @@ _TRANSFORMS: dict[str, Callable[[Element], np.ndarray]] = {
 def _revolved(profile: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The surface that (radius, z) points ``(N, 2)`` sweep about the z axis, normals to the left of their course."""
     turn = np.arange(ROUND) * 2 * np.pi / ROUND
-    radius, z = profile.T
-    vertices = np.stack(
-        [
-            np.outer(radius, np.cos(turn)),
-            np.outer(radius, np.sin(turn)),
-            np.repeat(z[:, None], ROUND, axis=1),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
-    ring, along = np.meshgrid(np.arange(len(profile) - 1) * ROUND, np.arange(ROUND), indexing="ij")
-    a, b = ring + along, ring + (along + 1) % ROUND
+    ring = np.column_stack([np.cos(turn), np.sin(turn), np.ones(ROUND)])
+    vertices = (ring * profile[:, None, [0, 0, 1]]).reshape(-1, 3)
+    start, along = np.meshgrid(np.arange(len(profile) - 1) * ROUND, np.arange(ROUND), indexing="ij")
+    a, b = start + along, start + (along + 1) % ROUND
     c, d = b + ROUND, a + ROUND
-    first, second = np.stack([a, d, c], axis=-1), np.stack([a, c, b], axis=-1)
-    poles = radius == 0
-    kept = [first[~poles[1:]], second[~poles[:-1]]]  # at a pole one of the two has no area
+    poles = profile[:, 0] == 0
+    kept = [np.stack([a, d, c], -1)[~poles[1:]], np.stack([a, c, b], -1)[~poles[:-1]]]  # others have no area
     return vertices, np.concatenate([faces.reshape(-1, 3) for faces in kept]).astype(np.int32)
 
 

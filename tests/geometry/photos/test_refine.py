@@ -8,13 +8,11 @@ import warp as wp
 from skimage.metrics import structural_similarity
 
 from warprrf.geometry.photos.config import RefineConfig
-from warprrf.geometry.photos.densify import densified
-from warprrf.geometry.photos.exposure import Exposures
-from warprrf.geometry.photos.fill import filled
+from warprrf.geometry.photos.densify import densified, filled
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.refine import OVERHEAD, _initial, refine
-from warprrf.geometry.photos.targets import PosedPhotos, Targets
+from warprrf.geometry.photos.targets import Exposures, PosedPhotos, Targets
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render

@@ -12,7 +12,7 @@ from views import look
 
 import warprrf as wr
 from warprrf.geometry.photos.report import colours_matched, psnr_db
-from warprrf.geometry.photos.report.sight import CLASSES, from_outside, how_seen
+from warprrf.geometry.photos.sight import CLASSES, from_outside, how_seen
 from warprrf.geometry.splats.discs import discs_on_mesh
 
 image = pytest.importorskip("PIL.Image")
@@ -31,7 +31,7 @@ def test_a_surface_is_seen_by_the_cameras_that_look_at_it(room):
     assert behind.sum() > 1000 and (seen.photos[behind] == 0).all()
     # Spread by area: the wall has 3 x 2.5 of 59 square metres.
     assert on_wall.mean() == pytest.approx(3 * 2.5 / 59, rel=0.05)
-    assert sum(seen.shares) == pytest.approx(1.0) and seen.shares[3] == seen.shares[4] == 0.0
+    assert seen.shares.sum() == pytest.approx(1.0) and seen.shares[3] == seen.shares[4] == 0.0
     assert [CLASSES[k][0] for k in np.unique(seen.classes)] == [0, 3]
 
 

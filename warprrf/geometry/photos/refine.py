@@ -19,12 +19,17 @@ from warprrf import tensor_files
 from warprrf.checks import check_count
 from warprrf.device import DeviceLike, Progress, launch, resolve
 from warprrf.geometry.photos.config import RefineConfig
-from warprrf.geometry.photos.densify import PARAMETERS, STATISTICS, Arrays, densified, opacity_and_scales
-from warprrf.geometry.photos.exposure import Exposures
-from warprrf.geometry.photos.fill import filled
+from warprrf.geometry.photos.densify import (
+    PARAMETERS,
+    STATISTICS,
+    Arrays,
+    densified,
+    filled,
+    opacity_and_scales,
+)
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.targets import PosedPhotos, Target, Targets
+from warprrf.geometry.photos.targets import Exposures, PosedPhotos, Target, Targets
 from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotations_of
 from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels import adam as optimize

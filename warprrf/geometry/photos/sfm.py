@@ -24,7 +24,6 @@ import numpy as np
 from warprrf.checks import check_count
 from warprrf.device import Progress, require
 from warprrf.geometry.photos.config import LENSES
-from warprrf.geometry.photos.lens_choice import FREE_MODEL, choose_lens, lens_of
 from warprrf.geometry.photos.photo_files import (
     MIN_PHOTOS,
     Photos,
@@ -40,8 +39,11 @@ from warprrf.geometry.photos.photo_files import (
 from warprrf.geometry.photos.poses import KnownCamera, KnownPoses
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.photos.undistort import (
+    FREE_MODEL,
     Lens,
+    choose_lens,
     colmap_camera,
+    lens_of,
     lenses_in_use,
     load_colmap,
     pinhole_of,

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
+
 from warprrf.rf.em.materials import Band, Material
 
 DEFAULT_THICKNESS_M = 0.1  # of a surface whose scene says nothing of it, as in Sionna RT
@@ -53,6 +55,11 @@ ITU_BANDS: dict[str, tuple[Band, ...]] = {
     "medium_dry_ground": _rows(3, (1, 10, 15, -0.1, 0.035, 1.63)),
     "wet_ground": _rows(3, (1, 10, 30, -0.4, 0.15, 1.3)),
 }
+
+BUILDING = (
+    "concrete", "brick", "plasterboard", "wood", "glass", "ceiling_board", "chipboard", "plywood", "marble", "floorboard",
+)  # fmt: skip
+"""What rooms are made of."""
 
 
 def itu_name(name: str) -> str | None:
@@ -100,3 +107,12 @@ def itu_material(
         xpd=xpd,
         itu=known,
     )
+
+
+def assumed_permittivity(name: str, frequency_hz: float) -> float:
+    """Magnitude of the relative permittivity that a surface called ``name`` is taken for before any measurement: that of
+    P.2040's material of this name, else the geometric mean of those that rooms are made of, less one."""
+    known = itu_name(name)
+    names = BUILDING if known is None else (known,)
+    found = [abs(itu_material(one).extrapolated().permittivity(frequency_hz)) for one in names]
+    return 1.0 + float(np.exp(np.mean(np.log(np.maximum(np.array(found) - 1.0, 1e-3)))))

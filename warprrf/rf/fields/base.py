@@ -23,6 +23,7 @@ from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.positions import check_positions, check_receivers
+from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Data
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
@@ -192,6 +193,42 @@ class RadioField(ABC):
         """
         receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
         return self.trace_links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
+
+    def suggest(
+        self,
+        candidates: ArrayLike,
+        n: int = 1,
+        *,
+        arrival: ArrayLike | None = None,
+        receive_pattern: Pattern | None = None,
+        progress: Progress | None = None,
+    ) -> np.ndarray:
+        """Where to measure next: the candidates that lower the expected error most, one after another.
+
+        It goes by what is seen there and how far that is known: a field of no measurement knows nothing but its prior;
+        at the receivers in ``fitted_on`` the same is taken to have been measured that is asked for here.
+
+        Args:
+            candidates: receivers that could be measured [m], shape ``(C, 3)``. Predictions count at all of them.
+            n: how many are chosen.
+            arrival: zenith and azimuth that a horn would be turned to at each candidate [rad], shape ``(C, 2)``; None
+                where a whole spectrum would be measured.
+            receive_pattern: its gain, as of :class:`Readings`; 1 in every direction for power alone.
+            progress: called as ``progress("suggest", done, total)``.
+
+        Returns:
+            Indices of candidates, best first, shape ``(n,)``.
+
+        Raises:
+            ValueError: as for :meth:`check_positions`, and for more than there are; for another model than ``bistatic``,
+                which tells no surfaces apart.
+
+        Example::
+
+            field = wr.RadioField.fit(room, wr.SpectrumDataset.empty(transmitter=source, frequency_hz=300e9))
+            first = candidates[field.suggest(candidates, 3)]
+        """
+        raise ValueError(f"suggest: got a field of model {self.model!r}, expected 'bistatic'")
 
     def check_positions(
         self, rx: ArrayLike, transmitter: ArrayLike | None = None

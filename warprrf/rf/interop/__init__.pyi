@@ -20,3 +20,6 @@ from warprrf.rf.interop.deepmimo import write_deepmimo as write_deepmimo
 
 # NeWRF's published rays
 from warprrf.rf.interop.newrf import load_newrf as load_newrf
+
+# complex reflection coefficients of surfaces from a few measured channels
+from warprrf.rf.paths.reflections import fit_reflections as fit_reflections

@@ -31,8 +31,7 @@ from scipy.optimize import minimize
 from warprrf.checks import checked
 from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
-from warprrf.rf.em.fresnel import LAMBERTIAN, lobe, slab_reflection
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import LAMBERTIAN, fresnel_curves, lobe, slab_reflection
 from warprrf.rf.em.materials import VACUUM_PERMITTIVITY, Band, Material, table_entry
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField

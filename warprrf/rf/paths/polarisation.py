@@ -17,7 +17,7 @@ from warprrf.geometry.mesh import vectors_across
 from warprrf.rf.spectra.spectrum import transverse_basis
 
 _PARALLEL = 1e-6  # sine of incidence below which a mirror has no plane of incidence of its own
-_EXCESS = (0.05, 200.0)  # of epsilon_r - 1, the range of :func:`warprrf.rf.em.half_spaces.fresnel_curves`
+_EXCESS = (0.05, 200.0)  # of epsilon_r - 1, the range of :func:`warprrf.rf.em.fresnel.fresnel_curves`
 
 
 def turns(stops: np.ndarray, normal: np.ndarray) -> np.ndarray:

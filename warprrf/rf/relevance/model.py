@@ -19,8 +19,7 @@ from warprrf.cache import cached_property
 from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m
-from warprrf.rf.em.fresnel import lobe, slab_reflection, surface_table
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Parameters

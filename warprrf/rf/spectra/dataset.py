@@ -18,6 +18,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.spectra import dataset_files, exr
 from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
 from warprrf.rf.spectra.spectrum import (
+    BEAM_SIGMA_RAD,
     Spectrum,
     check_pixels,
     check_range_db,
@@ -31,6 +32,7 @@ from warprrf.rf.spectra.spectrum import (
 POLARISATION = "mean over vertical and horizontal transmit, sum over both receive polarisations"
 
 _ROLES = ("train", "test")
+USUAL_M = 10.0  # between a transmitter and a receiver in a room
 SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
 _MOST_ATTRIBUTE_BYTES = 60_000  # HDF5 takes 64 kB
 
@@ -175,6 +177,40 @@ class SpectrumDataset:
             line_of_sight=line_of_sight,
             attributes={} if attributes is None else attributes,
         )
+
+    @classmethod
+    def empty(
+        cls,
+        *,
+        transmitter: ArrayLike,
+        frequency_hz: float,
+        shape: tuple[int, int] = (90, 180),
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        floor: float | None = None,
+    ) -> SpectrumDataset:
+        """A data set before the first measurement: a field that is fitted to it is what is known without any.
+
+        Args:
+            transmitter: position [m], shape ``(3,)``.
+            frequency_hz: carrier [Hz].
+            shape: rows and columns of spectra.
+            beam_sigma_rad: width of the receiver's beam.
+            floor: N0; if None, 60 dB below free space's path gain over :data:`USUAL_M`.
+
+        Raises:
+            TypeError, ValueError: naming the argument.
+        """
+        rows, columns = check_shape(shape)
+        strongest = (SPEED_OF_LIGHT / check_frequency(frequency_hz) / (4.0 * np.pi * USUAL_M)) ** 2
+        noise = 1e-6 * strongest if floor is None else check_positive("floor", floor, "linear noise floor")
+        return cls(
+            receivers=np.zeros((0, 3)), transmitter=check_array("transmitter", transmitter, (3,)),
+            frequency_hz=frequency_hz, path_gain=np.zeros((0, rows, columns)),
+            delay_s=np.zeros((0, rows, columns)), aod=np.zeros((0, rows, columns, 2)), floor=noise,
+            range_db=(10.0 * float(np.log10(noise)), 10.0 * float(np.log10(max(noise, strongest)))),
+            beam_sigma_rad=beam_sigma_rad, engine="none", polarisation=POLARISATION, seed=0,
+            role=np.zeros(0, "<U5"), line_of_sight=np.zeros(0, bool),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.receivers)

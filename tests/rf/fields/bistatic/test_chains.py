@@ -7,7 +7,7 @@ import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
 from warprrf.rf.fields.bistatic.terms import Terms

@@ -10,10 +10,9 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.rf.fields.harmonic.field import HarmonicField
-from warprrf.rf.fields.harmonic.interaction import interaction_points
 from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.fields.harmonic.paths import BEAM_REACH
-from warprrf.rf.fields.harmonic.transport import transport
+from warprrf.rf.fields.harmonic.transport import interaction_points, transport
 from warprrf.rf.spectra.metrics import psnr, unit_image
 from warprrf.rf.spectra.spectrum import angles_from_directions, pixel_directions, pixel_solid_angles
 

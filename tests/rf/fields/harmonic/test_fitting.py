@@ -7,10 +7,9 @@ import pytest
 import warp as wp
 
 from warprrf.kernels.ssim import RADIUS, WINDOW
-from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer
+from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer, weighted_means
 from warprrf.rf.fields.harmonic.options import Rates
 from warprrf.rf.fields.harmonic.problem import Problem
-from warprrf.rf.fields.harmonic.targets import weighted_means
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.spectrum import pixel_directions
 

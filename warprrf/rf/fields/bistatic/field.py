@@ -26,25 +26,29 @@ from warprrf.checks import Expected, check_array, check_arrays, check_count, che
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas, air_of
+from warprrf.rf.em.itu import assumed_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
-from warprrf.rf.fields.bistatic.observations import Frame, as_list, transmitters_of
+from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.render import Rendered, render, sent_radiance
+from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
+from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data
-from warprrf.rf.spectra.spectrum import Spectrum, default_floor, to_db
+from warprrf.rf.spectra.readings import Data, Readings, check_gains
+from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 
 
 @checked
@@ -148,6 +152,7 @@ class BistaticField(RadioField):
         Args:
             geometry: Reconstruction, Scene (its materials name the groups, nothing else is taken from them) or Mesh.
             ds: training set: spectra, readings, or a list of them, of one carrier. The field's own transmitter is the first.
+                Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
             transport: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
@@ -162,6 +167,8 @@ class BistaticField(RadioField):
             TypeError: for a geometry without a mesh, or an unknown option.
         """
         chosen, data = FitOptions.of(options, settings), as_list(ds)
+        if not any(map(len, data)):
+            return cls._unmeasured(geometry, data, chosen, device)
         found = train(geometry, data, chosen, transport=transport, device=device, progress=progress)
         frame = Frame.of(data)
         under = np.concatenate([np.atleast_2d(transmitters_of(one)) for one in data])
@@ -181,6 +188,20 @@ class BistaticField(RadioField):
         return replace(
             fitted, floor=floor, range_db=(10.0 * float(np.log10(floor)), float(to_db(gains.max(), floor)))
         )
+
+    @classmethod
+    def _unmeasured(
+        cls, geometry: GeometryLike, data: list[SpectrumDataset | Readings], o: FitOptions, device: DeviceLike
+    ) -> BistaticField:
+        """What a fit to no measurement gives: permittivities of ITU-R P.2040, by the names of materials where it has
+        them, terms left free as for few receivers."""
+        frame = Frame.of(data)
+        prior = cls.prior(geometry, frame, terms=o.unmeasured(frame.frequency_hz), device=device)
+        places_of(data, prior.mesh, device)
+        known = [assumed_permittivity(name, prior.frequency_hz) for name in prior.surface.group_names]
+        parameters = replace(prior.parameters, log_excess=np.log(np.array(known) - 1.0))
+        report = {"receivers": 0, "held_out": 0, "chains": {}, "unexplained": {}}
+        return replace(prior, parameters=parameters, report=report)
 
     @classmethod
     def prior(
@@ -263,7 +284,12 @@ class BistaticField(RadioField):
         return replace(spectrum, std_db=self._std_db(seen, found)) if uncertainty else spectrum
 
     def paths(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
+        self,
+        rx: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        max_paths: int | None = None,
+        *,
+        view: ReceiverView | None = None,
     ) -> Paths:
         """Propagation paths at ``rx``: line of sight, mirrors, and one diffuse path per pixel above the floor.
 
@@ -275,12 +301,15 @@ class BistaticField(RadioField):
             rx: receiver position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded.
             transmitter: as for :meth:`spectrum`.
             max_paths: keep the strongest only (the sum is then what they carry).
+            view: what the one receiver sees, if it was traced before (:meth:`view`).
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
+        if view is not None:
+            return paths_of(view, self.render(view), self.floor, self.air, max_paths)
         positions, source = self.check_positions(rx, transmitter)
         found = []
         for position in np.atleast_2d(positions):
@@ -316,6 +345,35 @@ class BistaticField(RadioField):
         :func:`warprrf.rf.fields.bistatic.render.sent_radiance`."""
         key = transport.transmitter.tobytes()
         return self._sent.get(key, lambda: sent_radiance(transport, self.materials))
+
+    def suggest(
+        self,
+        candidates: ArrayLike,
+        n: int = 1,
+        *,
+        arrival: ArrayLike | None = None,
+        receive_pattern: Pattern | None = None,
+        progress: Progress | None = None,
+    ) -> np.ndarray:
+        """Where to measure next; see :meth:`RadioField.suggest`, and :mod:`warprrf.rf.fields.bistatic.suggest` for how."""
+        places, source = self.check_positions(check_array("candidates", candidates, (None, 3)))
+        check_count("n", n, 1, len(places))
+        pointings = None
+        if (arrival is None) != (receive_pattern is None):
+            raise ValueError(
+                "receive_pattern: it goes with arrival, got one of the two; expected both or neither"
+            )
+        if arrival is not None and receive_pattern is not None:
+            check_gains("receive_pattern", receive_pattern)
+            angles = check_array("arrival", arrival, (len(places), 2))
+            pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
+        transport = self.transport(source).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
+        floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
+        return suggest(
+            Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material), places, n,
+            measured=np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on,
+            pointings=pointings, progress=progress,
+        )  # fmt: skip
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked, several at a time."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.fit import GroupFit, Reading, huber
 from warprrf.rf.fields.bistatic.materials import Parameters, mirror_power
 from warprrf.rf.fields.bistatic.response import Response, predict

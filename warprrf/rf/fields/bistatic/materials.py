@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from warprrf.checks import Expected, check_arrays, check_number
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.paths.polarisation import chain_reflection
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from warprrf.rf.em.half_spaces import fresnel_curves
+from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters, mirror_power
 from warprrf.rf.fields.bistatic.measured import Measurement
 from warprrf.rf.fields.bistatic.render import mirror_shown, sent_on

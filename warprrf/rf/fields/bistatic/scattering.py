@@ -18,8 +18,7 @@ import warp as wp
 
 from warprrf import device as _device
 from warprrf.kernels.radio import bounce
-from warprrf.rf.em.fresnel import lobe_norm, reciprocal_factor
-from warprrf.rf.em.half_spaces import COSINES, fresnel_curves
+from warprrf.rf.em.fresnel import COSINES, fresnel_curves, lobe_norm, reciprocal_factor
 from warprrf.rf.fields.bistatic.rays import Illumination
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -84,7 +83,7 @@ def resolve(
 
     Returns:
         The groups that are illuminated, shape ``(A,)``, and the sums, shape ``(count, A, L, 3)`` float32. The
-        components are those of :class:`warprrf.rf.em.half_spaces.FresnelCurves`.
+        components are those of :class:`warprrf.rf.em.fresnel.FresnelCurves`.
     """
     where = face.device
     order = np.argsort(bins, kind="stable")

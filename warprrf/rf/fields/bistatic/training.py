@@ -47,7 +47,7 @@ FEW: dict[str, Any] = {
     "mirror_order": 2, "mirror_scatter": True, "scatter_mirror": False, "diffuse_order": 3, "indirect": False,
     "residual": True,
 }  # fmt: skip
-"""What a fit tries first on receivers too few to hold any out: bounces that rooms have, which bring no parameters."""
+"""What a fit tries first on receivers too few to choose terms by: bounces that rooms have, which bring no parameters."""
 SINGLE: dict[str, Any] = {
     "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False,
     "residual": True,
@@ -77,6 +77,7 @@ class Selection:
 
     Attributes:
         least_receivers: training receivers below which nothing is held out.
+        least_held_out: receivers held out below which they choose no term: one alone likes what others do not.
         held_out: share of the receivers that are held out.
         most_held_out: receivers held out at most.
         few_receivers: up to which errors are learned from every receiver, held out in turn.
@@ -95,6 +96,7 @@ class Selection:
     """
 
     least_receivers: int = 4
+    least_held_out: int = 2
     held_out: float = 0.25
     most_held_out: int = 10
     few_receivers: int = 20
@@ -118,8 +120,7 @@ class FitOptions:
     """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
 
     A term given as None is kept only if it lowers the error on receivers held out of the data set (a quarter, ten at
-    most); with fewer than four receivers nothing is held out: :data:`FEW` is modelled, or
-    :data:`SINGLE` if it fits much better.
+    most); with fewer than eight receivers, :data:`FEW` is modelled, or :data:`SINGLE` if it fits much better.
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
@@ -199,6 +200,11 @@ class FitOptions:
     def given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         """Of ``values`` those of ``names`` that are None here."""
         return {name: values[name] for name in names if getattr(self, name) is None}
+
+    def unmeasured(self, frequency_hz: float) -> Terms:
+        """What is modelled before any measurement: terms left free are those of :data:`FEW`."""
+        found = self.decided(frequency_hz)
+        return replace(found, **found.given(FEW, TERMS)).terms()
 
     def terms(self) -> Terms:
         """What is modelled, terms left to the fit as in single bounces.
@@ -352,7 +358,10 @@ def train(
         if isinstance(one, SpectrumDataset) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     if transport is not None:
-        transport.check(places_of(data, as_mesh(geometry, "geometry"), device), o.sub_pixels)
+        places = places_of(data, as_mesh(geometry, "geometry"), device)
+        transport.check(places, o.sub_pixels)
+        # Places of a part of what was traced say where in the whole their readings are.
+        transport = replace(transport, places=places)
     seen = transport or trace(
         geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
@@ -430,14 +439,16 @@ class _Training:
         o, everyone = self.options, np.arange(self.count)
         terms, errors = o.terms(), None
         start = Parameters.prior(int(self.material.max()) + 1, len(terms.lobes))
-        if len(self.held):
+        free = any(getattr(o, name) is None for name in TERMS)
+        if len(self.held) >= (self.choose.least_held_out if free else 1):
             first = self._fit_groups(terms, start, self._few(1), self.choose.short_steps * 2)
             best = self._choose(_Candidate(terms, first, self._held_error(terms, first)))
-            residual, errors = self._held_in_turn(best)
-            terms, start = replace(best.terms, residual=residual), best.fit.parameters
         else:
             best = self._choose_of_few()
-            terms, start = best.terms, best.fit.parameters
+        terms, start = best.terms, best.fit.parameters
+        if len(self.held):
+            residual, errors = self._held_in_turn(best)
+            terms = replace(terms, residual=residual)
         # Chosen terms come with a fit to most receivers, under which light that goes on is settled: one round is left.
         fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=1)
         materials = self._materials(terms, fit)
@@ -532,12 +543,13 @@ class _Training:
         self.log.append({"term": term, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(error))})
 
     def _choose_of_few(self) -> _Candidate:
-        """With too few receivers to hold any out: further bounces as rooms have them, unless none fit much better."""
+        """With too few receivers to choose by those held out: further bounces as rooms have them, unless none fit much
+        better."""
         found = []
         for given in (FEW, SINGLE):
             terms = replace(self.options, **self.options.given(given, TERMS)).terms()
             start = Parameters.prior(int(self.material.max()) + 1, len(terms.lobes))
-            fit = self._fit_groups(terms, start, np.arange(self.count), self.options.iterations)
+            fit = self._fit_groups(terms, start, self.kept, self.options.iterations)
             bare = self._materials(replace(terms, residual=False), fit)
             found.append(_Candidate(terms, fit, self._image_error(bare, np.arange(self.count))))
         further, single = found

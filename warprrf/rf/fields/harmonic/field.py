@@ -44,13 +44,11 @@ from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer
+from warprrf.rf.fields.harmonic.fitting import KINDS, SAVED_EVERY, Checkpoint, State, fit_layer, targets
 from warprrf.rf.fields.harmonic.opacity import OpacityTraining, list_responses
-from warprrf.rf.fields.harmonic.options import FieldOptions, Rates
+from warprrf.rf.fields.harmonic.options import FieldOptions, Rates, SingleBounce
 from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.problem import Problem, harmonics
-from warprrf.rf.fields.harmonic.single_bounce import SingleBounce
-from warprrf.rf.fields.harmonic.targets import targets
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
 from warprrf.rf.positions import check_dataset

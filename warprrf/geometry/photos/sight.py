@@ -40,11 +40,15 @@ class Seen:
         return np.searchsorted([least for least, _, _ in CLASSES], self.photos, side="right") - 1
 
     @property
-    def shares(self) -> list[float]:
+    def shares(self) -> np.ndarray:
         """Part of the surface in each of :data:`CLASSES`."""
-        return [
-            float(share) for share in np.bincount(self.classes, minlength=len(CLASSES)) / len(self.photos)
-        ]
+        return np.bincount(self.classes, minlength=len(CLASSES)) / len(self.photos)
+
+    @property
+    def colours(self) -> np.ndarray:
+        """Colour of each point's class in [0, 1], shape ``(S, 3)``."""
+        table = [[int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)] for _, _, colour in CLASSES]
+        return np.array(table)[self.classes]
 
 
 def how_seen(mesh: Mesh, cameras: Sequence[Camera], *, device: DeviceLike = None, seed: int = 0) -> Seen:
@@ -79,25 +83,17 @@ def from_outside(
     Returns:
         Points met [m], shape ``(H, W, 3)``, NaN where nothing is, and how light they are, shape ``(H, W)``.
     """
-    elevation = np.radians(38.0)
-    back = np.array(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
-    )
+    back = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(np.radians(38.0))]) * np.cos(np.radians(38.0))
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    up = np.cross(back, right)
-    low, high = np.percentile(mesh.triangles.reshape(-1, 3), [0.5, 99.5], axis=0)  # far debris stays out
-    corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
-    spans = (
-        [(corners @ axis).min() - 0.1 for axis in (right, up)],
-        [(corners @ axis).max() + 0.1 for axis in (right, up)],
-    )
-    step = (spans[1][0] - spans[0][0]) / width
-    height = int(np.clip((spans[1][1] - spans[0][1]) / step, 1, 2 * width))
-    u, v = np.meshgrid(
-        spans[0][0] + step * (np.arange(width) + 0.5), spans[1][1] - step * (np.arange(height) + 0.5)
-    )
+    axes = np.stack([right, np.cross(back, right)], axis=1)
+    bounds = np.percentile(mesh.triangles.reshape(-1, 3), [0.5, 99.5], axis=0)  # far debris stays out
+    corners = np.stack(np.meshgrid(*bounds.T), axis=-1).reshape(-1, 3) @ axes
+    low, high = corners.min(axis=0) - 0.1, corners.max(axis=0) + 0.1
+    step = (high[0] - low[0]) / width
+    height = int(np.clip((high[1] - low[1]) / step, 1, 2 * width))
+    u, v = np.meshgrid(low[0] + step * (np.arange(width) + 0.5), high[1] - step * (np.arange(height) + 0.5))
     reach = float(np.abs(mesh.bounds).sum())  # from where all of it lies ahead
-    origins = (u[..., None] * right + v[..., None] * up + reach * back).reshape(-1, 3)
+    origins = np.stack([u, v], axis=-1).reshape(-1, 2) @ axes.T + reach * back
     points, light = np.full(origins.shape, np.nan), np.zeros(len(origins))
     left = np.arange(len(origins))
     for _ in range(LAYERS):
@@ -124,9 +120,3 @@ def painted(points: np.ndarray, light: np.ndarray, places: np.ndarray, colours: 
 def colours_of(gaussians: Gaussians) -> np.ndarray:
     """Mean colour of each Gaussian in [0, 1], shape ``(N, 3)``."""
     return np.clip(0.28209479177387814 * gaussians.sh[:, 0] + 0.5, 0.0, 1.0)
-
-
-def class_colours(seen: Seen) -> np.ndarray:
-    """Colour of each point's class in [0, 1], shape ``(S, 3)``."""
-    table = np.array([[int(c[k : k + 2], 16) / 255 for k in (1, 3, 5)] for _, _, c in CLASSES])
-    return table[seen.classes]

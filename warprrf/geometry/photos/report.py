@@ -16,15 +16,7 @@ from warprrf.device import DeviceLike, Progress, require
 from warprrf.files import write_text
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.photo_files import read_photo
-from warprrf.geometry.photos.report.plan import FITTED, HELD, plan
-from warprrf.geometry.photos.report.sight import (
-    CLASSES,
-    class_colours,
-    colours_of,
-    from_outside,
-    how_seen,
-    painted,
-)
+from warprrf.geometry.photos.sight import CLASSES, colours_of, from_outside, how_seen, painted
 from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -32,6 +24,9 @@ from warprrf.geometry.splats.render import render
 
 SHOWN = 6  # photos beside their renderings
 PICTURE_WIDTH = 420  # of one of them [pixels]
+WIDTH, MARGIN = 760.0, 34.0  # of the plan [pixels]
+MOST_LINES = 6000  # of walls
+FITTED, HELD = "#2166ac", "#e08214"
 SIDES = ((0.25, "from +x +y"), (0.75, "from -x +y"), (1.25, "from -x -y"), (1.75, "from +x -y"))  # [pi rad]
 
 STYLE = """
@@ -155,11 +150,53 @@ def _warnings(subject: Subject) -> str:
 
 
 def _from_above(subject: Subject) -> str:
+    """Cameras with the directions that they look in, over a section of the mesh at their median height, as SVG."""
+    cameras, mesh = subject.cameras, subject.mesh
+    places = np.array([c.position for c in cameras.values()])
+    walls = np.zeros((0, 2, 2))
+    if mesh is not None:
+        walls = mesh.cross_section(float(np.median(places[:, 2]))).reshape(-1, 2, 2)
+        walls = walls if len(walls) else mesh.triangles[:, [0, 1], :2]  # nothing at that height: its outline
+        walls = walls[np.argsort(-np.linalg.norm(walls[:, 1] - walls[:, 0], axis=1))[:MOST_LINES]]
+    spread = np.percentile(np.concatenate([places[:, :2], walls.reshape(-1, 2)]), [0.5, 99.5], axis=0)
+    low = np.minimum(spread[0], places[:, :2].min(axis=0))
+    high = np.maximum(spread[1], places[:, :2].max(axis=0))
+    extent = np.maximum(high - low, 1e-6)
+    scale = min((WIDTH - 2 * MARGIN) / extent[0], 1.2 * WIDTH / extent[1])
+    width, height = scale * extent + 2 * MARGIN
+
+    def line(*corners: np.ndarray) -> str:
+        x, y = np.asarray(corners)[:, :2].T
+        x, y = MARGIN + scale * (x - low[0]), height - MARGIN - scale * (y - low[1])
+        return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+
+    parts = [f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="plan of the cameras">']
+    rough = float(extent.max()) / 8
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = power * next(s for s in (1, 2, 5, 10) if s * power >= rough)
+    for axis, style in ((0, 'dy="16" text-anchor="middle"'), (1, 'dx="-6" dy="4" text-anchor="end"')):
+        for value in np.arange(np.ceil(low[axis] / step), np.floor(high[axis] / step) + 1) * step + 0.0:
+            ends = np.array([low, high])
+            ends[:, axis] = value
+            path = line(*ends)
+            x, y = path[1:].split("L")[0].split()
+            parts.append(f'<path d="{path}" stroke="#e4e4e4"/><text x="{x}" y="{y}" {style}>{value:g}</text>')
+    parts.append(f'<path d="{"".join(line(*wall) for wall in walls)}" stroke="#444" stroke-width="1.6"/>')
+    for name, camera in cameras.items():
+        colour = HELD if name in subject.held_out else FITTED
+        right, _, ahead = camera.rotation * 20 / scale
+        half = right * (camera.width / 2 / camera.fx if camera.fx else 1.0)
+        at = camera.position
+        x, y = line(at)[1:].split()
+        title = f"{html.escape(name)}: {at[0]:.2f}, {at[1]:.2f}, {at[2]:.2f}"
+        parts.append(
+            f'<path d="{line(at, at + ahead - half, at + ahead + half)}Z" fill="{colour}" opacity=".28"/>'
+            f'<circle cx="{x}" cy="{y}" r="3" fill="{colour}"><title>{title}</title></circle>'
+        )
     keys = _key(FITTED, "photos that were fitted") + _key(HELD, "held out.")
     return (
-        "<h2>Cameras from above</h2><figure>"
-        + plan(subject.mesh, subject.cameras, subject.held_out, subject.unit)
-        + f"<figcaption>{keys} Lines: where the mesh is at the cameras' median height.</figcaption></figure>"
+        f"<h2>Cameras from above</h2><figure>{''.join(parts)}</svg><figcaption>{keys} x and y in {subject.unit}. Lines: "
+        "where the mesh is at the cameras' median height.</figcaption></figure>"
     )
 
 
@@ -210,7 +247,7 @@ def _surface(mesh: Mesh, subject: Subject, device: DeviceLike) -> str:
         )
         parts.append(
             "<h2>How well each surface was seen</h2><p>Photos that show it, and the part of the area:"
-            f"{keys}</p>{_four(views, (seen.points, class_colours(seen)))}"
+            f"{keys}</p>{_four(views, (seen.points, seen.colours))}"
             '<p class="note">What fewer than three photos show is inferred from what is round it.</p>'
         )
     return "".join(parts)

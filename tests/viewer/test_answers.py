@@ -1,0 +1,114 @@
+"""What the viewer says of a receiver is what the library says."""
+
+import numpy as np
+import pytest
+from golden import make
+
+import warprrf as wr
+from warprrf.viewer import answers
+from warprrf.viewer.subject import Subject
+
+RECEIVER = make.TRANSMITTER + [2.0, 0.3, -1.0]
+
+
+@pytest.fixture(scope="module")
+def field():
+    return make.bistatic()
+
+
+def asked(source, transmitters=(make.TRANSMITTER,), mirror_order=3):
+    return answers.answer(
+        source, RECEIVER, transmitters, mirror_order=mirror_order, frequency_hz=make.CARRIER_HZ
+    )
+
+
+def test_an_answer_is_the_fields_own(field):
+    found = asked(field)
+    np.testing.assert_array_equal(found.spectrum.path_gain, field.spectrum(RECEIVER).path_gain)
+    np.testing.assert_array_equal(found.paths[0].gain, field.paths(RECEIVER, max_paths=200).gain)
+    assert found.total_db == pytest.approx(10 * np.log10(field.spectrum(RECEIVER).total_path_gain))
+
+
+def test_powers_of_two_transmitters_are_added(field):
+    other = make.TRANSMITTER + [0.4, 0.2, -0.2]
+    both = asked(field, [make.TRANSMITTER, other])
+    wanted = field.spectrum(RECEIVER).path_gain + field.spectrum(RECEIVER, other).path_gain
+    np.testing.assert_allclose(both.spectrum.path_gain, wanted, rtol=1e-6)
+    assert len(both.paths) == 2
+
+
+def test_fewer_mirrors_on_a_path_mean_fewer_paths(field):
+    kinds = [asked(field, mirror_order=k).paths[0].kind for k in range(field.terms.mirror_order + 1)]
+    mirrors = [int((kind == "mirror").sum()) for kind in kinds]
+    assert mirrors[0] == 0 and mirrors == sorted(mirrors) and mirrors[-1] > 0
+
+
+def test_a_scene_without_a_field_has_mirror_paths():
+    scene = make.room()
+    found = asked(scene, mirror_order=1)
+    wanted = wr.trace_paths(
+        scene, transmitter=make.TRANSMITTER, receivers=RECEIVER, frequency_hz=make.CARRIER_HZ, mirror_order=1
+    )
+    np.testing.assert_array_equal(found.paths[0].gain, wanted.gain)
+    assert found.spectrum is None
+
+
+def test_legs_of_a_path_are_as_long_as_its_delay_says(field):
+    paths = asked(field).paths[0]
+    legs = answers.segments(paths)
+    length = np.nansum(np.linalg.norm(legs[:, :, 1] - legs[:, :, 0], axis=-1), axis=1)
+    np.testing.assert_allclose(length, paths.tau * 299792458.0, rtol=1e-6)
+
+
+def test_a_delay_profile_holds_the_power_of_all_paths(field):
+    paths = asked(field).paths
+    _, power_db = answers.delay_profile(paths, 2e9)
+    assert 10 ** (power_db / 10) @ np.ones(len(power_db)) == pytest.approx(paths[0].power.sum(), rel=1e-6)
+
+
+def test_the_best_beam_gains_what_select_beams_promises(field):
+    paths = asked(field).paths
+    beam = answers.best_beam(paths, 4, 0.3)
+    choice = wr.channel.select_beams(paths[0], rx_array=wr.PlanarArray(4, 4, orientation=(0.3, 0.0, 0.0)))
+    assert beam["gain_db"] == pytest.approx(10 * np.log10(choice.gain[0] / paths[0].power.sum()), abs=1e-6)
+
+
+def test_truth_is_told_only_where_it_was_measured(field):
+    ds = make.spectra()
+    assert answers.measured_here(ds, ds.receivers[2]) == 2
+    assert answers.measured_here(ds, ds.receivers[2] + [0.0, 0.02, 0.0]) is None
+    assert answers.measured_here(None, ds.receivers[2]) is None
+    wrong = answers.errors(ds[2], ds[2])
+    assert (
+        wrong["direction_deg"] == pytest.approx(0, abs=0.1)
+        and wrong["total_db"] == 0
+        and wrong["psnr_db"] > 100
+    )
+
+
+def test_things_are_sorted_by_what_they_are(tmp_path, field):
+    ds, (mesh, _) = make.spectra(), make.room_mesh()
+    field.save(tmp_path / "field.safetensors")
+    ds.save(tmp_path / "spectra.nc")
+    found = Subject.of([mesh, tmp_path / "field.safetensors", str(tmp_path / "spectra.nc")])
+    assert found.mesh is mesh and found.spectra.receivers.shape == ds.receivers.shape
+    np.testing.assert_array_equal(found.transmitter, field.transmitter)
+    rec = wr.Reconstruction(None, mesh)
+    rec.save(tmp_path / "room")
+    field.save(tmp_path / "room" / "field.safetensors")
+    both = Subject.of([tmp_path / "room"])
+    assert both.field is not None and len(both.mesh.faces) == len(mesh.faces)
+
+
+@pytest.mark.parametrize(
+    ("things", "error", "said"),
+    [
+        ((), TypeError, "got nothing to show"),
+        ((3.0,), TypeError, "got float, expected a Reconstruction"),
+        (("none/such",), ValueError, "no such file"),
+        ((make.room_mesh()[0], make.room_mesh()[0]), ValueError, "two for mesh"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(things, error, said):
+    with pytest.raises(error, match=said):
+        Subject.of(things)

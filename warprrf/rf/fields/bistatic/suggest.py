@@ -1,0 +1,181 @@
+"""Where to measure next: greedy Bayesian experimental design (Chaloner and Verdinelli 1995) on what a field predicts.
+
+What is not known of surfaces is taken for gains in nepers, normal a priori: of the single bounces of each element, of
+the light that it sends on, and of each group's mirrors. Each is the sum of one that all surfaces of its material share
+and one of its own. A reading tells of a gain by how much of it is due to that gain, and predictions err likewise.
+Readings are chosen one after another, each the one that lowers the expected square error most (I-optimality). Gains
+that share a reading are told apart as if the others were known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from warprrf.device import Progress
+from warprrf.rf.fields.bistatic.fit import NEPER
+from warprrf.rf.fields.bistatic.materials import Materials
+from warprrf.rf.fields.bistatic.observations import READING_ERROR_DB
+from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
+from warprrf.rf.fields.bistatic.transport import Transport
+from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
+
+SHAPE = (40, 80)
+"""Pixels that are told apart around a receiver: as wide as a usual beam."""
+PIXEL_ERROR_DB = 3.0
+"""Standard deviation of a pixel's error, as in fits."""
+SHARED = (1.0, 0.3, 1.0)
+OWN = (0.5, 0.3, 0.3)
+"""Standard deviations of a material's gain, and of a surface's own over it [nepers]: for single bounces, for light that
+is sent on (a mean over many surfaces, so it is known better), for mirrors."""
+LEAST_DB = 1e-3  # per neper: readings that change less tell nothing
+
+
+@dataclass(frozen=True)
+class Pointings:
+    """Antennas turned to directions ``toward`` (K, 3), unit vectors, with a gain over the angle off boresight."""
+
+    toward: np.ndarray
+    pattern: Pattern
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """Gains that are not known before any measurement.
+
+    Attributes:
+        material: whose gain each shares, shape ``(U,)``.
+        shared: standard deviation of each material's gain [nepers], shape ``(M,)``.
+        own: of each gain over its material's [nepers], shape ``(U,)``.
+    """
+
+    material: np.ndarray
+    shared: np.ndarray
+    own: np.ndarray
+
+    @classmethod
+    def of(cls, transport: Transport, material: np.ndarray) -> Unknowns:
+        """Those of a surface; ``material`` (G,) is that of each group."""
+        element, count = material[transport.surface.element_group], int(material.max()) + 1
+        return cls(
+            np.concatenate([element, count + element, 2 * count + material]),
+            np.repeat(SHARED, count),
+            np.repeat(OWN, [len(element), len(element), len(material)]),
+        )
+
+    def variance(self, precision: np.ndarray) -> np.ndarray:
+        """Of gains that readings tell with ``precision`` (U,) [1/neper^2], shape ``(U,)``: the posterior of
+        x_u = m_material(u) + r_u."""
+        left = 1.0 / (1.0 + self.own**2 * precision)  # of the variance of r
+        told = np.bincount(self.material, precision * left, minlength=len(self.shared))
+        shared = 1.0 / (1.0 / self.shared**2 + told)
+        return np.asarray(self.own**2 * left + left**2 * shared[self.material])
+
+
+class Sensitivity:
+    """How readings and predictions at places depend on the gains.
+
+    Args:
+        transport: the geometry under the transmitter, on a grid of :data:`SHAPE`.
+        materials: of its surfaces.
+        floor: path gain of a pixel, and of a reading, below which nothing is told.
+    """
+
+    def __init__(self, transport: Transport, materials: Materials, floor: float) -> None:
+        self.transport, self.materials, self.floor = transport, materials, floor
+        self._sent = sent_radiance(transport, materials)
+
+    def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
+        """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
+        t, view = self.transport, self.transport.view(place, self.materials.terms)
+        found = path_powers(view, self.materials, self._sent)
+        s, face, sent, count = t.surface, view.hits.face.numpy(), found.further.sent, SHAPE[0] * SHAPE[1]
+        elements, single = len(s.element_area), np.flatnonzero(found.single > 0)
+        pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
+        mirror = view.path_groups[:, 0]
+        own = mirror >= 0
+        parts = (
+            (single, s.element[face[single]], found.single[single]),
+            (sent.ray, elements + s.element[sent.face], sent.power),
+            (pixel[own], 2 * elements + mirror[own], found.mirror[own]),
+        )
+        row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
+        table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
+        ray, shown = found.further.shown  # known, as line of sight is
+        rest = np.bincount(np.append(ray, pixel[~own]), np.append(shown, found.mirror[~own]), minlength=count)
+        return table, np.asarray(table.sum(axis=1)).ravel() + rest
+
+    def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[np.ndarray, csr_matrix]:
+        """Of a spectrum at ``place``: squared derivatives, summed over its pixels [dB^2/neper^2], shape ``(U,)``. And the
+        precisions at which readings there tell the gains [1/neper^2], shape ``(K, U)``: one row for a whole spectrum."""
+        table, total = self.powers(place)
+        square = table.copy()
+        square.data = (table.data * np.repeat(NEPER / (total + self.floor), np.diff(table.indptr))) ** 2
+        summed = np.asarray(square.sum(axis=0)).ravel()
+        if pointings is None:
+            return summed, csr_matrix(summed / PIXEL_ERROR_DB**2)
+        cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
+        gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
+        return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
+
+
+def suggest(
+    sensitivity: Sensitivity,
+    unknowns: Unknowns,
+    candidates: np.ndarray,
+    n: int,
+    *,
+    measured: np.ndarray,
+    pointings: Pointings | None = None,
+    progress: Progress | None = None,
+) -> np.ndarray:
+    """Indices of the ``n`` of ``candidates`` (C, 3) that tell most about spectra at all of them, best first.
+
+    Args:
+        measured: receivers that have been measured before, in every direction in which candidates would be [m], shape
+            ``(R, 3)``.
+        pointings: that each candidate would take, C of them; None for whole spectra.
+        progress: called with the stage ``"suggest"``.
+    """
+    places, own = np.unique(candidates, axis=0, return_inverse=True)
+    unknown, total = len(unknowns.material), len(places) + len(measured)
+    square, known = np.zeros(unknown), np.zeros(unknown)  # of predictions' derivatives; precision beforehand
+    told: dict[int, csr_matrix] = {}
+    for k, place in enumerate(places):
+        mine = np.flatnonzero(own.reshape(-1) == k)
+        turned = None if pointings is None else replace(pointings, toward=pointings.toward[mine])
+        whole, rows = sensitivity.of(place, turned)
+        square += len(mine) * whole
+        told |= {int(c): rows[j if len(rows.indptr) > 2 else 0] for j, c in enumerate(mine)}
+        if progress is not None:
+            progress("suggest", k + 1, total)
+    if pointings is not None:
+        pointings = replace(pointings, toward=np.unique(pointings.toward, axis=0))
+    for k, place in enumerate(measured):
+        known += np.asarray(sensitivity.of(place, pointings)[1].sum(axis=0)).ravel()
+        if progress is not None:
+            progress("suggest", len(places) + k + 1, total)
+    return _greedy(told, square, unknowns, known, n)
+
+
+def _greedy(
+    told: dict[int, csr_matrix], square: np.ndarray, unknowns: Unknowns, known: np.ndarray, n: int
+) -> np.ndarray:
+    """The ``n`` readings, each of which lowers the sum of ``square`` times variance most after those before it."""
+    chosen: list[int] = []
+
+    def with_reading(k: int) -> np.ndarray:
+        more = known.copy()
+        more[told[k].indices] += told[k].data
+        return more
+
+    for _ in range(n):
+        left = sorted(told.keys() - set(chosen))
+        errors = [square @ unknowns.variance(with_reading(k)) for k in left]
+        chosen.append(left[int(np.argmin(errors))])
+        known = with_reading(chosen[-1])
+    return np.array(chosen, int)

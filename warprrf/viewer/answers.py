@@ -1,0 +1,181 @@
+"""What is known at a receiver: spectrum, paths, truth where there is one, and the beam that an array would take."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.channel.beams import dft_codebook
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.metrics import angle_deg, psnr, strongest_direction, unit_image
+from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles
+
+AT_M = 0.005
+"""A receiver that stands no farther from a measured one has its truth."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What arrives at one receiver.
+
+    Attributes:
+        receiver: position [m], shape ``(3,)``.
+        paths: from each transmitter, strongest first.
+        spectrum: of all transmitters, powers added; None without a field.
+        seconds: that it took.
+    """
+
+    receiver: np.ndarray
+    paths: tuple[Paths, ...]
+    spectrum: Spectrum | None
+    seconds: float
+
+    @property
+    def total_db(self) -> float:
+        """Path gain of everything that arrives [dB]."""
+        if self.spectrum is not None:
+            total = self.spectrum.total_path_gain
+        else:
+            total = sum(float(p.power.sum()) for p in self.paths)
+        return 10.0 * float(np.log10(max(total, 1e-300)))
+
+
+def answer(
+    source: RadioField | Scene | Mesh,
+    receiver: np.ndarray,
+    transmitters: Sequence[np.ndarray],
+    *,
+    mirror_order: int,
+    frequency_hz: float,
+    max_paths: int = 200,
+) -> Answer:
+    """Ask a field for spectrum and paths, or trace mirror paths of a scene or a mesh.
+
+    Raises:
+        ValueError: for a place that ``source`` does not hold at.
+    """
+    start = time.perf_counter()
+    spectra, paths = [], []
+    for transmitter in transmitters:
+        if isinstance(source, BistaticField):
+            asked = source
+            if mirror_order < source.terms.mirror_order:
+                asked = replace(source, terms=replace(source.terms, mirror_order=mirror_order))
+            view = asked.view(receiver, transmitter)
+            spectra.append(asked.spectrum(receiver, transmitter, view=view))
+            paths.append(asked.paths(receiver, transmitter, max_paths, view=view))
+        elif isinstance(source, RadioField):
+            spectra.append(source.spectrum(receiver, transmitter))
+            paths.append(source.paths(receiver, transmitter, max_paths))
+        else:
+            paths.append(
+                trace_paths(
+                    source, transmitter=transmitter, receivers=receiver, frequency_hz=frequency_hz,
+                    mirror_order=mirror_order,
+                )
+            )  # fmt: skip
+    spectrum = None
+    if spectra:
+        gains = np.stack([s.path_gain for s in spectra])
+        spectrum = spectra[0] if len(spectra) == 1 else replace(
+            spectra[0], path_gain=gains.sum(axis=0, dtype=np.float64), delay_s=None, aod=None
+        )  # fmt: skip
+    return Answer(receiver, tuple(paths), spectrum, time.perf_counter() - start)
+
+
+def measured_here(ds: SpectrumDataset | None, receiver: np.ndarray) -> int | None:
+    """Which receiver of ``ds`` stands at ``receiver`` (3,) [m]; None if none does."""
+    if ds is None or len(ds) == 0:
+        return None
+    distance = np.linalg.norm(ds.receivers - receiver, axis=1)
+    nearest = int(distance.argmin())
+    return nearest if distance[nearest] <= AT_M else None
+
+
+def errors(predicted: Spectrum, truth: Spectrum) -> dict[str, float]:
+    """How wrong a spectrum is: PSNR of the dB image [dB], direction of the strongest pixel [degrees], total [dB]."""
+    if truth.range_db is None:
+        raise ValueError("truth: its range_db is None, expected the dB range of its data set")
+    images = [unit_image(s.path_gain, truth.floor, truth.range_db) for s in (predicted, truth)]
+    peaks = [strongest_direction(s.path_gain) for s in (predicted, truth)]
+    totals = [max(s.total_path_gain, 1e-300) for s in (predicted, truth)]
+    return {
+        "psnr_db": psnr(*images),
+        "direction_deg": float(angle_deg(*peaks)),
+        "total_db": 10.0 * float(np.log10(totals[0] / totals[1])),
+    }
+
+
+def segments(paths: Paths) -> np.ndarray:
+    """Legs of the paths of one receiver from transmitter to receiver, shape ``(L, D + 1, 2, 3)`` [m]; NaN past the last."""
+    count, depth = paths.vertices.shape[:2]
+    if paths.transmitter is None or paths.receiver is None:
+        raise ValueError("paths: got paths that do not say where they start and end, expected both")
+    ends = np.broadcast_to(paths.receiver, (count, 3))
+    points = np.empty((count, depth + 2, 3))
+    points[:, 0] = paths.transmitter
+    points[:, 1:-1] = np.where(np.isnan(paths.vertices), ends[:, None], paths.vertices)
+    points[:, -1] = ends
+    legs = np.stack([points[:, :-1], points[:, 1:]], axis=2)
+    legs[(legs[:, :, 0] == legs[:, :, 1]).all(axis=-1)] = np.nan
+    return legs
+
+
+def described(paths: Paths, index: int) -> str:
+    """One path in words: kind, gain, delay, angles of arrival and departure."""
+    degrees = [float(np.rad2deg(getattr(paths, n)[index])) for n in ("theta_r", "phi_r", "theta_t", "phi_t")]
+    gain = 10.0 * np.log10(max(float(paths.power[index]), 1e-300))
+    return (
+        f"{paths.kind[index]}: {gain:.1f} dB, {paths.tau[index] * 1e9:.2f} ns, "
+        f"arrives from {degrees[0]:.0f}° / {degrees[1]:.0f}°, sent to {degrees[2]:.0f}° / {degrees[3]:.0f}°"
+    )
+
+
+def delay_profile(
+    paths: Sequence[Paths], bandwidth_hz: float, taps: int = 256
+) -> tuple[np.ndarray, np.ndarray]:
+    """Power of each tap [dB] over delay [ns], shapes ``(taps,)``: those of ``bandwidth_hz``, from the first path on."""
+    tau = np.concatenate([p.tau for p in paths])
+    power = np.concatenate([p.power for p in paths])
+    first = tau.min() - 4.0 / bandwidth_hz if len(tau) else 0.0
+    index = np.round((tau - first) * bandwidth_hz).astype(int)
+    inside = index < taps
+    total = np.bincount(index[inside], power[inside], minlength=taps)
+    return (first + np.arange(taps) / bandwidth_hz) * 1e9, 10.0 * np.log10(np.maximum(total, 1e-300))
+
+
+def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> dict[str, Any]:
+    """The receiver's best beam of a DFT codebook, without pilots.
+
+    Args:
+        paths: that arrive.
+        size: rows and columns of the array.
+        azimuth_rad: that the array faces.
+
+    Returns:
+        ``gain_db`` over one isotropic antenna, and the beam's power gain ``lobe`` (K, M) along ``directions`` (K, M, 3).
+    """
+    codebook = dft_codebook(PlanarArray(size, size, orientation=(azimuth_rad, 0.0, 0.0)))
+    arrival = np.concatenate([directions_from_angles(p.theta_r, p.phi_r) for p in paths])
+    power = np.concatenate([p.power for p in paths])
+    received = codebook.power(arrival, power)
+    best = int(received.argmax())
+    zenith, azimuth = np.meshgrid(np.linspace(0, np.pi, 61), np.linspace(-np.pi, np.pi, 121), indexing="ij")
+    directions = directions_from_angles(zenith, azimuth)
+    lobe = np.abs(codebook.amplitude(directions.reshape(-1, 3))[best]) ** 2
+    return {
+        "gain_db": 10.0 * float(np.log10(max(received[best] / max(power.sum(), 1e-300), 1e-300))),
+        "directions": directions,
+        "lobe": lobe.reshape(zenith.shape),
+    }

@@ -1,0 +1,144 @@
+"""What a viewer shows: things of the library, or files of them, sorted by what they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.mesh_files import is_mesh_file
+from warprrf.geometry.ply_files import ply_columns
+from warprrf.geometry.reconstruction import FILE as RECONSTRUCTION_FILE
+from warprrf.geometry.reconstruction import Reconstruction
+from warprrf.geometry.splats.camera import Camera
+from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.readings import Readings
+
+KINDS = "a Reconstruction, Gaussians, Mesh, Scene, RadioField, SpectrumDataset or Readings, or a file of one"
+
+
+@dataclass
+class Subject:
+    """Everything to show; None or empty where there is none.
+
+    Attributes:
+        mesh: what is drawn, and what blocks where there is no field.
+        gaussians, cameras, photos: of a reconstruction.
+        scene: names its materials, and knows the truth.
+        field: answers for receivers.
+        spectra: truth at measured receivers.
+        readings: tables of received power.
+    """
+
+    mesh: Mesh | None = None
+    gaussians: Gaussians | None = None
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    photos: dict[str, Path] = field(default_factory=dict)
+    scene: Scene | None = None
+    field: RadioField | None = None
+    spectra: SpectrumDataset | None = None
+    readings: Readings | None = None
+
+    @classmethod
+    def of(cls, things: Sequence[Any]) -> Subject:
+        """Sort ``things``.
+
+        Raises:
+            TypeError: for a thing of another kind, or none at all.
+            ValueError: for a file that cannot be read, or two things of one kind.
+        """
+        if not things:
+            raise TypeError(f"things: got nothing to show, expected {KINDS}")
+        found = cls()
+        for thing in things:
+            for part in _opened(Path(thing)) if isinstance(thing, str | os.PathLike) else [thing]:
+                found._add(part)
+        if found.mesh is None:
+            whole = found.scene or found.field
+            found.mesh = whole.mesh if whole is not None else None
+        return found
+
+    def _add(self, thing: Any) -> None:
+        if isinstance(thing, Reconstruction):
+            self.cameras, self.photos = thing.cameras, thing.photos
+            if thing.has_gaussians:
+                self._set("gaussians", thing.gaussians)
+            if thing.has_mesh:
+                self._set("mesh", thing.mesh)
+            return
+        for name, kind in _KINDS.items():
+            if isinstance(thing, kind):
+                self._set(name, thing)
+                return
+        raise TypeError(f"things: got {type(thing).__name__}, expected {KINDS}")
+
+    def _set(self, name: str, thing: Any) -> None:
+        if getattr(self, name) is not None:
+            raise ValueError(f"things: got two for {name}, expected at most one of each kind")
+        setattr(self, name, thing)
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest corner of what is shown [m], shape ``(2, 3)``."""
+        if self.mesh is not None:
+            return np.asarray(self.mesh.bounds, dtype=np.float64)
+        if self.gaussians is not None:
+            return np.asarray(np.percentile(self.gaussians.means, [1, 99], axis=0), dtype=np.float64)
+        places = np.concatenate([d.receivers for d in (self.spectra, self.readings) if d is not None])
+        return np.stack([places.min(axis=0) - 1.0, places.max(axis=0) + 1.0])
+
+    @property
+    def transmitter(self) -> np.ndarray | None:
+        """Where the transmitter stands at first (3,) [m]."""
+        for source in (self.field, self.spectra):
+            if source is not None:
+                return np.asarray(source.transmitter, dtype=np.float64)
+        if self.readings is not None:
+            return np.asarray(self.readings.transmitters, dtype=np.float64)[0]
+        if self.scene is not None and self.scene.transmitters:
+            return np.asarray(next(iter(self.scene.transmitters.values())), dtype=np.float64)
+        return None
+
+
+_KINDS: dict[str, type] = {
+    "gaussians": Gaussians, "mesh": Mesh, "scene": Scene, "field": RadioField, "spectra": SpectrumDataset,
+    "readings": Readings,
+}  # fmt: skip
+
+
+def _opened(path: Path) -> list[Any]:
+    """What the file or folder ``path`` holds."""
+    if path.is_dir():
+        return _folder(path)
+    if not path.is_file():
+        raise ValueError(f"things: {path}: no such file or folder")
+    if path.suffix == ".safetensors":
+        return [RadioField.load(path)]
+    if path.suffix == ".nc":
+        return [SpectrumDataset.load(path)]
+    if path.suffix == ".xml":
+        return [Scene.load(path)]
+    if path.suffix == ".ply" and "opacity" in ply_columns(path):
+        return [Gaussians.load_ply(path)]
+    if is_mesh_file(path):
+        return [Mesh.load(path)]
+    raise ValueError(f"things: {path}: got a file of another kind, expected {KINDS}")
+
+
+def _folder(path: Path) -> list[Any]:
+    """A reconstruction's folder, or one of `make lobby`'s form: a reconstruction and the field fitted to it."""
+    for folder in (path, path / "reconstruction"):
+        if (folder / RECONSTRUCTION_FILE).is_file():
+            fields = [path / "field.safetensors"]
+            return [Reconstruction.load(folder), *(RadioField.load(f) for f in fields if f.is_file())]
+    raise ValueError(
+        f"things: {path} holds no {RECONSTRUCTION_FILE}, expected a folder that Reconstruction.save wrote"
+    )
