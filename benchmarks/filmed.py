@@ -227,7 +227,7 @@ def run(options: Options, job: Job) -> Report:
     film, reference = film.levelled(film.surface(options.reference_every, job.progress))
     chosen = range(0, len(film.stems), options.every)
     photos = {film.photo(k).name: k for k in chosen}
-    start = time.perf_counter()
+    fresh, start = not (job.out / "workspace").exists(), time.perf_counter()
     rec = wr.reconstruct(
         [film.photo(k) for k in chosen],
         workspace=job.out / "workspace",
@@ -238,7 +238,9 @@ def run(options: Options, job: Job) -> Report:
         device=job.device,
     )
     seconds = time.perf_counter() - start
-    figures: dict[str, Any] = {"frames": len(photos), "posed": len(rec.cameras), "seconds": seconds}
+    figures: dict[str, Any] = {"frames": len(photos), "posed": len(rec.cameras)}
+    if fresh:  # else some steps were there already
+        figures["seconds"] = seconds
     taken = film.poses[[photos[name] for name in rec.cameras]]
     errors, (scale, rotation, shift) = score_cameras(list(rec.cameras.values()), taken)
     mesh = Mesh(scale * rec.mesh.vertices @ rotation.T + shift, rec.mesh.faces)
@@ -254,8 +256,9 @@ def _text(figures: Mapping[str, Any]) -> str:
         [title, *(f"{figures[f'{key}_{part}']:.3f}" for part in ("median_m", "p90_m", "within_5_cm"))]
         for key, title in ROWS
     ]
+    took = f", {figures['seconds']:.0f} s" if "seconds" in figures else ""
     return (
-        f"{figures['posed']} of {figures['frames']} frames posed, {figures['seconds']:.0f} s; cameras "
+        f"{figures['posed']} of {figures['frames']} frames posed{took}; cameras "
         f"{100 * figures['camera_rms_m']:.1f} cm rms off, {figures['camera_rotation_median_deg']:.2f} degrees; "
         f"{100 * figures['covered']:.0f} % of the reference's pixels meet the mesh. The mesh is aligned by its cameras; *laid "
         f"on it*, by its surface: scale {figures['laid_on_scale']:.3f}, what is left is the error of its shape.\n\n"

@@ -114,7 +114,9 @@ def test_a_moved_mesh_is_laid_on_the_reference(reference, cameras):
         Mesh((true @ turn.T + [0.03, -0.02, 0.04]) / 1.04, box().faces), surface, levelled.rays(3)
     )
     assert scale == pytest.approx(1.04, abs=0.004)
-    np.testing.assert_allclose(mesh.vertices, true, atol=0.012)
+    np.testing.assert_allclose(
+        mesh.vertices, true, atol=0.02
+    )  # a voxel of the reference; moved by 5 to 17 cm
 
 
 def test_a_folder_without_frames_is_refused(tmp_path: Path):

@@ -8,7 +8,6 @@ import views
 
 from warprrf.geometry.photos.config import StereoConfig
 from warprrf.geometry.photos.fusion import fuse_depth
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.stereo import mended
 from warprrf.geometry.photos.targets import PosedPhotos
 
@@ -101,30 +100,6 @@ def test_a_plain_wall_keeps_its_depth(room, spoiled, found):
     plain = (ends[..., 0] > PLAIN_X - 1e-6) & ~spoiled[1]
     assert plain.sum() > 5000
     assert (found == np.array(spoiled[0]))[plain].mean() > 0.9
-
-
-def test_a_depth_on_a_known_plane_stays_unless_photos_prove_it_wrong(room):
-    cameras, true, photos = room
-    wall = Plane(np.array([0.0, -1.0, 0.0]), -HIGH[1], np.zeros(0, dtype=np.int64))
-    bent = [0.992 * t for t in true]  # up to 3 cm before the wall
-    ends = np.array([c.position + t[..., None] * c.directions() for c, t in zip(cameras, bent, strict=True)])
-    on = patterned(room) & (np.abs(ends[..., 1] - HIGH[1]) < 0.02)
-    shares = []
-    for planes in ([wall], []):
-        result = mended(
-            bent, cameras, photos, planes=planes, config=StereoConfig(), progress=silent, device="cpu"
-        )
-        shares.append((np.array(result) == bent)[on].mean())
-    assert on.sum() > 5000 and shares[0] > 0.95 and shares[1] < 0.8
-    far = Plane(wall.normal, wall.offset - 0.4, wall.inliers)
-    wrong = [
-        t * (1 + 0.4 / np.maximum(HIGH[1] - c.position[1], 0.1)) for c, t in zip(cameras, true, strict=True)
-    ]
-    result = mended(
-        wrong, cameras, photos, planes=[far], config=StereoConfig(), progress=silent, device="cpu"
-    )
-    shown = patterned(room) & (np.array(result) > 0)
-    assert np.median(np.abs(np.array(result) / true - 1)[shown]) < 0.02
 
 
 def test_the_fused_surface_is_nearer_to_the_room(room, spoiled, found):

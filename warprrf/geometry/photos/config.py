@@ -225,7 +225,6 @@ class StereoConfig:
         sources: photos that one is compared with.
         turns: how often planes are handed on between pixels.
         settled: a depth of less cost stays as it is.
-        on_plane_m: and so does one this close to a plane known beforehand, unless it costs more than ``proved``.
         proved: depths of more cost prove nothing.
         gain: a new depth has to cost less than the old one by this much.
         checked: maps of other photos that a depth is checked against.
@@ -236,8 +235,7 @@ class StereoConfig:
     downscale: int = 2
     sources: int = 3
     turns: int = 2
-    settled: float = 0.05
-    on_plane_m: float = 0.02
+    settled: float = 0.2
     proved: float = 0.6
     gain: float = 0.05
     checked: int = 8

@@ -55,9 +55,7 @@ def fuse_gaussians(
     )
     if photos is not None and config.stereo is not None:
         seen = photos.subset(chosen)
-        depths = mended(
-            depths, views, seen, planes=planes, config=config.stereo, progress=report, device=device
-        )
+        depths = mended(depths, views, seen, config=config.stereo, progress=report, device=device)
     return fuse_maps(views, depths, planes=planes, config=config, progress=report)
 
 

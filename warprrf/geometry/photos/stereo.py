@@ -17,7 +17,6 @@ from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, launch, require, resolve
 from warprrf.geometry.photos.config import StereoConfig
-from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, match
@@ -62,7 +61,6 @@ def mended(
     views: Sequence[Camera],
     photos: PosedPhotos,
     *,
-    planes: Sequence[Plane] = (),
     config: StereoConfig,
     progress: Progress,
     device: DeviceLike = None,
@@ -73,7 +71,6 @@ def mended(
         depths: ranges [m], ``(height, width)`` of each of ``views``, 0 where unknown.
         views: cameras of the photos, of any size.
         photos: one a view, in this order.
-        planes: known beforehand; a depth on one of them stays unless photos prove it wrong.
     """
     cameras = [
         v.resized(max(2, v.width // config.downscale), max(2, v.height // config.downscale)) for v in views
@@ -89,7 +86,7 @@ def mended(
     for k, depth in enumerate(coarse):
         progress("stereo", k, len(coarse))
         others = _companions(k, cameras, coarse, comparison.sharpness, config.sources)
-        maps.append(comparison.map_of(k, depth, others, planes))
+        maps.append(comparison.map_of(k, depth, others))
     progress("stereo", len(coarse), len(coarse))
     ranges = [found.ranges() for found in maps]
     result = []
@@ -168,7 +165,7 @@ class _Comparison:
         sharpness = np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
         return cls(cameras, sizes, flat, kept, sharpness, bounds, config, where)
 
-    def map_of(self, view: int, depth: np.ndarray, others: np.ndarray, known: Sequence[Plane]) -> _Map:
+    def map_of(self, view: int, depth: np.ndarray, others: np.ndarray) -> _Map:
         """The map of one photo, from ``depth`` and comparison with ``others``."""
         camera, config, device = self.cameras[view], self.config, self.device
         first = self._start(depth, camera, view)
@@ -200,21 +197,11 @@ class _Comparison:
                 count = camera.height * ((camera.width + 1) // 2)
                 launch(match, count, [*settings, *sources], device=device, grain=32)
             if number < 0:
-                before = costs.numpy().reshape(depth.shape)
-                before = np.where(self._flat(depth, camera, known) & (before < config.proved), 0.0, before)
-                costs.assign(before.ravel())
+                before = costs.numpy().reshape(depth.shape).copy()
         cost = costs.numpy().reshape(depth.shape)
         proved = (cost < config.proved) & self.kept[view]
         better = proved & ((cost < before - config.gain) | (depth <= 0))
         return _Map(camera, planes.numpy().reshape(first.shape).astype(np.float64), proved, better)
-
-    def _flat(self, depth: np.ndarray, camera: Camera, known: Sequence[Plane]) -> np.ndarray:
-        """Where a depth map lies on one of the ``known`` planes."""
-        points = camera.position + depth[..., None] * camera.directions()
-        flat = np.zeros(depth.shape, dtype=bool)
-        for plane in known:
-            flat |= np.abs(plane.distance(points)) < self.config.on_plane_m
-        return flat & (depth > 0)
 
     def _start(self, depth: np.ndarray, camera: Camera, view: int) -> np.ndarray:
         """Planes along a depth map; at any depth where it is unknown."""
