@@ -39,6 +39,7 @@ NAMES = {
         "benchmarks.measurements",
         "horns, power alone, delay profiles and one spectrum, beside ten spectra",
     ),
+    "arrays": ("benchmarks.arrays", "spectra of coherent arrays at places that were not measured"),
     "suggest": (
         "benchmarks.suggest",
         "receivers that the field suggests beside random ones, from none to ten",

@@ -1,9 +1,11 @@
-"""What a field learns from readings that are no whole spectra: horns, power alone, delay profiles, one spectrum."""
+"""What a field learns from readings that are no whole spectra, and from several transmitters, and at another carrier."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +17,26 @@ from benchmarks.machine import machine
 from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf import tensor_files
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.spectra.readings import path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
-from warprrf.steps import Attempt, Steps
+from warprrf.steps import Attempt, Steps, digest
 
 HELP = """\
 Readings of the lobby are made from the paths that Sionna RT finds at training receivers, never from a field of ours: a horn that
 turns, horns at both ends, power alone, power-delay profiles, with an unknown gain of the chain; then with wrong readings, places
-and directions. Fields on the reconstruction of `make lobby` are scored at the test receivers.
+and directions, and a rotator whose zero is unknown. Spectra of three more transmitters and of another carrier are simulated.
+Fields on the reconstruction of `make lobby` are scored at the test receivers. Each row is kept as soon as it is finished.
 
 examples:
   python -m benchmarks measurements
   python -m benchmarks measurements --every 4 --singles 2     a first look, in minutes
 """
 
+VERSION = 1
+"""Counted up by hand when a row computes something else."""
 KIND = "readings from Sionna RT's paths 1"
 CHAIN_DB = {"horn": -23.7, "horns at both ends": -31.0, "power": 13.0}
 """Gains that the fits are to find."""
@@ -40,12 +47,21 @@ SENT = np.radians(np.arange(-180, 180, 20.0))
 BANDWIDTH_HZ, TAPS = 2e9, 120
 SCANS, PROFILES, POWERS = 10, 20, 50  # receivers of each kind
 AT_ONCE = 20_000  # paths
+ZERO_DEG = 143.0  # of a rotator whose zero is to be found
+OTHERS = {"B": (1.2, 1.4, 2.6), "C": (13.8, 1.2, 2.4), "D": (2.0, 9.0, 2.5)}
+"""Transmitters beside that of the data set [m]; nothing is fitted under the last."""
+SHARE = 4  # spectra under each of three transmitters
+OTHER_HZ = 140e9
+FEWER = (
+    5  # each how-manieth of the test receivers is simulated under other transmitters and at the other carrier
+)
 COLUMNS = (
-    ("readings", "fitted to", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
+    ("readings", "fitted to", "{}"), ("test", "receivers", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
     ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
     ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"), ("total_rms_db", "total power, rms [dB]", "{:.2f}"),
     ("total_rms_db_blocked", "blocked [dB]", "{:.2f}"), ("gain_error_db", "chain's gain off [dB]", "{:+.2f}"),
-    ("named", "wrong ones named", "{}"),
+    ("zero_error_deg", "zero off [degrees]", "{:+.2f}"), ("named", "wrong ones named", "{}"),
+    ("fit_s", "fit [s]", "{:.0f}"),
 )  # fmt: skip
 
 
@@ -148,28 +164,125 @@ def spoilt(readings: wr.Readings, seed: int) -> Iterator[tuple[str, wr.Readings,
     wrong = np.flatnonzero(np.abs(np.log10(power / readings.power)) > 1.0)
     yield "horn, 10 % wrong by 20 dB", replace(readings, power=power), wrong
     places, own = np.unique(readings.receivers, axis=0, return_inverse=True)
-    moved = readings.receivers + (0.05 / np.sqrt(3.0) * rng.normal(size=places.shape))[own.reshape(-1)]
+    own = own.reshape(-1)
+    moved = readings.receivers + (0.05 / np.sqrt(3.0) * rng.normal(size=places.shape))[own]
     yield "horn, places off by 5 cm rms", replace(readings, receivers=moved), none
     if readings.arrival is not None:
-        turn = np.radians(3.0) * rng.normal(size=len(places))[own.reshape(-1)]
-        yield (
-            "horn, yaw off by 3 degrees rms",
-            replace(readings, arrival=readings.arrival + np.stack([0 * turn, turn], 1)),
-            none,
+        turn = np.radians(3.0) * rng.normal(size=len(places))[own]
+        turned = readings.arrival + np.stack([0 * turn, turn], 1)
+        yield "horn, yaw off by 3 degrees rms", replace(readings, arrival=turned), none
+        turned = readings.arrival - [0.0, np.radians(ZERO_DEG)]
+        yield "horn, zero of azimuth unknown", replace(readings, arrival=turned, azimuth_known=False), none
+
+
+class Lobby:
+    """The room, what was measured in it, and how fields of it are scored.
+
+    Attributes:
+        options, job: what was asked.
+        surface: of the reconstruction; one for all fits, which share what they trace.
+        ds, test: spectra of Sionna RT.
+        steps: where finished rows are kept.
+    """
+
+    def __init__(self, options: Options, job: Job, steps: Steps) -> None:
+        self.options, self.job, self.steps = options, job, steps
+        self.truth = Truth.load(Path(options.spectra), (10,), options.every)
+        self.ds, self.test = self.truth.data, self.truth.test
+        self.train = self.ds.split(POWERS)[0]
+        scene = Path(options.scene)
+        self.key = digest(self.truth.key, Path(options.reconstruction), scene.read_text(), options.every)
+        self._seen: dict[Any, Any] = {}
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Patches and groups of the reconstruction."""
+        return Surface.of(wr.Reconstruction.load(self.options.reconstruction))
+
+    @cached_property
+    def tables(self) -> dict[str, wr.Readings]:
+        """Readings of every kind."""
+
+        def make(attempt: Attempt) -> dict[str, Any]:
+            tensor_files.write(self._file, measured(self.options, self.ds, attempt), {}, KIND)
+            return {}
+
+        inputs = [self.truth.key, Path(self.options.scene).read_text()]
+        self.steps.run("readings", make, version=1, inputs=inputs, outputs=[self._file.name])
+        power = tensor_files.read(self._file, KIND)[0]
+        places = self.train.receivers
+        return {kind: table_of(kind, self.ds, places[: len(power[kind])], power[kind]) for kind in KINDS}
+
+    @property
+    def _file(self) -> Path:
+        return self.job.out / "readings.safetensors"
+
+    def simulated(self, name: str, receivers: np.ndarray, **ends: Any) -> wr.SpectrumDataset:
+        """Sionna RT's spectra of ``receivers`` under another transmitter or at another carrier; kept."""
+        file = self.job.out / f"{name}.nc"
+        setting: dict[str, Any] = {
+            "transmitter": self.ds.transmitter,
+            "frequency_hz": self.ds.frequency_hz,
+        } | ends
+
+        def make(attempt: Attempt) -> dict[str, Any]:
+            wr.simulate(
+                wr.Scene.load(self.options.scene), **setting, receivers=receivers, shape=self.ds.shape, engine="sionna",
+                depth=int(self.ds.attributes["depth"]), samples=int(self.ds.attributes["samples"]),
+                beam_sigma_rad=self.ds.beam_sigma_rad, refraction=False, seed=7, progress=attempt.progress,
+            ).save(file)  # fmt: skip
+            return {}
+
+        inputs = [self.key, receivers, list(setting["transmitter"]), float(setting["frequency_hz"])]
+        self.steps.run(name, make, version=1, inputs=inputs, outputs=[file.name])
+        return wr.SpectrumDataset.load(file)
+
+    def fit(self, data: Any, **settings: Any) -> BistaticField:
+        """A field on ``data``."""
+        return BistaticField.fit(
+            self.surface, data, device=self.job.device, progress=self.job.progress, **settings
         )
 
+    def scored(self, field: BistaticField, test: wr.SpectrumDataset) -> dict[str, Any]:
+        """Figures of a field at the receivers of ``test``; what those see is traced once for all fields."""
+        total = []
 
-def scored(field: wr.RadioField, test: wr.SpectrumDataset, job: Job) -> dict[str, Any]:
-    """Figures of a field at the test receivers."""
-    found = wr.evaluate(test, field.spectrum, progress=job.progress)
-    figures = {key: found[key] for key in ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db")}
-    total = np.array([field.spectrum(place).total_path_gain for place in test.receivers])
-    error = 10.0 * np.log10(total / test.path_gain.sum(axis=(1, 2), dtype=np.float64))
-    blocked = ~np.asarray(test.line_of_sight)
-    figures |= {"total_rms_db": float(np.sqrt(np.mean(error**2)))}
-    return figures | {
-        "total_rms_db_blocked": float(np.sqrt(np.mean(error[blocked] ** 2))) if blocked.any() else None
-    }
+        def predict(rx: np.ndarray) -> np.ndarray:
+            transport = field.transport(test.transmitter)
+            kind = field.frequency_hz, field.terms.sub_pixels, field.terms.mirror_order
+            key = *kind, test.transmitter.tobytes(), rx.tobytes()
+            if key not in self._seen:
+                self._seen[key] = transport.view(rx, field.terms)
+            seen = self._seen[key] = transport.complete(self._seen[key], field.terms)
+            found = field.render(seen).image
+            total.append(float(found.sum()))
+            return np.asarray(found, np.float32)
+
+        field = replace(field, shape=test.shape, beam_sigma_rad=test.beam_sigma_rad)
+        found = wr.evaluate(test, predict, progress=self.job.progress)
+        figures = {
+            key: found[key] for key in ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db")
+        }
+        error = 10.0 * np.log10(np.array(total) / test.path_gain.sum(axis=(1, 2), dtype=np.float64))
+        blocked = ~np.asarray(test.line_of_sight)
+        figures |= {"test": len(test), "total_rms_db": _rms(error)}
+        return figures | {"total_rms_db_blocked": _rms(error[blocked]) if blocked.any() else None}
+
+    def row(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """A row of the table, kept when finished."""
+
+        def step(attempt: Attempt) -> dict[str, Any]:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                return {"readings": name} | make()
+
+        inputs = [self.key, self.options.singles, self.job.seed]
+        file = "".join(c if c.isalnum() else "-" for c in name)
+        return self.steps.run(f"row-{file}", step, version=VERSION, inputs=inputs)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def run(options: Options, job: Job) -> Report:
@@ -178,62 +291,99 @@ def run(options: Options, job: Job) -> Report:
     Raises:
         FileNotFoundError, ValueError: as the reconstruction, the scene and the spectra do.
     """
-    room = wr.Reconstruction.load(options.reconstruction)
-    truth = Truth.load(Path(options.spectra), (10,), options.every)
-    ds, test = truth.data, truth.test
-
-    def readings(attempt: Attempt) -> dict[str, Any]:
-        tensor_files.write(job.out / "readings.safetensors", measured(options, ds, attempt), {}, KIND)
-        return {}
-
     with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
-        inputs = [truth.key, Path(options.scene).read_text()]
-        steps.run("readings", readings, version=1, inputs=inputs, outputs=["readings.safetensors"])
-    power = tensor_files.read(job.out / "readings.safetensors", KIND)[0]
-    places = ds.split(POWERS)[0].receivers
-    tables = {kind: table_of(kind, ds, places[: len(power[kind])], power[kind]) for kind in KINDS}
-
-    rows = [_single(room, ds, test, options.singles, job)]
-
-    def add(name: str, data: Any, wrong: np.ndarray | None = None) -> None:
-        field = wr.RadioField.fit(room, data, device=job.device, progress=job.progress)
-        row: dict[str, Any] = {"readings": name, "gain_error_db": None, "named": ""} | scored(
-            field, test, job
-        )
-        for chain, gain in field.report["chains"].items():
-            row["gain_error_db"] = gain["gain_db"] - CHAIN_DB[chain]
-        rows.append(row | (_named(field, wrong) if wrong is not None and len(wrong) else {}))
-
-    add("10 spectra", truth.train(10))
-    for kind, table in tables.items():
-        add(kind, table)
-    for name, table, wrong in spoilt(tables["horn"], job.seed):
-        add(name, table, wrong)
+        lobby = Lobby(options, job, steps)
+        rows = [*_spectra(lobby), *_readings(lobby), *_transmitters(lobby), *_carriers(lobby)]
     head = "Lobby from photos, Sionna RT's truth with three bounces, test receivers that no field has seen."
-    figures = {"machine": machine(job.device), "test": len(test), "rows": rows}
+    figures = {"machine": machine(job.device), "test": len(lobby.test), "rows": rows}
     return Report("measurements", figures, f"{head}\n\n{columns_table(COLUMNS, rows)}")
 
 
-def _single(
-    room: wr.Reconstruction, ds: wr.SpectrumDataset, test: wr.SpectrumDataset, count: int, job: Job
-) -> dict[str, Any]:
-    """The mean over fields of one spectrum each."""
-    train = ds.split(POWERS)[0]
-    each = []
-    for k in range(count):
-        job.progress("one spectrum", k, count)
-        field = wr.RadioField.fit(room, train.subset([k]), device=job.device)
-        each.append(scored(field, test, job))
-    mean = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
-    return {"readings": f"1 spectrum, mean of {count}", "gain_error_db": None, "named": "", **mean}
+def _spectra(lobby: Lobby) -> Iterator[dict[str, Any]]:
+    """No spectrum, one, and ten."""
+    test, count = lobby.test, lobby.options.singles
+    yield lobby.row("nothing", lambda: lobby.scored(BistaticField.prior(lobby.surface, lobby.ds), test))
+    for name, settings in (("1 spectrum", {}), ("1 spectrum, quick", {"quick": True})):
+        each = [
+            lobby.row(f"{name}, receiver {k}", lambda k=k, settings=settings: _one(lobby, k, settings))  # type: ignore[misc]
+            for k in range(count)
+        ]
+        names = [key for key, value in each[0].items() if isinstance(value, float)]
+        mean = {key: float(np.mean([one[key] for one in each])) for key in names}
+        worst = {"lowest_psnr_db": min(one["psnr_db"] for one in each)}
+        yield {"readings": f"{name}, mean of {count}", "test": len(test), **mean, **worst}
+    yield lobby.row("10 spectra", lambda: _scored_fit(lobby, lobby.train.subset(range(10)), test))
 
 
-def _named(field: wr.RadioField, wrong: np.ndarray) -> dict[str, Any]:
-    """How many of the wrong readings the report names, and how many others."""
-    named = np.array(field.report["unexplained"].get("horn", []), int)
-    return {
-        "named": f"{int(np.isin(wrong, named).sum())} of {len(wrong)}, {int((~np.isin(named, wrong)).sum())} others"
+def _one(lobby: Lobby, k: int, settings: dict[str, Any]) -> dict[str, Any]:
+    return _scored_fit(lobby, lobby.train.subset([k]), lobby.test, **settings)
+
+
+def _scored_fit(lobby: Lobby, data: Any, test: wr.SpectrumDataset, **settings: Any) -> dict[str, Any]:
+    """Figures of a fit to ``data``, and how long that took."""
+    field = lobby.fit(data, **settings)
+    found = lobby.scored(field, test)
+    found["fit_s"] = field.report["fit_time_s"] + field.report["transport_time_s"]
+    for chain, gain in field.report["chains"].items():
+        found["gain_error_db"] = gain["gain_db"] - CHAIN_DB[chain]
+    for turn in field.report["azimuth_zero_deg"].values():
+        found["zero_error_deg"] = turn - ZERO_DEG
+    found["unexplained"] = field.report["unexplained"]
+    return found
+
+
+def _readings(lobby: Lobby) -> Iterator[dict[str, Any]]:
+    """Each kind of table, then a horn's with errors."""
+    for kind in KINDS:
+        yield lobby.row(kind, lambda kind=kind: _scored_fit(lobby, lobby.tables[kind], lobby.test))  # type: ignore[misc]
+    for name, table, wrong in spoilt(lobby.tables["horn"], lobby.job.seed):
+        row = lobby.row(name, lambda table=table: _scored_fit(lobby, table, lobby.test))  # type: ignore[misc]
+        if len(wrong):
+            named = np.array(row["unexplained"].get("horn", []), int)
+            others = int((~np.isin(named, wrong)).sum())
+            row["named"] = f"{int(np.isin(wrong, named).sum())} of {len(wrong)}, {others} others"
+        yield row
+
+
+def _transmitters(lobby: Lobby) -> Iterator[dict[str, Any]]:
+    """Twelve spectra of one transmitter or of three, asked under a fourth."""
+    count = 3 * SHARE
+    sets = {"A": lobby.train.subset(range(count))}
+    for name in "BC":
+        sets[name] = lobby.simulated(
+            f"transmitter-{name}", lobby.train.receivers[:count], transmitter=OTHERS[name]
+        )
+    asked = lobby.test.receivers[::FEWER]
+    test = lobby.simulated("transmitter-D", asked, transmitter=OTHERS["D"])
+    for name, one in sets.items():
+        row = f"{count} spectra of transmitter {name}, asked under D"
+        yield lobby.row(row, lambda one=one: _scored_fit(lobby, one, test))  # type: ignore[misc]
+    some = [one.subset(range(k * SHARE, (k + 1) * SHARE)) for k, one in enumerate(sets.values())]
+    yield lobby.row(f"{SHARE} of each of A, B, C, asked under D", lambda: _scored_fit(lobby, some, test))
+
+
+def _carriers(lobby: Lobby) -> Iterator[dict[str, Any]]:
+    """Ten spectra at one carrier, asked at the other, and ten there."""
+    own = {
+        lobby.ds.frequency_hz: (
+            lobby.train.subset(range(10)),
+            lobby.test.subset(range(0, len(lobby.test), FEWER)),
+        )
     }
+    places = np.concatenate([one.receivers for one in own[lobby.ds.frequency_hz]])
+    both = lobby.simulated("carrier", places, frequency_hz=OTHER_HZ)
+    own[OTHER_HZ] = both.subset(range(10)), both.subset(range(10, len(places)))
+    fields: dict[float, BistaticField] = {}
+
+    def asked(at: float, of: float) -> dict[str, Any]:
+        if of not in fields:
+            fields[of] = lobby.fit(own[of][0])
+        return lobby.scored(fields[of].at_frequency(at), own[at][1])
+
+    for of in own:
+        for at in own:
+            name = f"10 spectra at {of / 1e9:g} GHz, asked at {at / 1e9:g} GHz"
+            yield lobby.row(name, lambda at=at, of=of: asked(at, of))  # type: ignore[misc]
 
 
 BENCHMARKS = {"measurements": Benchmark("measurements", Options, run, HELP)}

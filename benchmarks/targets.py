@@ -47,6 +47,9 @@ def _margins() -> tuple[Target, ...]:
 
 
 TARGETS: dict[str, tuple[Target, ...]] = {
+    "arrays": (
+        Target("rows.carrier_ghz=2.4&method=field.gained_db", "2.4 GHz, over the nearest", 3.0, True, "dB"),
+    ),
     "report": (  # the lobby's
         Target("photo_psnr_db", "held-out photo PSNR of stage 1", 25.0, True, "dB"),
         Target("camera_rms_m", "camera positions, rms error", 0.02, unit="m"),

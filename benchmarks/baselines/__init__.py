@@ -8,7 +8,6 @@ as any other method. The only package of stage 2 that uses torch, imported when 
 from benchmarks.baselines.cgan import CGAN, CGANOptions
 from benchmarks.baselines.images import SpectrumImages
 from benchmarks.baselines.nerf2 import NeRF2, NeRF2Options
-from benchmarks.baselines.nerf2_files import load_nerf2_spectra
 from benchmarks.baselines.training import Training
 
-__all__ = ["CGAN", "CGANOptions", "NeRF2", "NeRF2Options", "SpectrumImages", "Training", "load_nerf2_spectra"]
+__all__ = ["CGAN", "CGANOptions", "NeRF2", "NeRF2Options", "SpectrumImages", "Training"]

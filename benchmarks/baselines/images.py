@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warprrf.checks import check_array
+from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.spectra.metrics import unit_image
 from warprrf.rf.spectra.spectrum import pixel_directions
 
@@ -54,10 +55,12 @@ class SpectrumImages:
         object.__setattr__(self, "images", images)
 
     @classmethod
-    def of(cls, data: SpectrumDataset | SpectrumImages) -> SpectrumImages:
-        """A data set's dB images mapped to [0, 1] by its floor and range; pictures are returned as they are."""
+    def of(cls, data: SpectrumDataset | ArraySpectra | SpectrumImages) -> SpectrumImages:
+        """A data set's dB images mapped to [0, 1] by its floor and range; pictures, an array's too, as they are."""
         if isinstance(data, SpectrumImages):
             return data
+        if isinstance(data, ArraySpectra):
+            return cls(data.power, data.receivers, data.transmitters, data.directions)
         gain = np.asarray(data.path_gain)
         return cls(
             images=unit_image(gain, float(data.floor), data.range_db).astype(np.float32),

@@ -114,6 +114,17 @@ def _readings(p: Place) -> dict[str, Any]:
     }
 
 
+def _array_spectra(p: Place) -> dict[str, Any]:
+    return {
+        "transmitters": TRANSMITTER,
+        "receivers": POINTS,
+        "power": np.full((len(POINTS), 2), 0.5),
+        "frequency_hz": CARRIER,
+        "array": p.array,
+        "directions": np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]]),
+    }
+
+
 def _spectra(p: Place) -> dict[str, Any]:
     ds = p.train.subset([0, 1, 2])
     return {name: getattr(ds, name) for name in ds.__dataclass_fields__}
@@ -264,6 +275,9 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "Readings.load": lambda p: {"path": p.folder / "readings.csv", "frequency_hz": CARRIER, "floor": 1e-14},
     "Readings.subset": lambda p: {"self": wr.Readings(**_readings(p)), "rows": np.array([0, 2])},
+    "channel.ArraySpectra": _array_spectra,
+    "channel.ArraySpectra.load": lambda p: {"path": p.folder / "pictures", "frequency_hz": CARRIER, "part": "train"},
+    "channel.ArraySpectra.subset": lambda p: {"self": wr.channel.ArraySpectra(**_array_spectra(p)), "rows": np.array([0])},
     "horn": lambda p: {"width_rad": 0.2},
     "SpectrumDataset": _spectra,
     "SpectrumDataset.deembed": _on(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
+from warprrf.device import require
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.geometry.splats.discs import discs_on_mesh
 
@@ -48,6 +49,15 @@ class Place:
         header = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,power_db\n"
         at = ",".join(map(str, [*TRANSMITTER, *self.receivers[0]]))
         (self.folder / "readings.csv").write_text(header + f"{at},-80.0\n{at},-81.5\n")
+        pictures = self.folder / "pictures"
+        (pictures / "spectrum").mkdir(parents=True)
+        for k in (1, 2):
+            require("PIL.Image", extra="mesh").fromarray(np.full((3, 4), 90 * k, np.uint8)).save(
+                pictures / "spectrum" / f"{k}.png"
+            )
+        (pictures / "tx_pos.csv").write_text("x,y,z\n1,2,1\n2,1,1\n")
+        (pictures / "train_index.txt").write_text("1\n2\n")
+        (pictures / "gateway_info.yml").write_text("position: [4, 3, 1]\norientation: [0, 0, 0, 1]\n")
         self.spectra.save(self.folder / "compact.nc", compact=True)
         for name, model, options in (
             ("bistatic", "bistatic", {}),

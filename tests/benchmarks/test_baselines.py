@@ -17,11 +17,12 @@ from benchmarks.baselines import (
     NeRF2Options,
     SpectrumImages,
     Training,
-    load_nerf2_spectra,
     training,
 )
 from benchmarks.baselines import nerf2 as nerf2_module
 from benchmarks.baselines.images import path_gain_of
+from warprrf.rf.channel.array_spectra import ArraySpectra, hemisphere
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.spectra import lookups, metrics
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import pixel_directions
@@ -201,67 +202,17 @@ def test_errors_name_the_argument(fitted: dict[str, Any]) -> None:
         NeRF2.fit(train, SMALL, Training(iterations=1, device="cpu0x"))
 
 
-# ------------------------------------------------------------------------------------------- NeRF2's own files
-
-
-@pytest.fixture
-def public(tmp_path: Path) -> Path:
-    """Four views of NeRF2's layout: a bright spot at the transmitter's azimuth, a gateway turned by 90 degrees."""
-    image = pytest.importorskip("PIL.Image")
-    (tmp_path / "spectrum").mkdir()
-    rows = ["x,y,z"]
-    for k in range(4):
-        picture = np.zeros((9, 36), np.uint8)
-        picture[3, 9 * k] = 255
-        picture[5] = 51
-        picture[6:] = 200
-        image.fromarray(picture).save(tmp_path / "spectrum" / f"{k + 1}.png")
-        rows.append(f"{k + 0.5},1.0,1.5")
-    (tmp_path / "tx_pos.csv").write_text("\n".join(rows) + "\n")
-    (tmp_path / "gateway_info.yml").write_text(
-        "gateway1:\n  position: [1.0, 2.0, 0.5]\n  orientation: [0.0, 0.0, 0.7071067811865476, 0.7071067811865476]\n"
-    )
-    (tmp_path / "train_index.txt").write_text("4\n2\n1\n")
-    (tmp_path / "test_index.txt").write_text("3\n")
-    return tmp_path
-
-
-def test_public_layout_is_read_by_its_own_conventions(public: Path) -> None:
-    known = load_nerf2_spectra(public)
-    assert (len(known), known.shape) == (4, (9, 36))
-    assert known.images[2, 3, 18] == 1.0
-    assert known.images[0, 5, 7] == pytest.approx(0.2)
-    assert np.array_equal(known.transmitters[:, 0], [0.5, 1.5, 2.5, 3.5])
-    assert np.array_equal(known.receivers, np.tile([1.0, 2.0, 0.5], (4, 1)))
-    # Elevation 1 degree, azimuth 1 degree; the gateway's x axis points along the world's y.
-    e, a = np.radians(1.0), np.radians(1.0)
-    assert np.allclose(known.directions[0, 0], [-np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)])
-    assert np.allclose(known.directions[-1, 5], [0.0, 0.0, 1.0])
-    train = load_nerf2_spectra(public, "train")
-    assert np.array_equal(train.transmitters[:, 0], [3.5, 1.5, 0.5])
-    assert np.array_equal(load_nerf2_spectra(public, "test").images[0], known.images[2])
-
-
-def test_nerf2_trains_on_its_public_layout(public: Path) -> None:
-    model = fit("NeRF2", load_nerf2_spectra(public, "train"), iterations=300, rays=64)
+def test_nerf2_trains_on_spectra_of_arrays() -> None:
+    directions = hemisphere((9, 36))
+    power = np.zeros((4, 9, 36))
+    power[:, 6:] = 0.8
+    power[np.arange(4), 3, 9 * np.arange(4)] = 1.0
+    senders = np.array([[k + 0.5, 1.0, 1.5] for k in range(4)])
+    known = ArraySpectra(senders, np.array([1.0, 2.0, 0.5]), power, 920e6, PlanarArray(4, 4), directions)
+    model = fit("NeRF2", known, iterations=300, rays=64)
     losses = model.report["losses"]
     assert np.mean(losses[-10:]) < 0.6 * np.mean(losses[:10])
     drawn = model.image([1.0, 2.0, 0.5], [1.5, 1.0, 1.5])
     assert drawn.shape == (9, 36)
     with pytest.raises(ValueError, match="without a dB range"):
         model.spectrum([1.0, 2.0, 0.5])
-
-
-@pytest.mark.parametrize(
-    ("break_it", "said"),
-    [
-        (lambda p: (p / "tx_pos.csv").unlink(), "tx_pos.csv is missing"),
-        (lambda p: (p / "tx_pos.csv").write_text("x,y,z\n1,2,3\n"), "got 1 positions"),
-        (lambda p: (p / "gateway_info.yml").write_text("gateway1: 3\n"), "expected gateway1"),
-        (lambda p: (p / "spectrum" / "1.png").rename(p / "spectrum" / "0.png"), "named '0'"),
-    ],
-)
-def test_broken_layouts_name_the_file(public: Path, break_it: Any, said: str) -> None:
-    break_it(public)
-    with pytest.raises((ValueError, FileNotFoundError), match=said):
-        load_nerf2_spectra(public)

@@ -677,6 +677,38 @@ def _filmed() -> str:
     return markdown(("distance", "median [cm]", "90th percentile [cm]", "within 5 cm"), lines)
 
 
+@entry("measurements")
+def _measurements() -> str:
+    found = measured("measurements")
+    if found is None:
+        return missing("python -m benchmarks measurements")
+    columns = (
+        ("psnr_db", "PSNR [dB]", "{:.1f}"), ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
+        ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"), ("total_rms_db", "total power, rms [dB]", "{:.2f}"),
+        ("total_rms_db_blocked", "blocked", "{:.2f}"), ("gain_error_db", "chain's gain off [dB]", "{:+.2f}"),
+        ("zero_error_deg", "zero off [degrees]", "{:+.1f}"), ("named", "named", "{}"),
+    )  # fmt: skip
+    lines = [[r["readings"], *(show(r.get(key), form) for key, _, form in columns)] for r in found["rows"]]
+    return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
+
+
+@entry("arrays")
+def _arrays() -> str:
+    found = measured("arrays")
+    if found is None:
+        return missing("python -m benchmarks arrays")
+    lines = [
+        [
+            f"{r['carrier_ghz']:g}",
+            r["method"],
+            *(show(r[key]) for key in ("psnr_db", "gained_db", "psnr_db_blocked")),
+        ]
+        for r in found["rows"]
+    ]
+    head = ("carrier [GHz]", "prediction", "PSNR [dB]", "over the nearest [dB]", "where blocked [dB]")
+    return markdown(head, lines)
+
+
 @entry("map")
 def _map() -> str:
     found = read("map")

@@ -11,6 +11,9 @@ from warprrf.rf.channel.arrays import plane_wave_error as plane_wave_error
 # its phases, beam loss and entries
 from warprrf.rf.channel.arrays import PlaneWaveError as PlaneWaveError
 
+# angular spectra that small arrays measured, NeRF2's folders among them
+from warprrf.rf.channel.array_spectra import ArraySpectra as ArraySpectra
+
 # == beams ==
 # beams of an array
 from warprrf.rf.channel.beams import Codebook as Codebook

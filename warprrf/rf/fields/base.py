@@ -19,13 +19,13 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.data import Data
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
-from warprrf.rf.spectra.readings import Data
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
@@ -43,7 +43,8 @@ class RadioField(ABC):
         frequency_hz: carrier [Hz].
         shape: rows and columns of its spectra.
         floor, range_db, beam_sigma_rad: of the data set it was fitted to.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where an older file does not say.
+        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where an older file does not say.
+        fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
         mesh: what blocks; None if the geometry has no mesh.
         air: absorption in its path gains, that of the data set it was fitted to; None for none.
         device: where it computes.
@@ -58,6 +59,7 @@ class RadioField(ABC):
     range_db: tuple[float, float]
     beam_sigma_rad: float
     fitted_on: np.ndarray | None
+    fitted_under: np.ndarray | None = None
     mesh: Mesh | None
     air: Air | None
     device: DeviceLike
@@ -121,8 +123,9 @@ class RadioField(ABC):
         """Write everything to one safetensors file, in one go."""
         tensors, header = self._taken_apart()
         tensors["transmitter"] = self.transmitter
-        if self.fitted_on is not None:
-            tensors["fitted_on"] = self.fitted_on
+        for name in ("fitted_on", "fitted_under"):
+            if getattr(self, name) is not None:
+                tensors[name] = getattr(self, name)
         header |= {name: getattr(self, name) for name in _PLAIN} | {
             "model": self.model,
             "report": self.report,
@@ -281,7 +284,8 @@ class RadioField(ABC):
         """Which receivers of ``ds`` it was fitted on, under the same transmitter, shape ``(R,)`` bool."""
         if self.fitted_on is None:
             return np.zeros(len(ds.receivers), dtype=bool)
-        return measured_at(ds, self.fitted_on, self.transmitter)
+        under = self.transmitter if self.fitted_under is None else self.fitted_under
+        return measured_at(ds, self.fitted_on, under)
 
     def __post_init__(self) -> None:
         """Check what every model has; ValueError or TypeError names the attribute."""
@@ -296,7 +300,9 @@ class RadioField(ABC):
             raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
         check_number("beam_sigma_rad", self.beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
         if self.fitted_on is not None:
-            check_array("fitted_on", self.fitted_on, (None, 3))
+            known = check_array("fitted_on", self.fitted_on, (None, 3))
+            if self.fitted_under is not None:
+                check_array("fitted_under", self.fitted_under, known.shape)
         if np.abs(self.transmitter).max() > LARGEST_M:
             raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
         if self.air is not None:

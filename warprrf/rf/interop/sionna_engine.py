@@ -126,7 +126,8 @@ class SionnaEngine:
         return str(self._rt.__version__)
 
     def solve(self, receiver: ArrayLike, *, specular: bool = True) -> dict[str, np.ndarray]:
-        """Paths of one receiver (3,): ``power``, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.
+        """Paths of one receiver (3,): ``power``, ``jones`` (L,2,2) without the delay's phase, along zenith and azimuth unit
+        vectors, ``tau``, ``arrival`` (L,3), ``aod`` (L,2), ``diffuse``, ``bounces``.
 
         They come by rising delay: one seed gives the same paths to the bit, in the same order, in every run.
         Without ``specular`` reflections every ray scatters, and at depth 1 Sionna's result hardly depends on chance.
@@ -174,6 +175,7 @@ class SionnaEngine:
 
         found = {
             "power": per_path.sum(axis=0)[valid] / 2.0,
+            "jones": (real + 1j * imag).reshape(2, 2, -1).transpose(2, 0, 1)[valid],
             "tau": field(paths.tau),
             "arrival": directions_from_angles(field(paths.theta_r), field(paths.phi_r)),
             "aod": np.column_stack([field(paths.theta_t), field(paths.phi_t)]),
@@ -186,6 +188,7 @@ class SionnaEngine:
         if self.air is not None:
             through = self.air.transmittance(self.frequency_hz, SPEED_OF_LIGHT * found["tau"])
             found["power"] = found["power"] * through
+            found["jones"] = found["jones"] * np.sqrt(through)[:, None, None]
         sharp = np.flatnonzero(~found["diffuse"])
         copies = sharp[repeated(*(found[name][sharp] for name in ("tau", "arrival", "aod", "bounces")))]
         return {name: np.delete(values, copies, axis=0) for name, values in found.items()}

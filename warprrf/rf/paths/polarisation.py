@@ -49,20 +49,42 @@ def jones_matrices(
         turn: What it returns, shape ``(L, k)``.
         te, tm: Reflection coefficients of each mirror, complex, shape ``(L, k)``.
     """
-    leg = np.diff(stops, axis=1)
-    departure, arrival = leg[:, 0], -leg[:, -1]
-    jones = np.broadcast_to(np.eye(2, dtype=complex), (len(stops), 2, 2))
     if te.shape[1] == 0:
-        return transverse_basis(arrival) @ np.swapaxes(transverse_basis(departure), 1, 2) + 0j
+        return _directly(stops) + 0j
+    jones = np.broadcast_to(np.eye(2, dtype=complex), (len(stops), 2, 2))
     rotation, reflected = _rotations(turn), np.stack([te, tm], axis=-1)
     for k in range(te.shape[1]):
         jones = reflected[:, k, :, None] * (rotation[:, k] @ jones)
+    into, out = _ends(stops, normal)
+    return out @ jones @ into
+
+
+def vertical_ends(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fields of antennas along the zenith unit vectors of departure and arrival, in the (TE, TM) of the first mirror and
+    behind the last, shape ``(L, 2)`` each; arguments as for :func:`turns`."""
+    if normal.shape[1] == 0:
+        both = _directly(stops)[:, 0, 0]
+        return np.stack([both, 0.0 * both], axis=1), np.broadcast_to([1.0, 0.0], (len(both), 2))
+    into, out = _ends(stops, normal)
+    return into[:, :, 0], out[:, 0, :]
+
+
+def _directly(stops: np.ndarray) -> np.ndarray:
+    """From zenith and azimuth unit vectors of departure to those of arrival, without a mirror, shape ``(L, 2, 2)``."""
+    along = np.diff(stops, axis=1)[:, 0]
+    return transverse_basis(-along) @ np.swapaxes(transverse_basis(along), 1, 2)
+
+
+def _ends(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """From zenith and azimuth unit vectors of departure to the first mirror's (TE, TM), and from those behind the last
+    mirror to the unit vectors of arrival, shape ``(L, 2, 2)`` each."""
+    leg = np.diff(stops, axis=1)
     along, across = _frames(stops, normal)
     first, last = across[:, 0], across[:, -1]
     before = np.stack([first, np.cross(first, along[:, 0])], axis=1)
     behind = np.stack([last, np.cross(last, along[:, -1])], axis=1)
-    into = before @ np.swapaxes(transverse_basis(departure), 1, 2)
-    return (transverse_basis(arrival) @ np.swapaxes(behind, 1, 2)) @ jones @ into
+    into = before @ np.swapaxes(transverse_basis(leg[:, 0]), 1, 2)
+    return into, transverse_basis(-leg[:, -1]) @ np.swapaxes(behind, 1, 2)
 
 
 def _frames(stops: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -105,6 +127,39 @@ def chain_reflection(
     Returns:
         The share, shape ``(L,)``, and its logarithmic derivatives to ``log_excess``, shape ``(L, k)``.
     """
+    whole, slopes = _chains(log_excess, cosine, turn, reflects)
+    share = 0.5 * (whole**2).sum(axis=(1, 2))
+    return share, (whole * slopes).sum(axis=(2, 3)).T / np.maximum(share, 1e-12)[:, None]
+
+
+def chain_amplitude(
+    log_excess: np.ndarray,
+    cosine: np.ndarray,
+    turn: np.ndarray,
+    reflects: np.ndarray,
+    ends: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude between two polarised antennas over chains of half-spaces of real permittivity: it is real too.
+
+    Args:
+        log_excess, cosine, turn, reflects: as for :func:`chain_reflection`.
+        ends: fields of the antennas, as :func:`vertical_ends` gives them.
+
+    Returns:
+        The amplitude, shape ``(L,)``, and its derivatives to ``log_excess``, shape ``(L, k)``.
+    """
+    whole, slopes = _chains(log_excess, cosine, turn, reflects)
+    sent, received = ends
+    return (
+        np.einsum("li,lij,lj->l", received, whole, sent),
+        np.einsum("li,klij,lj->lk", received, slopes, sent),
+    )
+
+
+def _chains(
+    log_excess: np.ndarray, cosine: np.ndarray, turn: np.ndarray, reflects: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jones matrices of chains in (TE, TM), shape ``(L, 2, 2)``, and their derivatives, shape ``(k, L, 2, 2)``."""
     amplitude, rise = _half_space(log_excess, cosine)
     amplitude = np.where(reflects[..., None], amplitude, 1.0)
     rise = np.where(reflects[..., None], rise, 0.0)
@@ -117,8 +172,7 @@ def chain_reflection(
         whole = amplitude[:, k, :, None] * turned
         slopes[:k] = amplitude[:, k, :, None] * (rotation[:, k] @ slopes[:k])
         slopes[k] = rise[:, k, :, None] * turned
-    share = 0.5 * (whole**2).sum(axis=(1, 2))
-    return share, (whole * slopes).sum(axis=(2, 3)).T / np.maximum(share, 1e-12)[:, None]
+    return whole, slopes
 
 
 def _half_space(log_excess: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

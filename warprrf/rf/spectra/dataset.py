@@ -432,10 +432,13 @@ def _sees(
 
 
 def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-    """Which spectra of ``ds`` are of ``receivers`` (K, 3) under ``transmitter`` (3,) [m], shape ``(R,)`` bool."""
-    if len(receivers) == 0 or np.linalg.norm(ds.transmitter - transmitter) > SAME_PLACE_M:
+    """Which spectra of ``ds`` are of ``receivers`` (K, 3) under ``transmitter`` [m], (3,) or that of each (K, 3), shape
+    ``(R,)`` bool."""
+    under = np.broadcast_to(transmitter, receivers.shape)
+    own = receivers[np.linalg.norm(under - ds.transmitter, axis=1) <= SAME_PLACE_M]
+    if len(own) == 0:
         return np.zeros(len(ds.receivers), dtype=bool)
-    return np.asarray(cKDTree(receivers).query(ds.receivers)[0] <= SAME_PLACE_M)
+    return np.asarray(cKDTree(own).query(ds.receivers)[0] <= SAME_PLACE_M)
 
 
 def _check_roles(role: ArrayLike, count: int) -> np.ndarray:

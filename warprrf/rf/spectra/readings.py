@@ -11,17 +11,16 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import digamma, polygamma
 
-from warprrf.checks import check_array, check_count, check_number, check_positive, checked
+from warprrf.checks import check_array, check_count, check_number, check_positive, check_type, checked
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
-from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 NEPER = 10.0 / np.log(10.0)
@@ -69,6 +68,8 @@ class Readings:
             None where fading is averaged out. Fading is taken for Rayleigh's.
         air: whose absorption is in the powers; None for none.
         name: by which a report tells these readings from others.
+        azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
+            from line of sight and mirrors. Give readings whose zeros differ as several data sets.
 
     Raises:
         TypeError, ValueError: naming the argument.
@@ -96,6 +97,7 @@ class Readings:
     samples: int | None = None
     air: Air | None = None
     name: str = "readings"
+    azimuth_known: bool = True
 
     def __post_init__(self) -> None:
         power = check_array("power", self.power, (None,), finite=False)
@@ -138,6 +140,11 @@ class Readings:
         if self.delay_s is not None:
             fields["delay_s"] = check_array("delay_s", self.delay_s, (count,))
             fields["bandwidth_hz"] = check_positive("bandwidth_hz", self.bandwidth_hz)
+        check_type("azimuth_known", self.azimuth_known, bool)
+        if not self.azimuth_known and self.arrival is None:
+            raise ValueError(
+                "azimuth_known: got False without arrival; expected the azimuths whose zero is to be found"
+            )
         if self.samples is not None:
             check_count("samples", self.samples)
         if self.window not in WINDOWS:
@@ -187,6 +194,11 @@ class Readings:
         columns = {name: getattr(self, name) for name in own}
         taken: dict[str, Any] = {name: value[index] for name, value in columns.items() if value is not None}
         return replace(self, **taken)
+
+    @property
+    def total(self) -> bool:
+        """Whether each holds all power of its place: no directions, no delays."""
+        return self.arrival is None and self.departure is None and self.delay_s is None
 
     @property
     def expected_db(self) -> np.ndarray:
@@ -265,10 +277,6 @@ class Readings:
             raise ValueError(f"path: {file}: {error.args[0] if error.args else error}") from error
 
 
-Data: TypeAlias = SpectrumDataset | Readings | Sequence[SpectrumDataset | Readings]
-"""What fields are fitted to: a set of spectra, a table of readings, or several of them."""
-
-
 def path_weights(
     readings: Readings, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
 ) -> np.ndarray:
@@ -285,8 +293,9 @@ def path_weights(
         (r.departure, r.transmit_pattern, departure),
     ):
         if turned is not None and pattern is not None:
-            cosine = directions_from_angles(*turned[rows].T) @ path.T
-            weight *= sample_pattern(pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
+            once, own = np.unique(turned[rows], axis=0, return_inverse=True)
+            cosine = directions_from_angles(*once.T) @ path.T
+            weight *= sample_pattern(pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))[own.reshape(-1)]
     if r.delay_s is not None and r.bandwidth_hz is not None:
         weight *= _tap(r.bandwidth_hz * (r.delay_s[rows, None] - delay_s), r.window)
     return weight

@@ -95,7 +95,7 @@ def test_wrong_readings_are_named_and_hardly_count(
     assert score(spoilt, test) > score(clean, test) - 1.0
 
 
-def test_several_transmitters_are_fitted_together(scene: RadioScene) -> None:
+def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioScene, tmp_path: Path) -> None:
     second, third = np.array([4.3, 0.7, 2.0]), np.array([4.2, 3.4, 2.3])
     sets = [
         exact_spectra(scene, RECEIVERS[k : k + 3], transmitter=t, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
@@ -103,12 +103,47 @@ def test_several_transmitters_are_fitted_together(scene: RadioScene) -> None:
     ]
     field = RadioField.fit(scene, sets, quick=True)
     np.testing.assert_array_equal(field.transmitter, TX)
-    np.testing.assert_array_equal(field.fitted_on, RECEIVERS[:3])
+    np.testing.assert_array_equal(field.fitted_on, RECEIVERS[:6])
+    assert [field.was_fitted_on(one).all() for one in sets] == [True, True]
+    swapped = replace(sets[1], transmitter=TX)
+    assert not field.was_fitted_on(swapped).any()  # fitted there under another transmitter
+    field.save(tmp_path / "field.safetensors")
+    assert RadioField.load(tmp_path / "field.safetensors").was_fitted_on(sets[1]).all()
     truth = exact_spectra(scene, RECEIVERS[6:8], transmitter=third, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
     both = evaluate(truth, lambda r: field.spectrum(r, third))["psnr_db"]
     one = RadioField.fit(scene, sets[0], quick=True)
     assert both > evaluate(truth, lambda r: one.spectrum(r, third))["psnr_db"] - 0.5
     assert both > 25.0
+
+
+def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene: RadioScene, turned: Readings) -> None:
+    assert turned.arrival is not None
+    away = replace(
+        turned, arrival=turned.arrival - [0.0, np.radians(137.0)], azimuth_known=False, name="away"
+    )
+    zero = RadioField.fit(scene, away, quick=True, iterations=2).report["azimuth_zero_deg"]
+    assert zero["away"] == pytest.approx(137.0, abs=1.0)
+    with pytest.raises(ValueError, match="azimuth_known: got False without arrival"):
+        replace(turned, arrival=None, receive_pattern=None, azimuth_known=False)
+
+
+def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -> None:
+    """A mirror's share exp(-(4 pi sigma_h / lambda)^2) is found again, the sum of both shares stays, and so does what
+    free space gives: the square of the wavelength."""
+    truth = exact_spectra(scene, RECEIVERS[:3], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    field = RadioField.fit(scene, truth, quick=True, iterations=3)
+    other = field.at_frequency(F / 2)
+    share, there = (np.exp(f.parameters.log_mirror) for f in (field, other))
+    scattered, later = (f.parameters.weight.sum(axis=1) for f in (field, other))
+    np.testing.assert_allclose(share + scattered, there + later, rtol=1e-9)
+    np.testing.assert_allclose((share / (share + scattered)) ** 0.25, there / (there + later), rtol=1e-9)
+    again = other.at_frequency(F)
+    np.testing.assert_allclose(again.parameters.log_weight, field.parameters.log_weight, atol=1e-6)
+    assert (again.floor, again.range_db) == (pytest.approx(field.floor), pytest.approx(field.range_db))
+    direct = [f.view(RECEIVERS[0]).friis[0] for f in (field, other)]  # line of sight
+    assert direct[1] / direct[0] == pytest.approx(4.0, rel=1e-6)
+    with pytest.raises(ValueError, match="frequency_hz"):
+        field.at_frequency(-1.0)
 
 
 def test_directions_that_nobody_measured_do_not_count(scene: RadioScene, test: SpectrumDataset) -> None:

@@ -30,7 +30,7 @@ def delay_profile(view: ReceiverView) -> WeighedPaths:
     def weigh(arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray) -> np.ndarray:
         return (delay_s >= start[:, None]) & (delay_s < start[:, None] + 2e-9)
 
-    return WeighedPaths.of(view, weigh, departure=False, delay_step_s=2e-9)
+    return WeighedPaths.of(view, weigh, arrival=True, departure=False, delay_step_s=2e-9)
 
 
 @pytest.fixture(scope="module")

@@ -22,32 +22,36 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, checked, index_to
+from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked, index_to
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.rf.channel.array_spectra import check_steering
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.itu import assumed_permittivity
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
+from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
-from warprrf.rf.fields.bistatic.render import Rendered, render, sent_radiance
+from warprrf.rf.fields.bistatic.render import Rendered, path_powers, render, sent_radiance
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data, Readings, check_gains
+from warprrf.rf.spectra.readings import check_gains
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 
 
@@ -69,7 +73,8 @@ class BistaticField(RadioField):
             ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residuals`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         air: absorption of every path: that of the data set it was fitted to; None for none.
-        fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where it is not known.
+        fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
         report: how the fit went.
         device: where it computes.
     """
@@ -88,6 +93,7 @@ class BistaticField(RadioField):
     errors: uncertainty.ErrorModel | None = field(default=None, repr=False)
     air: Air | None = None
     fitted_on: np.ndarray | None = field(default=None, repr=False)
+    fitted_under: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _sent: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
@@ -171,14 +177,13 @@ class BistaticField(RadioField):
             return cls._unmeasured(geometry, data, chosen, device)
         found = train(geometry, data, chosen, transport=transport, device=device, progress=progress)
         frame = Frame.of(data)
-        under = np.concatenate([np.atleast_2d(transmitters_of(one)) for one in data])
-        own = (under == frame.transmitter).all(axis=1)
-        receivers = np.concatenate([one.receivers for one in data])[own]
-        receivers = receivers[np.sort(np.unique(receivers, axis=0, return_index=True)[1])]
+        ends = np.concatenate([np.column_stack([transmitters_of(one), one.receivers]) for one in data])
+        ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
+        receivers = ends[(ends[:, :3] == frame.transmitter).all(axis=1), 3:]
         fitted = replace(
             cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
-            errors=found.errors, report=found.report, fitted_on=receivers,
+            errors=found.errors, report=found.report, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
@@ -191,7 +196,7 @@ class BistaticField(RadioField):
 
     @classmethod
     def _unmeasured(
-        cls, geometry: GeometryLike, data: list[SpectrumDataset | Readings], o: FitOptions, device: DeviceLike
+        cls, geometry: GeometryLike, data: list[Measured], o: FitOptions, device: DeviceLike
     ) -> BistaticField:
         """What a fit to no measurement gives: permittivities of ITU-R P.2040, by the names of materials where it has
         them, terms left free as for few receivers."""
@@ -247,6 +252,32 @@ class BistaticField(RadioField):
     def with_gas(self, gas: Gas = True) -> BistaticField:
         """The same field with the absorption of ``gas``; see :meth:`RadioField.with_gas`."""
         return replace(self, air=air_of(gas, self.frequency_hz))
+
+    def at_frequency(self, frequency_hz: float) -> BistaticField:
+        """The same room at another carrier, with nothing measured there.
+
+        What carries over: geometry, and so directions and delays; permittivities, which ITU-R P.2040-4 has constant above
+        100 GHz for every indoor material; how surfaces differ; the roughness that their mirrored and scattered shares tell,
+        counted in the new wavelengths (Ament 1953); absorption by the air, at the new carrier. Floor and range move with
+        the square of the wavelength. What does not: the width of scattering lobes stays as it was, thin slabs are none,
+        gains of measuring chains and the stated uncertainty are not known there.
+
+        Args:
+            frequency_hz: the other carrier [Hz].
+
+        Raises:
+            ValueError: for no carrier; for one outside ITU-R P.676, where the field has absorption.
+
+        Example::
+
+            field_140 = field_300.at_frequency(140e9)
+        """
+        ratio = check_frequency(frequency_hz) / self.frequency_hz
+        fall = 20.0 * float(np.log10(ratio))
+        return replace(
+            self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
+            floor=self.floor / ratio**2, range_db=(self.range_db[0] - fall, self.range_db[1] - fall),
+        )  # fmt: skip
 
     # ------------------------------------------------------------------------------------------ asking
 
@@ -316,6 +347,38 @@ class BistaticField(RadioField):
             view = self.transport(source).view(position, self.terms)
             found.append(paths_of(view, self.render(view), self.floor, self.air, max_paths))
         return found[0] if positions.ndim == 1 else Paths.stack(found)
+
+    def array_spectrum(
+        self,
+        rx: ArrayLike,
+        array: PlanarArray,
+        directions: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        *,
+        length_std_m: float = 0.0,
+    ) -> np.ndarray:
+        """Angular spectrum |a^H h|^2 / M^2 of a coherent array at ``rx`` (3,) [m], in expectation over the phases of what
+        is scattered; see :class:`ArraySpectra`.
+
+        Args:
+            rx: the array's centre.
+            array: turned as it stands; without polarisation.
+            directions: unit vectors in world axes, shape ``(..., 3)``.
+            transmitter: as for :meth:`spectrum`.
+            length_std_m: how well the lengths of paths are known [m].
+
+        Returns:
+            Path gain, shape ``(...)``.
+
+        Raises:
+            TypeError, ValueError: as for :meth:`spectrum`, and naming the argument.
+        """
+        steered = check_steering(array, directions)
+        std = check_number("length_std_m", length_std_m, 0.0)
+        view = self.view(rx, transmitter)
+        image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
+        powers = path_powers(view, self.materials, self.sent_radiance(view.transport))
+        return np.maximum(read(view, image, powers), 0.0).reshape(steered.shape[:-1])
 
     def view(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> ReceiverView:
         """What the receiver at ``rx`` (3,) sees of the geometry, whatever the materials: the costly part of a spectrum.

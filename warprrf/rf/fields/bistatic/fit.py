@@ -20,6 +20,8 @@ from warprrf.rf.fields.bistatic.response import Response, jacobian, predict
 
 NEPER = 10.0 / np.log(10.0)
 """Decibels of a neper of power."""
+OWN_GAIN = -2
+"""In place of a measuring chain's index: readings of one place whose common gain is not known. Their sum tells it."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,11 @@ class Target:
         """The same with errors multiplied by ``trust`` (N,)."""
         return replace(self, trust=trust * (1.0 if self.trust is None else self.trust))
 
+    def gain(self, power: np.ndarray) -> float:
+        """Under which predicted powers (N,) in units of the floor have the sum of what was read."""
+        known = 1.0 if self.trust is None else self.trust > 0
+        return float((known * np.expm1(self.db / NEPER)).sum() / max((known * power).sum(), 1e-300))
+
     def error(self, power: np.ndarray) -> np.ndarray:
         """Error of predicted powers ``(..., N)`` in units of the floor, as it counts [dB]."""
         error = NEPER * np.log1p(power) - self.db
@@ -78,7 +85,7 @@ class Reading:
     Attributes:
         response: of the N readings, in units of the floor N0.
         target: what was read.
-        chain: measuring chain whose unknown gain they hold, -1 where the gain is known.
+        chain: measuring chain whose unknown gain they hold, -1 where the gain is known, or :data:`OWN_GAIN`.
     """
 
     response: Response
@@ -89,23 +96,39 @@ class Reading:
         """The same by materials instead of groups; ``material`` (G,) is that of each group."""
         return replace(self, response=self.response.tied(material))
 
-    def gain(self, p: Parameters) -> float:
-        """Of the measuring chain."""
-        return float(np.exp(p.log_gains[self.chain])) if self.chain >= 0 else 1.0
+    def gain(self, p: Parameters, power: np.ndarray) -> float:
+        """Of the measuring chain, or of these readings, where ``power`` (N,) is predicted."""
+        return gain_of(self.chain, p, self.target, power)
 
     def error_db(self, p: Parameters) -> np.ndarray:
         """Prediction less what was read, as it counts [dB], shape ``(N,)``."""
-        return self.target.error(self.gain(p) * predict(self.response, p))
+        power = predict(self.response, p)
+        return self.target.error(self.gain(p, power) * power)
 
     def linearised(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """:meth:`error_db` ``(N,)``, its derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
         power, table, index = jacobian(self.response, p, layout)
+        gain = self.gain(p, power)
+        if self.chain == OWN_GAIN:  # what changes all alike changes nothing
+            known = (
+                np.ones(len(power)) if self.target.trust is None else (self.target.trust > 0).astype(float)
+            )
+            alike = table @ known / max(float(known @ power), 1e-300)
+            table = table - alike[:, None] * power
+        if self.chain != -1:
+            power, table = gain * power, np.float32(gain) * table.astype(np.float32)
         if self.chain >= 0:
-            power = self.gain(p) * power
-            table = np.concatenate([np.float32(self.gain(p)) * table, power[None].astype(np.float32)])
+            table = np.concatenate([table, power[None].astype(np.float32)])
             index = np.append(index, layout.first_chain + self.chain)
         table *= self.target.slope(power).astype(np.float32)
         return self.target.error(power), table, index
+
+
+def gain_of(chain: int, p: Parameters, target: Target, power: np.ndarray) -> float:
+    """Gain of readings of ``chain``, of which ``target`` was read and ``power`` (N,) is predicted in units of the floor."""
+    if chain == OWN_GAIN:
+        return target.gain(power)
+    return float(np.exp(p.log_gains[chain])) if chain >= 0 else 1.0
 
 
 @dataclass(frozen=True)
@@ -218,7 +241,7 @@ def objective(readings: Sequence[Reading], p: Parameters, threshold_db: float) -
 
 def start_of(readings: Sequence[Reading], start: Parameters, options: GroupFit) -> tuple[Parameters, Layout]:
     """Where a fit starts, with an indirect radiance where one is wanted and none is known, and what is free."""
-    chains = max((r.chain + 1 for r in readings), default=0)
+    chains = max(0, *(r.chain + 1 for r in readings))
     if len(start.log_gains) != chains:
         start = replace(start, log_gains=np.array([_first_gain(readings, start, c) for c in range(chains)]))
     layout = Layout(*start.log_weight.shape, indirect=options.indirect, gain=options.gain, chains=chains)

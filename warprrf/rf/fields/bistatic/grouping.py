@@ -115,8 +115,10 @@ def _costs(readings: Sequence[Reading], p: Parameters, owner: np.ndarray) -> np.
     share = p.scattered_share.astype(np.float32)
     out = np.zeros((len(owner), count))
     for reading in readings:
-        r, gain = reading.response, p.gain * reading.gain(p)
-        power = reading.gain(p) * predict(r.tied(owner), p)
+        r = reading.response
+        power = predict(r.tied(owner), p)
+        gain = reading.gain(p, power)
+        power, gain = gain * power, gain * p.gain
         loss = huber(reading.target.error(power), fit.huber_db)[0].sum()
         reflects = r.path_group >= 0
         now = np.where(reflects, owner[np.where(reflects, r.path_group, 0)], -1)
@@ -138,6 +140,13 @@ def _mirror_change(r: Response, now: np.ndarray, unit: int, p: Parameters) -> np
     count, paths = len(p.log_excess), np.flatnonzero((r.path_group == unit).any(axis=1))
     if len(paths) == 0:
         return np.zeros((count, len(r.offset)), np.float32)
+    if r.together is not None:
+        each = [np.where(r.path_group == unit, material, now) for material in range(count)]
+        heard = [
+            r.together.received(r.together.amplitudes(r.path_power, groups, r.cosine, r.turn, p)[0])
+            for groups in (now, *each)
+        ]
+        return np.asarray(heard[1:], np.float32) - np.float32(heard[0])
     own = np.broadcast_to(r.path_group[paths] == unit, (count, len(paths), now.shape[1]))
     trial = np.where(own, np.arange(count)[:, None, None], now[paths]).reshape(-1, now.shape[1])
     cosine, turn = (np.tile(a[paths], (count, 1)) for a in (r.cosine, r.turn))

@@ -75,6 +75,21 @@ class Parameters:
             log_mirror=self.log_mirror[index], log_indirect=self.log_indirect[index],
         )  # fmt: skip
 
+    def at_ratio(self, ratio: float) -> Parameters:
+        """Those of the same surfaces at ``ratio`` times the carrier: roughness counts in wavelengths.
+
+        What is not scattered, exp(-(4 pi sigma_h / lambda)^2) (Ament 1953), is raised to the square of the ratio; the sum
+        of both shares, the mix of lobes and the permittivity stay.
+        """
+        scattered = self.weight.sum(axis=1)
+        both = scattered + np.exp(self.log_mirror)
+        log_smooth = ratio**2 * (self.log_mirror - np.log(both))
+        grown = np.log(np.maximum(-np.expm1(log_smooth), 1e-12) * both / scattered)
+        return replace(
+            self, log_weight=np.maximum(self.log_weight + grown[:, None], -MOST_NEPERS),
+            log_mirror=np.maximum(log_smooth + np.log(both), -MOST_NEPERS), log_indirect=self.log_indirect + grown,
+        )  # fmt: skip
+
     @classmethod
     def prior(cls, groups: int, lobes: int) -> Parameters:
         """What a surface is taken for before any measurement: half scattered, half mirrored, epsilon_r of 4."""

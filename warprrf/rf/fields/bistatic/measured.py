@@ -1,4 +1,4 @@
-"""What is read of a receiver's paths: anything linear in their powers.
+"""What is read of a receiver's paths: anything linear in their powers, and images of arrays that hear their phases.
 
 Rays are summed in bins that a reading cannot tell apart, and readings are linear in those. A spectrum's bins are its
 pixels, seen through a beam; a horn or a window of delays weighs bins of direction and delay.
@@ -7,14 +7,18 @@ pixels, seen through a beam; a horn or a window of delays weighs bins of directi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic.materials import Parameters
 from warprrf.rf.fields.bistatic.render import PathPowers
 from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.paths.mirror_paths import stops_of
+from warprrf.rf.paths.polarisation import chain_amplitude, vertical_ends
 from warprrf.rf.spectra.beam import BeamOperator
 
 DEPARTURES = (60, 120)
@@ -23,6 +27,10 @@ DEPARTURES = (60, 120)
 
 class Measurement(Protocol):
     """What is read of a receiver's path powers: rays are summed in B bins, and N readings are linear in those."""
+
+    @property
+    def together(self) -> Superposition | None:
+        """How line of sight and mirrors add up where their phases count; None where their powers add."""
 
     def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
         """Bin of each ray, shape ``(K,)``, -1 for none, and how many bins there are."""
@@ -45,7 +53,15 @@ def read(view: ReceiverView, measurement: Measurement, powers: PathPowers) -> np
     bins, count = measurement.bins(view)
     own, power = bins >= 0, powers.single + powers.further.by_ray()
     table = np.bincount(bins[own], power[own], minlength=count)[:, None]
-    direct = powers.mirror.astype(np.float32) @ measurement.of_paths(view)
+    together = measurement.together
+    if together is None:
+        direct = powers.mirror.astype(np.float32) @ measurement.of_paths(view)
+    else:
+        p = powers.parameters
+        amplitude = together.amplitudes(view.friis, view.path_groups, view.paths.cosine, view.paths.turn, p)[
+            0
+        ]
+        direct = p.gain * together.received(np.where(powers.mirror > 0, amplitude, 0.0))
     return np.asarray(measurement.of_bins(table)[:, 0] + direct)
 
 
@@ -60,6 +76,7 @@ class SpectrumPixels:
 
     beam: BeamOperator
     pixels: np.ndarray | None = None
+    together: None = None
 
     def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
         """A bin for each pixel."""
@@ -97,6 +114,14 @@ Weigh = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 each, shape ``(N, K)``."""
 
 
+def direct_paths(view: ReceiverView) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions of arrival and departure (L, 3) and delays (L,) [s] of one receiver's line of sight and mirror paths."""
+    paths, transmitter = view.paths, view.transport.transmitter
+    toward = np.where((paths.order > 0)[:, None], paths.point[:, 0], view.receivers[0]) - transmitter
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    return paths.arrival, toward, paths.length_m / SPEED_OF_LIGHT
+
+
 @dataclass(frozen=True, eq=False)
 class WeighedPaths:
     """Readings that weigh paths by where they arrive, where they left and how late they are: horns, profiles of delay.
@@ -110,10 +135,11 @@ class WeighedPaths:
     ray_bin: np.ndarray
     of_bin: np.ndarray
     path: np.ndarray
+    together: None = None
 
     @classmethod
     def of(
-        cls, view: ReceiverView, weigh: Weigh, *, departure: bool, delay_step_s: float | None
+        cls, view: ReceiverView, weigh: Weigh, *, arrival: bool, departure: bool, delay_step_s: float | None
     ) -> WeighedPaths:
         """Those of one receiver.
 
@@ -123,17 +149,18 @@ class WeighedPaths:
         Args:
             view: what the receiver sees.
             weigh: what is read of a path.
-            departure: whether that depends on where a path left.
+            arrival: whether that depends on where a path arrives.
+            departure: whether it depends on where a path left.
             delay_step_s: delays that differ by less are not told apart; None where they do not count.
         """
         grid, transmitter, hit = view.transport.grid, view.transport.transmitter, view.hits.face.numpy() >= 0
         ray = np.flatnonzero(hit)
-        arrival = grid.directions[ray % len(grid.directions)]
+        toward = grid.directions[ray % len(grid.directions)]
         out = view.hits.points(ray) - transmitter
         length = np.linalg.norm(out, axis=1)
         delay = (length + view.hits.range_m.numpy()[ray]) / SPEED_OF_LIGHT
         out /= np.maximum(length, 1e-9)[:, None]
-        key = [ray // grid.sub_pixels**2]
+        key = [ray // grid.sub_pixels**2 if arrival else np.zeros(len(ray), int)]
         if departure:
             rows, columns = DEPARTURES
             row = np.arccos(np.clip(out[:, 2], -1.0, 1.0)) / np.pi * rows
@@ -145,20 +172,16 @@ class WeighedPaths:
         own, number = own.reshape(-1), len(first)
         mean = [
             np.stack([np.bincount(own, column, minlength=number) for column in values.T], axis=1)
-            for values in (arrival, out, delay[:, None])
+            for values in (toward, out, delay[:, None])
         ]
         ray_bin = np.full(len(hit), -1)
         ray_bin[ray] = own
-        paths = view.paths
-        toward = np.where((paths.order > 0)[:, None], paths.point[:, 0], view.receivers[0]) - transmitter
-        unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (*mean[:2], toward)]
+        unit = [v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in mean[:2]]
         count = np.bincount(own, minlength=number)
         return cls(
             ray_bin,
             weigh(unit[0], unit[1], mean[2][:, 0] / np.maximum(count, 1)).astype(np.float32),
-            np.ascontiguousarray(
-                weigh(paths.arrival, unit[2], paths.length_m / SPEED_OF_LIGHT).T, np.float32
-            ),
+            np.ascontiguousarray(weigh(*direct_paths(view)).T, np.float32),
         )
 
     def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
@@ -180,3 +203,129 @@ class WeighedPaths:
     def part(self, index: np.ndarray) -> WeighedPaths:
         """Some of the readings."""
         return WeighedPaths(self.ray_bin, self.of_bin[index], self.path[:, index])
+
+
+@dataclass(frozen=True, eq=False)
+class Superposition:
+    """How L line-of-sight and mirror paths add up in N readings of an array, between vertical antennas.
+
+    Attributes:
+        field: amplitude of each reading for a path of amplitude 1, phase of its length included, shape ``(L, N)``.
+        power: what adds in power beside, because lengths are not known so well, shape ``(L, N)`` float32.
+        ends: fields of the antennas at both ends of each path; see :func:`vertical_ends`.
+    """
+
+    field: np.ndarray
+    power: np.ndarray
+    ends: tuple[np.ndarray, np.ndarray]
+
+    def amplitudes(
+        self, power: np.ndarray, path_group: np.ndarray, cosine: np.ndarray, turn: np.ndarray, p: Parameters
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of each path ``(L,)``, real because half-spaces have no phase but their sign, and its derivatives to
+        ``log_excess`` of each group met ``(L, 3)``; those to ``log_mirror`` are half of it. The common gain apart.
+
+        Args: as for :func:`warprrf.rf.fields.bistatic.materials.mirror_power`.
+        """
+        reflects = path_group >= 0
+        own = np.maximum(path_group, 0)
+        size = np.sqrt(power) * np.exp(0.5 * np.where(reflects, p.log_mirror[own], 0.0).sum(axis=1))
+        polarised, slope = chain_amplitude(p.log_excess[own], cosine, turn, reflects, self.ends)
+        return size * polarised, size[:, None] * slope
+
+    def received(self, amplitude: np.ndarray) -> np.ndarray:
+        """Readings of paths of ``amplitude`` (L,), shape ``(N,)``."""
+        return np.asarray(0.5 * amplitude @ self.slopes(amplitude))
+
+    def slopes(self, amplitude: np.ndarray) -> np.ndarray:
+        """Derivatives of :meth:`received` to the amplitudes, shape ``(L, N)``."""
+        whole = np.conj(amplitude.astype(np.float32) @ self.field)
+        return np.asarray(2.0 * ((whole * self.field).real + amplitude[:, None] * self.power))
+
+    def subset(self, chosen: np.ndarray) -> Superposition:
+        """That of some paths."""
+        ends = self.ends[0][chosen], self.ends[1][chosen]
+        return Superposition(self.field[chosen], self.power[chosen], ends)
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayImage:
+    """Angular spectrum |a^H h|^2 / M^2 of an array, in expectation over the phases of what is scattered.
+
+    Scattered light adds a^H R a, R its covariance between elements: sums over the lags between them.
+
+    Attributes:
+        steered: of each reading by lag, shape ``(N, K)`` float32.
+        arriving: of unit power in each bin by lag, shape ``(K, B)`` float32; bins are pixels of the rays' grid.
+        together: line of sight and mirrors.
+    """
+
+    steered: np.ndarray
+    arriving: np.ndarray
+    together: Superposition
+
+    @classmethod
+    def of(
+        cls, view: ReceiverView, array: PlanarArray, directions: np.ndarray, length_std_m: float
+    ) -> ArrayImage:
+        """That of the one receiver of ``view``, steered to ``directions`` (N, 3); lengths of paths are known to
+        ``length_std_m`` [m]."""
+        grid, paths = view.transport.grid, view.paths
+        place = array.positions(1.0)
+        lag = np.round((place[:, None] - place[None]).reshape(-1, 3), 9)
+        first = np.take_along_axis(lag, (lag != 0).argmax(axis=1)[:, None], axis=1)
+        lag, count = np.unique(lag * np.where(first < 0, -1.0, 1.0) + 0.0, axis=0, return_counts=True)
+        pixels = grid.directions.reshape(-1, grid.sub_pixels**2, 3).mean(axis=1)
+        pixels /= np.linalg.norm(pixels, axis=1, keepdims=True)
+        wave, met = 2.0 * np.pi * directions @ lag.T, 2.0 * np.pi * pixels @ lag.T
+        share = count / array.elements**2
+        steered = np.concatenate([share * np.cos(wave), share * np.sin(wave)], axis=1)
+        arriving = np.concatenate([np.cos(met), np.sin(met)], axis=1) * array.gain(pixels)[:, None]
+        heard = array.response(paths.arrival, 1.0) @ array.response(directions, 1.0).conj().T / array.elements
+        heard *= np.sqrt(array.gain(paths.arrival))[:, None]
+        wavelength = view.transport.wavelength_m
+        kept = np.exp(-0.5 * (2.0 * np.pi * length_std_m / wavelength) ** 2)
+        phase = np.exp(-2j * np.pi * np.mod(paths.length_m / wavelength, 1.0))
+        together = Superposition(
+            (kept * phase[:, None] * heard).astype(np.complex64),
+            ((1.0 - kept**2) * np.abs(heard) ** 2).astype(np.float32),
+            _vertical(view),
+        )
+        return cls(steered.astype(np.float32), np.ascontiguousarray(arriving.T, np.float32), together)
+
+    def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
+        """A bin for each pixel of the rays' grid."""
+        grid = view.transport.grid
+        return np.arange(len(view.hits.face)) // grid.sub_pixels**2, grid.shape[0] * grid.shape[1]
+
+    def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
+        """By their lags."""
+        return np.asarray(
+            self.steered @ (self.arriving @ power.astype(np.float32 if quick else power.dtype, copy=False))
+        )
+
+    def to_bins(self, readings: np.ndarray) -> np.ndarray:
+        """By their lags, the other way."""
+        return np.asarray(self.arriving.T @ (self.steered.T @ readings.astype(np.float32)))
+
+    def of_paths(self, view: ReceiverView) -> np.ndarray:
+        """Of each path alone."""
+        return np.asarray(np.abs(self.together.field) ** 2 + self.together.power)
+
+    def part(self, index: np.ndarray) -> ArrayImage:
+        """Some of the directions."""
+        t = self.together
+        fewer = replace(t, field=t.field[:, index], power=t.power[:, index])
+        return replace(self, steered=self.steered[index], together=fewer)
+
+
+def _vertical(view: ReceiverView) -> tuple[np.ndarray, np.ndarray]:
+    """Fields of vertical antennas at both ends of each path of one receiver, shape ``(L, 2)`` each."""
+    paths, surface = view.paths, view.transport.surface
+    sent, received = np.zeros((len(paths), 2)), np.zeros((len(paths), 2))
+    for order in np.unique(paths.order):
+        own = np.flatnonzero(paths.order == order)
+        ends = np.broadcast_to(view.receivers[0], (len(own), 3))
+        stops = stops_of(view.transport.transmitter, paths.point[own, :order], ends)
+        sent[own], received[own] = vertical_ends(stops, surface.plane_normal[paths.patch[own, :order]])
+    return sent, received

@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
+from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.fields.bistatic.fit import NEPER, Target
-from warprrf.rf.fields.bistatic.measured import Measurement, SpectrumPixels, WeighedPaths
+from warprrf.rf.fields.bistatic.fit import NEPER, OWN_GAIN, Target, gain_of
+from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.measured import ArrayImage, Measurement, SpectrumPixels, WeighedPaths
+from warprrf.rf.fields.bistatic.response import predict, respond
+from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.open_air import warn_of_unmodelled
 from warprrf.rf.positions import check_dataset, check_positions, question_unit
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data, Readings, path_weights
+from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 
 READINGS_SHAPE = (60, 120)
 """Rows and columns of the rays around a receiver of whom no spectrum is known, and of its field's spectra."""
+PIXELS_PER_LAG = 4
+"""Directions of an array's spectrum that a fit takes, per pair of elements that tells something of its own."""
 READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
+TOTAL_ERROR_DB = 0.5
+"""The same of all power of a place: errors of single directions average out."""
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 
 
@@ -61,18 +70,18 @@ class Place:
         return *ends, self.frequency_hz, self.shape, self.beam_sigma_rad, self.air
 
 
-def as_list(data: Data) -> list[SpectrumDataset | Readings]:
+def as_list(data: Data) -> list[Measured]:
     """Data sets as a list.
 
     Raises:
         TypeError: for anything else.
         ValueError: for none, or different carriers.
     """
-    several: list[SpectrumDataset | Readings] = []
+    several: list[Measured] = []
     for one in data if isinstance(data, list | tuple) else [data]:
-        if not isinstance(one, SpectrumDataset | Readings):
+        if not isinstance(one, Measured):
             raise TypeError(
-                f"ds: got {type(one).__name__}, expected a SpectrumDataset, Readings, or a list of them"
+                f"ds: got {type(one).__name__}, expected a SpectrumDataset, Readings, ArraySpectra, or a list of them"
             )
         several.append(one)
     if not several:
@@ -85,16 +94,14 @@ def as_list(data: Data) -> list[SpectrumDataset | Readings]:
     return several
 
 
-def transmitters_of(one: SpectrumDataset | Readings) -> np.ndarray:
+def transmitters_of(one: Measured) -> np.ndarray:
     """Position of the transmitter of each of its receivers [m], shape ``(R, 3)``."""
-    if isinstance(one, Readings):
-        return one.transmitters
-    return np.broadcast_to(one.transmitter, one.receivers.shape)
+    if isinstance(one, SpectrumDataset):
+        return np.broadcast_to(one.transmitter, one.receivers.shape)
+    return one.transmitters
 
 
-def places_of(
-    data: Sequence[SpectrumDataset | Readings], mesh: Mesh | None, device: DeviceLike
-) -> list[Place]:
+def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -> list[Place]:
     """The places of data sets, in their order.
 
     Raises:
@@ -118,6 +125,13 @@ def places_of(
                 for r, receiver in enumerate(receivers)
             ]
             continue
+        _check_readings(mesh, one, device)
+        if isinstance(one, ArraySpectra):
+            found += [
+                Place(k, np.array([r]), *ends, one.frequency_hz, READINGS_SHAPE, None, one.air)
+                for r, ends in enumerate(zip(one.transmitters, one.receivers, strict=True))
+            ]
+            continue
         names, chain = np.unique(np.asarray(one.chain), return_inverse=True)
         key = np.column_stack([one.transmitters, one.receivers, chain])
         first, own = np.unique(key, axis=0, return_index=True, return_inverse=True)[1:]
@@ -131,11 +145,10 @@ def places_of(
                         one.air, str(names[chain[at]]),
                     )
                 )  # fmt: skip
-        _check_readings(mesh, one, device)
     return found
 
 
-def _check_readings(mesh: Mesh | None, one: Readings, device: DeviceLike) -> None:
+def _check_readings(mesh: Mesh | None, one: Readings | ArraySpectra, device: DeviceLike) -> None:
     wavelength_m = SPEED_OF_LIGHT / one.frequency_hz
     if mesh is not None:
         question_unit(mesh, wavelength_m)
@@ -156,7 +169,7 @@ class Observed:
         measured: how readings come from paths.
         target: what was read.
         floor: path gain that readings are in units of.
-        chain: index of the measuring chain whose gain is unknown, -1 where it is known.
+        chain: index of the measuring chain whose gain is unknown, -1 where it is known, or :data:`OWN_GAIN`.
     """
 
     place: Place
@@ -167,7 +180,7 @@ class Observed:
 
 
 def observe(
-    data: Sequence[SpectrumDataset | Readings],
+    data: Sequence[Measured],
     places: Sequence[Place],
     views: Sequence[ReceiverView],
     noise_db: float,
@@ -194,18 +207,52 @@ def observe(
             target = Target(above, None if known.all() else known.astype(float))
             found.append(Observed(place, whole[key], target, float(one.floor), -1))
             continue
+        if isinstance(one, ArraySpectra):
+            found.append(_observe_array(one, place, view, noise_db))
+            continue
         rows, floors = place.rows, np.asarray(one.floor)[place.rows]
         floor = float(floors.min())
         expected = one.expected_db[rows] - 10.0 * np.log10(floor)
         above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
         measured = WeighedPaths.of(
-            view, partial(path_weights, one, rows), departure=one.departure is not None, delay_step_s=step
-        )
-        trust = noise_db / np.hypot(READING_ERROR_DB, one.noise_db[rows])
+            view, partial(path_weights, one, rows), arrival=one.arrival is not None,
+            departure=one.departure is not None, delay_step_s=step,
+        )  # fmt: skip
+        unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
+        trust = noise_db / np.hypot(unexplained, one.noise_db[rows])
         target = Target(above, trust, one.power[rows] <= floors)
         found.append(Observed(place, measured, target, floor, index.get(place.chain, -1)))
     return found, chains
+
+
+def _observe_array(one: ArraySpectra, place: Place, view: ReceiverView, noise_db: float) -> Observed:
+    """An array's spectrum: evenly chosen directions, some times as many as it can tell apart, each trusted the less the
+    more of it is scattered.
+
+    Random phases give |c + n|^2, n complex Gaussian of power s, the variance s^2 + 2 s |c|^2.
+    """
+    measured = ArrayImage.of(view, one.array, one.directions.reshape(-1, 3), one.length_std_m)
+    power = one.power[place.rows[0]].ravel()
+    known = np.flatnonzero(np.isfinite(power))
+    most = PIXELS_PER_LAG * measured.steered.shape[1]
+    if len(known) > most:
+        known = known[np.round(np.linspace(0, len(known) - 1, most)).astype(int)]
+    unit = 1.0
+    if one.relative:  # of a size that prediction's is comparable to
+        distance = float(np.linalg.norm(place.receiver - place.transmitter))
+        unit = (SPEED_OF_LIGHT / one.frequency_hz / (4.0 * np.pi * distance)) ** 2
+    target, measured = Target(NEPER * np.log1p(power[known] / one.floor)), measured.part(known)
+    chain, floor, terms = OWN_GAIN if one.relative else -1, unit * one.floor, Terms()
+    response = respond(view, measured, terms, floor)
+    start = Parameters.prior(view.transport.surface.groups, len(terms.lobes))
+    total = predict(response, start)
+    scattered = predict(replace(response, path_power=np.zeros(len(response.path_power))), start)
+    gain = gain_of(chain, start, target, total)
+    std_db = (
+        NEPER * gain * np.sqrt(scattered * np.maximum(2.0 * total - scattered, 0.0)) / (1.0 + gain * total)
+    )
+    return Observed(place, measured, target.trusted(noise_db / np.hypot(noise_db, std_db)), floor, chain)
 
 
 @dataclass(frozen=True)
@@ -226,7 +273,7 @@ class Frame:
     air: Air | None
 
     @classmethod
-    def of(cls, data: Sequence[SpectrumDataset | Readings]) -> Frame:
+    def of(cls, data: Sequence[Measured]) -> Frame:
         """That of data sets; floor and range of readings are those of their powers."""
         for one in data:
             if isinstance(one, SpectrumDataset):
@@ -240,8 +287,8 @@ class Frame:
                     one.air,
                 )
         first = data[0]
-        if not isinstance(first, Readings):
-            raise TypeError(f"ds: got {type(first).__name__}, expected a SpectrumDataset or Readings")
+        if isinstance(first, SpectrumDataset):
+            raise TypeError(f"ds: got {type(first).__name__}, expected Readings or ArraySpectra")
         floor = float(np.min(first.floor))
         levels = 10.0 * float(np.log10(floor)), 10.0 * float(np.log10(np.nanmax(first.power)))
         return cls(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warprrf.rf.fields.bistatic.elements import RAYS
-from warprrf.rf.fields.bistatic.materials import Materials, mirror_power, mirror_share
+from warprrf.rf.fields.bistatic.materials import Materials, Parameters, mirror_power, mirror_share
 from warprrf.rf.fields.bistatic.scattering import scatter
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.spectra.beam import BeamOperator
@@ -61,11 +61,13 @@ class PathPowers:
         single: of each ray's single bounce, shape ``(R K,)``.
         mirror: of each line-of-sight and mirror path, shape ``(L,)``.
         further: of what comes after a first bounce.
+        parameters: under which they are.
     """
 
     single: np.ndarray
     mirror: np.ndarray
     further: Further
+    parameters: Parameters
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | Non
         face = view.hits.face
         power = scatter(t.surface, face, view.light, terms, p.weight, p.log_excess, t.wavelength_m)
         single = p.gain * power * materials.cell_gain(t.surface.cell[np.maximum(face.numpy(), 0)])
-    return PathPowers(single, mirror, further_bounces(view, materials, sent))
+    return PathPowers(single, mirror, further_bounces(view, materials, sent), p)
 
 
 def further_bounces(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> Further:

@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters, mirror_power
-from warprrf.rf.fields.bistatic.measured import Measurement
+from warprrf.rf.fields.bistatic.measured import Measurement, Superposition
 from warprrf.rf.fields.bistatic.render import mirror_shown, sent_on
 from warprrf.rf.fields.bistatic.scattering import resolve
 from warprrf.rf.fields.bistatic.terms import Terms
@@ -41,6 +41,7 @@ class Response:
         path_power: of each path without its reflections, shape ``(K,)``.
         path: readings of unit power on each path, shape ``(K, N)`` float32.
         offset: power that no parameter changes but the common gain, shape ``(N,)``.
+        together: how those paths add up where their phases count; None where their powers add.
     """
 
     group: np.ndarray
@@ -55,6 +56,7 @@ class Response:
     path_power: np.ndarray
     path: np.ndarray
     offset: np.ndarray
+    together: Superposition | None = None
 
     def tied(self, material: np.ndarray) -> Response:
         """The response of materials instead of groups; ``material`` (G,) is that of each group."""
@@ -75,6 +77,7 @@ class Response:
         return replace(
             self, group=self.group[scattered], bounce=self.bounce[scattered], path_group=self.path_group[keep],
             cosine=self.cosine[keep], turn=self.turn[keep], path_power=self.path_power[keep], path=self.path[keep],
+            together=None if self.together is None else self.together.subset(keep),
         )  # fmt: skip
 
 
@@ -109,7 +112,7 @@ def respond(view: ReceiverView, measurement: Measurement, terms: Terms, floor: f
     return Response(
         group=group[strong], bounce=bounce[strong], seen=seen, indirect=indirect, sender=np.zeros(0, int), sent=none,
         path_group=view.path_groups, cosine=view.paths.cosine, turn=view.paths.turn, path_power=view.friis / floor,
-        path=path, offset=np.zeros(path.shape[1], np.float32),
+        path=path, offset=np.zeros(path.shape[1], np.float32), together=measurement.together,
     )  # fmt: skip
 
 
@@ -228,10 +231,16 @@ def _blocks(r: Response, p: Parameters, layout: Layout) -> Iterator[_Block]:
     if layout.indirect:
         radiance = np.exp(p.log_indirect[r.seen])
         yield r.indirect, radiance, [(layout.radiance(r.seen), radiance)]
-    power, slope = mirror_power(r.path_power, r.path_group, r.cosine, r.turn, p)
+    where = r.path_power, r.path_group, r.cosine, r.turn, p
+    if r.together is None:
+        power, slope = mirror_power(*where)
+        columns, coefficient, to_mirror, to_excess = r.path, power, power, power[:, None] * slope
+    else:  # quadratic: half its slopes times the amplitudes
+        amplitude, to_excess = r.together.amplitudes(*where)
+        columns, coefficient, to_mirror = r.together.slopes(amplitude), 0.5 * amplitude, 0.5 * amplitude
     slopes = []
     for b in range(r.path_group.shape[1]):
         own, reflects = r.path_group[:, b], r.path_group[:, b] >= 0
-        slopes.append((np.where(reflects, layout.mirror(own), -1), power))
-        slopes.append((np.where(reflects, layout.excess(own), -1), power * slope[:, b]))
-    yield r.path, power, slopes
+        slopes.append((np.where(reflects, layout.mirror(own), -1), to_mirror))
+        slopes.append((np.where(reflects, layout.excess(own), -1), to_excess[:, b]))
+    yield columns, coefficient, slopes

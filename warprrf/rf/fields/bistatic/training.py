@@ -13,10 +13,21 @@ from threadpoolctl import threadpool_limits
 from warprrf.checks import check_count, check_seed, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
-from warprrf.rf.fields.bistatic.fit import NEPER, Fitted, GroupFit, Reading, fit_groups, huber
+from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.fields.bistatic.azimuth import with_azimuths
+from warprrf.rf.fields.bistatic.fit import (
+    NEPER,
+    OWN_GAIN,
+    Fitted,
+    GroupFit,
+    Reading,
+    fit_groups,
+    gain_of,
+    huber,
+)
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
-from warprrf.rf.fields.bistatic.measured import SpectrumPixels, read
+from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import Place, as_list, observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
@@ -26,8 +37,9 @@ from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
+from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Data, Readings
+from warprrf.rf.spectra.readings import Readings
 
 MORE: tuple[tuple[str, Any], ...] = (
     ("mirror_scatter", True),
@@ -52,7 +64,7 @@ SINGLE: dict[str, Any] = {
     "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False,
     "residual": True,
 }  # fmt: skip
-"""What it takes where that fits much worse."""
+"""What it takes where that fits much worse, with an indirect radiance if that is better still."""
 TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "indirect", "residual")
 """Terms that a fit decides on where they are None."""
 KNOWN_BETTER = 2.0
@@ -85,6 +97,7 @@ class Selection:
         short_steps: of such a fit.
         better: share to which a term must lower the held-out mean square error.
         much_better: share to which single bounces alone must lower the mean square error where receivers are few.
+        even_better: share to which an indirect radiance must then lower it further.
         clearly_worse: share to which the residual may raise it: one that is learned from all receivers gains more.
         not_much_worse: share to which it may rise where fewer materials fit the training receivers better.
         few_materials: up to which light that is sent on follows the parameters of its group.
@@ -104,6 +117,7 @@ class Selection:
     short_steps: int = 10
     better: float = 0.995
     much_better: float = 0.5
+    even_better: float = 0.9
     clearly_worse: float = 1.05
     not_much_worse: float = 1.5
     few_materials: int = 30
@@ -124,7 +138,8 @@ class FitOptions:
 
     Attributes:
         line_of_sight, diffuse: switches of those terms.
-        mirror_order: mirror reflections on a path: 0 to 3; None also stops short of 3 where a search would be refused.
+        mirror_order: mirror reflections on a path: 0 to 3; None also stops short of 3 where a search would be refused, and
+            tries nothing for spectra of arrays: they hear the phases of all.
         lobes: exponents of the scattering lobes ((1 + cos psi) / 2)^n, 0 for Lambertian; None for 0, 2, 5, 12, 30.
         reciprocal: lobes that scatter alike when transmitter and receiver change places. By default they are those of
             Degli-Esposti et al. (2007), Sionna RT's, which do not.
@@ -196,6 +211,15 @@ class FitOptions:
         if self.quick:
             found = replace(found, quick=False, **found.given(QUICK, QUICK))
         return found
+
+    def of_totals(self) -> FitOptions:
+        """The same for power alone, which cannot tell bounces or materials apart: bounces as rooms have them, surfaces as
+        they look, and mirrors that may be stronger than priors have it (metal) before a reading is taken for wrong."""
+        groups = self.groups
+        if groups == GroupFit():
+            groups = replace(groups, huber_db=10.0, deviations=replace(groups.deviations, energy=1.0))
+        selection = replace(self.selection, regrouped=0)
+        return replace(self, groups=groups, selection=selection, **self.given(FEW, TERMS))
 
     def given(self, values: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
         """Of ``values`` those of ``names`` that are None here."""
@@ -366,11 +390,17 @@ def train(
         geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
     )
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
+    if all(isinstance(one, Readings) and one.total for one in data):
+        o = o.of_totals()
+    if o.mirror_order is None and any(isinstance(one, ArraySpectra) for one in data):
+        o = replace(o, mirror_order=max(int(view.paths.order.max(initial=0)) for view in seen.views))
     if o.residuals is None:
         o = replace(o, residuals=QUICK_RESIDUAL if options.quick else ResidualFit())
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
-        return _Training(seen, data, o, progress).run()
+        data, zeros = with_azimuths(data, seen.places, seen.views)
+        found = _Training(seen, data, o, progress).run()
+    return replace(found, report=found.report | {"azimuth_zero_deg": zeros})
 
 
 def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
@@ -395,7 +425,7 @@ class _Training:
     def __init__(
         self,
         seen: TrainingViews,
-        data: Sequence[SpectrumDataset | Readings],
+        data: Sequence[Measured],
         options: FitOptions,
         progress: Progress | None,
     ) -> None:
@@ -428,7 +458,8 @@ class _Training:
             self.measured.append(observed.measured.part(chosen))
             response = respond(self.views[r], self.measured[r], terms, observed.floor)
             part = target.part(chosen)
-            if not isinstance(observed.measured, SpectrumPixels):
+            one = data[observed.place.data]
+            if isinstance(one, Readings) and not one.total:
                 part = part.trusted(1.0 + KNOWN_BETTER * _line_of_sight_share(response, start))
             self.readings.append(Reading(response, part, observed.chain))
             self.progress("fit", r, (1 + self.steps) * self.count)
@@ -487,7 +518,7 @@ class _Training:
         sent, sd, found = self._sent(materials), self.options.groups.noise_db, []
         for k, observed in enumerate(self.observed):
             rows = np.zeros(0, int)
-            if not isinstance(observed.measured, SpectrumPixels):
+            if isinstance(observed.measured, WeighedPaths):
                 error = observed.target.error(self._predicted(materials, sent, k)) / sd
                 rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
             found.append(rows)
@@ -545,18 +576,26 @@ class _Training:
     def _choose_of_few(self) -> _Candidate:
         """With too few receivers to choose by those held out: further bounces as rooms have them, unless none fit much
         better."""
-        found = []
-        for given in (FEW, SINGLE):
+
+        def tried(given: dict[str, Any]) -> _Candidate:
             terms = replace(self.options, **self.options.given(given, TERMS)).terms()
             start = Parameters.prior(int(self.material.max()) + 1, len(terms.lobes))
             fit = self._fit_groups(terms, start, self.kept, self.options.iterations)
             bare = self._materials(replace(terms, residual=False), fit)
-            found.append(_Candidate(terms, fit, self._image_error(bare, np.arange(self.count))))
-        further, single = found
-        fewer = single.error < self.choose.much_better * further.error
+            return _Candidate(terms, fit, self._image_error(bare, np.arange(self.count)))
+
+        further, best = tried(FEW), tried(SINGLE)
+        fewer = best.error < self.choose.much_better * further.error
         self._note("further bounces", not fewer, further.error)
-        self._note("single bounces", fewer, single.error)
-        return single if fewer else further
+        self._note("single bounces", fewer, best.error)
+        if not fewer:
+            return further
+        if self.options.indirect is None and best.terms.diffuse:
+            even = tried(SINGLE | {"indirect": True})
+            kept = even.error < self.choose.even_better * best.error
+            self._note("indirect", kept, even.error)
+            best = even if kept else best
+        return best
 
     def _choose(self, best: _Candidate) -> _Candidate:
         """Terms that lower the held-out error, one after another, each with a short fit of its own."""
@@ -642,10 +681,9 @@ class _Training:
     ) -> np.ndarray:
         """All that is read at a place, in units of its floor, shape ``(N,)``."""
         observed, view = self.observed[place], self._view(place, materials.terms)
-        gains = materials.parameters.log_gains
-        gain = float(np.exp(gains[observed.chain])) if observed.chain >= 0 else 1.0
         power = read(view, observed.measured, path_powers(view, materials, sent(view)))
-        return np.asarray(np.maximum(power, 0.0) * gain / observed.floor)
+        power = np.maximum(power, 0.0) / observed.floor
+        return np.asarray(gain_of(observed.chain, materials.parameters, observed.target, power) * power)
 
     def _sent(self, materials: Materials) -> Callable[[ReceiverView], np.ndarray | None]:
         """What elements send on under the transmitter of a view; computed once for each."""
@@ -776,9 +814,13 @@ class _Training:
         sent = self._sent(materials)
         shares = []
         for r in chosen:
-            view, observed, gain = self._view(r, materials.terms), self.observed[r], 1.0
-            if observed.chain >= 0:
-                gain = float(np.exp(materials.parameters.log_gains[observed.chain]))
+            view, observed, p = self._view(r, materials.terms), self.observed[r], materials.parameters
+            power = np.zeros(0)
+            if observed.chain == OWN_GAIN:
+                power = (
+                    read(view, observed.measured, path_powers(view, materials, sent(view))) / observed.floor
+                )
+            gain = gain_of(observed.chain, p, observed.target, power)
             shares.append(
                 shares_of(
                     view, materials, sent(view), observed.measured, observed.floor / gain, observed.target

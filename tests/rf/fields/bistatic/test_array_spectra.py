@@ -1,0 +1,179 @@
+"""Fields and coherent arrays: phases of line of sight and mirrors, scattered light in expectation, fits to pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
+
+from warprrf.rf.channel.array_spectra import UP, ArraySpectra, hemisphere
+from warprrf.rf.channel.arrays import PlanarArray
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.fit import OWN_GAIN, Reading, Target
+from warprrf.rf.fields.bistatic.materials import Layout
+from warprrf.rf.fields.bistatic.measured import ArrayImage, read
+from warprrf.rf.fields.bistatic.observations import Frame
+from warprrf.rf.fields.bistatic.render import path_powers
+from warprrf.rf.fields.bistatic.response import jacobian, predict, respond
+from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.trace import trace_paths
+from warprrf.rf.spectra.spectrum import directions_from_angles
+
+F = 28e9  # of whose zones mirrors hold the whole, so that exact paths are the truth
+TX = np.array([0.8, 0.9, 2.2])
+RECEIVERS = np.array(
+    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
+     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0]]
+)  # fmt: skip
+ARRAY = PlanarArray(4, 4, orientation=UP)
+DIRECTIONS = hemisphere((18, 36))
+STEERED = ARRAY.response(DIRECTIONS, 1.0).conj() / ARRAY.elements
+WALLS = SlabMaterial("walls", 5.0, 0.0, np.inf, 0.2)
+BOX = SlabMaterial("box", 12.0, 0.0, np.inf, 0.6)
+
+
+@pytest.fixture(scope="module")
+def scene() -> RadioScene:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+    )
+    return RadioScene(mesh, part, [WALLS, BOX])
+
+
+@pytest.fixture(scope="module")
+def field(scene: RadioScene) -> BistaticField:
+    frame = Frame(TX, F, (24, 48), 1e-12, (-120.0, -40.0), np.radians(5.0), None)
+    prior = BistaticField.prior(scene, frame, terms=Terms(mirror_order=2, sub_pixels=2))
+    known = prior.parameters
+    share = np.log([1.0 - m.scattering**2 for m in (WALLS, BOX)])
+    excess = np.log([m.relative_permittivity - 1.0 for m in (WALLS, BOX)])
+    group = np.array([0, 1])[: len(known.log_excess)]
+    assert len(group) == len(known.log_excess) == 2
+    return replace(prior, parameters=replace(known, log_excess=excess, log_mirror=share))
+
+
+def heard(paths: Paths) -> np.ndarray:
+    """Channel (M,) of complex paths between vertical antennas."""
+    toward = directions_from_angles(paths.theta_r, paths.phi_r)
+    return ARRAY.response(toward, 1.0).T @ paths.jones[:, 0, 0]
+
+
+def test_mirrors_and_line_of_sight_add_up_as_complex_paths_do(
+    scene: RadioScene, field: BistaticField
+) -> None:
+    """Of the exact paths of the scene with their Jones matrices; zones that a mirror's edge covers in part are left out."""
+    alone = replace(field, terms=replace(field.terms, diffuse=False))
+    compared = 0
+    for place in RECEIVERS:
+        view = alone.view(place)
+        exact = trace_paths(scene, transmitter=TX, receivers=place, frequency_hz=F, mirror_order=2)
+        if len(exact.tau) != len(view.paths) or view.paths.share.min() < 1.0:
+            continue
+        found = alone.array_spectrum(place, ARRAY, DIRECTIONS)
+        truth = np.abs(STEERED @ heard(exact)) ** 2
+        np.testing.assert_allclose(found, truth, atol=1e-3 * truth.max())
+        compared += 1
+    assert compared >= 1
+
+
+def test_one_path_alone_peaks_at_its_path_gain(field: BistaticField) -> None:
+    alone = replace(field, terms=replace(field.terms, diffuse=False, mirror_order=0))
+    place = RECEIVERS[1]
+    toward = (TX - place) / np.linalg.norm(TX - place)
+    found = alone.array_spectrum(place, ARRAY, toward[None])
+    friis = (SPEED_OF_LIGHT / F / (4 * np.pi * np.linalg.norm(TX - place))) ** 2
+    assert found[0] == pytest.approx(friis, rel=1e-5)
+    assert alone.array_spectrum(place, ARRAY, DIRECTIONS).max() <= friis * (1 + 1e-5)
+
+
+def test_scattered_light_is_the_mean_over_its_random_phases(field: BistaticField) -> None:
+    alone = replace(field, terms=replace(field.terms, line_of_sight=False, mirror_order=0))
+    place = RECEIVERS[0]
+    view = alone.view(place)
+    power = path_powers(view, alone.materials, None).single
+    lit = np.flatnonzero(power > 1e-4 * power.max())
+    wave = ARRAY.response(view.transport.grid.directions[lit], 1.0) * np.sqrt(power[lit])[:, None]
+    rng = np.random.default_rng(0)
+    phases = np.exp(2j * np.pi * rng.random((2000, len(lit))))
+    drawn = (np.abs(np.einsum("hwm,sm->shw", STEERED, phases @ wave)) ** 2).mean(axis=0)
+    found = alone.array_spectrum(place, ARRAY, DIRECTIONS)
+    assert np.abs(found - drawn).max() < 0.12 * found.max()  # 2000 draws: 2 % each, the largest of hundreds
+
+
+def test_paths_of_unknown_length_add_in_power(field: BistaticField) -> None:
+    place = RECEIVERS[0]
+    alone = replace(field, terms=replace(field.terms, diffuse=False))
+    view = alone.view(place)
+    together = ArrayImage.of(view, ARRAY, DIRECTIONS.reshape(-1, 3), 0.0).together
+    amplitude = together.amplitudes(
+        view.friis, view.path_groups, view.paths.cosine, view.paths.turn, alone.parameters
+    )[0]
+    each = sum(np.abs(a * row) ** 2 for a, row in zip(amplitude, together.field, strict=True))
+    found = alone.array_spectrum(place, ARRAY, DIRECTIONS, length_std_m=1.0).ravel()
+    np.testing.assert_allclose(found, each, rtol=1e-4)
+    mean = np.zeros(len(each))
+    rng = np.random.default_rng(1)
+    std = 0.25 * SPEED_OF_LIGHT / F / (2 * np.pi)
+    for _ in range(400):
+        turned = np.exp(2j * np.pi * F / SPEED_OF_LIGHT * std * rng.normal(size=len(amplitude)))
+        mean += np.abs((turned * amplitude) @ together.field) ** 2 / 400
+    found = alone.array_spectrum(place, ARRAY, DIRECTIONS, length_std_m=std).ravel()
+    assert np.abs(found - mean).max() < 0.05 * found.max()
+
+
+def test_its_jacobian_is_that_of_differences(field: BistaticField) -> None:
+    view = field.view(RECEIVERS[0])
+    chosen = np.arange(0, DIRECTIONS[..., 0].size, 13)
+    image = ArrayImage.of(view, ARRAY, DIRECTIONS.reshape(-1, 3), 0.0004).part(chosen)
+    floor = 1e-2 * read(view, image, path_powers(view, field.materials, None)).max()
+    response = respond(view, image, field.terms, floor)
+    layout = Layout(*field.parameters.log_weight.shape, indirect=False, gain=False)
+    x = layout.pack(field.parameters)
+    values, table, index = jacobian(response, layout.unpack(x), layout)
+    np.testing.assert_allclose(values, predict(response, layout.unpack(x)), rtol=1e-4)
+    power = read(view, image, path_powers(view, field.materials, None)) / floor
+    np.testing.assert_allclose(values, power, rtol=0.02, atol=0.01 * power.max())
+    reading = Reading(response, Target(10 * np.log10(1 + np.roll(values, 3))), OWN_GAIN)
+    errors, slopes, places = reading.linearised(layout.unpack(x), layout)
+    np.testing.assert_allclose(errors, reading.error_db(layout.unpack(x)), atol=1e-4)
+    for k, place in enumerate(index):
+        step = 1e-2 * (np.arange(layout.size) == place)
+        up, down = layout.unpack(x + step), layout.unpack(x - step)
+        slope = (predict(response, up) - predict(response, down)) / 2e-2
+        # the table of Fresnel curves is linear in steps
+        allowed = 0.15 if place % layout.stride == layout.lobes else 0.01
+        assert np.abs(table[k] - slope).max() <= allowed * np.abs(slope).max() + 1e-5 * values.max()
+        slope = (reading.error_db(up) - reading.error_db(down)) / 2e-2
+        own = slopes[np.flatnonzero(places == place)[0]]
+        assert np.abs(own - slope).max() <= allowed * np.abs(slope).max() + 1e-3
+
+
+def test_a_fit_to_normalised_pictures_beats_the_nearest(scene: RadioScene, field: BistaticField) -> None:
+    """Readings of exact complex paths and of scattering with drawn phases, as pictures of 8 bits."""
+    rng, truth = np.random.default_rng(5), []
+    for place in RECEIVERS:
+        exact = trace_paths(scene, transmitter=TX, receivers=place, frequency_hz=F, mirror_order=2)
+        h = heard(exact)
+        view = field.view(place)
+        power = path_powers(view, field.materials, None).single
+        phase = np.exp(2j * np.pi * rng.random(len(power)))
+        h = h + ARRAY.response(view.transport.grid.directions, 1.0).T @ (np.sqrt(power) * phase)
+        seen = np.abs(STEERED @ h) ** 2
+        truth.append(np.round(255 * seen / seen.max()) / 255)
+    pictures = np.array(truth)
+    known = ArraySpectra(TX, RECEIVERS[:6], pictures[:6], F, ARRAY, DIRECTIONS)
+    fitted = RadioField.fit(scene, known, quick=True, mirror_order=2)
+    assert isinstance(fitted, BistaticField)
+
+    def psnr(a: np.ndarray, b: np.ndarray) -> float:
+        return float(-10 * np.log10(np.mean((a - b) ** 2)))
+
+    for place, picture in zip(RECEIVERS[6:], pictures[6:], strict=True):
+        nearest = pictures[np.linalg.norm(RECEIVERS[:6] - place, axis=1).argmin()]
+        found = fitted.array_spectrum(place, ARRAY, DIRECTIONS)
+        assert psnr(found / found.max(), picture) > psnr(nearest, picture) + 3.0
+    with pytest.raises(ValueError, match="directions"):
+        fitted.array_spectrum(RECEIVERS[0], ARRAY, 2.0 * DIRECTIONS)
