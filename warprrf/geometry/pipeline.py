@@ -275,7 +275,7 @@ def _steps(
     first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
     planes = files.to_planes(first)
     gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
-    inputs = [steps.key("refined"), config.stereo, config.surface, config.completion]
+    inputs: list[Any] = [steps.key("refined"), config.stereo, config.surface, config.completion]
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     return gaussians, files.to_patches(_kept(steps, "surface", surface, inputs))
