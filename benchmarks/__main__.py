@@ -14,6 +14,7 @@ from warprrf import cli
 
 NAMES = {
     "lobby": ("benchmarks.lobby.pipeline", "the main job: photos -> geometry -> radio -> evaluation"),
+    "lobby-plain": ("benchmarks.lobby.plain", "the lobby with plain walls: photos -> geometry -> one field"),
     "lobby-seeds": ("benchmarks.lobby.seeds", "the main job's figures over several seeds: mean and spread"),
     "data": ("benchmarks.lobby.make_data", "regenerate data/lobby/ from nothing (hours; resumable)"),
     "table1": ("benchmarks.evaluation.command", "every method of the paper's table, and more, side by side"),
@@ -45,6 +46,7 @@ NAMES = {
         "receivers that the field suggests beside random ones, from none to ten",
     ),
     "view": ("benchmarks.viewer", "the viewer: from a drag to its answer, and whether anything grows"),
+    "outside": ("benchmarks.outside", "measurements by others: received power in a furnished flat"),
     "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ examples:
 """
 POOL = 60  # candidates: training receivers
 COLUMNS = (
-    ("fit", "fit", "{}"), ("readings", "spectra of", "{}"), ("draws", "draws", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
+    ("readings", "spectra of", "{}"), ("draws", "draws", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
     ("psnr_std_db", "spread [dB]", "{:.2f}"), ("psnr_least_db", "least [dB]", "{:.2f}"),
     ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
     ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"),
@@ -45,7 +45,8 @@ class Options:
         every: each how-manieth test receiver counts.
         draws: random sets of each size.
         counts: their sizes.
-        sub_pixels: square root of the rays per pixel of default fits.
+        quick: quick fits in the place of default ones.
+        sub_pixels: square root of the rays per pixel.
     """
 
     reconstruction: str = option("runs/lobby/reconstruction", "folder of the geometry")
@@ -53,7 +54,10 @@ class Options:
     every: int = option(1, "each how-manieth test receiver counts")
     draws: int = option(10, "random sets of each size")
     counts: tuple[int, ...] = option((1, 2, 3, 5, 6, 10), "their sizes")
-    sub_pixels: int = option(1, "square root of the rays per pixel of default fits; 3 takes twice the time")
+    quick: bool = option(False, "quick fits in the place of default ones")
+    sub_pixels: int = option(
+        1, "square root of the rays per pixel; 3, the fit's default, takes twice the time"
+    )
 
 
 def run(options: Options, job: Job) -> Report:
@@ -70,40 +74,46 @@ def run(options: Options, job: Job) -> Report:
     rows: list[dict[str, Any]] = []
     nothing = pool.subset([])
     unmeasured = wr.RadioField.fit(surface, nothing, device=job.device)
-    for quick in (True, False):
-        settings = {"quick": True} if quick else {"sub_pixels": options.sub_pixels}
-        seen = trace(surface, pool, sub_pixels=1 if quick else options.sub_pixels, device=job.device)
+    seen = trace(surface, pool, sub_pixels=options.sub_pixels, device=job.device)
 
-        def fitted(
-            chosen: Sequence[int] | np.ndarray, settings: dict[str, Any] = settings, seen: Any = seen
-        ) -> wr.RadioField:
-            part = pool.subset(np.asarray(chosen, int))
-            return wr.RadioField.fit(
-                surface, part, transport=seen.subset(chosen), device=job.device, **settings
-            )
+    def fitted(chosen: Sequence[int] | np.ndarray) -> wr.RadioField:
+        part = pool.subset(np.asarray(chosen, int))
+        transport = seen.subset(chosen)
+        return wr.RadioField.fit(surface, part, transport=transport, device=job.device, quick=options.quick)
 
-        def add(name: str, fields: list[wr.RadioField], kind: str = "quick" if quick else "default") -> None:
-            each = []
-            for k, field in enumerate(fields):
-                job.progress(f"{kind}, {name}", k, len(fields))
-                each.append(wr.evaluate(test, field.spectrum))
-            row: dict[str, Any] = {"fit": kind, "readings": name, "draws": len(each)}
-            for key in ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db"):
-                row[key] = float(np.mean([one[key] for one in each]))
-            psnr = [one["psnr_db"] for one in each]
-            rows.append(row | {"psnr_std_db": float(np.std(psnr)), "psnr_least_db": float(np.min(psnr))})
+    def add(name: str, fields: Iterable[wr.RadioField]) -> None:
+        each: list[dict[str, Any]] = []
+        for field in fields:
+            job.progress(name, len(each), options.draws)
+            each.append(wr.evaluate(test, field.spectrum))
+        row: dict[str, Any] = {"readings": name, "draws": len(each)}
+        for key in ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db"):
+            row[key] = float(np.mean([one[key] for one in each]))
+        psnr = [one["psnr_db"] for one in each]
+        rows.append(row | {"psnr_std_db": float(np.std(psnr)), "psnr_least_db": float(np.min(psnr))})
 
-        add("no receiver", [unmeasured])
-        for count in options.counts:
-            add(f"{count} random", [fitted(order[:count]) for order in orders])
-        add("3 suggested from none", [fitted(unmeasured.suggest(pool.receivers, 3))])
-        after = []
-        for order in orders:
-            first = fitted(order[:1])
-            after.append(fitted([order[0], *first.suggest(pool.receivers, 2)]))
-        add("1 random and 2 suggested", after)
-    head = f"Lobby from photos, Sionna RT's truth with three bounces, {len(pool)} candidates, {len(test)} test receivers."
-    figures = {"machine": machine(job.device), "test": len(test), "candidates": len(pool), "rows": rows}
+    add("no receiver", [unmeasured])
+    add("3 suggested from none", [fitted(unmeasured.suggest(pool.receivers, 3))])
+    for count in options.counts:
+        add(f"{count} random", (fitted(order[:count]) for order in orders))
+    begun = ((order[0], fitted(order[:1])) for order in orders)
+    add(
+        "1 random and 2 suggested",
+        (fitted([first, *field.suggest(pool.receivers, 2)]) for first, field in begun),
+    )
+    kind = "quick" if options.quick else "default"
+    head = (
+        f"Lobby from photos, Sionna RT's truth with three bounces, {kind} fits, {len(pool)} candidates, "
+        f"{len(test)} test receivers."
+    )
+    about = {"quick": options.quick, "sub_pixels": options.sub_pixels}
+    figures = {
+        "machine": machine(job.device),
+        **about,
+        "test": len(test),
+        "candidates": len(pool),
+        "rows": rows,
+    }
     return Report("suggest", figures, f"{head}\n\n{columns_table(COLUMNS, rows)}")
 
 

@@ -61,6 +61,16 @@ TARGETS: dict[str, tuple[Target, ...]] = {
         Target("fit_time_s", "stage 2 fit of RF-3DGS+", 60.0, unit="s"),
         Target("pipeline_time_s", "photos to evaluation, set-up apart", 900.0, unit="s"),
     ),
+    "lobby_plain": (
+        Target(
+            "geometry.mesh_distance_median_m",
+            "mesh to true surface where a photo sees it, median",
+            0.02,
+            unit="m",
+        ),
+        Target("geometry.mesh_distance_p90_m", "the same, 90th percentile", 0.15, unit="m"),
+        Target("bistatic.psnr_db", "bistatic field, 10 exact spectra", 33.0, True, "dB"),
+    ),
     "bistatic": (
         *_margins(),
         Target("margins.sionna.50.psnr_db", "PSNR, Sionna RT, 50 spectra", 28.0, True, "dB"),

@@ -98,7 +98,9 @@ from warprrf.geometry.photos.sfm import structure_from_motion
 from warprrf.geometry.photos.sparse import align_to_known
 
 start = time.perf_counter()
-sparse = structure_from_motion(photos, workspace=WORK / "workspace", max_features=1200, seed=0)
+sparse = structure_from_motion(
+    photos, workspace=WORK / "workspace", config=ReconstructionConfig(max_features=1200), seed=0
+)
 print(
     f"{len(sparse.cameras)} of {len(photos)} photos posed, {len(sparse.points)} points, "
     f"{time.perf_counter() - start:.0f} s"

@@ -300,6 +300,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         "geometry": p.scene, "ds": p.train, "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False,
         "residual": False, "sub_pixels": 1, "device": "cpu", "relevance": p.relevance,
     },
+    "RadioField.spectra": _on(lambda p: p.field, rx=POINTS),
     "RadioField.links": _on(lambda p: p.field, rx=POINTS, shape=(8, 16)),
     "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": "cpu"},
     "RadioField.paths": _on(lambda p: p.field, rx=POINTS[0], max_paths=20),

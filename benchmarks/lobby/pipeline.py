@@ -152,31 +152,40 @@ class Lobby:
 
     def check_data(self) -> None:
         """Refuse a folder that lacks something; ValueError names it."""
-        needed = ("photos", "photos.json", "surveyed.json", "poses_true.json", "scene.xml", *TRUTHS.values())
+        self.check_photos(*TRUTHS.values())
+
+    def check_photos(self, *more: str) -> None:
+        """Refuse a folder that lacks a file that stage 1 or its score needs, or one of ``more``; ValueError names it."""
+        needed = ("photos", "photos.json", "surveyed.json", "poses_true.json", "scene.xml", *more)
         missing = [name for name in needed if not (self.data / name).exists()]
         if missing:
             raise ValueError(
-                f"data: {self.data} lacks {', '.join(missing)}; expected the folder data/lobby of a checkout, or make "
-                "it: python -m benchmarks data"
+                f"data: {self.data} lacks {', '.join(missing)}; expected the folder {self.data.name} of a checkout's "
+                "data, or make it: python -m benchmarks data"
             )
 
-    def figures(self, steps: Steps) -> dict[str, Any]:
-        """Everything that the report holds, from the steps."""
+    def stage_1(self, steps: Steps) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What the geometry is and how far it is from the truth, from the steps."""
         inputs = [
             *(self.data / name for name in ("photos", "photos.json", "surveyed.json")),
             self.job.seed,
             self.sizes,
         ]
-        v = VERSIONS
         geometry = steps.run(
-            "geometry", self.geometry, version=v["geometry"], inputs=[*inputs, stage_1.VERSIONS],
+            "geometry", self.geometry, version=VERSIONS["geometry"], inputs=[*inputs, stage_1.VERSIONS],
             outputs=("reconstruction", "geometry.ply", "mesh.ply", "cameras.json"),
         )  # fmt: skip
-        base = [steps.key("geometry")]
         errors = steps.run(
             "geometry error", self.geometry_error, version=1, outputs=("geometry_error.npz",),
-            inputs=[*base, self.data / "poses_true.json", self.data / "scene.xml"],
+            inputs=[steps.key("geometry"), self.data / "poses_true.json", self.data / "scene.xml"],
         )  # fmt: skip
+        return geometry, errors
+
+    def figures(self, steps: Steps) -> dict[str, Any]:
+        """Everything that the report holds, from the steps."""
+        v = VERSIONS
+        geometry, errors = self.stage_1(steps)
+        base = [steps.key("geometry")]
         found: dict[str, dict[str, Any]] = {}
         for truth, name in TRUTHS.items():
             radio = [*base, self.data / name]
@@ -245,6 +254,8 @@ class Lobby:
             "scale_rms_m": found.scale_rms_m,
             "photos": len(files),
             "posed": len(found.cameras),
+            "unposed": {name: found.causes.get(name, "") for name in found.unposed},
+            "guessed": list(found.guessed),
             "held_out": len(held_out),
             "surveyed": len(surveyed),
             "gaussians": len(found.gaussians),

@@ -13,7 +13,7 @@ import pytest
 from places import LOBBY
 
 import warprrf as wr
-from benchmarks.lobby import pipeline, seeds
+from benchmarks.lobby import pipeline, plain, seeds
 from benchmarks.runner import Job, execute
 from warprrf.files import write_json
 from warprrf.geometry.splats.discs import discs_on_mesh
@@ -91,6 +91,9 @@ def _true_geometry(lobby: pipeline.Lobby, attempt: Any) -> dict[str, Any]:
         (out / name).write_text("")
     return {
         "photos": 4,
+        "posed": 4,
+        "unposed": {"v9.jpg": "shows 3 features"},
+        "guessed": ["surface: 5% of it carries no feature"],
         "held_out": 2,
         "gaussians": len(reconstruction.gaussians),
         "triangles": len(mesh.faces),
@@ -174,6 +177,15 @@ def test_missing_data_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"photos.*benchmarks data"):
         whole(tmp_path / "out", tmp_path)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("small")
+def test_the_plain_lobby_is_scored_and_says_what_is_guessed(data: Path, tmp_path: Path) -> None:
+    options = plain.Options(data=str(data), spectra=str(data / pipeline.TRUTHS["exact"]), train=6)
+    figures = execute(plain.BENCHMARKS["lobby-plain"], options, Job(tmp_path / "out", device="cpu"))
+    assert figures["geometry"]["mesh_distance_median_m"] < 1e-3 and figures["bistatic"]["receivers"] == 4
+    page = (tmp_path / "out" / "lobby_plain.md").read_text()
+    assert "v9.jpg: shows 3 features" in page and "5% of it" in page and "at least 33 dB" in page
 
 
 def test_spread_over_seeds_is_that_of_the_reports() -> None:

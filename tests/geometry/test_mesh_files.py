@@ -13,6 +13,7 @@ from model_files import BLUE, RED, changed_glb, obj_with_materials, room_glb, ro
 from places import ROOT
 
 import warprrf as wr
+from warprrf.geometry import gltf_files
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh
 
 BLUE_SRGB = np.array(BLUE) / 255.0
@@ -189,6 +190,13 @@ def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told: str, 
         wr.Mesh.load(path)
 
 
+@pytest.mark.parametrize("most", [10, 15])
+def test_a_small_file_that_makes_many_triangles_is_refused(most: int, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(gltf_files, "LARGEST_FACES", most)  # 12 and 2 are made, 2 of them stand there twice
+    with pytest.raises(ValueError, match=rf"room\.glb.*more than {most} triangles"):
+        wr.Mesh.load(room_glb(tmp_path))
+
+
 @pytest.mark.parametrize("make", [room_glb, room_gltf, obj_with_materials])
 def test_damage_is_refused_by_the_file_s_name_or_gives_numbers(make, tmp_path: Path) -> None:
     found = survey(make(tmp_path), "file_formats:read_mesh_file", flips=60, cuts=20)
@@ -234,3 +242,21 @@ def test_vertices_at_one_place_become_one_in_the_file_s_order(tmp_path: Path) ->
     content = load_mesh(tmp_path / "two.obj", MeshOptions())
     np.testing.assert_array_equal(content.vertices, [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 1]])
     np.testing.assert_array_equal(content.faces, [[0, 1, 2], [1, 0, 3]])
+
+
+def test_a_ply_of_triangles_and_few_other_polygons_is_read(tmp_path):
+    """Its rows differ in length, so that they are walked one by one, far beyond what a byte counts."""
+    grid = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0), [0.0], indexing="ij"), axis=-1).reshape(
+        -1, 3
+    )
+    corner = np.array([12 * i + j for i in range(11) for j in range(11)])
+    faces = [list(f) for k in corner for f in ((k, k + 12, k + 13), (k, k + 13, k + 1))]
+    faces[-2:] = [[corner[-1], corner[-1] + 12, corner[-1] + 13, corner[-1] + 1]]
+    path = tmp_path / "mixed.ply"
+    path.write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 144\nproperty float x\nproperty float y\nproperty float z\n"
+        + f"element face {len(faces)}\nproperty list uchar uint vertex_indices\nend_header\n".encode()
+        + grid.astype("<f4").tobytes()
+        + b"".join(bytes([len(f)]) + np.array(f, "<u4").tobytes() for f in faces)
+    )
+    assert wr.Mesh.load(path).areas.sum() == pytest.approx(121.0)

@@ -32,6 +32,7 @@ PLANE_ARRAYS = {
     "planes": lengths("K 8"),
     "plane_shapes": Expected("K 2", 0, 2**15, kind="iu"),
     "plane_cells": Expected("C", kind="b"),
+    "plane_plain": Expected("K", kind="b"),
 }
 """What the arrays of planes must be: K planes, C cells of all of them."""
 Arrays = dict[str, np.ndarray]
@@ -65,6 +66,7 @@ def of_planes(planes: Sequence[Plane]) -> Arrays:
         "planes": np.array(rows, dtype=np.float64).reshape(-1, 8),
         "plane_shapes": np.array([p.occupied.shape for p in planes], dtype=np.int64).reshape(-1, 2),
         "plane_cells": np.concatenate(cells) if cells else np.zeros(0, dtype=bool),
+        "plane_plain": np.array([p.plain for p in planes], dtype=bool),
     }
 
 
@@ -74,8 +76,19 @@ def to_planes(arrays: Arrays) -> list[Plane]:
     shapes, nothing = arrays["plane_shapes"], np.zeros(0, dtype=np.int64)
     cells = np.split(arrays["plane_cells"], np.cumsum(shapes.prod(axis=1))[:-1])
     return [
-        Plane(row[:3], float(row[3]), nothing, float(row[4]), row[5:7], float(row[7]), own.reshape(shape))
-        for row, shape, own in zip(arrays["planes"], shapes, cells, strict=False)
+        Plane(
+            row[:3],
+            float(row[3]),
+            nothing,
+            float(row[4]),
+            row[5:7],
+            float(row[7]),
+            own.reshape(shape),
+            bool(plain),
+        )
+        for row, shape, own, plain in zip(
+            arrays["planes"], shapes, cells, arrays["plane_plain"], strict=False
+        )
     ]
 
 

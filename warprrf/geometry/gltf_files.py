@@ -75,7 +75,7 @@ class _File:
     """The header and the buffers of a file; its rows are read when they are asked for."""
 
     def __init__(self, folder: Folder) -> None:
-        self.folder = folder
+        self.folder, self.triangles = folder, 0  # those that were made
         self.header, binary = _split(folder.path)
         unread = [x for x in self.header.get("extensionsRequired", []) if not str(x).startswith(_HARMLESS)]
         if unread:
@@ -170,6 +170,7 @@ class _File:
         if own is not None:
             most = np.iinfo(own.dtype).max if own.dtype.kind in "iu" else 1
             colours *= (own[:, :3].astype(np.float64) / most)[corners].mean(axis=1).clip(0.0, 1.0)
+        self.triangles = _counted(self.triangles, corners, positions)
         return material.name, positions.astype(np.float64), corners, colours
 
     def _material(self, index: int) -> _Material:
@@ -244,6 +245,14 @@ def _check_span(what: str, start: object, length: object, whole: int) -> None:
         raise ValueError(f"{what} states {length!r} bytes from {start!r} on, of {whole}")
 
 
+def _counted(total: int, corners: np.ndarray, positions: np.ndarray) -> int:
+    """``total`` with more triangles: a file of few bytes may make many."""
+    total += max(len(corners), len(positions) // 3)
+    if total > LARGEST_FACES:
+        raise ValueError(f"it makes more than {LARGEST_FACES} triangles")
+    return total
+
+
 def _corners(index: np.ndarray, mode: int) -> np.ndarray:
     """Triangles (F, 3) of a list or a strip."""
     if mode == _FAN:
@@ -277,9 +286,7 @@ def _joined(file: _File) -> MeshContent:
     start = total = 0
     for name, place, parts in file.instances():
         for material, positions, corners, colour in parts:
-            total += len(corners)
-            if total > LARGEST_FACES:
-                raise ValueError(f"it makes more than {LARGEST_FACES} triangles")
+            total = _counted(total, corners, positions)
             vertices.append(positions @ place[:3, :3].T + place[:3, 3])
             faces.append((corners[:, ::-1] if np.linalg.det(place[:3, :3]) < 0 else corners) + start)
             start += len(positions)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import warnings
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -41,14 +41,15 @@ class _Lines:
     textures: array[float] = field(default_factory=lambda: array("d"))
     corners: array[int] = field(default_factory=lambda: array("q"))
     corner_textures: array[int] = field(default_factory=lambda: array("q"))
+    names: dict[str, str] = field(default_factory=dict)
     libraries: list[str] = field(default_factory=list)
-    material: str | None = None
-    object: str | None = None
-    group: str | None = None
-    runs: list[tuple[int, str | None, str | None]] = field(default_factory=list)
+    runs: list[tuple[int, str | None, str | None]] = field(default_factory=lambda: [(0, None, None)])
 
     def add(self, words: list[str]) -> None:
         """One statement."""
+        least, most = _STATEMENTS.get(words[0], (0, -1))
+        if not least <= len(words) - 1 <= most:
+            raise ValueError(f"it is no statement of an OBJ file, or has {len(words) - 1} words after it")
         match words:
             case ["v", *numbers]:
                 self.positions.extend(map(float, numbers[:3]))
@@ -57,41 +58,25 @@ class _Lines:
             case ["vt", *numbers]:
                 self.textures.extend(map(float, (numbers + ["0"])[:2]))
             case ["f", *corners]:
-                self._add_face(corners)
-            case ["usemtl", *name]:
-                self.material = " ".join(name)
-                self._begin()
-            case ["o", *name]:
-                self.object = " ".join(name)
-                self._begin()
-            case ["g", *name]:
-                self.group = " ".join(name)
-                self._begin()
+                vertex, texture = [], []
+                for corner in corners:
+                    parts = corner.split("/")
+                    vertex.append(_index(parts[0], len(self.positions) // 3))
+                    mapped = len(parts) > 1 and parts[1] != ""
+                    texture.append(_index(parts[1], len(self.textures) // 2) if mapped else -1)
+                for k in range(1, len(corners) - 1):  # a fan around the first corner
+                    self.corners.extend((vertex[0], vertex[k], vertex[k + 1]))
+                    self.corner_textures.extend((texture[0], texture[k], texture[k + 1]))
+            case ["usemtl" | "o" | "g" as kind, *name]:
+                self.names[kind] = " ".join(name)
+                thing = self.names.get("o") or self.names.get("g")
+                self.runs.append((len(self.corners) // 3, self.names.get("usemtl"), thing or None))
             case ["mtllib", *name]:
                 self.libraries.append(" ".join(name))
 
-    def _begin(self) -> None:
-        self.runs.append((len(self.corners) // 3, self.material, self.object or self.group))
 
-    def _add_face(self, corners: list[str]) -> None:
-        """A fan of triangles around the first corner."""
-        vertex, texture = [], []
-        for corner in corners:
-            parts = corner.split("/")
-            vertex.append(_index(parts[0], len(self.positions) // 3))
-            has = len(parts) > 1 and parts[1] != ""
-            texture.append(_index(parts[1], len(self.textures) // 2) if has else -1)
-        for k in range(1, len(corners) - 1):
-            self.corners.extend((vertex[0], vertex[k], vertex[k + 1]))
-            self.corner_textures.extend((texture[0], texture[k], texture[k + 1]))
-
-
-@dataclass(frozen=True)
-class _Material:
-    """Of an MTL file: linear colour (3,), and the picture that stands for it."""
-
-    colour: np.ndarray
-    picture: np.ndarray | None = None
+_Material = tuple[np.ndarray, np.ndarray | None]
+"""Of an MTL file: linear colour (3,), and the picture that stands for it."""
 
 
 def read_obj(folder: Folder) -> MeshContent:
@@ -104,24 +89,25 @@ def read_obj(folder: Folder) -> MeshContent:
         UserWarning: if a file of materials or a texture is missing: those colours stay unknown.
     """
     lines = _lines(folder)
-    vertices = np.array(lines.positions, dtype=np.float64).reshape(-1, 3)
     if not np.isfinite(lines.textures).all() or not np.isfinite(lines.colours).all():
         raise ValueError(f"path: {folder.path} holds texture coordinates or colours that are not finite")
     faces = np.array(lines.corners, dtype=np.int64).reshape(-1, 3)
-    starts = [0, *(start for start, _, _ in lines.runs), len(faces)]
-    counts = np.diff(starts)
+    starts, material, thing = zip(*lines.runs, strict=True)
+    ends = [*starts[1:], len(faces)]
     known: dict[str, _Material] = {}
     for library in lines.libraries if folder.colours else ():
         try:
             known |= _read_materials(folder, library)
         except FileNotFoundError as error:
             warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=4)
-    material = [None, *(name for _, name, _ in lines.runs)]
-    pages = {name for name, found in known.items() if found.picture is not None}
-    names = numbered([material_name(name, name in pages) for name in material], counts.tolist())
-    objects = numbered([None, *(name or None for _, _, name in lines.runs)], counts.tolist())
+    pages = {name for name, (_, picture) in known.items() if picture is not None}
+    counts = np.subtract(ends, starts).tolist()
+    names = numbered([material_name(name, name in pages) for name in material], counts)
+    objects = numbered(thing, counts)
+    runs = [(known[m], k, n) for m, k, n in zip(material, starts, ends, strict=True) if m in known and k < n]
     return MeshContent(
-        vertices, faces.astype(np.int32), face_colours=_colours(lines, faces, material, counts, known),
+        np.array(lines.positions, dtype=np.float64).reshape(-1, 3), faces.astype(np.int32),
+        face_colours=_colours(lines, faces, runs),
         face_material=names[0], material_names=names[1], face_object=objects[0], object_names=objects[1],
     )  # fmt: skip
 
@@ -155,10 +141,7 @@ def _lines(folder: Folder) -> _Lines:
         raise ValueError(f"path: {folder.path} is not a readable mesh: {error}") from error
     found = _Lines()
     for number, words in _statements(text):
-        least, most = _STATEMENTS.get(words[0], (0, -1))
         try:
-            if not least <= len(words) - 1 <= most:
-                raise ValueError(f"it is no statement of an OBJ file, or has {len(words) - 1} words after it")
             found.add(words)
         except (ValueError, OverflowError) as error:
             raise ValueError(
@@ -185,16 +168,16 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
             match words:
                 case ["newmtl", *parts]:
                     name = " ".join(parts)
-                    known[name] = _Material(np.full(3, np.nan))
+                    known[name] = (np.full(3, np.nan), None)
                 case ["Kd", red, green, blue] if name is not None:
                     colour = to_linear(np.array([float(red), float(green), float(blue)]))
-                    known[name] = _Material(colour, known[name].picture)
+                    known[name] = (colour, known[name][1])
                 case ["map_Kd", *parts] if name is not None and parts:
                     file = parts[-1] if parts[0].startswith("-") else " ".join(parts)
                     picture = read_picture(
                         folder.find(file).read_bytes(), f"path: {folder.path}, texture {file}"
                     )
-                    known[name] = _Material(known[name].colour, picture)
+                    known[name] = (known[name][0], picture)
         except FileNotFoundError as error:
             warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=5)
         except ValueError as error:
@@ -202,14 +185,12 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
     return known
 
 
-def _colours(
-    lines: _Lines,
-    faces: np.ndarray,
-    material: list[str | None],
-    counts: np.ndarray,
-    known: Mapping[str, _Material],
-) -> np.ndarray | None:
-    """sRGB of faces: of the texture, else of the vertices, else of the material; None without any."""
+def _colours(lines: _Lines, faces: np.ndarray, runs: list[tuple[_Material, int, int]]) -> np.ndarray | None:
+    """sRGB of faces: of the texture, else of the vertices, else of the material; None without any.
+
+    Args:
+        runs: faces that have a material, from a first one to behind a last one.
+    """
     colour = np.full((len(faces), 3), np.nan)
     if len(lines.colours) == len(lines.positions):
         vertex = to_linear(np.array(lines.colours).reshape(-1, 3))
@@ -217,14 +198,10 @@ def _colours(
         colour[own] = vertex[faces[own]].mean(axis=1)
     uv = np.array(lines.textures, dtype=np.float64).reshape(-1, 2)
     corner = np.array(lines.corner_textures, dtype=np.int64).reshape(-1, 3)
-    start = np.concatenate([[0], np.cumsum(counts)])
-    for name, low, high in zip(material, start[:-1], start[1:], strict=True):
-        found = known.get(name) if name is not None else None
-        if found is None or low == high:
-            continue
+    for (plain, picture), low, high in runs:
         part, at = colour[low:high], corner[low:high]
-        part[np.isnan(part[:, 0])] = found.colour
+        part[np.isnan(part[:, 0])] = plain
         mapped = (at >= 0).all(axis=1) & (at < len(uv)).all(axis=1)
-        if found.picture is not None and mapped.any():
-            part[mapped] = sampled(found.picture, uv[at[mapped]])
+        if picture is not None and mapped.any():
+            part[mapped] = sampled(picture, uv[at[mapped]])
     return None if np.isnan(colour).all() else to_srgb(colour).astype(np.float32)

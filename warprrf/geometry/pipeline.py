@@ -8,12 +8,14 @@ run continues, a change starts over from the first step that it changes.
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import checked
@@ -21,6 +23,7 @@ from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos import sfm
+from warprrf.geometry.photos.cells import surface_shares
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians, fuse_maps
 from warprrf.geometry.photos.initialise import initialise
@@ -44,8 +47,10 @@ from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 1, "refined": 2, "surface": 2}
+VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 3}
 """Of all steps: counted up by whoever changes what a step computes."""
+
+MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
 
 
 @checked
@@ -116,10 +121,7 @@ def reconstruct(
     sparse = sfm.structure_from_motion(
         photos,
         workspace=workspace,
-        max_features=config.max_features,
-        lens=config.lens,
-        max_pixels=config.max_pixels,
-        pairs=config.pairs,
+        config=config,
         poses=known,
         seed=seed,
         progress=progress,
@@ -134,7 +136,7 @@ def reconstruct(
             f"held_out: all {len(sparse.cameras)} posed photos are held out; none is left to fit to"
         )
     with Steps(workspace, progress=progress) as steps:
-        gaussians, patches = _steps(steps, sparse, fitted, measured, config, seed, device)
+        gaussians, patches, said = _steps(steps, sparse, fitted, measured, config, seed, device)
     return Reconstruction(
         gaussians,
         patches.mesh,
@@ -144,7 +146,7 @@ def reconstruct(
         metric=sparse.metric,
         unposed=sparse.unposed,
         held_out=sorted(skipped),
-        guessed=sparse.guessed,
+        guessed=(*sparse.guessed, *said),
         lenses=sparse.lenses,
         causes=sparse.causes,
         photos=sparse.photos,
@@ -214,8 +216,9 @@ def _steps(
     config: ReconstructionConfig,
     seed: int,
     device: DeviceLike,
-) -> tuple[Gaussians, PlanarPatches]:
-    """The steps after structure from motion: planes and Gaussians to start from, Gaussians refined, mesh and patches.
+) -> tuple[Gaussians, PlanarPatches, tuple[str, ...]]:
+    """The steps after structure from motion: planes and Gaussians to start from, Gaussians refined, mesh and patches;
+    and what the mesh holds that no photo shows, in words.
 
     Args:
         fitted: the photos that Gaussians are fitted to, by name.
@@ -254,31 +257,50 @@ def _steps(
         return files.of_gaussians(gaussians)
 
     def surface(attempt: Attempt) -> files.Arrays:
+        everywhere = list(sparse.cameras.values())
         if measured:
             maps = range_maps(sparse, measured, most=config.surface.views).values()
             views, ranges = (list(part) for part in zip(*maps, strict=True))
-            return files.of_patches(
-                fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
-            )
-        patches = fuse_gaussians(
-            gaussians,
-            list(cameras.values()),
-            photos=photos(),
-            planes=planes,
-            config=config,
-            progress=attempt.progress,
-            device=device,
-        )
-        return files.of_patches(patches)
+            patches = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
+        else:
+            patches = fuse_gaussians(
+                gaussians, list(cameras.values()), photos=photos(), planes=planes, config=config,
+                progress=attempt.progress, device=device,
+            )  # fmt: skip
+        shares = np.array(surface_shares(patches.mesh, planes, everywhere))
+        return files.of_patches(patches) | {"shares": shares}
 
-    settings = [config.max_reprojection_error, config.planes, config.sweep, config.gaussians, seed]
+    settings = [
+        config.max_reprojection_error,
+        config.planes,
+        config.sweep,
+        config.plain,
+        config.gaussians,
+        seed,
+    ]
     first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
     planes = files.to_planes(first)
     gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
     inputs: list[Any] = [steps.key("refined"), config.stereo, config.surface, config.completion]
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
-    return gaussians, files.to_patches(_kept(steps, "surface", surface, inputs))
+    kept = _kept(steps, "surface", surface, inputs)
+    return gaussians, files.to_patches(kept), _said_of_surface(*kept["shares"])
+
+
+def _said_of_surface(unseen: float, plain: float) -> tuple[str, ...]:
+    """What no photo shows of the surface, as a sentence; a warning where it is much."""
+    if max(unseen, plain) < 0.005:
+        return ()
+    said = (
+        f"surface: {plain:.0%} of it carries no feature and was found from its edges; {unseen:.0%} is seen by no photo "
+        "and closes what is seen"
+    )
+    if unseen + plain > MUCH_UNKNOWN:
+        warnings.warn(
+            f"{said}; look at the mesh there, and take more photos of what is missing", stacklevel=3
+        )
+    return (said,)
 
 
 def _kept(

@@ -195,7 +195,7 @@ def _walk(element: _Stated, order: str, rest: np.ndarray, count: int) -> tuple[E
 
     def take(kind: str, n: float) -> np.ndarray:
         nonlocal place
-        dtype = np.dtype(order + kind if order else "f8")
+        dtype, n = np.dtype(order + kind if order else "f8"), float(n)  # a byte overflows
         if n != int(n) or n < 0 or place + n * dtype.itemsize > len(rest):
             raise ValueError(f"cut short: a list of {n} in {element.name!r} is not there")
         start, place = place, place + int(n) * dtype.itemsize

@@ -30,13 +30,17 @@ def blocks_of(width: int, lanes: int) -> int:
     return -(-CHANNELS * width // lanes)
 
 
-@once
 def build(real: type, lanes: int) -> SimpleNamespace:
     """The kernels for one scalar type and size of a block; compiled when first launched."""
+    return SimpleNamespace(**vars(_filters(real, lanes)), **vars(_loss(real, lanes)))
+
+
+@once
+def _blocks(real: type, lanes: int) -> SimpleNamespace:
+    """What kernels do with a block."""
     block = wp.types.vector(lanes, real)
     window = wp.constant(wp.types.vector(len(WINDOW), real)(*WINDOW))
     name = real.__name__
-    c1, c2 = wp.constant(real(C1)), wp.constant(real(C2))
     plane = wp.array(dtype=real)
 
     @wp.func_native(f"""
@@ -73,6 +77,17 @@ def build(real: type, lanes: int) -> SimpleNamespace:
         for k in range(wp.static(2 * RADIUS + 1)):
             total += window[k] * load(source, at + (k - wp.static(RADIUS)) * wp.static(CHANNELS))
         return total
+
+    return SimpleNamespace(
+        block=block, window=window, plane=plane, load=load, store=store, signs=signs, along_row=along_row
+    )
+
+
+@once
+def _filters(real: type, lanes: int) -> SimpleNamespace:
+    """Window averages of planes."""
+    f = _blocks(real, lanes)
+    block, window, plane, load, store, along_row = f.block, f.window, f.plane, f.load, f.store, f.along_row
 
     @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
     def moments(
@@ -124,6 +139,16 @@ def build(real: type, lanes: int) -> SimpleNamespace:
             if r >= 0 and r < height:
                 total += window[k] * load(source, r * stride + at)
         store(out, row * stride + at, total)
+
+    return SimpleNamespace(filter_columns=filter_columns, filter_rows=filter_rows, moments=moments)
+
+
+@once
+def _loss(real: type, lanes: int) -> SimpleNamespace:
+    """SSIM of planes, and the way back."""
+    f = _blocks(real, lanes)
+    block, plane, load, store, signs, along_row = f.block, f.plane, f.load, f.store, f.signs, f.along_row
+    c1, c2 = wp.constant(real(C1)), wp.constant(real(C2))
 
     @wp.kernel(module="unique", module_options=VECTORISED, enable_backward=False)
     def slopes(
@@ -196,10 +221,4 @@ def build(real: type, lanes: int) -> SimpleNamespace:
         )
         store(out, at, absolute_share * signs(u - t) - ssim_share * filtered)
 
-    return SimpleNamespace(
-        adjoint=adjoint,
-        filter_columns=filter_columns,
-        filter_rows=filter_rows,
-        moments=moments,
-        slopes=slopes,
-    )
+    return SimpleNamespace(adjoint=adjoint, slopes=slopes)

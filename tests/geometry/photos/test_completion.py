@@ -170,7 +170,7 @@ def test_a_mesh_without_planes_or_views_stays_as_it_is():
     assert complete(patches, [], []) is patches
     label = np.where(np.arange(40) < 3, 0, -1)
     slope = PlanarPatches.from_planes(mesh, label, [[0.6, 0.0, 0.8]], [0.0], tolerance_m=1e-6)
-    assert directions(slope, CompletionConfig()) is None
+    assert directions(slope.normal, slope.area, float(mesh.areas.sum()), CompletionConfig()) is None
     with pytest.raises(ValueError, match="depths: got 0 maps for 6"):
         complete(patches, views, [])
 

@@ -8,6 +8,7 @@ from bent_photos import bent
 from places import LOBBY
 
 from warprrf.geometry.photos import sfm
+from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import (
     cameras_of,
     check_photos,
@@ -61,7 +62,11 @@ def through_a_lens(tmp_path_factory):
     mask[:, : width // 3] = 0
     Image.fromarray(mask).save(folder / "view_005.mask.png")
     work = tmp_path_factory.mktemp("work")
-    return folder, work, sfm.structure_from_motion(folder, workspace=work, max_features=1500)
+    return (
+        folder,
+        work,
+        sfm.structure_from_motion(folder, workspace=work, config=ReconstructionConfig(max_features=1500)),
+    )
 
 
 # ------------------------------------------------------------------------------------------- lens
@@ -105,7 +110,9 @@ def test_undistorted_photos_show_what_the_straight_ones_do(through_a_lens):
 def test_photos_without_distortion_are_taken_as_they_are(tmp_path):
     names = BENT[:6]
     sparse = sfm.structure_from_motion(
-        [LOBBY / "photos" / n for n in names], workspace=tmp_path, max_features=1000
+        [LOBBY / "photos" / n for n in names],
+        workspace=tmp_path,
+        config=ReconstructionConfig(max_features=1000),
     )
     lens = sparse.lenses[names[0]]
     assert lens.model == "SIMPLE_PINHOLE" and lens.straight
@@ -206,7 +213,9 @@ def test_photos_of_two_sizes_are_posed_together(tmp_path):
         photo = Image.open(LOBBY / "photos" / name)
         (photo if k % 2 else photo.resize((512, 384))).save(tmp_path / name, quality=95)
     sparse = sfm.structure_from_motion(
-        tmp_path, workspace=tmp_path / "work", max_features=1500, lens="SIMPLE_PINHOLE"
+        tmp_path,
+        workspace=tmp_path / "work",
+        config=ReconstructionConfig(max_features=1500, lens="SIMPLE_PINHOLE"),
     )
     assert set(sparse.cameras) == set(names)
     assert list(find_photos(tmp_path)) == names  # not those in the workspace beside them
@@ -272,8 +281,12 @@ def test_a_mask_that_is_gone_is_forgotten(tmp_path):
     grey = np.full((480, 640), 255, np.uint8)
     grey[:20] = 0
     Image.fromarray(grey).save(mask)
-    found = sfm.structure_from_motion(photos, workspace=work, max_features=1000, lens="SIMPLE_PINHOLE")
+    found = sfm.structure_from_motion(
+        photos, workspace=work, config=ReconstructionConfig(max_features=1000, lens="SIMPLE_PINHOLE")
+    )
     np.testing.assert_array_equal(read_mask(found.photos["view_001.jpg"]), grey == 0)
     mask.unlink()
-    again = sfm.structure_from_motion(photos, workspace=work, max_features=1000, lens="SIMPLE_PINHOLE")
+    again = sfm.structure_from_motion(
+        photos, workspace=work, config=ReconstructionConfig(max_features=1000, lens="SIMPLE_PINHOLE")
+    )
     assert read_mask(again.photos["view_001.jpg"]) is None

@@ -160,7 +160,7 @@ def triangulated(tmp_path_factory):
     named = find_photos(PHOTOS[:6])
     known = KnownPoses({photo: cameras[name] for photo, name in match_photos(cameras, named).items()})
     return folder, sfm.structure_from_motion(
-        PHOTOS[:6], workspace=folder / "w", max_features=1500, poses=known
+        PHOTOS[:6], workspace=folder / "w", config=ReconstructionConfig(max_features=1500), poses=known
     )
 
 

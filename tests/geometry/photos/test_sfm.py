@@ -9,6 +9,7 @@ import pytest
 from places import LOBBY
 
 from warprrf.geometry.photos import sfm
+from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import find_photos, match_names, read_photo
 from warprrf.geometry.photos.sparse import SparseModel, align_to_known, fit_similarity
 from warprrf.geometry.splats.camera import Camera
@@ -56,7 +57,9 @@ def lobby():
 @pytest.fixture(scope="module")
 def posed(lobby, tmp_path_factory):
     workspace = tmp_path_factory.mktemp("sfm")
-    return workspace, sfm.structure_from_motion(lobby[0], workspace=workspace, max_features=1500)
+    return workspace, sfm.structure_from_motion(
+        lobby[0], workspace=workspace, config=ReconstructionConfig(max_features=1500)
+    )
 
 
 # ------------------------------------------------------------------------------------------- similarity
@@ -173,7 +176,10 @@ def test_finished_work_is_reused_and_repeats_itself(posed, lobby, tmp_path):
     workspace, first = posed
     stages = []
     again = sfm.structure_from_motion(
-        lobby[0], workspace=workspace, max_features=1500, progress=lambda s, d, n: stages.append(s)
+        lobby[0],
+        workspace=workspace,
+        config=ReconstructionConfig(max_features=1500),
+        progress=lambda s, d, n: stages.append(s),
     )
     assert stages == []
     np.testing.assert_array_equal(again.points, first.points)
@@ -184,7 +190,10 @@ def test_finished_work_is_reused_and_repeats_itself(posed, lobby, tmp_path):
     (scratch / "mapping" / "0").mkdir(parents=True)
     (scratch / "matches.db").write_bytes(b"half written")
     resumed = sfm.structure_from_motion(
-        lobby[0], workspace=tmp_path / "w", max_features=1500, progress=lambda s, d, n: stages.append(s)
+        lobby[0],
+        workspace=tmp_path / "w",
+        config=ReconstructionConfig(max_features=1500),
+        progress=lambda s, d, n: stages.append(s),
     )
     assert set(stages) == {"mapping"}
     np.testing.assert_array_equal(resumed.points, first.points)
@@ -194,7 +203,10 @@ def test_other_photos_do_not_reuse_old_work(posed, lobby, tmp_path):
     shutil.copytree(posed[0], tmp_path / "w", symlinks=True)
     stages = set()
     sparse = sfm.structure_from_motion(
-        lobby[0][:9], workspace=tmp_path / "w", max_features=1500, progress=lambda s, d, n: stages.add(s)
+        lobby[0][:9],
+        workspace=tmp_path / "w",
+        config=ReconstructionConfig(max_features=1500),
+        progress=lambda s, d, n: stages.add(s),
     )
     assert stages == {"features", "matching", "mapping", "undistorting"}
     assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:9])
@@ -309,7 +321,7 @@ def test_photos_without_anything_in_common_are_refused(tmp_path):
 
 def test_unknown_lenses_are_refused(tmp_path, lobby):
     with pytest.raises(ValueError, match="lens: got 'MAGIC', expected one of auto, SIMPLE_PINHOLE"):
-        sfm.structure_from_motion(lobby[0], workspace=tmp_path, lens="MAGIC")
+        sfm.structure_from_motion(lobby[0], workspace=tmp_path, config=ReconstructionConfig(lens="MAGIC"))
 
 
 def test_short_names_serve_where_they_are_unique():

@@ -94,6 +94,63 @@ class SweepConfig:
 
 
 @dataclass(frozen=True)
+class PlainConfig:
+    """How surfaces without features are found from their edges (see :mod:`warprrf.geometry.photos.plain`).
+
+    Attributes:
+        blur_px: photos are smoothed by so much before they are differentiated.
+        edge: an edge changes some colour by this part of white per pixel.
+        edge_deg: its direction in the photo is good to this.
+        segment_px, gap_px: shortest segment, and longest gap in one.
+        side_px, alike: colours so far on either side of an edge are one surface's when they differ by no more than this.
+        meeting_deg: two bearings that differ by less meet nowhere for sure.
+        line_views: fewest photos that show an edge; from ``sure_views`` on it counts, when it is ``line_m`` long.
+        line_m, sure_views: see above.
+        plain, plain_px: a pixel is plain where no pixel in a square of this side changes by more than this.
+        shown_share: where so much of an edge shows in a photo, all of it parts regions.
+        least_share: photos with fewer plain pixels than this share, in a dozen of them, show no plain surface.
+        region_px: fewest pixels of a plain region.
+        votes_px: fewest pixels of its border on a plane.
+        same_m: an edge this close to a plane lies on it.
+        rival: of the planes with at least this share of the most votes, the nearest has the region.
+        behind_m: an edge, or a surface, this far behind a plane is behind it.
+        stride: cells look up every so many-th pixel.
+        cell_m: side of a plane's cells.
+        agreeing: fewest photos that put a cell on its plane; more than those that see through it.
+        piece_m2: smallest piece of a plane.
+        mirror_share: a pane is a mirror when so much of what is seen through it alone has its twin before it, by length
+            times views, which must come to ``mirror_m`` [m].
+    """
+
+    blur_px: float = 1.5
+    edge: float = 0.009
+    edge_deg: float = 6.0
+    segment_px: float = 24.0
+    gap_px: float = 6.0
+    side_px: float = 4.0
+    alike: float = 0.08
+    meeting_deg: float = 3.0
+    line_views: int = 3
+    line_m: float = 0.4
+    sure_views: int = 4
+    plain: float = 0.006
+    plain_px: int = 7
+    shown_share: float = 0.15
+    least_share: float = 0.12
+    region_px: int = 150
+    votes_px: float = 25.0
+    same_m: float = 0.04
+    rival: float = 0.8
+    behind_m: float = 0.15
+    stride: int = 4
+    cell_m: float = 0.1
+    agreeing: int = 2
+    piece_m2: float = 0.1
+    mirror_share: float = 0.5
+    mirror_m: float = 10.0
+
+
+@dataclass(frozen=True)
 class RefineConfig:
     """Settings of :func:`warprrf.geometry.photos.refine.refine`; for about 100 photos on two CPU cores.
 
@@ -314,14 +371,16 @@ class ReconstructionConfig:
     """Settings of :func:`warprrf.reconstruct`.
 
     Attributes:
-        max_features: SIFT features per photo.
-        lens: COLMAP's model of the lenses, or ``"auto"``: see
-            :func:`~warprrf.geometry.photos.sfm.structure_from_motion`.
-        max_pixels: photos are reduced to about so many pixels before Gaussians are fitted to them.
-        pairs: which photos are matched, ``"auto"`` or ``"exhaustive"``.
+        max_features: SIFT features kept per photo (the largest ones).
+        lens: COLMAP's model of the lenses, one of :data:`LENSES`; ``"auto"`` takes the simplest of pinhole,
+            ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has to be named.
+        max_pixels: undistorted photos are reduced to about so many pixels.
+        pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
+            largest features finds promising, once there are more than 2000 pairs.
         max_reprojection_error: sparse points above it are dropped [pixels].
         planes: how planes are found among sparse points.
         sweep: how planes are corrected and completed by comparing the photos; None: not at all.
+        plain: how surfaces without features are found from their edges; None: not at all.
         gaussians: Gaussians to start the refinement from (about).
         refine: photometric refinement.
         stereo: how depth maps are mended by comparing the photos; None: not at all.
@@ -336,6 +395,7 @@ class ReconstructionConfig:
     max_reprojection_error: float = 1.0
     planes: PlaneConfig = field(default_factory=PlaneConfig)
     sweep: SweepConfig | None = field(default_factory=SweepConfig)
+    plain: PlainConfig | None = field(default_factory=PlainConfig)
     gaussians: int = 32_000
     refine: RefineConfig = field(default_factory=RefineConfig)
     stereo: StereoConfig | None = field(default_factory=StereoConfig)

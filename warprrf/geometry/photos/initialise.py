@@ -8,8 +8,10 @@ import numpy as np
 
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.cells import meeting, occupancy, seen_cells
-from warprrf.geometry.photos.config import ReconstructionConfig
+from warprrf.geometry.photos.completion.room_planes import directions
+from warprrf.geometry.photos.config import CompletionConfig, ReconstructionConfig
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
+from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.planes import Plane, aligned
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel
@@ -43,7 +45,7 @@ def initialise(
         ValueError: for fewer than three points.
     """
     report = progress or (lambda stage, done, total: None)
-    report("planes", 0, 5)
+    report("planes", 0, 6)
     if len(sparse.points) < 3:
         raise ValueError(
             f"photos: only {len(sparse.points)} points were reconstructed; more overlap is needed"
@@ -65,20 +67,43 @@ def initialise(
     eyes = np.array([c.position for c in sparse.cameras.values()])[sparse.track_camera]
     lines = eyes, np.repeat(points, sparse.track_length, axis=0)
     planes = occupancy(planes, points, *lines, config=config.planes)
-    report("planes", 1, 5)
+    report("planes", 1, 6)
     if config.sweep is not None and len(cameras) > 2 and planes:
         photos = GreyPhotos.upload(list(cameras.values()), images, config.sweep, device)
         planes = proven_cells(planes, points, photos)
-        report("planes", 2, 5)
+        report("planes", 2, 6)
         if level:
             levels = []
             for k, up in enumerate((True, False)):
                 levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
-                report("planes", 3 + k, 5)
+                report("planes", 3 + k, 6)
             planes = joined(planes, levels, config.sweep)
+    real = np.ones(len(points), dtype=bool)
+    axes = _axes(planes, config) if config.plain is not None else None
+    if axes is not None:
+        plain = plain_surfaces(list(cameras.values()), images, axes, config.plain)
+        reflected = plain.reflected(*lines)
+        sight = lines[0][~reflected], lines[1][~reflected]
+        planes = with_plain(planes, plain.planes, points, sight, config.planes)
+        real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
+    report("planes", 5, 6)
     planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
     gaussians = initial_gaussians(
-        points, sparse.colors, normals, planes, list(cameras.values()), images, count=config.gaussians
+        points[real],
+        sparse.colors[real],
+        normals[real],
+        planes,
+        list(cameras.values()),
+        images,
+        count=config.gaussians,
     )
-    report("planes", 5, 5)
+    report("planes", 6, 6)
     return planes, gaussians
+
+
+def _axes(planes: Sequence[Plane], config: ReconstructionConfig) -> np.ndarray | None:
+    """The three directions that most of the planes face along, shape ``(3, 3)``; None when there are none."""
+    known = [plane for plane in planes if plane.occupied.any()]
+    areas = np.array([plane.area() for plane in known])
+    normals = np.array([plane.normal for plane in known])
+    return directions(normals, areas, float(areas.sum()), config.completion or CompletionConfig())

@@ -35,6 +35,7 @@ class Plane:
         corner: in-plane coordinates of the outer corner of cell (0, 0) [m], shape ``(2,)``.
         cell_m: side of a cell [m].
         occupied: cells where a surface is, shape ``(A, B)`` bool.
+        plain: whether no feature lies on it and its edges alone showed it.
     """
 
     normal: np.ndarray
@@ -44,6 +45,7 @@ class Plane:
     corner: np.ndarray = field(default_factory=lambda: np.zeros(2), repr=False)
     cell_m: float = 0.1
     occupied: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool), repr=False)
+    plain: bool = False
 
     @cached_property
     def axes(self) -> np.ndarray:

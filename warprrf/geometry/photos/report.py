@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ from warprrf.files import write_text
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.photo_files import read_photo
 from warprrf.geometry.photos.sight import CLASSES, colours_of, from_outside, how_seen, painted
-from warprrf.geometry.photos.undistort import Lens, lenses_in_use
+from warprrf.geometry.photos.undistort import Lens
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -264,14 +265,14 @@ def _four(
 
 
 def _lenses(subject: Subject) -> str:
-    groups: dict[tuple[float, ...], int] = {}
-    for c in subject.cameras.values():
-        lens = (c.width, c.height, round(c.fx, 2), round(c.fy, 2), round(c.cx, 2), round(c.cy, 2))
-        groups[lens] = groups.get(lens, 0) + 1
+    groups = Counter(
+        (c.width, c.height, *(round(x, 2) for x in (c.fx, c.fy, c.cx, c.cy)))
+        for c in subject.cameras.values()
+    )
     if not groups:
         return ""
     rows = [("photos", "pixels used", "focal length [pixels]", "principal point", "field of view")]
-    for (width, height, fx, fy, cx, cy), count in sorted(groups.items(), key=lambda item: -item[1])[:SHOWN]:
+    for (width, height, fx, fy, cx, cy), count in groups.most_common(SHOWN):
         view = " x ".join(
             f"{np.degrees(2 * np.arctan(n / 2 / f)):.0f}°" for n, f in ((width, fx), (height, fy))
         )
@@ -283,13 +284,12 @@ def _lenses(subject: Subject) -> str:
 
 def _taken_with(subject: Subject) -> str:
     """Lenses before photos were undistorted and reduced."""
-    used = sorted(lenses_in_use(subject.lenses).items(), key=lambda item: -len(item[1]))[:SHOWN]
-    if not used:
+    if not subject.lenses:
         return ""
     rows = [("photos", "pixels as stored", "lens model", "distortion")]
-    for lens, names in used:
+    for lens, count in Counter(subject.lenses.values()).most_common(SHOWN):
         bends = ", ".join(f"{c:.4g}" for c in lens.coefficients) if not lens.straight else "none"
-        rows.append((f"{len(names)}", f"{lens.width} x {lens.height}", lens.model, bends))
+        rows.append((f"{count}", f"{lens.width} x {lens.height}", lens.model, bends))
     return f"<p>They were taken with:</p>{_table(rows)}"
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from warprrf.checks import check_count
 from warprrf.device import Progress, require
-from warprrf.geometry.photos.config import LENSES
+from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
 from warprrf.geometry.photos.photo_files import (
     MIN_PHOTOS,
     Photos,
@@ -75,10 +75,7 @@ def structure_from_motion(
     photos: Photos,
     *,
     workspace: str | os.PathLike[str],
-    max_features: int = 2400,
-    lens: str = "auto",
-    max_pixels: int = 1_000_000,
-    pairs: str = "auto",
+    config: ReconstructionConfig | None = None,
     poses: KnownPoses | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -96,13 +93,7 @@ def structure_from_motion(
     Args:
         photos: a folder, or a sequence of image files.
         workspace: folder for the feature database, the model and the undistorted photos; made if it is not there.
-        max_features: SIFT features kept per photo (the largest ones).
-        lens: COLMAP's model of the lenses, one of :data:`~warprrf.geometry.photos.config.LENSES`; ``"auto"`` takes the
-            simplest of pinhole, ``"SIMPLE_RADIAL"``, ``"RADIAL"`` and ``"OPENCV"`` that explains the photos. A fisheye has
-            to be named.
-        max_pixels: undistorted photos are reduced to about so many pixels.
-        pairs: ``"exhaustive"`` matches every pair of photos; ``"auto"`` only those that a coarse comparison of their
-            largest features finds promising, once there are more than 2000 pairs.
+        config: features, lens, pixels and pairs.
         poses: poses and lenses that are known; points are triangulated, where they and depth are not known too.
         seed: seed of every random draw.
         progress: called as ``progress("features" | "comparing" | "matching" | "mapping" | "undistorting", done, total)``.
@@ -112,12 +103,13 @@ def structure_from_motion(
             little to be posed; the message names the files.
         ImportError: if pycolmap is not installed.
     """
-    if lens not in LENSES:
-        raise ValueError(f"lens: got {lens!r}, expected one of {', '.join(LENSES)}")
-    if pairs not in ("auto", "exhaustive"):
-        raise ValueError(f'pairs: got {pairs!r}, expected "auto" or "exhaustive"')
-    check_count("max_features", max_features, 100)
-    check_count("max_pixels", max_pixels, LEAST_PIXELS)
+    config = config or ReconstructionConfig()
+    lens, pairs = config.lens, config.pairs
+    for name, value, known_values in (("lens", lens, LENSES), ("pairs", pairs, ("auto", "exhaustive"))):
+        if value not in known_values:
+            raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(known_values)}")
+    max_features = check_count("max_features", config.max_features, 100)
+    max_pixels = check_count("max_pixels", config.max_pixels, LEAST_PIXELS)
     everything = named = find_photos(photos)
     colmap = load_colmap()
     known: Any = None

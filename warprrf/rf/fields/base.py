@@ -161,6 +161,30 @@ class RadioField(ABC):
     def spectrum(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> Spectrum:
         """The spatial spectrum at ``rx`` (3,) [m]."""
 
+    def spectra(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, progress: Progress | None = None
+    ) -> np.ndarray:
+        """Path gain of the spectra at many receivers: what :meth:`spectrum` says of each, without delays and departures.
+
+        Args:
+            rx: positions [m], shape ``(R, 3)``.
+            transmitter: as for :meth:`spectrum`.
+            progress: called as ``progress("spectra", done, total)``.
+
+        Returns:
+            Path gain [linear], shape ``(R, H, W)``, float32.
+
+        Raises:
+            ValueError: as for :meth:`spectrum`.
+        """
+        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
+        found = np.empty((len(receivers), *self.shape), np.float32)
+        for k, receiver in enumerate(receivers):
+            found[k] = self.spectrum(receiver, source).path_gain
+            if progress is not None:
+                progress("spectra", k + 1, len(receivers))
+        return found
+
     @abstractmethod
     def paths(
         self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None

@@ -60,6 +60,9 @@ def test_an_empty_data_set_is_enough_to_start(scene) -> None:
     # 60 dB below free space over ten metres
     assert nothing.floor == pytest.approx(1e-6 * (299792458.0 / CARRIER_HZ / (4 * np.pi * 10.0)) ** 2)
     assert field.spectrum(EAST[0]).path_gain.sum() > 0 and field.shape == (24, 48)
+    power = wr.Readings(TX, EAST[:1], np.array([1e-9]), CARRIER_HZ, 1e-14)
+    both = wr.RadioField.fit(scene, [nothing, power], quick=True)
+    assert both.shape == (24, 48) and both.floor == nothing.floor and np.array_equal(both.fitted_on, EAST[:1])
     with pytest.raises(ValueError, match=r"transmitter.*outside the scene"):
         wr.RadioField.fit(scene, wr.SpectrumDataset.empty(transmitter=[9, 9, 9], frequency_hz=CARRIER_HZ))
     with pytest.raises(ValueError, match="receivers: got none"):

@@ -58,7 +58,8 @@ def complete(
     config = config or CompletionConfig()
     if len(depths) != len(cameras):
         raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
-    mesh, axes = patches.mesh, directions(patches, config)
+    mesh = patches.mesh
+    axes = directions(patches.normal, patches.area, float(mesh.areas.sum()), config)
     if axes is None or not len(cameras):
         return patches
     levels, faces = known_levels(patches, planes, axes, config)

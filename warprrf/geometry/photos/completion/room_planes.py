@@ -39,12 +39,14 @@ class FaceLevels:
         self.axis[faces], self.sign[faces], self.height[faces] = level[:3]
 
 
-def directions(patches: PlanarPatches, config: CompletionConfig) -> np.ndarray | None:
-    """Three perpendicular unit rows along which most of the mesh is planar; None when there are none."""
-    if not len(patches):
+def directions(
+    normals: np.ndarray, areas: np.ndarray, whole_m2: float, config: CompletionConfig
+) -> np.ndarray | None:
+    """Three perpendicular unit rows along which planes of these normals ``(P, 3)`` and areas [m^2] face, when they make
+    up most of ``whole_m2``; None when there are none."""
+    if not len(normals):
         return None
     parallel = np.cos(np.radians(config.aligned_deg))
-    normals, areas = patches.normal, patches.area
     alike = (np.abs(normals @ normals.T) > parallel) @ areas
     first = normals[alike.argmax()]
     across = np.where(np.abs(normals @ first) < np.sqrt(1 - parallel**2), alike, 0.0)
@@ -64,7 +66,7 @@ def directions(patches: PlanarPatches, config: CompletionConfig) -> np.ndarray |
         u, _, vt = np.linalg.svd(mean)
         axes = u @ vt
     on = areas[(np.abs(normals @ axes.T) > parallel).any(axis=1)].sum()
-    if on < config.least_share * patches.mesh.areas.sum():
+    if on < config.least_share * whole_m2:
         return None
     main = np.abs(axes).argmax(axis=1)
     if len(set(main)) == 3:  # in the order and sense of the world axes

@@ -32,13 +32,13 @@ from warprrf.rf.em.itu import assumed_permittivity
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
-from warprrf.rf.fields.bistatic.links import LinkTracer
+from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
 from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
-from warprrf.rf.fields.bistatic.render import Rendered, path_powers, render, sent_radiance
+from warprrf.rf.fields.bistatic.render import Rendered, images, path_powers, render, sent_radiance
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
@@ -347,6 +347,24 @@ class BistaticField(RadioField):
             view = self.transport(source).view(position, self.terms)
             found.append(paths_of(view, self.render(view), self.floor, self.air, max_paths))
         return found[0] if positions.ndim == 1 else Paths.stack(found)
+
+    def spectra(
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, progress: Progress | None = None
+    ) -> np.ndarray:
+        """Path gain of the spectra at ``rx`` (R, 3); see :meth:`RadioField.spectra`. Several receivers are traced at once."""
+        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
+        transport = self.transport(source)
+        sent, found = self.sent_radiance(transport), np.empty((len(receivers), *self.shape), np.float32)
+        batch = max(1, RAYS_AT_A_TIME // len(transport.grid.directions))
+        for first in range(0, len(receivers), batch):
+            view = transport.view(receivers[first : first + batch], self.terms)
+            powers = path_powers(view, self.materials, sent)
+            found[first : first + batch] = images(
+                view, powers, powers.single + powers.further.by_ray(), self._beam
+            )
+            if progress is not None:
+                progress("spectra", min(first + batch, len(receivers)), len(receivers))
+        return found
 
     def array_spectrum(
         self,

@@ -95,13 +95,27 @@ def render(view: ReceiverView, materials: Materials, beam: BeamOperator, sent: n
         sent: what elements send on under these materials; see :func:`sent_radiance`.
     """
     powers = path_powers(view, materials, sent)
-    shape = view.transport.grid.shape
-    further = powers.further.by_ray().reshape(*shape, -1).sum(axis=-1)
+    further = powers.further.by_ray()
+    (image,) = images(view, powers, powers.single + further, beam)
+    return Rendered(powers, further.reshape(*view.transport.grid.shape, -1).sum(axis=-1), image)
+
+
+def images(view: ReceiverView, powers: PathPowers, by_ray: np.ndarray, beam: BeamOperator) -> np.ndarray:
+    """Spectra (R, H, W) of the receivers of ``view``: line of sight and mirrors of ``powers``, and what else each ray sees
+    ``by_ray`` (R K,), through the receivers' beam.
+
+    Raises:
+        ValueError: for a view that was traced without a beam.
+    """
     if view.beams is None:
         raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
-    image = np.tensordot(powers.mirror.astype(np.float32), view.beams, axes=1).astype(np.float64)
-    image += beam(powers.single.reshape(*shape, -1).sum(axis=-1) + further)
-    return Rendered(powers, further, np.maximum(image, 0.0))
+    count, shape, paths = len(view.receivers), view.transport.grid.shape, view.paths
+    pixels = by_ray.reshape(count, *shape, -1).sum(axis=-1)
+    found = np.moveaxis(beam(np.ascontiguousarray(np.moveaxis(pixels, 0, -1))), -1, 0)
+    sharp = powers.mirror.astype(np.float32)
+    for image, own in zip(found, (paths.receiver == k for k in range(count)), strict=True):
+        image += np.tensordot(sharp[own], view.beams[own], axes=1)
+    return np.maximum(found, 0.0)
 
 
 def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> PathPowers:

@@ -379,7 +379,7 @@ def train(
     if transport is not None and options.sub_pixels is None:
         o = replace(o, sub_pixels=None)  # it is what the rays were traced with, quick or not
     for one in data:
-        if isinstance(one, SpectrumDataset) and not (one.path_gain > one.floor).any():
+        if isinstance(one, SpectrumDataset) and len(one) and not (one.path_gain > one.floor).any():
             raise ValueError("ds: got no pixel above the floor, expected spectra with power to fit to")
     if transport is not None:
         places = places_of(data, as_mesh(geometry, "geometry"), device)

@@ -1,0 +1,166 @@
+"""Measurements by others: received power in a furnished flat."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import warprrf as wr
+from benchmarks.machine import machine
+from benchmarks.report import Report, columns_table
+from benchmarks.runner import Benchmark, Job, option
+from warprrf.rf.fields.bistatic.field import BistaticField
+
+HELP = """\
+Received power of a tag at 2.4 GHz on a robot in a furnished flat, which six anchors heard; its walls are known as an outline. Five
+anchors are fitted, the sixth is predicted, each in turn. You fetch the data yourself (github.com/marckolak/
+ble-rss-fingerprints-calib2021).
+
+examples:
+  python -m benchmarks outside --data ble-rss-fingerprints-calib2021
+"""
+
+HEIGHT_M, TAG_M = 2.7, 1.3  # of the flat's ceiling (assumed), and of the tag on its robot (stated)
+CELL_M = 0.5  # readings in a cell are averaged: it holds several wavelengths
+FLOOR_DBM = -100.0
+FLAT = (
+    ("anchor", "anchor", "{}"), ("field_db", "field, rms [dB]", "{:.1f}"), ("log_distance_db", "log-distance", "{:.1f}"),
+    ("nearest_db", "nearest reading", "{:.1f}"), ("field_seen_db", "field where seen", "{:.1f}"),
+    ("field_blocked_db", "behind walls", "{:.1f}"), ("field_blocked_bias_db", "behind walls, mean", "{:+.1f}"),
+    ("log_distance_blocked_db", "log-distance behind walls", "{:.1f}"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the comparison.
+
+    Attributes:
+        data: folder of the flat.
+        anchors: how many anchors in turn.
+    """
+
+    data: str = option("", "folder of the flat")
+    anchors: int = option(6, "how many anchors are predicted in turn")
+
+
+def run(options: Options, job: Job) -> Report:
+    """Read what is there, fit and score.
+
+    Raises:
+        FileNotFoundError, ValueError: naming the file that does not fit.
+    """
+    rows = flat(Path(options.data), options.anchors, job)
+    text = f"Received power of an anchor from that of five others, errors rms [dB].\n\n{columns_table(FLAT, rows)}"
+    return Report("outside", {"machine": machine(job.device), "flat": rows}, text)
+
+
+def walls(corners: np.ndarray, height_m: float) -> wr.Mesh:
+    """A flat of one outline (N, 2) with right angles: walls along it, floor and ceiling inside."""
+    vertices: list[list[float]] = []
+
+    def quad(points: list[list[float]]) -> None:
+        vertices.extend(points)
+
+    ends = np.roll(corners, -1, axis=0)
+    for (ax, ay), (bx, by) in zip(corners, ends, strict=True):
+        if (ax, ay) != (bx, by):
+            quad([[ax, ay, 0.0], [bx, by, 0.0], [bx, by, height_m], [ax, ay, height_m]])
+    xs, ys = (np.unique(corners[:, axis]) for axis in (0, 1))
+    for x0, x1 in zip(xs[:-1], xs[1:], strict=True):
+        for y0, y1 in zip(ys[:-1], ys[1:], strict=True):
+            if inside(corners, np.array([[0.5 * (x0 + x1), 0.5 * (y0 + y1)]]))[0]:
+                for z in (0.0, height_m):
+                    quad([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
+    first = 4 * np.arange(len(vertices) // 4)[:, None, None]
+    return wr.Mesh(np.array(vertices), (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3))
+
+
+def inside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether ``points`` (N, 2) are within the outline."""
+    ends = np.roll(corners, -1, axis=0)
+    a, b = corners[None], ends[None]
+    crossed = (a[..., 1] > points[:, None, 1]) != (b[..., 1] > points[:, None, 1])
+    rise = np.where(b[..., 1] == a[..., 1], 1.0, b[..., 1] - a[..., 1])
+    at = a[..., 0] + (points[:, None, 1] - a[..., 1]) / rise * (b[..., 0] - a[..., 0])
+    return np.asarray((crossed & (points[:, None, 0] < at)).sum(axis=1) % 2 == 1)
+
+
+def table(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a CSV file by name; empty cells are NaN."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0] if name}
+
+
+def flat(folder: Path, anchors: int, job: Job) -> list[dict[str, Any]]:
+    """A row for each anchor that is predicted from the others."""
+    outline = np.column_stack([table(folder / "layout.csv")[axis] for axis in "xy"])
+    at = table(folder / "anchors.csv")
+    places = np.column_stack([at[axis] for axis in "xyz"])
+    read = table(folder / "calibration" / "calibration_df.csv")
+    spots = np.column_stack([read["x"], read["y"], np.full(len(read["x"]), TAG_M)])
+    level = np.column_stack([read[f"rssi_{k + 1}"] for k in range(len(places))])
+    cells, own = np.unique(np.floor(spots[:, :2] / CELL_M), axis=0, return_inverse=True)
+    own = own.reshape(-1)
+    mesh = walls(outline, HEIGHT_M)
+    centre, mean = np.zeros((len(cells), 3)), np.full((len(cells), len(places)), np.nan)
+    for c in range(len(cells)):
+        centre[c] = spots[own == c].mean(axis=0)
+        power = 10.0 ** (level[own == c] / 10.0)
+        heard = np.isfinite(power).sum(axis=0) >= 3
+        mean[c, heard] = np.nanmean(power[:, heard], axis=0)
+    free = inside(outline, centre[:, :2]) & (mesh.distance(centre) > 0.15)
+    centre, mean = centre[free], mean[free]
+    rows = []
+    for out in range(min(anchors, len(places))):
+        rows.append({"anchor": out + 1} | _predicted(mesh, places, centre, mean, out, job))
+    each = {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "anchor"}
+    return [*rows, {"anchor": "mean", **each}]
+
+
+def _predicted(
+    mesh: wr.Mesh, places: np.ndarray, spots: np.ndarray, power: np.ndarray, out: int, job: Job
+) -> dict[str, float]:
+    """Errors [dB] at anchor ``out`` of what was fitted to the others."""
+    others = [k for k in range(len(places)) if k != out]
+    sender = np.repeat(places[others], len(spots), axis=0)
+    receiver, measured = np.tile(spots, (len(others), 1)), power[:, others].T.ravel()
+    heard = np.isfinite(measured)
+    readings = wr.Readings(
+        sender[heard], receiver[heard], measured[heard], 2.45e9, 10.0 ** (FLOOR_DBM / 10.0), chain=["ble"] * int(heard.sum()),
+        samples=6,
+    )  # fmt: skip
+    field = BistaticField.fit(
+        mesh, readings, quick=True, mirror_order=2, device=job.device, progress=job.progress
+    )
+    asked = np.isfinite(power[:, out])
+    spots, truth = spots[asked], 10.0 * np.log10(power[asked, out])
+    gain = field.report["chains"]["ble"]["gain_db"]
+    field_db = gain + 10.0 * np.log10(field.links(spots, places[out]).total_path_gain)
+    distance = np.linalg.norm(receiver - sender, axis=1)[heard]
+    law = np.polyfit(np.log10(distance), 10.0 * np.log10(measured[heard]), 1)
+    log_distance = np.polyval(law, np.log10(np.linalg.norm(spots - places[out], axis=1)))
+    near = others[int(np.linalg.norm(places[others] - places[out], axis=1).argmin())]
+    nearest = 10.0 * np.log10(power[asked, near])
+    seen = mesh.visible(spots, np.broadcast_to(places[out], spots.shape))
+
+    def rms(error: np.ndarray) -> float:
+        return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
+
+    return {
+        "field_db": rms(field_db - truth),
+        "log_distance_db": rms(log_distance - truth),
+        "nearest_db": rms(nearest - truth),
+        "field_seen_db": rms((field_db - truth)[seen]),
+        "field_blocked_db": rms((field_db - truth)[~seen]),
+        "field_blocked_bias_db": float(np.mean((field_db - truth)[~seen])),
+        "log_distance_blocked_db": rms((log_distance - truth)[~seen]),
+    }
+
+
+BENCHMARKS = {"outside": Benchmark("outside", Options, run, HELP)}

@@ -1,0 +1,319 @@
+"""Straight edges along a room's three directions: found in photos of known cameras, and placed in space.
+
+A line along a known direction has two unknowns, its place in the cross-section. There a photo's edge is a bearing from
+its camera: edge pixels that run along the direction and share a bearing are a segment, and where the bearings of several
+photos meet is the line (for known directions and poses, the interpretation planes of Coughlan and Yuille, "Manhattan
+world", 1999, and the triangulation of lines by Bartoli and Sturm, 2005). Cameras, lines and lengths are in the room's
+frame, whose axes are the three directions. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from warprrf.geometry.photos.config import PlainConfig
+from warprrf.geometry.splats.camera import Camera
+
+LEAST_SLOPE = 0.15  # a ray closer to the direction than this (sine) fixes no bearing
+FARTHEST_M = 25.0  # a line is sought so far from a camera
+POSE_M = 0.02  # what poses may be off
+REFITS = 5
+LEAST_SUPPORT = 0.5  # segments that meet, by how sharply: a guess with less is not tried
+
+
+@dataclass(frozen=True)
+class Edgels:
+    """Edge pixels of a photo.
+
+    Attributes:
+        position: shape ``(N, 2)`` [pixels].
+        across: unit direction in which the photo changes most, shape ``(N, 2)``.
+        strength: change per pixel of the colour that changes most, of all pixels, shape ``(H, W)``.
+    """
+
+    position: np.ndarray
+    across: np.ndarray
+    strength: np.ndarray
+
+    @property
+    def pixel(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each."""
+        height, width = self.strength.shape
+        x, y = self.position.astype(int).T
+        return np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A straight edge in space.
+
+    Attributes:
+        axis: the direction it runs along.
+        at: its place on the two axes that follow in cyclic order [m], shape ``(2,)``.
+        low, high: where it begins and ends along its axis [m].
+        views: the cameras that show it.
+    """
+
+    axis: int
+    at: np.ndarray
+    low: float
+    high: float
+    views: tuple[int, ...]
+
+    @property
+    def weight(self) -> float:
+        """How well it is known: its length times the number of its views, ten at most."""
+        return (self.high - self.low) * min(len(self.views), 10)
+
+    def height(self, axis: int) -> float:
+        """Its place on another axis than its own."""
+        return float(self.at[(axis - self.axis) % 3 - 1])
+
+    def points(self, along: np.ndarray) -> np.ndarray:
+        """Points at these places along its axis, shape ``(N, 3)``."""
+        result = np.empty((len(along), 3))
+        result[:, self.axis] = along
+        result[:, (self.axis + 1) % 3], result[:, (self.axis + 2) % 3] = self.at
+        return result
+
+
+def find_edgels(image: np.ndarray, config: PlainConfig) -> Edgels:
+    """Edge pixels of a photo ``(H, W, 3)`` in [0, 1], to a fraction of a pixel (the scheme of Canny, 1986)."""
+    change = [
+        np.stack([ndimage.gaussian_filter(c, config.blur_px, order=order) for c in np.moveaxis(image, 2, 0)])
+        for order in ((0, 1), (1, 0))
+    ]
+    main = (change[0] ** 2 + change[1] ** 2).argmax(axis=0)[None]
+    dx, dy = (np.take_along_axis(c, main, axis=0)[0].astype(np.float64) for c in change)
+    strength = np.hypot(dx, dy)
+    inside = np.zeros(strength.shape, dtype=bool)
+    inside[2:-2, 2:-2] = True
+    y, x = np.nonzero(inside & (strength > config.edge))
+    here = strength[y, x]
+    across = np.stack([dx[y, x], dy[y, x]], axis=1) / here[:, None]
+    before, after = (
+        ndimage.map_coordinates(strength, [y + s * across[:, 1], x + s * across[:, 0]], order=1)
+        for s in (-1, 1)
+    )
+    top = (here >= before) & (here > after)
+    here, before, after, across = here[top], before[top], after[top], across[top]
+    shift = 0.5 * (before - after) / np.minimum(before - 2 * here + after, -1e-9)  # top of the parabola
+    position = np.stack([x[top] + 0.5, y[top] + 0.5], axis=1) + np.clip(shift, -0.5, 0.5)[:, None] * across
+    return Edgels(position, across, strength)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Segments of photos along one direction.
+
+    Attributes:
+        camera: which camera shows it, shape ``(N,)``.
+        bearing: from the camera in the cross-section [rad], shape ``(N,)``.
+        rise: where it begins and ends: metres along the direction per metre of distance, shape ``(N, 2)``.
+        pixel: radians of bearing that a pixel is worth, shape ``(N,)``.
+        length: [pixels], shape ``(N,)``.
+        sides: colours on the side of smaller and of larger bearing, shape ``(N, 2, 3)``.
+    """
+
+    camera: np.ndarray
+    bearing: np.ndarray
+    rise: np.ndarray
+    pixel: np.ndarray
+    length: np.ndarray
+    sides: np.ndarray
+
+    def alike(self, k: int, tolerance: float) -> np.ndarray:
+        """Which have the colour of segment ``k`` on one side at least (an occluding edge keeps only one)."""
+        gap = np.abs(self.sides - self.sides[k]).max(axis=2).min(axis=1)
+        return np.asarray(gap < tolerance)
+
+
+def find_segments(
+    camera: Camera, number: int, image: np.ndarray, edgels: Edgels, axis: int, config: PlainConfig
+) -> list[tuple[int, float, tuple[float, float], float, float, np.ndarray]]:
+    """Rows of :class:`Segments` along ``axis`` in one photo."""
+    position, across = edgels.position, edgels.across
+    rays, along_image = lines_through(camera, position, axis)
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    size = np.hypot(rays[:, u], rays[:, v])
+    straight = np.abs((along_image * across).sum(axis=1)) < np.sin(np.radians(config.edge_deg))
+    own = np.flatnonzero(straight & (size > LEAST_SLOPE * np.linalg.norm(rays, axis=1)))
+    # How the bearing changes along ``across``, per pixel.
+    step = np.pad(across / [camera.fx, camera.fy], [(0, 0), (0, 1)]) @ camera.rotation
+    turn = (step[:, v] * rays[:, u] - step[:, u] * rays[:, v]) / np.maximum(size, 1e-9) ** 2
+    bearing, rise = np.arctan2(rays[:, v], rays[:, u]), rays[:, axis] / np.maximum(size, 1e-9)
+    own = own[np.argsort(bearing[own], kind="stable")]
+    wide = 1.2 * np.abs(turn[own])
+    first = np.searchsorted(bearing[own], bearing[own] - wide)
+    last = np.searchsorted(bearing[own], bearing[own] + wide, side="right")
+    used, result = np.zeros(len(own), dtype=bool), []
+    for k in np.argsort(first - last, kind="stable"):
+        if last[k] - first[k] < config.segment_px:
+            break
+        group = np.arange(first[k], last[k])
+        group = group[~used[group]]
+        if len(group) < config.segment_px:
+            continue
+        group = group[np.argsort(rise[own[group]], kind="stable")]
+        gap = np.linalg.norm(np.diff(position[own[group]], axis=0), axis=1)
+        for run in np.split(group, np.flatnonzero(gap > config.gap_px) + 1):
+            pixels = own[run]
+            length = float(np.linalg.norm(position[pixels[-1]] - position[pixels[0]]))
+            if len(run) < config.segment_px or length < config.segment_px or len(run) < 0.6 * length:
+                continue
+            used[run] = True
+            ends = float(rise[pixels[0]]), float(rise[pixels[-1]])
+            outward = np.sign(turn[pixels])[:, None] * across[pixels]
+            sides = np.stack(
+                [_colour(image, position[pixels] + s * config.side_px * outward) for s in (-1, 1)]
+            )
+            angle, pixel = float(np.median(bearing[pixels])), float(np.abs(turn[pixels]).mean())
+            result.append((number, angle, ends, pixel, length, sides))
+    return result
+
+
+def lines_through(camera: Camera, pixels: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of pixels, shape ``(N, 3)``, of depth one, and the image direction of lines along ``axis`` there, ``(N, 2)``."""
+    lens = np.array([camera.fx, camera.fy])
+    local = np.pad((pixels - [camera.cx, camera.cy]) / lens, [(0, 0), (0, 1)], constant_values=1.0)
+    towards = camera.rotation[:, axis]
+    image = lens * (towards[:2] - local[:, :2] * towards[2])
+    return local @ camera.rotation, image / np.maximum(np.linalg.norm(image, axis=1, keepdims=True), 1e-9)
+
+
+def _colour(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    x, y = positions.astype(int).T
+    taken = image[np.clip(y, 0, image.shape[0] - 1), np.clip(x, 0, image.shape[1] - 1)]
+    return np.asarray(np.median(taken, axis=0))
+
+
+def find_lines(
+    cameras: Sequence[Camera], images: Sequence[np.ndarray], edgels: Sequence[Edgels], config: PlainConfig
+) -> list[Line]:
+    """Lines along the three axes that at least ``config.line_views`` photos show, from different directions."""
+    positions = np.array([camera.position for camera in cameras])
+    lines = []
+    for axis in range(3):
+        rows = [
+            row
+            for k, (camera, image) in enumerate(zip(cameras, images, strict=True))
+            for row in find_segments(camera, k, image, edgels[k], axis, config)
+        ]
+        if rows:
+            segments = Segments(*(np.array(column) for column in zip(*rows, strict=True)))
+            lines += _placed(segments, positions, axis, config)
+    return lines
+
+
+def _placed(segments: Segments, positions: np.ndarray, axis: int, config: PlainConfig) -> list[Line]:
+    """Lines where segments meet, the best supported first; each segment belongs to one."""
+    eye = positions[segments.camera]
+    across, along = eye[:, [(axis + 1) % 3, (axis + 2) % 3]], eye[:, axis]
+    towards = np.stack([np.cos(segments.bearing), np.sin(segments.bearing)], axis=1)
+    guesses = [_met(k, segments, across, along, towards, config) for k in range(len(segments.camera))]
+    support = np.array([weight for weight, _ in guesses])
+    free, lines = np.ones(len(support), dtype=bool), []
+    for k in np.argsort(-support, kind="stable"):
+        if support[k] < LEAST_SUPPORT:
+            break
+        if not free[k]:
+            continue
+        distance = guesses[k][1]
+        alike = free & segments.alike(k, config.alike)
+        start = across[k] + distance * towards[k], along[k] + distance * segments.rise[k]
+        place, chosen = _fitted(alike, start, segments, across, along, towards)
+        line = _extent(place, chosen, segments, across, along, axis)
+        if line is not None and len(line.views) >= config.line_views:
+            free[chosen] = False
+            lines.append(line)
+    return lines
+
+
+def _met(
+    k: int,
+    segments: Segments,
+    across: np.ndarray,
+    along: np.ndarray,
+    towards: np.ndarray,
+    config: PlainConfig,
+) -> tuple[float, float]:
+    """How many segments of other photos meet segment ``k`` at one place, by weight, and at which distance [m]."""
+    sine = towards[k, 0] * towards[:, 1] - towards[k, 1] * towards[:, 0]
+    apart = across - across[k]
+    ok = (np.abs(sine) > np.sin(np.radians(config.meeting_deg))) & (segments.camera != segments.camera[k])
+    ok &= segments.alike(k, config.alike)
+    safe = np.where(ok, sine, 1.0)
+    mine = (apart[:, 0] * towards[:, 1] - apart[:, 1] * towards[:, 0]) / safe
+    theirs = (apart[:, 0] * towards[k, 1] - apart[:, 1] * towards[k, 0]) / safe
+    ok &= (np.minimum(mine, theirs) > 0.15) & (np.maximum(mine, theirs) < FARTHEST_M)
+    ends = along[:, None] + segments.rise * theirs[:, None]
+    own = along[k] + segments.rise[k] * mine[:, None]
+    ok &= np.minimum(ends[:, 1], own[:, 1]) - np.maximum(ends[:, 0], own[:, 0]) > 0.05
+    blur = (1.5 * (segments.pixel * theirs + segments.pixel[k] * mine) + POSE_M) / np.abs(safe)
+    ok &= blur < 0.4
+    if not ok.any():
+        return 0.0, 0.0
+    weight = np.minimum(1.0, 0.08 / blur[ok])
+    stop = np.concatenate([mine[ok] - blur[ok], mine[ok] + blur[ok]])
+    order = np.argsort(stop, kind="stable")
+    total = np.cumsum(np.concatenate([weight, -weight])[order])
+    best = int(total.argmax())
+    return float(total[best]), float(stop[order][best : best + 2].mean())
+
+
+def _fitted(
+    alike: np.ndarray,
+    start: tuple[np.ndarray, np.ndarray],
+    segments: Segments,
+    across: np.ndarray,
+    along: np.ndarray,
+    towards: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Place in the cross-section that the segments near a first guess fix, and which segments those are."""
+    (place, (low, high)), chosen = start, alike
+    for step in range(REFITS):
+        reach = place - across
+        distance = np.linalg.norm(reach, axis=1)
+        miss = reach[:, 0] * towards[:, 1] - reach[:, 1] * towards[:, 0]
+        near = (2 if step > 1 else 3) * segments.pixel * distance + POSE_M
+        ends = along[:, None] + segments.rise * distance[:, None]
+        chosen = alike & ((reach * towards).sum(axis=1) > 0.1) & (np.abs(miss) < near)
+        chosen &= np.minimum(ends[:, 1], high) - np.maximum(ends[:, 0], low) > -0.3
+        if chosen.sum() < 2:
+            break
+        normal = np.stack([towards[chosen, 1], -towards[chosen, 0]], axis=1)
+        sure = np.minimum(segments.length, 100) / ((segments.pixel * distance) ** 2 + 1e-4)
+        w = (sure / (1 + (2 * miss / near) ** 2))[chosen, None] * normal
+        place = np.linalg.lstsq(w.T @ normal, w.T @ (normal * across[chosen]).sum(axis=1), rcond=1e-9)[0]
+        low, high = np.percentile(ends[chosen, 0], 2), np.percentile(ends[chosen, 1], 98)
+    return place, chosen
+
+
+def _extent(
+    place: np.ndarray,
+    chosen: np.ndarray,
+    segments: Segments,
+    across: np.ndarray,
+    along: np.ndarray,
+    axis: int,
+) -> Line | None:
+    """The line at ``place``, from where to where two photos at least show it."""
+    picked = np.flatnonzero(chosen)
+    if not len(picked):
+        return None
+    distance = np.linalg.norm(place - across[picked], axis=1)
+    ends = along[picked, None] + segments.rise[picked] * distance[:, None]
+    bins = np.arange(ends.min(), ends.max() + 0.05, 0.05)
+    views = np.unique(segments.camera[picked])
+    shown = np.zeros(len(bins), dtype=int)
+    for view in views:
+        own = ends[segments.camera[picked] == view]
+        shown += ((bins >= own[:, :1]) & (bins <= own[:, 1:])).any(axis=0)
+    twice = bins[shown >= 2]
+    if not len(twice):
+        return None
+    return Line(axis, place, float(twice[0]), float(twice[-1]), tuple(int(view) for view in views))
