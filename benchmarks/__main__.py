@@ -35,6 +35,7 @@ NAMES = {
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
     "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
+    "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
     "measurements": (
         "benchmarks.measurements",
         "horns, power alone, delay profiles and one spectrum, beside ten spectra",

@@ -120,6 +120,11 @@ TARGETS: dict[str, tuple[Target, ...]] = {
         Target("blend.image_difference.quantile_99.9", "difference of the two images, 99.9 %", 1e-4),
         Target("growth.gaussians=100000.seconds", "spectrum of 100 000 Gaussians", 0.150, unit="s"),
     ),
+    "filmed": (
+        Target("back_median_m", "reference surface to mesh, median", 0.03, unit="m"),
+        Target("back_p90_m", "the same, 90th percentile", 0.15, unit="m"),
+        Target("back_within_5_cm", "share of it within 5 cm", 0.65, True),
+    ),
     "beams": tuple(
         Target(f"within.{truth}.{which}", f"within 1 dB of exhaustive search, {truth}, {name}", share, True)
         for truth in ("exact", "sionna")

@@ -190,7 +190,7 @@ def test_a_killed_run_continues_to_the_same_result(whole):
     (workspace / "surface.safetensors.partial").write_bytes(b"half")
     stages = set()
     resumed = reconstruct(photos, config=SMALL, progress=lambda s, d, n: stages.add(s), **options)
-    assert stages == {"depth", "surface"}
+    assert stages == {"depth", "stereo", "surface"}
     np.testing.assert_array_equal(resumed.gaussians.means, rec.gaussians.means)
     np.testing.assert_array_equal(resumed.mesh.vertices, rec.mesh.vertices)
 
@@ -198,9 +198,9 @@ def test_a_killed_run_continues_to_the_same_result(whole):
 @pytest.mark.parametrize(
     "changed, again",
     [
-        ("initial", {"planes", "refine", "depth", "surface"}),
-        ("refined", {"refine", "depth", "surface"}),
-        ("surface", {"depth", "surface"}),
+        ("initial", {"planes", "refine", "depth", "stereo", "surface"}),
+        ("refined", {"refine", "depth", "stereo", "surface"}),
+        ("surface", {"depth", "stereo", "surface"}),
     ],
 )
 def test_a_step_of_another_version_is_done_again_and_those_after_it(
@@ -226,7 +226,7 @@ def test_a_changed_setting_is_not_served_from_the_old_run(whole):
         photos, workspace=workspace, known_positions=known, held_out=VIEWS[4:6], config=SMALL, iterations=2,
         device="cpu", progress=lambda s, d, n: stages.add(s),
     )  # fmt: skip
-    assert stages == {"planes", "refine", "depth", "surface"}  # the photos' poses stay
+    assert stages == {"planes", "refine", "depth", "stereo", "surface"}  # the photos' poses stay
     assert other.held_out == tuple(VIEWS[4:6])
 
 

@@ -657,6 +657,26 @@ def _bare_mesh() -> str:
     return markdown(head, lines)
 
 
+@entry("filmed")
+def _filmed() -> str:
+    found = measured("filmed")
+    if found is None:
+        return missing("python -m benchmarks filmed")
+    rows = {
+        "distance": "mesh to reference", "back": "reference to mesh", "laid_on_distance": "mesh to reference, laid on it",
+        "laid_on_back": "reference to mesh, laid on it",
+    }  # fmt: skip
+    lines = [
+        [
+            name,
+            *(f"{100 * found[f'{key}_{part}_m']:.1f}" for part in ("median", "p90")),
+            f"{100 * found[f'{key}_within_5_cm']:.0f} %",
+        ]
+        for key, name in rows.items()
+    ]
+    return markdown(("distance", "median [cm]", "90th percentile [cm]", "within 5 cm"), lines)
+
+
 @entry("measurements")
 def _measurements() -> str:
     found = measured("measurements")

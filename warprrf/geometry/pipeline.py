@@ -47,7 +47,7 @@ from warprrf.geometry.reconstruction import Reconstruction
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
-VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 2}
+VERSIONS = {**sfm.VERSIONS, "initial": 2, "refined": 2, "surface": 3}
 """Of all steps: counted up by whoever changes what a step computes."""
 
 MUCH_UNKNOWN = 0.25  # share of a surface that is worth a warning
@@ -225,19 +225,29 @@ def _steps(
         measured: depth images by photo; with some, they make the surface.
     """
     cameras = {name: sparse.cameras[name] for name in fitted}
-    photos = cache(lambda: [read_photo(photo) for photo in fitted.values()])
     masks = [mask_beside(photo) for photo in fitted.values()]
+
+    @cache
+    def photos() -> PosedPhotos:
+        images = [read_photo(photo) for photo in fitted.values()]
+        return PosedPhotos(images, list(cameras.values()), [read_mask(photo) for photo in fitted.values()])
 
     def initial(attempt: Attempt) -> files.Arrays:
         planes, gaussians = initialise(
-            sparse, cameras, photos(), config=config, seed=seed, progress=attempt.progress, device=device
+            sparse,
+            cameras,
+            photos().images,
+            config=config,
+            seed=seed,
+            progress=attempt.progress,
+            device=device,
         )
         return files.of_planes(planes) | files.of_gaussians(gaussians)
 
     def refined(attempt: Attempt) -> files.Arrays:
         gaussians = refine(
             files.to_gaussians(first),
-            PosedPhotos(photos(), list(cameras.values()), [read_mask(photo) for photo in fitted.values()]),
+            photos(),
             config=config.refine,
             planes=planes,
             progress=attempt.progress,
@@ -254,8 +264,9 @@ def _steps(
             patches = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
         else:
             patches = fuse_gaussians(
-                gaussians, everywhere, planes=planes, config=config, progress=attempt.progress, device=device
-            )
+                gaussians, list(cameras.values()), photos=photos(), planes=planes, config=config,
+                progress=attempt.progress, device=device,
+            )  # fmt: skip
         shares = np.array(surface_shares(patches.mesh, planes, everywhere))
         return files.of_patches(patches) | {"shares": shares}
 
@@ -270,8 +281,7 @@ def _steps(
     first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
     planes = files.to_planes(first)
     gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
-    photos.cache_clear()
-    inputs = [steps.key("refined"), config.surface, config.completion]
+    inputs: list[Any] = [steps.key("refined"), config.stereo, config.surface, config.completion]
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     kept = _kept(steps, "surface", surface, inputs)

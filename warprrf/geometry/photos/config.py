@@ -239,7 +239,8 @@ class SurfaceConfig:
         views: at most so many depth maps are fused, spread over all cameras.
         alpha: a depth counts where at least so much light is blocked.
         depth_spread: and where the blended depth and that of the dominant Gaussian differ by no more than this part.
-        voxel_m: side of a voxel of the fusion.
+        voxel_m: largest side of a voxel of the fusion.
+        voxel_pixels: and how wide it is, in pixels of the depth maps, at their median range.
         truncation_voxels: the distance field is truncated at so many voxels.
         max_range_m: depths beyond this are left out.
         edge_tolerance: a pixel is left out where inverse depth bends by more than this part of itself, per focal length
@@ -257,6 +258,7 @@ class SurfaceConfig:
     alpha: float = 0.6
     depth_spread: float = 0.05
     voxel_m: float = 0.05
+    voxel_pixels: float = 4.0
     truncation_voxels: float = 4.0
     max_range_m: float = 12.0
     edge_tolerance: float = 8.0
@@ -269,6 +271,37 @@ class SurfaceConfig:
 
     def __post_init__(self) -> None:
         check_positive("voxel_m", self.voxel_m, "length in metres")
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """How photos mend depth maps (see :mod:`warprrf.geometry.photos.stereo`). Costs are one minus a correlation.
+
+    Attributes:
+        downscale: photos are compared at the depth maps' size divided by this.
+        sources: photos that one is compared with.
+        turns: how often planes are handed on between pixels.
+        settled: a depth of less cost stays as it is.
+        proved: depths of more cost prove nothing.
+        gain: a new depth has to cost less than the old one by this much.
+        checked: maps of other photos that a depth is checked against.
+        agreed: so many of them must confirm a new depth, or see through an old one.
+        tolerance: up to this part of the range two depths agree.
+    """
+
+    downscale: int = 2
+    sources: int = 3
+    turns: int = 2
+    settled: float = 0.2
+    proved: float = 0.6
+    gain: float = 0.05
+    checked: int = 8
+    agreed: int = 2
+    tolerance: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name in ("downscale", "sources", "turns", "checked", "agreed"):
+            check_count(name, getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -350,6 +383,7 @@ class ReconstructionConfig:
         plain: how surfaces without features are found from their edges; None: not at all.
         gaussians: Gaussians to start the refinement from (about).
         refine: photometric refinement.
+        stereo: how depth maps are mended by comparing the photos; None: not at all.
         surface: from Gaussians to a mesh.
         completion: how holes are closed and borders straightened where the planes allow it; None: not at all.
     """
@@ -364,5 +398,6 @@ class ReconstructionConfig:
     plain: PlainConfig | None = field(default_factory=PlainConfig)
     gaussians: int = 32_000
     refine: RefineConfig = field(default_factory=RefineConfig)
+    stereo: StereoConfig | None = field(default_factory=StereoConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     completion: CompletionConfig | None = field(default_factory=CompletionConfig)

@@ -1,4 +1,4 @@
-"""From Gaussians to a surface: depth maps rendered at cameras, fused to a mesh, snapped to planes, made whole.
+"""From Gaussians to a surface: depth maps rendered at cameras, mended by photos, fused, snapped to planes, made whole.
 
 Fusion is Open3D's truncated signed distance field (Curless and Levoy, "A volumetric method for building complex models
 from range images", 1996).
@@ -7,6 +7,7 @@ from range images", 1996).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -20,6 +21,8 @@ from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.snapping import find_patches, flattened, largest_first, simplified
+from warprrf.geometry.photos.stereo import mended
+from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -32,17 +35,28 @@ def fuse_gaussians(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     *,
+    photos: PosedPhotos | None = None,
     planes: Sequence[Plane] = (),
     config: ReconstructionConfig | None = None,
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> PlanarPatches:
-    """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first; planes
-    known beforehand are what it is snapped to."""
+    """Mesh of Gaussians from depth maps rendered at ``cameras``, with its planar patches, the largest first.
+
+    Args:
+        photos: what these cameras saw, in the same order; the depth maps are mended by them.
+        planes: known beforehand; the mesh is snapped to them.
+    """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    maps = depth_maps(gaussians, cameras, config=config.surface, progress=report, device=device)
-    return fuse_maps(*maps, planes=planes, config=config, progress=report)
+    chosen = _spread_out(len(cameras), config.surface.views)
+    views, depths = depth_maps(
+        gaussians, [cameras[k] for k in chosen], config=config.surface, progress=report, device=device
+    )
+    if photos is not None and config.stereo is not None:
+        seen = photos.subset(chosen)
+        depths = mended(depths, views, seen, config=config.stereo, progress=report, device=device)
+    return fuse_maps(views, depths, planes=planes, config=config, progress=report)
 
 
 def fuse_maps(
@@ -57,7 +71,7 @@ def fuse_maps(
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
     report("surface", 0, 4)
-    mesh = fuse_depth(depths, views, config=config.surface)
+    mesh = fuse_depth(depths, views, config=_with_voxels(config.surface, views, depths))
     report("surface", 1, 4)
     patches = flattened(find_patches(mesh, planes, config.surface))
     report("surface", 2, 4)
@@ -77,12 +91,10 @@ def depth_maps(
     progress: Progress,
     device: DeviceLike = None,
 ) -> tuple[list[Camera], list[np.ndarray]]:
-    """Smaller cameras spread over all ``cameras``, and the ranges that they see [m], 0 where no Gaussian is reliable."""
-    chosen = np.linspace(0, len(cameras) - 1, min(len(cameras), config.views)).round().astype(int)
+    """Smaller ``cameras``, and the ranges that they see [m], 0 where no Gaussian is reliable."""
     views, depths = [], []
-    for k, index in enumerate(chosen):
-        progress("depth", k, len(chosen))
-        camera = cameras[index]
+    for k, camera in enumerate(cameras):
+        progress("depth", k, len(cameras))
         view = camera.resized(
             max(1, camera.width // config.downscale), max(1, camera.height // config.downscale)
         )
@@ -91,8 +103,23 @@ def depth_maps(
             agree = np.abs(out.depth - out.peak) <= config.depth_spread * out.peak
         depths.append(np.where(agree & (out.alpha >= config.alpha), out.depth, 0.0))
         views.append(view)
-    progress("depth", len(chosen), len(chosen))
+    progress("depth", len(cameras), len(cameras))
     return views, depths
+
+
+def _spread_out(count: int, most: int) -> list[int]:
+    """At most so many of ``count`` numbers, evenly spread."""
+    return [int(k) for k in np.linspace(0, count - 1, min(count, most)).round()]
+
+
+def _with_voxels(
+    config: SurfaceConfig, views: Sequence[Camera], depths: Sequence[np.ndarray]
+) -> SurfaceConfig:
+    """``config`` with smaller voxels where the views look from near by: they show finer things."""
+    pixel_m = [np.median(d[d > 0]) / v.fx for v, d in zip(views, depths, strict=True) if (d > 0).any()]
+    if not pixel_m:
+        return config
+    return replace(config, voxel_m=min(config.voxel_m, config.voxel_pixels * float(np.median(pixel_m))))
 
 
 def fuse_depth(

@@ -19,6 +19,7 @@ from warprrf.geometry.photos.planes import Plane, detect_planes, drawn_by_place
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 
 LONGEST_MOVE_M = 0.15  # of a vertex to its plane
+ALIKE = 0.95  # cosine between the normals of planes that are nearly parallel
 FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
 DRAWN = 100_000  # faces are enough to find planes among
 SCAN_NOISE_M = 2e-3  # vertices whose errors are larger are a scanner's
@@ -112,10 +113,12 @@ def flattened(patches: PlanarPatches) -> PlanarPatches:
         planes = pairs[start[which][:, None] + np.arange(size), 1]
         n, x = patches.normal[planes], vertices[which]
         residual = patches.offset[planes] - np.einsum("vki,vi->vk", n, x)
-        # Least move that meets every plane; nearly parallel planes must not send a vertex far away.
-        move = np.einsum("vik,vk->vi", np.linalg.pinv(n, rcond=0.2), residual)
         nearest, rows = np.abs(residual).argmin(axis=1), np.arange(len(which))
         single = residual[rows, nearest][:, None] * n[rows, nearest]
+        # Least move that meets every plane, but of nearly parallel ones, which may not meet near by, the nearest alone.
+        nearer = np.abs(residual)[:, None, :] < np.abs(residual)[:, :, None]
+        left = ~(nearer & (np.einsum("vki,vli->vkl", n, n) > ALIKE)).any(axis=2)
+        move = np.einsum("vik,vk->vi", np.linalg.pinv(n * left[..., None], rcond=0.2), residual * left)
         for cut in (single, np.zeros_like(single)):
             far = np.linalg.norm(move, axis=1) > LONGEST_MOVE_M
             move[far] = cut[far]

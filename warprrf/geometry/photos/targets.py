@@ -56,6 +56,11 @@ class PosedPhotos:
             if mask is not None:
                 check_array(f"masks[{k}]", mask, shape, np.uint8)
 
+    def subset(self, chosen: Sequence[int]) -> PosedPhotos:
+        """The photos of these numbers."""
+        masks = [self.masks[k] for k in chosen] if self.masks else []
+        return PosedPhotos([self.images[k] for k in chosen], [self.cameras[k] for k in chosen], masks)
+
 
 @dataclass(frozen=True)
 class Target:

@@ -1,0 +1,138 @@
+"""Depth maps mended by photos, in a box whose depth is known in closed form."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import views
+
+from warprrf.geometry.photos.config import StereoConfig
+from warprrf.geometry.photos.fusion import fuse_depth
+from warprrf.geometry.photos.stereo import mended
+from warprrf.geometry.photos.targets import PosedPhotos
+
+look = partial(views.look, width=160, height=120, f=130.0)
+LOW, HIGH = np.array([-2.0, -2.0, 0.0]), np.array([2.0, 2.0, 2.5])
+PLAIN_X = HIGH[0]  # the wall there shows nothing
+
+
+def silent(stage, done, total):
+    pass
+
+
+def truth(camera):
+    """Range along every pixel's ray to the inside of the box, and the photo of its pattern."""
+    d = camera.directions()
+    with np.errstate(divide="ignore"):
+        t = np.where(d > 0, (HIGH - camera.position) / d, (LOW - camera.position) / d).min(axis=-1)
+    x = camera.position + t[..., None] * d
+    rng = np.random.default_rng(5)
+    waves = rng.normal(size=(12, 3)) * 2 * np.pi / 0.5
+    pattern = np.sin(x @ waves.T + rng.uniform(0, 6, 12)).sum(axis=-1) / 12
+    grey = np.where(x[..., 0] > PLAIN_X - 1e-6, 0.5, 0.5 + 0.5 * pattern)
+    return t, np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def room():
+    cameras = [
+        look([-0.6 + 0.4 * (k % 4), -1.2 + 0.3 * (k // 4), 1.2], [0.3 + 0.1 * k, 2.0, 1.1]) for k in range(8)
+    ]
+    true, images = zip(*map(truth, cameras), strict=True)
+    return cameras, list(true), PosedPhotos(images, cameras)
+
+
+@pytest.fixture(scope="module")
+def spoiled(room):
+    """The room's depth maps, each with two squares too far or too near by 15 to 30 % and one without a depth."""
+    _, true, _ = room
+    rng, maps, wrong = np.random.default_rng(2), [], []
+    for t in true:
+        depth, bad = t.copy(), np.zeros(t.shape, bool)
+        for factor in (rng.uniform(1.15, 1.3), rng.uniform(0.7, 0.85), 0.0):
+            i, j = rng.integers(0, 88), rng.integers(0, 128)
+            depth[i : i + 32, j : j + 32] = factor * t[i : i + 32, j : j + 32]
+            bad[i : i + 32, j : j + 32] = True
+        maps.append(depth)
+        wrong.append(bad)
+    return maps, np.array(wrong)
+
+
+@pytest.fixture(scope="module")
+def found(room, spoiled):
+    cameras, _, photos = room
+    return np.array(mended(spoiled[0], cameras, photos, config=StereoConfig(), progress=silent, device="cpu"))
+
+
+def patterned(room):
+    """Pixels that show the pattern, a window's width from the plain wall and from the border."""
+    cameras, true, _ = room
+    shown = np.array(
+        [
+            (c.position + t[..., None] * c.directions())[..., 0] < PLAIN_X - 0.3
+            for c, t in zip(cameras, true, strict=True)
+        ]
+    )
+    shown[:, :8] = shown[:, -8:] = False
+    shown[:, :, :8] = shown[:, :, -8:] = False
+    return shown
+
+
+def test_photos_mend_wrong_depths(room, spoiled, found):
+    true, wrong = np.array(room[1]), spoiled[1] & patterned(room)
+    before = np.abs(np.array(spoiled[0]) / true - 1)[wrong]
+    assert np.median(before) > 0.14
+    after = np.abs(found / true - 1)[wrong & (found > 0)]
+    assert (found[wrong] > 0).mean() > 0.8
+    assert np.median(after) < 0.01 and (after < 0.03).mean() > 0.9
+
+
+def test_right_depths_stay_as_they_are(room, spoiled, found):
+    true = np.array(room[1])
+    error = np.abs(found / true - 1)[~spoiled[1]]
+    assert (error == 0).mean() > 0.9
+    assert (error < 0.02).mean() > 0.97
+
+
+def test_a_plain_wall_keeps_its_depth(room, spoiled, found):
+    cameras, true, _ = room
+    ends = np.array([c.position + t[..., None] * c.directions() for c, t in zip(cameras, true, strict=True)])
+    plain = (ends[..., 0] > PLAIN_X - 1e-6) & ~spoiled[1]
+    assert plain.sum() > 5000
+    assert (found == np.array(spoiled[0]))[plain].mean() > 0.9
+
+
+def test_the_fused_surface_is_nearer_to_the_room(room, spoiled, found):
+    cameras = room[0]
+
+    def errors(maps):
+        x = fuse_depth(list(maps), cameras).vertices
+        return np.percentile(np.minimum(np.abs(x - LOW), np.abs(x - HIGH)).min(axis=1), [50, 95])
+
+    before, after = errors(spoiled[0]), errors(found)
+    assert after[1] < 0.03 < before[1]
+    assert after[0] <= before[0]
+
+
+def test_masked_pixels_are_not_mended(room, spoiled):
+    cameras, _, photos = room
+    masks = [np.ones((120, 160), np.uint8) for _ in cameras]
+    hidden = PosedPhotos(photos.images, cameras, masks)
+    result = mended(spoiled[0], cameras, hidden, config=StereoConfig(), progress=silent, device="cpu")
+    np.testing.assert_array_equal(result, spoiled[0])
+
+
+def test_depths_do_not_depend_on_the_number_of_threads(room, spoiled, found, monkeypatch):
+    cameras, _, photos = room
+    monkeypatch.setattr("warprrf.device.threads", lambda: 1)
+    again = mended(spoiled[0], cameras, photos, config=StereoConfig(), progress=silent, device="cpu")
+    np.testing.assert_array_equal(again, found)
+
+
+def test_one_photo_or_no_depth_mends_nothing(room, spoiled):
+    cameras, _, photos = room
+    for maps in (spoiled[0][:1], [np.zeros((120, 160))]):
+        result = mended(
+            maps, cameras[:1], photos.subset([0]), config=StereoConfig(), progress=silent, device="cpu"
+        )
+        np.testing.assert_array_equal(result, maps)

@@ -1,0 +1,199 @@
+"""Depth of every pixel of a photo by comparison with others: small planes, tried, kept where photos agree, handed on.
+
+A pixel's plane is its inverse depth along the optical axis and how that changes per pixel, ``(w, dw/du, dw/dv)``: inverse
+depth is linear in the image on a plane. With ``A = K_s R K^-1`` and ``b = K_s t`` of another photo, pixel ``p`` lies there
+at ``A (u, v, 1) + b w(p)``. Source: Bleyer, Rhemann and Rother, "PatchMatch Stereo", BMVC 2011; the two colours of a
+chess board are updated in turns as in Galliani, Lasinger and Schindler, "Massively parallel multiview stereopsis by
+surface normal diffusion", ICCV 2015.
+"""
+
+import warp as wp
+
+from warprrf.kernels.photo_consistency import bilinear
+
+wp.set_module_options({"enable_backward": False})
+
+SIDE = 5  # pixels along a window's side
+SAMPLES = wp.constant(SIDE * SIDE)
+UNKNOWN = wp.constant(2.0)  # cost of what no two photos show: that of opposite textures
+BLANK = wp.constant(3.0)  # cost of a window that shows nothing
+SAME = wp.constant(1.0e-3)  # planes whose inverse depths differ by this part of them in a window are one
+SIMILAR = wp.constant(0.06)  # grey values this far from the middle's count 1/e: a window ends at an edge
+FLAT = wp.constant(1.0e-5)  # variance of a window that shows nothing
+TRIALS = wp.constant(6)  # planes near its best that a pixel tries in a turn, the first at any depth
+WANDER = wp.constant(
+    0.3
+)  # their inverse depths differ by up to this part in the first turn, by half in each next
+STEEPEST = wp.constant(6.0)  # tangent of a plane's largest angle to the image
+window = wp.types.vector(length=SIDE * SIDE, dtype=wp.float32)
+
+
+@wp.func
+def correlation(
+    plane: wp.vec3,
+    u: float,
+    v: float,
+    grey: window,
+    weight: window,
+    mean: float,
+    variance: float,
+    a: wp.mat33,
+    b: wp.vec3,
+    images: wp.array(dtype=wp.float32),
+    size: wp.vec3i,
+) -> float:
+    """Weighted normalised cross-correlation of a window and its image in another photo; -2 where that does not show it."""
+    start = a * wp.vec3(u, v, 1.0) + b * plane[0]
+    across = wp.vec3(a[0, 0], a[1, 0], a[2, 0]) + b * plane[1]
+    down = wp.vec3(a[0, 1], a[1, 1], a[2, 1]) + b * plane[2]
+    total = float(0.0)
+    square = float(0.0)
+    product = float(0.0)
+    for k in range(SAMPLES):
+        i = float(k % wp.static(SIDE)) - wp.static(0.5 * (SIDE - 1))
+        j = float(k // wp.static(SIDE)) - wp.static(0.5 * (SIDE - 1))
+        h = start + across * i + down * j
+        if h[2] < 1.0e-6:
+            return float(-2.0)
+        x = h[0] / h[2]
+        y = h[1] / h[2]
+        if x < 0.5 or y < 0.5 or x > float(size[1]) - 0.51 or y > float(size[2]) - 0.51:
+            return float(-2.0)
+        value = bilinear(images, size[0], size[1], x, y)
+        w = weight[k]
+        total = total + w * value
+        square = square + w * value * value
+        product = product + w * value * grey[k]
+    spread = square - total * total
+    if spread < FLAT:
+        return float(0.0)
+    return (product - total * mean) / wp.sqrt(spread * variance)
+
+
+@wp.func
+def disagreement(
+    plane: wp.vec3,
+    u: float,
+    v: float,
+    grey: window,
+    weight: window,
+    mean: float,
+    variance: float,
+    turns: wp.array(dtype=wp.mat33),
+    shifts: wp.array(dtype=wp.vec3),
+    sizes: wp.array(dtype=wp.vec3i),
+    images: wp.array(dtype=wp.float32),
+) -> float:
+    """One minus the mean of the two best correlations: what hides a surface in some photos does not count."""
+    best = float(-2.0)
+    second = float(-2.0)
+    for s in range(sizes.shape[0]):
+        c = correlation(plane, u, v, grey, weight, mean, variance, turns[s], shifts[s], images, sizes[s])
+        if c > best:
+            second = best
+            best = c
+        elif c > second:
+            second = c
+    if second < -1.5:
+        return UNKNOWN
+    return 1.0 - 0.5 * (best + second)
+
+
+@wp.kernel
+def match(
+    offset: int,
+    colour: int,
+    turn: int,
+    seed: int,
+    slope: float,
+    bounds: wp.vec2,
+    settled: float,
+    size: wp.vec3i,
+    turns: wp.array(dtype=wp.mat33),
+    shifts: wp.array(dtype=wp.vec3),
+    sizes: wp.array(dtype=wp.vec3i),
+    images: wp.array(dtype=wp.float32),
+    planes: wp.array(dtype=wp.vec3),
+    costs: wp.array(dtype=wp.float32),
+):
+    """Better planes for the pixels of one colour: their own, their neighbours', and some close to the best.
+
+    Args:
+        turn: counted from 0; -1 finds the costs of ``planes`` as they are.
+        slope: change of inverse depth per pixel, over itself, of a plane at 45 degrees to the image.
+        bounds: lowest and highest inverse depth [1/m].
+        settled: planes of less cost stay.
+        size: of the photo: where it begins in ``images``, its width and its height.
+        turns, shifts, sizes: ``A``, ``b`` and size of each photo that it is compared with.
+    """
+    n = offset + wp.tid()
+    width = size[1]
+    height = size[2]
+    half = (width + 1) // 2
+    i = n // half
+    j = 2 * (n % half) + (i + colour) % 2
+    if j >= width:
+        return
+    u = float(j) + 0.5
+    v = float(i) + 0.5
+    here = i * width + j
+    cost = costs[here]
+    if turn >= 0 and (cost < settled or cost > UNKNOWN):
+        return
+    middle = images[size[0] + here]
+    grey = window()
+    weight = window()
+    whole = float(0.0)
+    for k in range(SAMPLES):
+        x = wp.clamp(j + k % wp.static(SIDE) - wp.static(SIDE // 2), 0, width - 1)
+        y = wp.clamp(i + k // wp.static(SIDE) - wp.static(SIDE // 2), 0, height - 1)
+        grey[k] = images[size[0] + y * width + x]
+        weight[k] = wp.exp(-wp.abs(grey[k] - middle) / SIMILAR)
+        whole = whole + weight[k]
+    mean = float(0.0)
+    square = float(0.0)
+    for k in range(SAMPLES):
+        weight[k] = weight[k] / whole
+        mean = mean + weight[k] * grey[k]
+        square = square + weight[k] * grey[k] * grey[k]
+    variance = square - mean * mean
+    if variance < FLAT:
+        costs[here] = BLANK
+        return
+    best = planes[here]
+    if turn < 0:
+        costs[here] = disagreement(best, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
+        return
+    for k in range(8):
+        far = 1 + 4 * (k // 4)
+        x = j + far * wp.where(k % 4 == 0, 1, wp.where(k % 4 == 1, -1, 0))
+        y = i + far * wp.where(k % 4 == 2, 1, wp.where(k % 4 == 3, -1, 0))
+        if x >= 0 and y >= 0 and x < width and y < height:
+            other = planes[y * width + x]
+            w = other[0] + other[1] * float(j - x) + other[2] * float(i - y)
+            bend = wp.abs(other[1] - best[1]) + wp.abs(other[2] - best[2])
+            new = wp.abs(w - best[0]) + wp.static(0.5 * SIDE) * bend > SAME * best[0]
+            if new and w > bounds[0] and w < bounds[1]:
+                trial = wp.vec3(w, other[1], other[2])
+                c = disagreement(trial, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
+                if c < cost:
+                    cost = c
+                    best = trial
+    state = wp.rand_init(seed, here * 64 + turn)
+    reach = WANDER * wp.pow(0.5, float(turn))
+    for k in range(TRIALS):
+        w = best[0] * (1.0 + reach * wp.randf(state, -1.0, 1.0))
+        if k == 0:
+            w = bounds[0] + (bounds[1] - bounds[0]) * wp.randf(state)
+        limit = STEEPEST * slope * w
+        dx = wp.clamp(best[1] + reach * 4.0 * slope * w * wp.randf(state, -1.0, 1.0), -limit, limit)
+        dy = wp.clamp(best[2] + reach * 4.0 * slope * w * wp.randf(state, -1.0, 1.0), -limit, limit)
+        if w > bounds[0] and w < bounds[1]:
+            trial = wp.vec3(w, dx, dy)
+            c = disagreement(trial, u, v, grey, weight, mean, variance, turns, shifts, sizes, images)
+            if c < cost:
+                cost = c
+                best = trial
+        reach = 0.6 * reach
+    planes[here] = best
+    costs[here] = cost
