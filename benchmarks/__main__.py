@@ -46,7 +46,10 @@ NAMES = {
         "receivers that the field suggests beside random ones, from none to ten",
     ),
     "view": ("benchmarks.viewer", "the viewer: from a drag to its answer, and whether anything grows"),
-    "outside": ("benchmarks.outside", "measurements by others: received power in a furnished flat"),
+    "outside": (
+        "benchmarks.outside",
+        "measurements by others: an array's pictures, received power in a furnished flat",
+    ),
     "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""

@@ -44,7 +44,7 @@ FLAT = (
     ("anchor", "anchor", "{}"), ("field_db", "field, rms [dB]", "{:.1f}"), ("log_distance_db", "log-distance", "{:.1f}"),
     ("nearest_db", "nearest reading", "{:.1f}"), ("field_seen_db", "field where seen", "{:.1f}"),
     ("field_blocked_db", "behind walls", "{:.1f}"), ("field_blocked_bias_db", "behind walls, mean", "{:+.1f}"),
-    ("bare_blocked_db", "without even light behind walls", "{:.1f}"), ("bare_blocked_bias_db", "mean", "{:+.1f}"),
+    ("dark_blocked", "behind walls, without any path but even light", "{:.0%}"),
     ("log_distance_blocked_db", "log-distance behind walls", "{:.1f}"),
 )  # fmt: skip
 
@@ -217,24 +217,15 @@ def _predicted(
         sender[heard], receiver[heard], measured[heard], 2.45e9, 10.0 ** (FLOOR_DBM / 10.0), chain=["ble"] * int(heard.sum()),
         samples=6,
     )  # fmt: skip
-    field, bare = (
-        BistaticField.fit(
-            mesh,
-            readings,
-            quick=True,
-            mirror_order=2,
-            indirect=even,
-            device=job.device,
-            progress=job.progress,
-        )
-        for even in (True, False)
+    field = BistaticField.fit(
+        mesh, readings, quick=True, mirror_order=2, indirect=True, device=job.device, progress=job.progress
     )
     asked = np.isfinite(power[:, out])
     spots, truth = spots[asked], 10.0 * np.log10(power[asked, out])
-    field_db, bare_db = (
-        one.report["chains"]["ble"]["gain_db"]
-        + 10.0 * np.log10(one.links(spots, places[out]).total_path_gain)
-        for one in (field, bare)
+    gain_db = field.report["chains"]["ble"]["gain_db"]
+    field_db = gain_db + 10.0 * np.log10(field.links(spots, places[out]).total_path_gain)
+    bare = (
+        replace(field, terms=replace(field.terms, indirect=False)).links(spots, places[out]).total_path_gain
     )
     distance = np.linalg.norm(receiver - sender, axis=1)[heard]
     law = np.polyfit(np.log10(distance), 10.0 * np.log10(measured[heard]), 1)
@@ -253,8 +244,7 @@ def _predicted(
         "field_seen_db": rms((field_db - truth)[seen]),
         "field_blocked_db": rms((field_db - truth)[~seen]),
         "field_blocked_bias_db": float(np.mean((field_db - truth)[~seen])),
-        "bare_blocked_db": rms((bare_db - truth)[~seen]),
-        "bare_blocked_bias_db": float(np.mean((bare_db - truth)[~seen])),
+        "dark_blocked": float(np.mean(bare[~seen] == 0.0)),
         "log_distance_blocked_db": rms((log_distance - truth)[~seen]),
     }
 
