@@ -23,6 +23,7 @@ GROUPS = {
         "Radio fields",
         "Stage 2: fitted models of a place, which give spectra, paths, links and maps.",
     ),
+    "viewer": ("Viewer", "Everything in the browser."),
 }
 WITH = {
     "rf.em": "rf.scene", "rf.simulate": "rf.scene", "rf.paths": "rf.scene", "rf.channel": "rf.scene",
@@ -47,6 +48,8 @@ def pages() -> dict[str, str]:
         groups["rf.fields"].append(
             _entry(options.__module__, options.__name__, options) + "\n   :no-members:"
         )
+    shown = importlib.import_module("warprrf.viewer")
+    groups["viewer"].append(_entry(shown.__name__, "Viewer", shown.Viewer))
     written = {
         f"reference/{key.replace('.', '-')}.rst": "\n\n".join([_title(title), words, *groups[key]]) + "\n"
         for key, (title, words) in GROUPS.items()
