@@ -31,6 +31,7 @@ class MeshContent:
     Attributes:
         vertices: positions in the file's own unit and axes, shape ``(V, 3)``, float64.
         faces: vertex indices, shape ``(F, 3)``, int32.
+        uv: texture coordinates of vertices, shape ``(V, 2)``, or None.
         face_colours: sRGB in [0, 1], shape ``(F, 3)`` float32, NaN where unknown; None without any.
         face_material: index into ``material_names``, -1 for none, shape ``(F,)`` int32; None without any.
         material_names: names that the file gives materials.
@@ -40,6 +41,7 @@ class MeshContent:
 
     vertices: np.ndarray
     faces: np.ndarray
+    uv: np.ndarray | None = None
     face_colours: np.ndarray | None = None
     face_material: np.ndarray | None = None
     material_names: tuple[str, ...] = ()
@@ -62,7 +64,7 @@ class MeshContent:
             for held in (self.face_colours, self.face_material, self.face_object)
         )
         return replace(
-            self, vertices=vertices, faces=faces, face_colours=colours, face_material=material,
+            self, vertices=vertices, faces=faces, uv=None, face_colours=colours, face_material=material,
             face_object=thing,
         )  # fmt: skip
 

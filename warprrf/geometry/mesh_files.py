@@ -84,7 +84,7 @@ def load_mesh(path: str | os.PathLike[str], options: MeshOptions) -> MeshContent
             UserWarning,
             stacklevel=3,
         )
-    content = replace(content, vertices=vertices, faces=faces)
+    content = replace(content, vertices=vertices, faces=faces, uv=None)
     if options.simplify is None or len(faces) <= options.simplify:
         return content
     return content.with_faces(*_simplified(vertices, faces, options.simplify))
@@ -116,8 +116,9 @@ def read_mesh(
     vertices, faces = content.vertices, content.faces
     if len(faces) == 0:
         raise ValueError(f"path: {path} holds no triangles")
-    if not (np.abs(vertices) < LARGEST_M).all():
-        raise ValueError(f"path: {path} holds vertices that are NaN, infinite or above {LARGEST_M:g}")
+    for name, values in (("vertices", vertices), ("texture coordinates", content.uv)):
+        if values is not None and not (np.abs(values) < LARGEST_M).all():
+            raise ValueError(f"path: {path} holds {name} that are NaN, infinite or above {LARGEST_M:g}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(
             f"path: {path} names vertices from {faces.min()} to {faces.max()} but holds {len(vertices)}"
@@ -175,6 +176,11 @@ def _from_ply(folder: Folder) -> MeshContent:
         raise ValueError(
             f"path: {path} holds no triangles: it lacks x, y, z of vertices or lists of their indices"
         )
+    uv = next((names for names in (("s", "t"), ("u", "v")) if set(names) & set(vertex)), None)
+    if uv is not None and not set(uv) <= set(vertex):
+        raise ValueError(
+            f"path: {path} holds one of the texture coordinates {' and '.join(uv)}, expected both"
+        )
     vertices, (faces, polygon) = _columns(vertex, "xyz"), _fans(corners, path)
     own, seen = _ply_colours(face, path), _ply_colours(vertex, path)
     colours = None
@@ -182,7 +188,7 @@ def _from_ply(folder: Folder) -> MeshContent:
         colours = own[polygon]
     elif seen is not None and faces.min(initial=0) >= 0 and faces.max(initial=0) < len(vertices):
         colours = to_srgb(to_linear(seen)[faces].mean(axis=1)).astype(np.float32)
-    return MeshContent(vertices, faces, colours)
+    return MeshContent(vertices, faces, None if uv is None else _columns(vertex, uv), colours)
 
 
 def _ply_colours(element: Element, path: Path) -> np.ndarray | None:
