@@ -14,7 +14,7 @@ from places import ROOT
 
 import warprrf as wr
 from warprrf.geometry import gltf_files
-from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh
+from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh, write_mesh
 
 BLUE_SRGB = np.array(BLUE) / 255.0
 
@@ -260,3 +260,15 @@ def test_a_ply_of_triangles_and_few_other_polygons_is_read(tmp_path):
         + b"".join(bytes([len(f)]) + np.array(f, "<u4").tobytes() for f in faces)
     )
     assert wr.Mesh.load(path).areas.sum() == pytest.approx(121.0)
+
+
+def test_texture_coordinates_that_are_nan_are_left_out(tmp_path):
+    corners, faces = np.eye(3), [[0, 1, 2]]
+    write_mesh(tmp_path / "mesh.ply", corners, faces, uv=np.full((3, 2), 0.625))
+    data, known = (tmp_path / "mesh.ply").read_bytes(), np.float32(0.625).tobytes()
+    assert data.count(known) == 6
+    (tmp_path / "nan.ply").write_bytes(data.replace(known, np.float32(np.nan).tobytes()))
+    assert read_mesh(tmp_path / "mesh.ply").uv.shape == (3, 2)
+    found = read_mesh(tmp_path / "nan.ply")
+    assert found.uv is None
+    np.testing.assert_array_equal(found.vertices, corners)

@@ -116,9 +116,10 @@ def read_mesh(
     vertices, faces = content.vertices, content.faces
     if len(faces) == 0:
         raise ValueError(f"path: {path} holds no triangles")
-    for name, values in (("vertices", vertices), ("texture coordinates", content.uv)):
-        if values is not None and not (np.abs(values) < LARGEST_M).all():
-            raise ValueError(f"path: {path} holds {name} that are NaN, infinite or above {LARGEST_M:g}")
+    if not (np.abs(vertices) < LARGEST_M).all():
+        raise ValueError(f"path: {path} holds vertices that are NaN, infinite or above {LARGEST_M:g}")
+    if content.uv is not None and not np.isfinite(content.uv).all():
+        content = replace(content, uv=None)  # of faces without a texture, as some programs write them
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(
             f"path: {path} names vertices from {faces.min()} to {faces.max()} but holds {len(vertices)}"
@@ -204,7 +205,8 @@ def _ply_colours(element: Element, path: Path) -> np.ndarray | None:
 
 
 def _columns(element: Element, names: Sequence[str]) -> np.ndarray:
-    return np.column_stack([np.asarray(element[name], dtype=np.float64) for name in names])
+    with np.errstate(invalid="ignore"):  # NaN, whose bits are what they are
+        return np.column_stack([np.asarray(element[name], dtype=np.float64) for name in names])
 
 
 def _fans(polygons: Lists, path: Path) -> tuple[np.ndarray, np.ndarray]:
