@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from warprrf.checks import check_count, check_seed, checked
+from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
@@ -35,7 +37,7 @@ from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shar
 from warprrf.rf.fields.bistatic.response import Response, predict, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport, traced
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -289,6 +291,7 @@ def trace(
     *,
     mirror_order: int | None = None,
     sub_pixels: int | None = None,
+    client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> TrainingViews:
@@ -297,6 +300,7 @@ def trace(
     Args:
         mirror_order: most mirror reflections on a path; 3 by default, or as many as can be searched (2 in a city).
         sub_pixels: square root of the rays per pixel; 3 by default.
+        client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
         device: where rays are cast.
         progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
 
@@ -331,9 +335,9 @@ def trace(
             most = transport.images.affordable(receivers, terms.mirror_order)
             terms = replace(terms, mirror_order=most)
         found = transport.paths(receivers, terms.mirror_order, progress)
-        for r, k in enumerate(own):
-            mine = found.subset(np.flatnonzero(found.receiver == r))
-            views[k] = transport.view(receivers[r], terms, paths=mine)
+        parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        for r, view in each(partial(traced, transport.recipe, terms), parts, client):
+            views[own[r]] = transport.adopt(view)
             tell("transport", len(views), len(places))
     return TrainingViews(places, [views[k] for k in range(len(places))], time.perf_counter() - started)
 
@@ -370,6 +374,7 @@ def train(
     options: FitOptions,
     *,
     transport: TrainingViews | None = None,
+    client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Trained:
@@ -387,8 +392,9 @@ def train(
         # Places of a part of what was traced say where in the whole their readings are.
         transport = replace(transport, places=places)
     seen = transport or trace(
-        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
-    )
+        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, client=client, device=device,
+        progress=progress,
+    )  # fmt: skip
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
     if all(isinstance(one, Readings) and one.total for one in data):
         o = o.of_totals()
