@@ -159,7 +159,7 @@ class BistaticField(RadioField):
 
         Args:
             geometry: Reconstruction, Scene (its materials name the groups, nothing else is taken from them) or Mesh.
-            ds: training set: spectra, readings, or a list of them, of one carrier. The field's own transmitter is the first.
+            ds: training set: spectra, readings, or a list of them. The field's own transmitter and carrier are the first.
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.

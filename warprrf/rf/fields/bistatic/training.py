@@ -30,7 +30,7 @@ from warprrf.rf.fields.bistatic.fit import (
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
-from warprrf.rf.fields.bistatic.observations import Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.observations import Frame, Place, as_list, observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
@@ -380,7 +380,7 @@ def train(
 ) -> Trained:
     """Fit materials to what ``ds`` holds; arguments and errors as for :meth:`BistaticField.fit`."""
     data = as_list(ds)
-    o = options.decided(float(data[0].frequency_hz))
+    o = options.decided(Frame.of(data).frequency_hz)
     if transport is not None and options.sub_pixels is None:
         o = replace(o, sub_pixels=None)  # it is what the rays were traced with, quick or not
     for one in data:
@@ -416,6 +416,10 @@ def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
     return np.asarray(power / np.maximum(predict(response, p), np.maximum(power, 1e-300)))
 
 
+Lit = Callable[[int], tuple[Materials, np.ndarray | None]]
+"""From a place to the materials at its carrier, and what elements send on under its transmitter."""
+
+
 @dataclass(frozen=True)
 class _Candidate:
     """Terms with their fit, and the held-out mean square error [dB^2]."""
@@ -438,6 +442,7 @@ class _Training:
         self.seen, self.options, self.choose = seen, options, options.selection
         self.started = time.perf_counter()
         self.surface, self.count, self.views = seen.surface, len(seen.places), list(seen.views)
+        self.frequency_hz = Frame.of(data).frequency_hz
         self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
         self.material = self.surface.material
         self.observed, self.chains = observe(data, seen.places, self.views, options.groups.noise_db)
@@ -467,7 +472,8 @@ class _Training:
             one = data[observed.place.data]
             if isinstance(one, Readings) and not one.total:
                 part = part.trusted(1.0 + KNOWN_BETTER * _line_of_sight_share(response, start))
-            self.readings.append(Reading(response, part, observed.chain))
+            ratio = float(observed.place.frequency_hz / self.frequency_hz)
+            self.readings.append(Reading(response, part, observed.chain, ratio))
             self.progress("fit", r, (1 + self.steps) * self.count)
         self.log: list[dict[str, Any]] = []
 
@@ -521,11 +527,11 @@ class _Training:
     def _unexplained(self, materials: Materials) -> list[np.ndarray]:
         """Of each place the readings of tables that the fit misses by more than :attr:`Selection.unexplained` of their
         standard deviations."""
-        sent, sd, found = self._sent(materials), self.options.groups.noise_db, []
+        lit, sd, found = self._lit(materials), self.options.groups.noise_db, []
         for k, observed in enumerate(self.observed):
             rows = np.zeros(0, int)
             if isinstance(observed.measured, WeighedPaths):
-                error = observed.target.error(self._predicted(materials, sent, k)) / sd
+                error = observed.target.error(self._predicted(lit, k)) / sd
                 rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
             found.append(rows)
         return found
@@ -672,8 +678,8 @@ class _Training:
 
     def _image_error(self, materials: Materials, places: np.ndarray) -> float:
         """Mean loss of all readings of ``places`` [dB^2]."""
-        sent = self._sent(materials)
-        errors = [self.observed[r].target.error(self._predicted(materials, sent, r)) for r in places]
+        lit = self._lit(materials)
+        errors = [self.observed[r].target.error(self._predicted(lit, r)) for r in places]
         return float(np.mean([self._losses(r, e).mean() for r, e in zip(places, errors, strict=True)]))
 
     def _losses(self, place: int, error: np.ndarray) -> np.ndarray:
@@ -682,24 +688,26 @@ class _Training:
             return error**2
         return huber(error, self.options.groups.huber_db)[0]
 
-    def _predicted(
-        self, materials: Materials, sent: Callable[[ReceiverView], np.ndarray | None], place: int
-    ) -> np.ndarray:
-        """All that is read at a place, in units of its floor, shape ``(N,)``."""
-        observed, view = self.observed[place], self._view(place, materials.terms)
-        power = read(view, observed.measured, path_powers(view, materials, sent(view)))
+    def _predicted(self, lit: Lit, place: int) -> np.ndarray:
+        """All that is read at a place under what :meth:`_lit` gave, in units of its floor, shape ``(N,)``."""
+        observed = self.observed[place]
+        materials, sent = lit(place)
+        view = self._view(place, materials.terms)
+        power = read(view, observed.measured, path_powers(view, materials, sent))
         power = np.maximum(power, 0.0) / observed.floor
         return np.asarray(gain_of(observed.chain, materials.parameters, observed.target, power) * power)
 
-    def _sent(self, materials: Materials) -> Callable[[ReceiverView], np.ndarray | None]:
-        """What elements send on under the transmitter of a view; computed once for each."""
-        known: dict[int, np.ndarray | None] = {}
+    def _lit(self, materials: Materials) -> Lit:
+        """Materials at the carrier of a place, and what elements send on under its transmitter; computed once for each."""
+        known: dict[int, tuple[Materials, np.ndarray | None]] = {}
 
-        def of(view: ReceiverView) -> np.ndarray | None:
-            key = id(view.transport)
-            if key not in known:
-                known[key] = sent_radiance(view.transport, materials)
-            return known[key]
+        def of(place: int) -> tuple[Materials, np.ndarray | None]:
+            transport = self.views[place].transport
+            if id(transport) not in known:
+                parameters = materials.parameters.at_ratio(self.readings[place].ratio)
+                here = replace(materials, parameters=parameters)
+                known[id(transport)] = here, sent_radiance(transport, here)
+            return known[id(transport)]
 
         return of
 
@@ -724,8 +732,8 @@ class _Training:
                 if residual:
                     terms = replace(best.terms, residual=True)
                     materials = replace(bare, terms=terms, residual=self._residual(bare, kept))
-                sent = self._sent(materials)
-                found += [self._predicted(materials, sent, r) for r in held]
+                lit = self._lit(materials)
+                found += [self._predicted(lit, r) for r in held]
         errors = {
             one: [self.observed[r].target.error(x) for r, x in zip(order, found, strict=True)]
             for one, found in power.items()
@@ -792,8 +800,7 @@ class _Training:
         if not terms.after_first_bounce:
             return limited
         # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
-        known = self._materials(replace(terms, indirect=False, residual=False), fit)
-        sent = self._sent(known)
+        lit = self._lit(self._materials(replace(terms, indirect=False, residual=False), fit))
         return [
             replace(
                 reading,
@@ -801,8 +808,7 @@ class _Training:
                     reading.response,
                     self._view(r, terms),
                     self.measured[r],
-                    known,
-                    sent(self.views[r]),
+                    *lit(r),
                     self.observed[r].floor,
                     follow=follow,
                 ),
@@ -817,20 +823,16 @@ class _Training:
 
     def _residual(self, materials: Materials, chosen: np.ndarray) -> np.ndarray:
         """Gains of surface cells over ``materials``, shape ``(2, X)``."""
-        sent = self._sent(materials)
+        lit = self._lit(materials)
         shares = []
         for r in chosen:
-            view, observed, p = self._view(r, materials.terms), self.observed[r], materials.parameters
+            view, observed, (here, sent) = self._view(r, materials.terms), self.observed[r], lit(r)
             power = np.zeros(0)
             if observed.chain == OWN_GAIN:
-                power = (
-                    read(view, observed.measured, path_powers(view, materials, sent(view))) / observed.floor
-                )
-            gain = gain_of(observed.chain, p, observed.target, power)
+                power = read(view, observed.measured, path_powers(view, here, sent)) / observed.floor
+            gain = gain_of(observed.chain, here.parameters, observed.target, power)
             shares.append(
-                shares_of(
-                    view, materials, sent(view), observed.measured, observed.floor / gain, observed.target
-                )
+                shares_of(view, here, sent, observed.measured, observed.floor / gain, observed.target)
             )
         found = fit_residual(shares, self.surface, self.options.residuals)
         self._stepped()
