@@ -50,6 +50,8 @@ FOUND = [
     ("RadioField.fit", ("relevance", "text")),
     ("RadioField.links", ("shape", "with inf")),
     ("RadioField.load", ("path", "no text")),
+    ("RadioField.suggest", ("candidates", "with 1e9")),
+    ("Readings.from_table", ("table", "list")),
     ("Spectrum", ("range_db", "as objects")),
     ("Reconstruction", ("photos", "dictionary")),
     ("SpectrumDataset.deembed", ("pattern", "class")),

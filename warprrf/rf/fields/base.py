@@ -258,18 +258,19 @@ class RadioField(ABC):
         raise ValueError(f"suggest: got a field of model {self.model!r}, expected 'bistatic'")
 
     def check_positions(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, name: str = "rx"
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``rx`` (3,) or (R, 3) and ``transmitter`` (3,), by default the fitted one, if the field holds there [m].
+        """``rx`` (3,) or (R, 3), which errors call ``name``, and ``transmitter`` (3,), by default the fitted one, if the
+        field holds there [m].
 
         Raises:
             ValueError: for a place that is not finite, outside the scene, on a surface, in another solid than the air
                 of the fitted transmitter, or a receiver within the transmitter's reactive near field.
         """
-        receivers = check_receivers("rx", rx)
+        receivers = check_receivers(name, rx)
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         check_positions(
-            self.mesh, source, receivers, SPEED_OF_LIGHT / self.frequency_hz, names=("transmitter", "rx"),
+            self.mesh, source, receivers, SPEED_OF_LIGHT / self.frequency_hz, names=("transmitter", name),
             known=self.transmitter, device=self.device,
         )  # fmt: skip
         return receivers, source

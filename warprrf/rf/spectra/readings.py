@@ -223,12 +223,12 @@ class Readings:
             settings: other arguments of :class:`Readings`.
 
         Raises:
-            KeyError: naming columns that are missing.
+            ValueError: naming columns that are missing.
         """
         names = set(map(str, table))
         missing = sorted({*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db"} - names)
         if missing:
-            raise KeyError(
+            raise ValueError(
                 f"table: lacks the columns {', '.join(missing)}; it has {', '.join(sorted(names))}"
             )
 
@@ -273,8 +273,8 @@ class Readings:
             if "chain" in table:
                 table["chain"] = table["chain"].fillna("")
             return cls.from_table(table, **settings)
-        except (KeyError, TypeError, ValueError, UnicodeError) as error:
-            raise ValueError(f"path: {file}: {error.args[0] if error.args else error}") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"path: {file}: {error}") from error
 
 
 def path_weights(

@@ -206,10 +206,10 @@ class HarmonicField(RadioField):
         return replace(self, air=air)
 
     def check_positions(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, name: str = "rx"
     ) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`RadioField.check_positions`; ValueError also for another transmitter of an ``rf3dgs`` field."""
-        receivers, source = super().check_positions(rx, transmitter)
+        receivers, source = super().check_positions(rx, transmitter, name)
         if self.options.model == "rf3dgs" and not np.array_equal(source, self.transmitter):
             raise ValueError(
                 f"transmitter: got {source.tolist()}, but an rf3dgs field holds only for the one it was fitted for, "
