@@ -18,7 +18,7 @@ from warprrf.checks import LARGEST_M, check_array, check_number, check_positive,
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.em.absorption import Air, Gas
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.data import Data
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
@@ -30,7 +30,6 @@ from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 """Attributes of every model that are numbers, under these names in the header of a file."""
-CARRIERS_HZ = (1e3, 1e16)
 NARROWEST_BEAM_RAD = 1e-4
 
 

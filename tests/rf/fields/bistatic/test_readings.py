@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
@@ -12,7 +13,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.fit import Target
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
-from warprrf.rf.spectra.readings import Readings, horn, path_weights
+from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
@@ -253,3 +254,11 @@ def test_bad_readings_are_named(changed: dict, told: str) -> None:
     Readings(**good)
     with pytest.raises(ValueError, match=told):
         Readings(**{**good, **changed})
+
+
+def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
+    table = pd.DataFrame({name: [1.0, 2.0] for end in ("transmitter", "receiver") for name in COLUMNS[end]})
+    table["power_db"] = -80.0
+    for missing in (None, np.nan):
+        read = Readings.from_table(table.assign(chain=["horn", missing]), frequency_hz=F, floor=1e-12)
+        assert read.chain.tolist() == ["horn", ""]

@@ -1,10 +1,9 @@
-"""Where to measure next: greedy Bayesian experimental design (Chaloner and Verdinelli 1995) on what a field predicts.
+"""Where to measure next: greedy Bayesian experimental design (Chaloner and Verdinelli 1995) for what a fit learns.
 
-What is not known of surfaces is taken for gains in nepers, normal a priori: of the single bounces of each element, of
-the light that it sends on, and of each group's mirrors. Each is the sum of one that all surfaces of its material share
-and one of its own. A reading tells of a gain by how much of it is due to that gain, and predictions err likewise.
-Readings are chosen one after another, each the one that lowers the expected square error most (I-optimality). Gains
-that share a reading are told apart as if the others were known.
+That is the parameters of materials, normal a priori as in a fit, with its priors and errors of readings, linearised
+about what the field holds. Readings are chosen one after another, each the one that lowers the expected mean square
+error of the dB images of spectra at all candidates most (I-optimality). What differs within a material is left out: a
+spectrum tells of the few surface elements that it sees well, which no choice of a few places changes much.
 """
 
 from __future__ import annotations
@@ -12,26 +11,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, identity
 
 from warprrf.device import Progress
-from warprrf.rf.fields.bistatic.fit import NEPER
-from warprrf.rf.fields.bistatic.materials import Materials
+from warprrf.rf.fields.bistatic.fit import NEPER, GroupFit, priors
+from warprrf.rf.fields.bistatic.materials import Layout, Materials
+from warprrf.rf.fields.bistatic.measured import WeighedPaths
 from warprrf.rf.fields.bistatic.observations import READING_ERROR_DB
-from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
+from warprrf.rf.fields.bistatic.render import sent_radiance
+from warprrf.rf.fields.bistatic.response import jacobian, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.transport import Transport
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 
 SHAPE = (40, 80)
 """Pixels that are told apart around a receiver: as wide as a usual beam."""
-PIXEL_ERROR_DB = 3.0
-"""Standard deviation of a pixel's error, as in fits."""
-SHARED = (1.0, 0.3, 1.0)
-OWN = (0.5, 0.3, 0.3)
-"""Standard deviations of a material's gain, and of a surface's own over it [nepers]: for single bounces, for light that
-is sent on (a mean over many surfaces, so it is known better), for mirrors."""
-LEAST_DB = 1e-3  # per neper: readings that change less tell nothing
 
 
 @dataclass(frozen=True)
@@ -43,89 +37,78 @@ class Pointings:
 
 
 @dataclass(frozen=True)
-class Unknowns:
-    """Gains that are not known before any measurement.
+class Told:
+    """What readings tell of the parameters ``index`` (C,): their precision is ``root @ root.T`` [1/neper^2], root of
+    shape ``(C, N)``."""
 
-    Attributes:
-        material: whose gain each shares, shape ``(U,)``.
-        shared: standard deviation of each material's gain [nepers], shape ``(M,)``.
-        own: of each gain over its material's [nepers], shape ``(U,)``.
-    """
-
-    material: np.ndarray
-    shared: np.ndarray
-    own: np.ndarray
-
-    @classmethod
-    def of(cls, transport: Transport, material: np.ndarray) -> Unknowns:
-        """Those of a surface; ``material`` (G,) is that of each group."""
-        element, count = material[transport.surface.element_group], int(material.max()) + 1
-        return cls(
-            np.concatenate([element, count + element, 2 * count + material]),
-            np.repeat(SHARED, count),
-            np.repeat(OWN, [len(element), len(element), len(material)]),
-        )
-
-    def variance(self, precision: np.ndarray) -> np.ndarray:
-        """Of gains that readings tell with ``precision`` (U,) [1/neper^2], shape ``(U,)``: the posterior of
-        x_u = m_material(u) + r_u."""
-        left = 1.0 / (1.0 + self.own**2 * precision)  # of the variance of r
-        told = np.bincount(self.material, precision * left, minlength=len(self.shared))
-        shared = 1.0 / (1.0 / self.shared**2 + told)
-        return np.asarray(self.own**2 * left + left**2 * shared[self.material])
+    index: np.ndarray
+    root: np.ndarray
 
 
 class Sensitivity:
-    """How readings and predictions at places depend on the gains.
+    """How readings at places depend on the parameters of materials.
 
     Args:
         transport: the geometry under the transmitter, on a grid of :data:`SHAPE`.
-        materials: of its surfaces.
+        materials: of its groups; what differs within a group is left out.
+        material: of each group, shape ``(G,)``.
         floor: path gain of a pixel, and of a reading, below which nothing is told.
     """
 
-    def __init__(self, transport: Transport, materials: Materials, floor: float) -> None:
-        self.transport, self.materials, self.floor = transport, materials, floor
-        self._sent = sent_radiance(transport, materials)
+    def __init__(
+        self, transport: Transport, materials: Materials, material: np.ndarray, floor: float
+    ) -> None:
+        self.transport, self.material, self.floor = transport, material, floor
+        self.materials = replace(materials, terms=replace(materials.terms, residual=False))
+        self.parameters = materials.parameters.take(np.unique(material, return_index=True)[1])
+        lobes, terms = self.parameters.log_weight.shape[1], materials.terms
+        self.layout = Layout(int(material.max()) + 1, lobes, indirect=terms.indirect, gain=False)
+        self._sent = sent_radiance(transport, self.materials)
 
-    def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
-        """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
-        t, view = self.transport, self.transport.view(place, self.materials.terms)
-        found = path_powers(view, self.materials, self._sent)
-        s, face, sent, count = t.surface, view.hits.face.numpy(), found.further.sent, SHAPE[0] * SHAPE[1]
-        elements, single = len(s.element_area), np.flatnonzero(found.single > 0)
+    @property
+    def prior(self) -> np.ndarray:
+        """Precision of the parameters without any reading [1/neper^2], shape ``(F, F)``."""
+        surface = self.transport.surface
+        area = np.bincount(self.material[surface.element_group], surface.element_area, self.layout.groups)
+        rows = priors(self.parameters, self.parameters, self.layout, GroupFit().deviations, area)[1]
+        return np.asarray(rows.T @ rows)
+
+    def pixels(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Powers of the spectrum's pixels at ``place`` (3,) in units of the floor, shape ``(P,)``, their derivatives to
+        the parameters ``(C, P)``, and which those are ``(C,)``."""
+        terms, count = self.materials.terms, SHAPE[0] * SHAPE[1]
+        view = self.transport.view(place, terms)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
-        mirror = view.path_groups[:, 0]
-        own = mirror >= 0
-        parts = (
-            (single, s.element[face[single]], found.single[single]),
-            (sent.ray, elements + s.element[sent.face], sent.power),
-            (pixel[own], 2 * elements + mirror[own], found.mirror[own]),
-        )
-        row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
-        table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
-        ray, shown = found.further.shown  # known, as line of sight is
-        rest = np.bincount(np.append(ray, pixel[~own]), np.append(shown, found.mirror[~own]), minlength=count)
-        return table, np.asarray(table.sum(axis=1)).ravel() + rest
+        one = np.ones(len(pixel), np.float32)
+        own = csr_matrix((one, (np.arange(len(pixel)), pixel)), shape=(len(pixel), count)).toarray()
+        apart = WeighedPaths(np.arange(count), identity(count, np.float32, "csr"), own)
+        response = respond(view, apart, terms, self.floor).limited(terms)
+        if terms.after_first_bounce:
+            further = view, apart, self.materials, self._sent, self.floor
+            response = with_further_bounces(response, *further, follow=True)
+        return jacobian(response.tied(self.material), self.parameters, self.layout)
 
-    def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[np.ndarray, csr_matrix]:
-        """Of a spectrum at ``place``: squared derivatives, summed over its pixels [dB^2/neper^2], shape ``(U,)``. And the
-        precisions at which readings there tell the gains [1/neper^2], shape ``(K, U)``: one row for a whole spectrum."""
-        table, total = self.powers(place)
-        square = table.copy()
-        square.data = (table.data * np.repeat(NEPER / (total + self.floor), np.diff(table.indptr))) ** 2
-        summed = np.asarray(square.sum(axis=0)).ravel()
-        if pointings is None:
-            return summed, csr_matrix(summed / PIXEL_ERROR_DB**2)
-        cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
-        gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
-        slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
-        return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
+    def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[Told, list[Told]]:
+        """Of ``place``: derivatives of its dB image, scaled so that their squares sum to the mean square error
+        [dB/neper], and what each of ``pointings`` tells; one for a whole spectrum."""
+        power, slope, index = self.pixels(place)
+        image = _compressed(slope * (NEPER / (1.0 + power)))
+        told = [image / GroupFit().noise_db]
+        if pointings is not None:
+            cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
+            gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
+            read = (slope @ gain.T) * (NEPER / (1.0 + gain @ power)) / READING_ERROR_DB
+            told = list(read.T[:, :, None])
+        return Told(index, image / np.sqrt(len(power))), [Told(index, root) for root in told]
+
+
+def _compressed(slopes: np.ndarray) -> np.ndarray:
+    """A root ``(C, N)`` of the same square as ``slopes`` (C, P), with no more columns than rows."""
+    return np.asarray(np.linalg.qr(slopes.T, mode="r").T)
 
 
 def suggest(
     sensitivity: Sensitivity,
-    unknowns: Unknowns,
     candidates: np.ndarray,
     n: int,
     *,
@@ -142,40 +125,37 @@ def suggest(
         progress: called with the stage ``"suggest"``.
     """
     places, own = np.unique(candidates, axis=0, return_inverse=True)
-    unknown, total = len(unknowns.material), len(places) + len(measured)
-    square, known = np.zeros(unknown), np.zeros(unknown)  # of predictions' derivatives; precision beforehand
-    told: dict[int, csr_matrix] = {}
-    for k, place in enumerate(places):
-        mine = np.flatnonzero(own.reshape(-1) == k)
-        turned = None if pointings is None else replace(pointings, toward=pointings.toward[mine])
-        whole, rows = sensitivity.of(place, turned)
-        square += len(mine) * whole
-        told |= {int(c): rows[j if len(rows.indptr) > 2 else 0] for j, c in enumerate(mine)}
-        if progress is not None:
-            progress("suggest", k + 1, total)
-    if pointings is not None:
-        pointings = replace(pointings, toward=np.unique(pointings.toward, axis=0))
-    for k, place in enumerate(measured):
-        known += np.asarray(sensitivity.of(place, pointings)[1].sum(axis=0)).ravel()
-        if progress is not None:
-            progress("suggest", len(places) + k + 1, total)
-    return _greedy(told, square, unknowns, known, n)
+    precision, square = sensitivity.prior, np.zeros_like(sensitivity.prior)
+    told: dict[int, Told] = {}
 
+    def add(total: np.ndarray, one: Told, times: int = 1) -> None:
+        total[np.ix_(one.index, one.index)] += times * one.root @ one.root.T
 
-def _greedy(
-    told: dict[int, csr_matrix], square: np.ndarray, unknowns: Unknowns, known: np.ndarray, n: int
-) -> np.ndarray:
-    """The ``n`` readings, each of which lowers the sum of ``square`` times variance most after those before it."""
+    everywhere = pointings and replace(pointings, toward=np.unique(pointings.toward, axis=0))
+    for k, place in enumerate(np.concatenate([places, measured])):
+        if k < len(places):
+            mine = np.flatnonzero(own.reshape(-1) == k)
+            turned = pointings and replace(pointings, toward=pointings.toward[mine])
+            image, found = sensitivity.of(place, turned)
+            add(square, image, len(mine))
+            told |= {int(c): found[j % len(found)] for j, c in enumerate(mine)}
+        else:
+            for one in sensitivity.of(place, everywhere)[1]:
+                add(precision, one)
+        if progress is not None:
+            progress("suggest", k + 1, len(places) + len(measured))
     chosen: list[int] = []
-
-    def with_reading(k: int) -> np.ndarray:
-        more = known.copy()
-        more[told[k].indices] += told[k].data
-        return more
-
     for _ in range(n):
+        covariance = np.linalg.inv(precision)
+        moved = covariance @ square @ covariance
+
+        def fall(k: int, covariance: np.ndarray = covariance, moved: np.ndarray = moved) -> float:
+            """Of the sum of square errors, if candidate ``k`` is read too (matrix inversion lemma)."""
+            root, part = told[k].root, np.ix_(told[k].index, told[k].index)
+            within = np.eye(root.shape[1]) + root.T @ covariance[part] @ root
+            return float(np.trace(np.linalg.solve(within, root.T @ moved[part] @ root)))
+
         left = sorted(told.keys() - set(chosen))
-        errors = [square @ unknowns.variance(with_reading(k)) for k in left]
-        chosen.append(left[int(np.argmin(errors))])
-        known = with_reading(chosen[-1])
+        chosen.append(left[int(np.argmax([fall(k) for k in left]))])
+        add(precision, told[chosen[-1]])
     return np.array(chosen, int)
