@@ -1,9 +1,9 @@
 """Where to measure next: greedy Bayesian experimental design (Chaloner and Verdinelli 1995) for what a fit learns.
 
-That is the parameters of materials, normal a priori as in a fit, with its priors and errors of readings, linearised
-about what the field holds. Readings are chosen one after another, each the one that lowers the expected mean square
-error of the dB images of spectra at all candidates most (I-optimality). What differs within a material is left out: a
-spectrum tells of the few surface elements that it sees well, which no choice of a few places changes much.
+That is the parameters of materials, and the gain of each surface element over its material: normal a priori and read
+with errors as in fits, linearised about what the field holds. Readings are chosen one after another, each the one that
+lowers the expected square error of the dB images of spectra at all candidates most (I-optimality). Materials are told
+as if elements were known, and elements as if materials were.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_matrix, identity
+from threadpoolctl import threadpool_limits
 
 from warprrf.device import Progress
 from warprrf.rf.fields.bistatic.fit import NEPER, GroupFit, priors
 from warprrf.rf.fields.bistatic.materials import Layout, Materials
 from warprrf.rf.fields.bistatic.measured import WeighedPaths
 from warprrf.rf.fields.bistatic.observations import READING_ERROR_DB
-from warprrf.rf.fields.bistatic.render import sent_radiance
+from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
+from warprrf.rf.fields.bistatic.residuals import ResidualFit
 from warprrf.rf.fields.bistatic.response import jacobian, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.transport import Transport
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
@@ -26,6 +28,8 @@ from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 
 SHAPE = (40, 80)
 """Pixels that are told apart around a receiver: as wide as a usual beam."""
+NEGLIGIBLE = 0.01
+"""Combinations of parameters of which a spectrum tells less [dB^2/neper^2] are left out: priors tell more."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +42,35 @@ class Pointings:
 
 @dataclass(frozen=True)
 class Told:
-    """What readings tell of the parameters ``index`` (C,): their precision is ``root @ root.T`` [1/neper^2], root of
-    shape ``(C, N)``."""
+    """What readings tell of materials and of single elements.
+
+    Attributes:
+        index: parameters of materials, shape ``(C,)``.
+        root: they are told with precision ``root @ root.T`` [1/neper^2], shape ``(C, N)``.
+        own: precision at which gains of elements over their material are told, of single bounces, then of light sent on
+            [1/neper^2], shape ``(2 E,)``.
+    """
 
     index: np.ndarray
     root: np.ndarray
+    own: np.ndarray
+
+    def scaled(self, by: float) -> Told:
+        """The same with all precisions multiplied."""
+        return Told(self.index, np.sqrt(by) * self.root, by * self.own)
+
+
+@dataclass
+class Known:
+    """Sums of what was told: of all parameters of materials ``(F, F)`` and of elements' gains ``(2 E,)`` [1/neper^2]."""
+
+    materials: np.ndarray
+    own: np.ndarray
+
+    def add(self, told: Told) -> None:
+        """One more."""
+        self.materials[np.ix_(told.index, told.index)] += told.root @ told.root.T
+        self.own = self.own + told.own
 
 
 class Sensitivity:
@@ -50,7 +78,7 @@ class Sensitivity:
 
     Args:
         transport: the geometry under the transmitter, on a grid of :data:`SHAPE`.
-        materials: of its groups; what differs within a group is left out.
+        materials: of its groups; what differs within a group is taken for unknown.
         material: of each group, shape ``(G,)``.
         floor: path gain of a pixel, and of a reading, below which nothing is told.
     """
@@ -66,47 +94,58 @@ class Sensitivity:
         self._sent = sent_radiance(transport, self.materials)
 
     @property
-    def prior(self) -> np.ndarray:
-        """Precision of the parameters without any reading [1/neper^2], shape ``(F, F)``."""
-        surface = self.transport.surface
-        area = np.bincount(self.material[surface.element_group], surface.element_area, self.layout.groups)
-        rows = priors(self.parameters, self.parameters, self.layout, GroupFit().deviations, area)[1]
-        return np.asarray(rows.T @ rows)
+    def prior(self) -> Known:
+        """What is known without any reading."""
+        p, alike = self.parameters, np.ones(self.layout.groups)
+        rows = priors(p, p, self.layout, GroupFit().deviations, alike)[1]
+        deviations = [element for element, _ in ResidualFit().deviations]
+        own = np.repeat(deviations, len(self.transport.surface.element_area)) ** -2.0
+        return Known(rows.T @ rows, own)
 
-    def pixels(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def pixels(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, csr_matrix]:
         """Powers of the spectrum's pixels at ``place`` (3,) in units of the floor, shape ``(P,)``, their derivatives to
-        the parameters ``(C, P)``, and which those are ``(C,)``."""
-        terms, count = self.materials.terms, SHAPE[0] * SHAPE[1]
-        view = self.transport.view(place, terms)
+        the parameters ``(C, P)``, which those are ``(C,)``, and what they have of each element's single bounces and
+        of light that it sends on ``(P, 2 E)``."""
+        t, terms, count = self.transport, self.materials.terms, SHAPE[0] * SHAPE[1]
+        view = t.view(place, terms)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
-        one = np.ones(len(pixel), np.float32)
-        own = csr_matrix((one, (np.arange(len(pixel)), pixel)), shape=(len(pixel), count)).toarray()
-        apart = WeighedPaths(np.arange(count), identity(count, np.float32, "csr"), own)
+        sharp = np.zeros((len(pixel), count), np.float32)
+        sharp[np.arange(len(pixel)), pixel] = 1.0
+        apart = WeighedPaths(np.arange(count), identity(count, np.float32, "csr"), sharp)
         response = respond(view, apart, terms, self.floor).limited(terms)
         if terms.after_first_bounce:
             further = view, apart, self.materials, self._sent, self.floor
             response = with_further_bounces(response, *further, follow=True)
-        return jacobian(response.tied(self.material), self.parameters, self.layout)
+        powers, element = path_powers(view, self.materials, self._sent), t.surface.element
+        lit, sent, elements = (
+            np.flatnonzero(powers.single > 0),
+            powers.further.sent,
+            len(t.surface.element_area),
+        )
+        gain = np.append(element[view.hits.face.numpy()[lit]], elements + element[sent.face])
+        power = np.append(powers.single[lit], sent.power) / self.floor
+        own = csr_matrix((power, (np.append(lit, sent.ray), gain)), shape=(count, 2 * elements))
+        return *jacobian(response.tied(self.material), self.parameters, self.layout), own
 
     def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[Told, list[Told]]:
-        """Of ``place``: derivatives of its dB image, scaled so that their squares sum to the mean square error
-        [dB/neper], and what each of ``pointings`` tells; one for a whole spectrum."""
-        power, slope, index = self.pixels(place)
-        image = _compressed(slope * (NEPER / (1.0 + power)))
-        told = [image / GroupFit().noise_db]
-        if pointings is not None:
-            cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
-            gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
-            read = (slope @ gain.T) * (NEPER / (1.0 + gain @ power)) / READING_ERROR_DB
-            told = list(read.T[:, :, None])
-        return Told(index, image / np.sqrt(len(power))), [Told(index, root) for root in told]
+        """What the spectrum at ``place`` (3,) tells, if each pixel is known to 1 dB, and what each of ``pointings`` does as
+        fits weigh it, or the spectrum itself."""
+        power, slope, index, own = self.pixels(place)
+        image = slope * (NEPER / (1.0 + power)).astype(np.float32)
+        strength, direction = np.linalg.eigh((image @ image.T).astype(float))
+        kept = strength > NEGLIGIBLE
+        single = np.asarray(own.power(2).T @ (NEPER / (1.0 + power)) ** 2)
+        whole = Told(index, direction[:, kept] * np.sqrt(strength[kept]), single)
+        if pointings is None:
+            return whole, [whole.scaled(GroupFit().noise_db ** -2.0)]
+        cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
+        gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
+        to_db = NEPER / (1.0 + gain @ power) / READING_ERROR_DB
+        rows = zip((slope @ gain.T * to_db).T, (gain @ own * to_db[:, None]) ** 2, strict=True)
+        return whole, [Told(index, of_materials[:, None], of_own) for of_materials, of_own in rows]
 
 
-def _compressed(slopes: np.ndarray) -> np.ndarray:
-    """A root ``(C, N)`` of the same square as ``slopes`` (C, P), with no more columns than rows."""
-    return np.asarray(np.linalg.qr(slopes.T, mode="r").T)
-
-
+@threadpool_limits.wrap(limits=1, user_api="blas")  # small matrices: threads would wait for each other
 def suggest(
     sensitivity: Sensitivity,
     candidates: np.ndarray,
@@ -124,38 +163,37 @@ def suggest(
         pointings: that each candidate would take, C of them; None for whole spectra.
         progress: called with the stage ``"suggest"``.
     """
-    places, own = np.unique(candidates, axis=0, return_inverse=True)
-    precision, square = sensitivity.prior, np.zeros_like(sensitivity.prior)
-    told: dict[int, Told] = {}
-
-    def add(total: np.ndarray, one: Told, times: int = 1) -> None:
-        total[np.ix_(one.index, one.index)] += times * one.root @ one.root.T
-
+    places, place_of = np.unique(candidates, axis=0, return_inverse=True)
+    known, told = sensitivity.prior, {}
+    square = Known(np.zeros_like(known.materials), np.zeros_like(known.own))
     everywhere = pointings and replace(pointings, toward=np.unique(pointings.toward, axis=0))
     for k, place in enumerate(np.concatenate([places, measured])):
         if k < len(places):
-            mine = np.flatnonzero(own.reshape(-1) == k)
+            mine = np.flatnonzero(place_of.reshape(-1) == k)
             turned = pointings and replace(pointings, toward=pointings.toward[mine])
-            image, found = sensitivity.of(place, turned)
-            add(square, image, len(mine))
+            whole, found = sensitivity.of(place, turned)
+            square.add(whole.scaled(len(mine)))
             told |= {int(c): found[j % len(found)] for j, c in enumerate(mine)}
         else:
             for one in sensitivity.of(place, everywhere)[1]:
-                add(precision, one)
+                known.add(one)
         if progress is not None:
             progress("suggest", k + 1, len(places) + len(measured))
+    return _greedy(told, square, known, n)
+
+
+def _greedy(told: dict[int, Told], square: Known, known: Known, n: int) -> np.ndarray:
+    """The ``n`` readings, each of which lowers the variances that ``square`` weighs most after those before it."""
     chosen: list[int] = []
     for _ in range(n):
-        covariance = np.linalg.inv(precision)
-        moved = covariance @ square @ covariance
-
-        def fall(k: int, covariance: np.ndarray = covariance, moved: np.ndarray = moved) -> float:
-            """Of the sum of square errors, if candidate ``k`` is read too (matrix inversion lemma)."""
-            root, part = told[k].root, np.ix_(told[k].index, told[k].index)
-            within = np.eye(root.shape[1]) + root.T @ covariance[part] @ root
-            return float(np.trace(np.linalg.solve(within, root.T @ moved[part] @ root)))
-
-        left = sorted(told.keys() - set(chosen))
-        chosen.append(left[int(np.argmax([fall(k) for k in left]))])
-        add(precision, told[chosen[-1]])
+        covariance = np.linalg.inv(known.materials)
+        moved, falls = covariance @ square.materials @ covariance, {}
+        for k in sorted(told.keys() - set(chosen)):
+            one = told[k]
+            part = np.ix_(one.index, one.index)
+            within = np.eye(one.root.shape[1]) + one.root.T @ covariance[part] @ one.root
+            falls[k] = float(np.trace(np.linalg.solve(within, one.root.T @ moved[part] @ one.root)))
+            falls[k] += float(square.own @ (1.0 / known.own - 1.0 / (known.own + one.own)))
+        chosen.append(max(falls, key=lambda k: falls[k]))
+        known.add(told[chosen[-1]])
     return np.array(chosen, int)
