@@ -6,7 +6,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 
 import warprrf as wr
 from warprrf.rf.em.itu import assumed_permittivity
-from warprrf.rf.fields.bistatic.suggest import SHAPE, Known, Sensitivity, Told, _greedy
+from warprrf.rf.fields.bistatic.suggest import Unknowns
 from warprrf.rf.fields.bistatic.training import trace
 
 CARRIER_HZ = 300e9
@@ -103,40 +103,17 @@ def test_a_horn_is_not_pointed_twice_at_one_place(unmeasured) -> None:
     assert len({(0, 0, 0, 1, 1, 2)[k] for k in chosen}) == 3
 
 
-def test_each_choice_leaves_the_least_expected_error() -> None:
-    """Against the posterior's covariance as a dense inverse."""
+def test_variances_are_those_of_the_joint_posterior() -> None:
     rng = np.random.default_rng(0)
-    told = {
-        k: Told(rng.choice(6, 4, replace=False), rng.normal(size=(4, 1 + k % 3)), rng.random(5))
-        for k in range(8)
-    }
-    square, prior = (Known(np.diag(1.0 + rng.random(6)), 1.0 + rng.random(5)) for _ in range(2))
-
-    def error(read: list[int]) -> float:
-        precision, own = prior.materials.copy(), prior.own.copy()
-        for k in read:
-            root = np.zeros((6, told[k].root.shape[1]))
-            root[told[k].index] = told[k].root
-            precision, own = precision + root @ root.T, own + told[k].own
-        return float(np.trace(square.materials @ np.linalg.inv(precision)) + (square.own / own).sum())
-
-    known = Known(prior.materials.copy(), prior.own)
-    chosen = _greedy(told, square, known, 3).tolist()
-    for n in range(3):
-        left = set(told) - set(chosen[:n])
-        assert chosen[n] == min(left, key=lambda k: error([*chosen[:n], k]))
-
-
-def test_what_a_place_tells_is_told_of_its_whole_spectrum(unmeasured) -> None:
-    transport = unmeasured.transport().on_grid(SHAPE, 1, mirror_sub_pixels=1)
-    at = Sensitivity(transport, unmeasured.materials, unmeasured.material, unmeasured.floor)
-    for place in (WEST[0], EAST[0]):
-        power, slope, index, own = at.pixels(place)
-        assert power.sum() * unmeasured.floor == pytest.approx(
-            unmeasured.spectrum(place).path_gain.sum(), rel=0.05
-        )
-        # curves of Fresnel are interpolated
-        assert slope.shape == (len(index), len(power)) and (own.sum(axis=1).A1 <= 1.1 * power).all()
+    material = np.array([0, 0, 0, 1, 1])
+    unknowns = Unknowns(material, np.array([1.0, 0.3]), np.array([0.5, 0.5, 0.2, 0.3, 0.3]))
+    precision = np.array([0.0, 3.0, 0.7, 1.2, 0.0])
+    prior = np.diag(unknowns.own**2) + np.where(
+        material[:, None] == material, np.outer(*2 * [unknowns.shared[material]]), 0.0
+    )
+    posterior = np.linalg.inv(np.linalg.inv(prior) + np.diag(precision))
+    assert unknowns.variance(precision) == pytest.approx(np.diag(posterior))
+    assert (unknowns.variance(precision + rng.random(5)) < unknowns.variance(precision)).all()
 
 
 @pytest.mark.parametrize(

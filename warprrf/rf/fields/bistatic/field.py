@@ -40,7 +40,7 @@ from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, t
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
 from warprrf.rf.fields.bistatic.render import Rendered, images, path_powers, render, sent_radiance
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
-from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, suggest
+from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
@@ -452,7 +452,7 @@ class BistaticField(RadioField):
         transport = self.transport(source).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
         floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
         return suggest(
-            Sensitivity(transport, self.materials, self.material, floor), places, n,
+            Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material), places, n,
             measured=np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on,
             pointings=pointings, progress=progress,
         )  # fmt: skip

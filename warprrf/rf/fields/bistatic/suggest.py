@@ -1,9 +1,10 @@
-"""Where to measure next: greedy Bayesian experimental design (Chaloner and Verdinelli 1995) for what a fit learns.
+"""Where to measure next: greedy Bayesian experimental design (Chaloner and Verdinelli 1995) on what a field predicts.
 
-That is the parameters of materials, and the gain of each surface element over its material: normal a priori and read
-with errors as in fits, linearised about what the field holds. Readings are chosen one after another, each the one that
-lowers the expected square error of the dB images of spectra at all candidates most (I-optimality). Materials are told
-as if elements were known, and elements as if materials were.
+What is not known of surfaces is taken for gains in nepers, normal a priori: of the single bounces of each element, of
+the light that it sends on, and of each group's mirrors. Each is the sum of one that all surfaces of its material share
+and one of its own. A reading tells of a gain by how much of it is due to that gain, and predictions err likewise.
+Readings are chosen one after another, each the one that lowers the expected square error most (I-optimality). Gains
+that share a reading are told apart as if the others were known.
 """
 
 from __future__ import annotations
@@ -11,25 +12,26 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_matrix, identity
-from threadpoolctl import threadpool_limits
+from scipy.sparse import csr_matrix
 
 from warprrf.device import Progress
-from warprrf.rf.fields.bistatic.fit import NEPER, GroupFit, priors
-from warprrf.rf.fields.bistatic.materials import Layout, Materials
-from warprrf.rf.fields.bistatic.measured import WeighedPaths
+from warprrf.rf.fields.bistatic.fit import NEPER
+from warprrf.rf.fields.bistatic.materials import Materials
 from warprrf.rf.fields.bistatic.observations import READING_ERROR_DB
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
-from warprrf.rf.fields.bistatic.residuals import ResidualFit
-from warprrf.rf.fields.bistatic.response import jacobian, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.transport import Transport
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_of
 
 SHAPE = (40, 80)
 """Pixels that are told apart around a receiver: as wide as a usual beam."""
-NEGLIGIBLE = 0.01
-"""Combinations of parameters of which a spectrum tells less [dB^2/neper^2] are left out: priors tell more."""
+PIXEL_ERROR_DB = 3.0
+"""Standard deviation of a pixel's error, as in fits."""
+SHARED = (1.0, 0.3, 1.0)
+OWN = (0.5, 0.3, 0.3)
+"""Standard deviations of a material's gain, and of a surface's own over it [nepers]: for single bounces, for light that
+is sent on (a mean over many surfaces, so it is known better), for mirrors."""
+LEAST_DB = 1e-3  # per neper: readings that change less tell nothing
 
 
 @dataclass(frozen=True)
@@ -41,113 +43,101 @@ class Pointings:
 
 
 @dataclass(frozen=True)
-class Told:
-    """What readings tell of materials and of single elements.
+class Unknowns:
+    """Gains that are not known before any measurement.
 
     Attributes:
-        index: parameters of materials, shape ``(C,)``.
-        root: they are told with precision ``root @ root.T`` [1/neper^2], shape ``(C, N)``.
-        own: precision at which gains of elements over their material are told, of single bounces, then of light sent on
-            [1/neper^2], shape ``(2 E,)``.
+        material: whose gain each shares, shape ``(U,)``.
+        shared: standard deviation of each material's gain [nepers], shape ``(M,)``.
+        own: of each gain over its material's [nepers], shape ``(U,)``.
     """
 
-    index: np.ndarray
-    root: np.ndarray
+    material: np.ndarray
+    shared: np.ndarray
     own: np.ndarray
 
-    def scaled(self, by: float) -> Told:
-        """The same with all precisions multiplied."""
-        return Told(self.index, np.sqrt(by) * self.root, by * self.own)
+    @classmethod
+    def of(cls, transport: Transport, material: np.ndarray) -> Unknowns:
+        """Those of a surface; ``material`` (G,) is that of each group."""
+        element, count = material[transport.surface.element_group], int(material.max()) + 1
+        return cls(
+            np.concatenate([element, count + element, 2 * count + material]),
+            np.repeat(SHARED, count),
+            np.repeat(OWN, [len(element), len(element), len(material)]),
+        )
 
-
-@dataclass
-class Known:
-    """Sums of what was told: of all parameters of materials ``(F, F)`` and of elements' gains ``(2 E,)`` [1/neper^2]."""
-
-    materials: np.ndarray
-    own: np.ndarray
-
-    def add(self, told: Told) -> None:
-        """One more."""
-        self.materials[np.ix_(told.index, told.index)] += told.root @ told.root.T
-        self.own = self.own + told.own
+    def variance(self, precision: np.ndarray) -> np.ndarray:
+        """Of gains that readings tell with ``precision`` (U,) [1/neper^2], shape ``(U,)``: the posterior of
+        x_u = m_material(u) + r_u."""
+        left = 1.0 / (1.0 + self.own**2 * precision)  # of the variance of r
+        told = np.bincount(self.material, precision * left, minlength=len(self.shared))
+        shared = 1.0 / (1.0 / self.shared**2 + told)
+        return np.asarray(self.own**2 * left + left**2 * shared[self.material])
 
 
 class Sensitivity:
-    """How readings at places depend on the parameters of materials.
+    """How readings and predictions at places depend on the gains.
 
     Args:
         transport: the geometry under the transmitter, on a grid of :data:`SHAPE`.
-        materials: of its groups; what differs within a group is taken for unknown.
-        material: of each group, shape ``(G,)``.
+        materials: of its surfaces.
         floor: path gain of a pixel, and of a reading, below which nothing is told.
     """
 
-    def __init__(
-        self, transport: Transport, materials: Materials, material: np.ndarray, floor: float
-    ) -> None:
-        self.transport, self.material, self.floor = transport, material, floor
-        self.materials = replace(materials, terms=replace(materials.terms, residual=False))
-        self.parameters = materials.parameters.take(np.unique(material, return_index=True)[1])
-        lobes, terms = self.parameters.log_weight.shape[1], materials.terms
-        self.layout = Layout(int(material.max()) + 1, lobes, indirect=terms.indirect, gain=False)
-        self._sent = sent_radiance(transport, self.materials)
+    def __init__(self, transport: Transport, materials: Materials, floor: float) -> None:
+        self.transport, self.materials, self.floor = transport, materials, floor
+        self._sent = sent_radiance(transport, materials)
 
-    @property
-    def prior(self) -> Known:
-        """What is known without any reading."""
-        p, alike = self.parameters, np.ones(self.layout.groups)
-        rows = priors(p, p, self.layout, GroupFit().deviations, alike)[1]
-        deviations = [element for element, _ in ResidualFit().deviations]
-        own = np.repeat(deviations, len(self.transport.surface.element_area)) ** -2.0
-        return Known(rows.T @ rows, own)
-
-    def pixels(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, csr_matrix]:
-        """Powers of the spectrum's pixels at ``place`` (3,) in units of the floor, shape ``(P,)``, their derivatives to
-        the parameters ``(C, P)``, which those are ``(C,)``, and what they have of each element's single bounces and
-        of light that it sends on ``(P, 2 E)``."""
-        t, terms, count = self.transport, self.materials.terms, SHAPE[0] * SHAPE[1]
-        view = t.view(place, terms)
+    def powers(self, place: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
+        """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
+        t, view = self.transport, self.transport.view(place, self.materials.terms)
+        found = path_powers(view, self.materials, self._sent)
+        s, face, sent, count = t.surface, view.hits.face.numpy(), found.further.sent, SHAPE[0] * SHAPE[1]
+        elements, single = len(s.element_area), np.flatnonzero(found.single > 0)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
-        sharp = np.zeros((len(pixel), count), np.float32)
-        sharp[np.arange(len(pixel)), pixel] = 1.0
-        apart = WeighedPaths(np.arange(count), identity(count, np.float32, "csr"), sharp)
-        response = respond(view, apart, terms, self.floor).limited(terms)
-        if terms.after_first_bounce:
-            further = view, apart, self.materials, self._sent, self.floor
-            response = with_further_bounces(response, *further, follow=True)
-        powers, element = path_powers(view, self.materials, self._sent), t.surface.element
-        lit, sent, elements = (
-            np.flatnonzero(powers.single > 0),
-            powers.further.sent,
-            len(t.surface.element_area),
+        mirror = view.path_groups[:, 0]
+        own = mirror >= 0
+        parts = (
+            (single, s.element[face[single]], found.single[single]),
+            (sent.ray, elements + s.element[sent.face], sent.power),
+            (pixel[own], 2 * elements + mirror[own], found.mirror[own]),
         )
-        gain = np.append(element[view.hits.face.numpy()[lit]], elements + element[sent.face])
-        power = np.append(powers.single[lit], sent.power) / self.floor
-        own = csr_matrix((power, (np.append(lit, sent.ray), gain)), shape=(count, 2 * elements))
-        return *jacobian(response.tied(self.material), self.parameters, self.layout), own
+        row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
+        table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
+        ray, shown = found.further.shown  # known, as line of sight is
+        rest = np.bincount(np.append(ray, pixel[~own]), np.append(shown, found.mirror[~own]), minlength=count)
+        return table, np.asarray(table.sum(axis=1)).ravel() + rest
 
-    def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[Told, list[Told]]:
-        """What the spectrum at ``place`` (3,) tells, if each pixel is known to 1 dB, and what each of ``pointings`` does as
-        fits weigh it, or the spectrum itself."""
-        power, slope, index, own = self.pixels(place)
-        image = slope * (NEPER / (1.0 + power)).astype(np.float32)
-        strength, direction = np.linalg.eigh((image @ image.T).astype(float))
-        kept = strength > NEGLIGIBLE
-        single = np.asarray(own.power(2).T @ (NEPER / (1.0 + power)) ** 2)
-        whole = Told(index, direction[:, kept] * np.sqrt(strength[kept]), single)
+    def of(self, place: np.ndarray, pointings: Pointings | None) -> tuple[np.ndarray, csr_matrix]:
+        """Of a spectrum at ``place``: squared derivatives, summed over its pixels [dB^2/neper^2], shape ``(U,)``. And the
+        precisions at which readings there tell the gains [1/neper^2], shape ``(K, U)``: one row for a whole spectrum."""
+        table, total = self.powers(place)
+        square = table.copy()
+        square.data = (table.data * np.repeat(NEPER / (total + self.floor), np.diff(table.indptr))) ** 2
+        summed = np.asarray(square.sum(axis=0)).ravel()
         if pointings is None:
-            return whole, [whole.scaled(GroupFit().noise_db ** -2.0)]
+            return summed, csr_matrix(summed / PIXEL_ERROR_DB**2)
         cosine = pointings.toward @ pixel_directions(SHAPE).reshape(-1, 3).T
         gain = sample_pattern(pointings.pattern, np.arccos(np.clip(cosine, -1.0, 1.0)))
-        to_db = NEPER / (1.0 + gain @ power) / READING_ERROR_DB
-        rows = zip((slope @ gain.T * to_db).T, (gain @ own * to_db[:, None]) ** 2, strict=True)
-        return whole, [Told(index, of_materials[:, None], of_own) for of_materials, of_own in rows]
+        slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
+        return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
+
+    def precision(
+        self, places: np.ndarray, pointings: Pointings | None = None, progress: Progress | None = None
+    ) -> np.ndarray:
+        """With which readings at all of ``places`` (R, 3) tell the gains [1/neper^2], shape ``(U,)``."""
+        surface = self.transport.surface
+        known = np.zeros(2 * len(surface.element_area) + surface.groups)
+        for k, place in enumerate(places):
+            known += np.asarray(self.of(place, pointings)[1].sum(axis=0)).ravel()
+            if progress is not None:
+                progress("suggest", k + 1, len(places))
+        return known
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # small matrices: threads would wait for each other
 def suggest(
     sensitivity: Sensitivity,
+    unknowns: Unknowns,
     candidates: np.ndarray,
     n: int,
     *,
@@ -163,37 +153,41 @@ def suggest(
         pointings: that each candidate would take, C of them; None for whole spectra.
         progress: called with the stage ``"suggest"``.
     """
-    places, place_of = np.unique(candidates, axis=0, return_inverse=True)
-    known, told = sensitivity.prior, {}
-    square = Known(np.zeros_like(known.materials), np.zeros_like(known.own))
-    everywhere = pointings and replace(pointings, toward=np.unique(pointings.toward, axis=0))
-    for k, place in enumerate(np.concatenate([places, measured])):
-        if k < len(places):
-            mine = np.flatnonzero(place_of.reshape(-1) == k)
-            turned = pointings and replace(pointings, toward=pointings.toward[mine])
-            whole, found = sensitivity.of(place, turned)
-            square.add(whole.scaled(len(mine)))
-            told |= {int(c): found[j % len(found)] for j, c in enumerate(mine)}
-        else:
-            for one in sensitivity.of(place, everywhere)[1]:
-                known.add(one)
+    places, own = np.unique(candidates, axis=0, return_inverse=True)
+    total, square = (
+        len(places) + len(measured),
+        np.zeros(len(unknowns.material)),
+    )  # of predictions' derivatives
+    told: dict[int, csr_matrix] = {}
+    for k, place in enumerate(places):
+        mine = np.flatnonzero(own.reshape(-1) == k)
+        turned = None if pointings is None else replace(pointings, toward=pointings.toward[mine])
+        whole, rows = sensitivity.of(place, turned)
+        square += len(mine) * whole
+        told |= {int(c): rows[j if len(rows.indptr) > 2 else 0] for j, c in enumerate(mine)}
         if progress is not None:
-            progress("suggest", k + 1, len(places) + len(measured))
-    return _greedy(told, square, known, n)
+            progress("suggest", k + 1, total)
+    if pointings is not None:
+        pointings = replace(pointings, toward=np.unique(pointings.toward, axis=0))
+    after = None if progress is None else lambda stage, done, _: progress(stage, len(places) + done, total)
+    known = sensitivity.precision(measured, pointings, after)
+    return _greedy(told, square, unknowns, known, n)
 
 
-def _greedy(told: dict[int, Told], square: Known, known: Known, n: int) -> np.ndarray:
-    """The ``n`` readings, each of which lowers the variances that ``square`` weighs most after those before it."""
+def _greedy(
+    told: dict[int, csr_matrix], square: np.ndarray, unknowns: Unknowns, known: np.ndarray, n: int
+) -> np.ndarray:
+    """The ``n`` readings, each of which lowers the sum of ``square`` times variance most after those before it."""
     chosen: list[int] = []
+
+    def with_reading(k: int) -> np.ndarray:
+        more = known.copy()
+        more[told[k].indices] += told[k].data
+        return more
+
     for _ in range(n):
-        covariance = np.linalg.inv(known.materials)
-        moved, falls = covariance @ square.materials @ covariance, {}
-        for k in sorted(told.keys() - set(chosen)):
-            one = told[k]
-            part = np.ix_(one.index, one.index)
-            within = np.eye(one.root.shape[1]) + one.root.T @ covariance[part] @ one.root
-            falls[k] = float(np.trace(np.linalg.solve(within, one.root.T @ moved[part] @ one.root)))
-            falls[k] += float(square.own @ (1.0 / known.own - 1.0 / (known.own + one.own)))
-        chosen.append(max(falls, key=lambda k: falls[k]))
-        known.add(told[chosen[-1]])
+        left = sorted(told.keys() - set(chosen))
+        errors = [square @ unknowns.variance(with_reading(k)) for k in left]
+        chosen.append(left[int(np.argmin(errors))])
+        known = with_reading(chosen[-1])
     return np.array(chosen, int)
