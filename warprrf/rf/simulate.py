@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -74,7 +76,7 @@ def simulate(
         roles: "train" or "test" for each receiver, shape ``(R,)``; an eighth is for test by default.
         floor: N0 [linear]; median over views of the view's maximum, less 60 dB, by default.
         workspace: Folder that keeps each finished receiver, so that a killed run goes on where it stopped.
-        progress: Called as ``progress("simulate", done, total)``.
+        progress: Called as ``progress("simulate", done, total)``; what ``workspace`` holds is done from the start.
         device: Where our own kernels run.
 
     Raises:
@@ -118,11 +120,15 @@ def simulate(
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver = (sampling, _versions(engine, solver_only=True)) if engine == "sionna" else None
     inputs = digest(engine, common, air, surfaces, solver)
-    results: list[ReceivedPaths] = []
-    for k, point in enumerate(points):
-        if progress is not None:
-            progress("simulate", k, len(points))
-        results.append(receive(point) if workspace is None else _kept(workspace, inputs, point, receive))
+    names = [digest(inputs, point)[:24] for point in points]
+    kept = [workspace is not None and (Path(workspace) / f"{name}.npz").exists() for name in names]
+    found: dict[int, ReceivedPaths] = {}
+    for k in sorted(range(len(points)), key=lambda k: not kept[k]):
+        if progress is not None and len(found) >= sum(kept):
+            progress("simulate", len(found), len(points))
+        made = partial(receive, points[k])
+        found[k] = made() if workspace is None else _kept(workspace, names[k], [inputs, points[k]], made)
+    results = [found[k] for k in range(len(points))]
     if progress is not None:
         progress("simulate", len(points), len(points))
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
@@ -215,15 +221,12 @@ def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:
 
 
 def _kept(
-    workspace: str | os.PathLike[str],
-    inputs: str,
-    point: np.ndarray,
-    receive: Callable[[np.ndarray], ReceivedPaths],
+    workspace: str | os.PathLike[str], name: str, inputs: list[Any], receive: Callable[[], ReceivedPaths]
 ) -> ReceivedPaths:
-    """What ``receive`` returns for ``point``, in single precision, from the file of an earlier run if there is one."""
+    """What ``receive`` returns, in single precision, from the file of an earlier run if there is one."""
 
     def make() -> dict[str, np.ndarray]:
-        found = receive(point)
+        found = receive()
         return {
             "path_gain": found.path_gain.astype(np.float32),
             "delay_s": found.delay_s,
@@ -234,8 +237,7 @@ def _kept(
         }
 
     with Steps(workspace, shared=True) as steps:
-        name = digest(inputs, point)[:24]
-        held = steps.arrays(name, make, version=REVISION, inputs=[inputs, point])
+        held = steps.arrays(name, make, version=REVISION, inputs=inputs)
     return ReceivedPaths(
         path_gain=held["path_gain"],
         delay_s=held["delay_s"],
