@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
 from warprrf.checks import Expected, check_arrays, check_number
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -87,6 +88,8 @@ class Parameters:
         What is not scattered, exp(-(4 pi sigma_h / lambda)^2) (Ament 1953), is raised to the square of the ratio; the sum
         of both shares, the mix of lobes and the permittivity stay.
         """
+        if ratio == 1.0:
+            return self
         scattered = self.weight.sum(axis=1)
         both = scattered + np.exp(self.log_mirror)
         log_smooth = ratio**2 * self.log_smooth
@@ -191,6 +194,25 @@ class Layout:
             table[:, n + 2].copy() if self.indirect else np.full(self.groups, -np.inf),
             float(vector[self.common_gain]) if self.gain else 0.0, vector[self.first_chain :].copy(),
         )  # fmt: skip
+
+    def slopes_at_ratio(self, p: Parameters, ratio: float) -> csr_matrix:
+        """Derivatives of the vector of ``p.at_ratio(ratio)`` (rows) to that of ``p`` (columns)."""
+        weight, mirror, n = p.weight, np.exp(p.log_mirror), self.lobes
+        scattered = weight.sum(axis=1)
+        both = scattered + mirror
+        share, own = np.zeros((2, self.groups, self.stride))  # of ln both, and of ln mirror
+        share[:, :n], share[:, n + 1] = weight / both[:, None], mirror / both
+        own[:, n + 1] = 1.0
+        smooth = ratio**2 * (own - share)
+        fall = 1.0 / np.maximum(np.expm1(-(ratio**2) * (p.log_mirror - np.log(both))), 1e-12)
+        grown = share - fall[:, None] * smooth
+        grown[:, :n] -= weight / scattered[:, None]
+        table = np.tile(np.eye(self.stride), (self.groups, 1, 1))
+        table[:, n + 1] = smooth + share
+        for row in (*range(n), *range(n + 2, self.stride)):
+            table[:, row] += grown
+        groups = bsr_matrix((table, np.arange(self.groups), np.arange(self.groups + 1)))
+        return block_diag([groups, identity(self.size - groups.shape[0])], format="csr")
 
 
 def mirror_share(p: Parameters, group: np.ndarray, cosine: np.ndarray) -> np.ndarray:
