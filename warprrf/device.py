@@ -11,9 +11,11 @@ mended where it is started.
 
 from __future__ import annotations
 
+import copyreg
 import importlib
 import os
 import tempfile
+import threading
 import time
 import warnings
 from collections import deque
@@ -93,10 +95,31 @@ def resolve(device: DeviceLike = None) -> wp.Device:
         raise ValueError(f"device: got {device!r}, expected one of {known}") from error
 
 
-@cache
+_own = threading.local()
+
+
 def threads() -> int:
-    """CPU threads that one launch is split over: ``WARPRRF_THREADS`` if set, else the cores this process may use."""
+    """CPU threads that one launch is split over: ``WARPRRF_THREADS`` if set, else the cores this process may use, or one
+    within :func:`one_thread`."""
+    return _threads(getattr(_own, "alone", False))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Launches of this thread stay on it, unless ``WARPRRF_THREADS`` is set: others work beside it."""
+    before = getattr(_own, "alone", False)
+    _own.alone = True
+    try:
+        yield
+    finally:
+        _own.alone = before
+
+
+@cache
+def _threads(alone: bool) -> int:
     wanted = os.environ.get("WARPRRF_THREADS")
+    if wanted is None and alone:
+        return 1
     if wanted is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not wanted.isdigit() or int(wanted) < 1:
@@ -208,6 +231,13 @@ def require(module: str, extra: str) -> ModuleType:
             raise
         raise ImportError(f'{module} is not installed: pip install "warprrf[{extra}]"') from error
 
+
+def _uploaded(values: Any, dtype: Any, device: str) -> wp.array:
+    return wp.array(values, dtype=dtype, device=device)
+
+
+copyreg.pickle(wp.array, lambda a: (_uploaded, (a.numpy(), a.dtype, str(a.device))))
+# Warp's arrays have no pickles of their own, which workers of a cluster need.
 
 _NO_CUDA = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 
