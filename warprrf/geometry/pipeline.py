@@ -259,7 +259,7 @@ def _steps(
     def surface(attempt: Attempt) -> files.Arrays:
         everywhere = list(sparse.cameras.values())
         if measured:
-            maps = range_maps(sparse, measured, most=config.surface.views).values()
+            maps = range_maps(sparse, measured).values()
             views, ranges = (list(part) for part in zip(*maps, strict=True))
             patches = fuse_maps(views, ranges, planes=planes, config=config, progress=attempt.progress)
         else:
@@ -271,7 +271,6 @@ def _steps(
         return files.of_patches(patches) | {"shares": shares}
 
     settings = [
-        config.max_reprojection_error,
         config.planes,
         config.sweep,
         config.plain,

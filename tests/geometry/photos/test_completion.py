@@ -7,7 +7,7 @@ import warprrf as wr
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.completion.room_planes import directions
-from warprrf.geometry.photos.config import CompletionConfig, SurfaceConfig
+from warprrf.geometry.photos.config import SurfaceConfig
 from warprrf.geometry.photos.snapping import find_patches, largest_first
 from warprrf.geometry.planar_patches import PlanarPatches
 
@@ -82,7 +82,7 @@ def run(broken, whole, places, min_patch_m2=0.15):
     mesh, truth = as_mesh(broken), as_mesh(whole)
     views = cameras(np.asarray(places, dtype=float))
     patches = find_patches(mesh, config=FLAT)
-    whole = complete(patches, views, seen(mesh, truth, views), config=CompletionConfig(stride=3))
+    whole = complete(patches, views, seen(mesh, truth, views))
     return largest_first(whole, min_patch_m2), truth
 
 
@@ -170,7 +170,7 @@ def test_a_mesh_without_planes_or_views_stays_as_it_is():
     assert complete(patches, [], []) is patches
     label = np.where(np.arange(40) < 3, 0, -1)
     slope = PlanarPatches.from_planes(mesh, label, [[0.6, 0.0, 0.8]], [0.0], tolerance_m=1e-6)
-    assert directions(slope.normal, slope.area, float(mesh.areas.sum()), CompletionConfig()) is None
+    assert directions(slope.normal, slope.area, float(mesh.areas.sum())) is None
     with pytest.raises(ValueError, match="depths: got 0 maps for 6"):
         complete(patches, views, [])
 
@@ -183,7 +183,7 @@ def test_a_place_seen_in_part_only_is_not_guessed():
     patches = find_patches(mesh, config=FLAT)
     views = [cameras([[8.0, 3.0, 2.0]])[3]]  # looks there
     depths = seen(mesh, as_mesh(hall), views)
-    assert complete(patches, views, depths, config=CompletionConfig(stride=1, cell_m=0.25)) is patches
+    assert complete(patches, views, depths) is patches
 
 
 def test_an_oblique_surface_is_kept():

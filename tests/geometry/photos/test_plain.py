@@ -6,7 +6,6 @@ import trimesh
 from helpers.views import look
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.config import PlainConfig, PlaneConfig
 from warprrf.geometry.photos.edges import find_edgels, find_lines
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.planes import Plane
@@ -66,8 +65,8 @@ def bare(cameras):
 
 
 def test_edges_under_the_ceiling_and_of_the_pillar_are_placed_within_a_centimetre(cameras):
-    images, config = photos(cameras), PlainConfig()
-    lines = find_lines(cameras, images, [find_edgels(image, config) for image in images], config)
+    images = photos(cameras)
+    lines = find_lines(cameras, images, [find_edgels(image) for image in images])
     (x0, y0, _), (x1, y1, _) = PILLAR
     asked = [(0, (y, SIZE[2])) for y in (0.0, SIZE[1])] + [(1, (SIZE[2], x)) for x in (0.0, SIZE[0])]
     for axis, place in asked + [(2, (x, y)) for x in (x0, x1) for y in (y0, y1)]:
@@ -119,7 +118,7 @@ def test_a_plain_cell_gives_way_to_points_on_a_plane_and_to_lines_of_sight():
     poster = Plane(wall.normal, 0.08, np.array([0]), corner=np.zeros(2), occupied=everywhere)
     through = wall.to_world(np.array([[1.55, 1.55]]))
     sight = np.repeat(through + [0, 2.0, 0], 2, axis=0), np.repeat(through - [0, 2.0, 0], 2, axis=0)
-    ours, plain = with_plain([poster], [wall], points, sight, PlaneConfig())
+    ours, plain = with_plain([poster], [wall], points, sight)
     kept = np.zeros((20, 20), dtype=bool)
     kept[4:7, 4:7] = kept[15, 15] = (
         True  # its point and what lies round it; and where the wall is seen through

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import views
 
-from warprrf.geometry.photos.config import StereoConfig
 from warprrf.geometry.photos.fusion import fuse_depth
 from warprrf.geometry.photos.stereo import mended
 from warprrf.geometry.photos.targets import PosedPhotos
@@ -61,7 +60,7 @@ def spoiled(room):
 @pytest.fixture(scope="module")
 def found(room, spoiled):
     cameras, _, photos = room
-    return np.array(mended(spoiled[0], cameras, photos, config=StereoConfig(), progress=silent, device="cpu"))
+    return np.array(mended(spoiled[0], cameras, photos, progress=silent, device="cpu"))
 
 
 def patterned(room):
@@ -118,21 +117,19 @@ def test_masked_pixels_are_not_mended(room, spoiled):
     cameras, _, photos = room
     masks = [np.ones((120, 160), np.uint8) for _ in cameras]
     hidden = PosedPhotos(photos.images, cameras, masks)
-    result = mended(spoiled[0], cameras, hidden, config=StereoConfig(), progress=silent, device="cpu")
+    result = mended(spoiled[0], cameras, hidden, progress=silent, device="cpu")
     np.testing.assert_array_equal(result, spoiled[0])
 
 
 def test_depths_do_not_depend_on_the_number_of_threads(room, spoiled, found, monkeypatch):
     cameras, _, photos = room
     monkeypatch.setattr("warprrf.device.threads", lambda: 1)
-    again = mended(spoiled[0], cameras, photos, config=StereoConfig(), progress=silent, device="cpu")
+    again = mended(spoiled[0], cameras, photos, progress=silent, device="cpu")
     np.testing.assert_array_equal(again, found)
 
 
 def test_one_photo_or_no_depth_mends_nothing(room, spoiled):
     cameras, _, photos = room
     for maps in (spoiled[0][:1], [np.zeros((120, 160))]):
-        result = mended(
-            maps, cameras[:1], photos.subset([0]), config=StereoConfig(), progress=silent, device="cpu"
-        )
+        result = mended(maps, cameras[:1], photos.subset([0]), progress=silent, device="cpu")
         np.testing.assert_array_equal(result, maps)

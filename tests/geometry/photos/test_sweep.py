@@ -9,11 +9,10 @@ import views
 
 from warprrf.geometry.photos import sweep
 from warprrf.geometry.photos.cells import meeting, occupancy
-from warprrf.geometry.photos.config import PlaneConfig, SweepConfig
+from warprrf.geometry.photos.config import PlaneConfig
 from warprrf.geometry.photos.planes import Plane, aligned, plane_axes
 
 pytest.importorskip("open3d")
-CONFIG = SweepConfig()
 look = partial(views.look, width=240, height=180, f=170.0)
 
 TABLE = (np.array([-0.5, -0.4]), np.array([0.5, 0.4]), 0.7)  # corners and height of its top
@@ -70,11 +69,11 @@ def test_photos_agree_on_a_surface_and_nowhere_else(views):
     )
     up = np.tile([0.0, 0, 1], (200, 1))
     axes = plane_axes(up[0])
-    chosen = sweep.choose_views(place, up[0], np.ones((200, 12), dtype=bool), cameras, CONFIG)
+    chosen = sweep.choose_views(place, up[0], np.ones((200, 12), dtype=bool), cameras)
     values = {}
     for z in (-0.1, 0.0, 0.1):
         values[z], contrast = photos.agreement(place + [0, 0, z], axes, chosen)
-        assert (contrast[values[z] > -1] > CONFIG.contrast).all()
+        assert (contrast[values[z] > -1] > sweep.CONTRAST).all()
     assert np.median(values[0.0]) > 0.9
     assert max(np.median(values[-0.1]), np.median(values[0.1])) < 0.3
 
@@ -83,10 +82,10 @@ def test_photos_agree_on_a_surface_and_nowhere_else(views):
 def test_agreement_is_the_mean_correlation_over_pairs(views):
     cameras, photos = views
     centre, axes = np.array([[0.9, -1.0, 0.02]]), plane_axes(np.array([0.0, 0, 1]))
-    chosen = sweep.choose_views(centre, np.array([0.0, 0, 1]), np.ones((1, 12), dtype=bool), cameras, CONFIG)
+    chosen = sweep.choose_views(centre, np.array([0.0, 0, 1]), np.ones((1, 12), dtype=bool), cameras)
     got, contrast = photos.agreement(centre, axes, chosen)
     # By brute force: bilinear samples, then np.corrcoef over all pairs.
-    offsets = (np.arange(sweep.SIDE) - (sweep.SIDE - 1) / 2) * CONFIG.patch_m / (sweep.SIDE - 1)
+    offsets = (np.arange(sweep.SIDE) - (sweep.SIDE - 1) / 2) * sweep.PATCH_M / (sweep.SIDE - 1)
     grid = np.array([a * axes[0] + b * axes[1] for b in offsets for a in offsets]) + centre
     rows = []
     for c in chosen[0]:
@@ -108,13 +107,13 @@ def test_compared_photos_differ_in_direction():
         look([0, 2.0, 1.0], [0, 0, 0.0])
     ]
     chosen = sweep.choose_views(
-        np.zeros((1, 3)), np.array([0.0, 0, 1]), np.ones((1, 11), dtype=bool), cameras, CONFIG
+        np.zeros((1, 3)), np.array([0.0, 0, 1]), np.ones((1, 11), dtype=bool), cameras
     )
     used = chosen[chosen >= 0]
     line = np.array([cameras[c].position for c in used])
     line /= np.linalg.norm(line, axis=1, keepdims=True)
     angle = np.arccos(np.clip(line @ line.T, -1, 1))[np.triu_indices(len(used), 1)]
-    assert 10 in used and (angle > np.radians(CONFIG.min_angle_deg)).all()
+    assert 10 in used and (angle > np.radians(sweep.MIN_ANGLE_DEG)).all()
 
 
 def test_a_table_top_without_any_feature_is_found_at_its_height(views):

@@ -14,6 +14,8 @@ from warprrf.geometry.photos.config import PlaneConfig
 from warprrf.geometry.photos.planes import Plane, dilate
 from warprrf.geometry.splats.camera import Camera
 
+BEHIND_M = 0.1  # a line of sight empties a cell when its target is more than this behind the plane
+CONTESTED_M = 0.25  # of parallel planes closer than this, such as a sign and its wall, only one has a cell
 PARALLEL = np.cos(np.radians(10.0))  # planes that face alike
 REACH_CELLS = 3  # a gap at an inner corner up to this wide is closed, an overhang of any width cut
 NEAR_M = 0.5  # cells this close to the other plane tell on which side of it they stand
@@ -49,11 +51,11 @@ def occupancy(
         grid = replace(plane, corner=corner, cell_m=config.cell_m, occupied=np.ones(shape, dtype=bool))
         inside = _in_hull(grid.to_plane(grid.cells()), uv, config.margin_m).reshape(shape)
         supported = grid.count(points[plane.inliers]) > 0
-        lines = grid.seen_through(eyes, targets, config.behind_m)
+        lines = grid.seen_through(eyes, targets, BEHIND_M)
         empty = dilate(lines > 0, 2) & ~dilate(supported, 1)
         empty |= (lines > 2) & ~supported
         result.append(replace(grid, occupied=inside & ~empty))
-    return [_uncontested(k, result, points, config.contested_m) for k in range(len(result))]
+    return [_uncontested(k, result, points, CONTESTED_M) for k in range(len(result))]
 
 
 def _uncontested(k: int, planes: Sequence[Plane], points: np.ndarray, contested_m: float) -> Plane:

@@ -32,8 +32,11 @@ position), ``hits`` (steps) and ``seen`` (sum of blending weights)."""
 
 PARAMETERS = ("means", "quaternions", "log_scales", "logits", "sh")
 STATISTICS = ("pull", "hits", "seen")
+SPLIT_ABOVE_M = 0.03  # larger ones are split, smaller ones cloned
+PRUNE_OPACITY = 0.02  # fainter ones are removed
 APART = 0.7  # of its largest standard deviation: how far the halves of a split Gaussian lie from its centre
 SMALLER = 1.6  # the largest standard deviation of a split Gaussian is divided by this
+DENSIFY_SHARE = 0.08  # at most of the Gaussians is split or cloned at a time, those pulled hardest
 LARGEST_SHARE = 0.5  # of the Gaussians that is split or cloned at a time
 JITTER = 0.3  # standard deviation of a clone's place, in those of the Gaussian
 
@@ -58,7 +61,7 @@ def densified(
     opacity, scales = opacity_and_scales(arrays)
     hits, seen, largest = arrays["hits"][:, 0], arrays["seen"][:, 0], scales.max(axis=1)
     unseen = (hits > 0) & (seen < 1e-3)
-    keep = ~((largest > config.max_scale_m) | unseen | (opacity < config.prune_opacity))
+    keep = ~((largest > config.max_scale_m) | unseen | (opacity < PRUNE_OPACITY))
     if not keep.any():
         raise RuntimeError(
             "refine: every Gaussian would be pruned; do photos and camera poses belong together?"
@@ -66,12 +69,12 @@ def densified(
     pull = np.where(keep, arrays["pull"][:, 0] / np.maximum(hits, 1), 0.0)
     kept = int(keep.sum())
     catching_up = min((config.densify_to - kept) / rounds_left, LARGEST_SHARE * kept)
-    room = min(config.max_gaussians - kept, int(max(config.densify_share * kept, catching_up)))
+    room = min(config.max_gaussians - kept, int(max(DENSIFY_SHARE * kept, catching_up)))
     chosen = np.argsort(-pull, kind="stable")[: max(room, 0)]
     chosen = np.sort(chosen[pull[chosen] > 0])
 
     rows = {name: value[chosen].astype(np.float64) for name, value in arrays.items()}
-    split = (largest[chosen] > config.split_above_m)[:, None]
+    split = (largest[chosen] > SPLIT_ABOVE_M)[:, None]
     longest = np.eye(3)[scales[chosen].argmax(axis=1)]
     rotations = rotations_of(rows["quaternions"])
     jitter = JITTER * scales[chosen] * rng.normal(size=(len(chosen), 3)) * [1, 1, 0]  # in the surface

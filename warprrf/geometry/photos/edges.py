@@ -15,9 +15,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from warprrf.geometry.photos.config import PlainConfig
 from warprrf.geometry.splats.camera import Camera
 
+BLUR_PX = 1.5  # photos are smoothed by so much before they are differentiated
+EDGE, EDGE_DEG = (
+    0.009,
+    6.0,
+)  # an edge changes some colour by this part of white a pixel; its direction is good to so much
+SEGMENT_PX, GAP_PX = 24.0, 6.0  # shortest segment, and longest gap in one
+SIDE_PX, ALIKE = (
+    4.0,
+    0.08,
+)  # colours so far beside an edge are one surface's when they differ by no more than this
+MEETING_DEG = 3.0  # two bearings that differ by less meet nowhere for sure
+LINE_VIEWS = 3  # fewest photos that show an edge
 LEAST_SLOPE = 0.15  # a ray closer to the direction than this (sine) fixes no bearing
 FARTHEST_M = 25.0  # a line is sought so far from a camera
 POSE_M = 0.02  # what poses may be off
@@ -81,10 +92,10 @@ class Line:
         return result
 
 
-def find_edgels(image: np.ndarray, config: PlainConfig) -> Edgels:
+def find_edgels(image: np.ndarray) -> Edgels:
     """Edge pixels of a photo ``(H, W, 3)`` in [0, 1], to a fraction of a pixel (the scheme of Canny, 1986)."""
     change = [
-        np.stack([ndimage.gaussian_filter(c, config.blur_px, order=order) for c in np.moveaxis(image, 2, 0)])
+        np.stack([ndimage.gaussian_filter(c, BLUR_PX, order=order) for c in np.moveaxis(image, 2, 0)])
         for order in ((0, 1), (1, 0))
     ]
     main = (change[0] ** 2 + change[1] ** 2).argmax(axis=0)[None]
@@ -92,7 +103,7 @@ def find_edgels(image: np.ndarray, config: PlainConfig) -> Edgels:
     strength = np.hypot(dx, dy)
     inside = np.zeros(strength.shape, dtype=bool)
     inside[2:-2, 2:-2] = True
-    y, x = np.nonzero(inside & (strength > config.edge))
+    y, x = np.nonzero(inside & (strength > EDGE))
     here = strength[y, x]
     across = np.stack([dx[y, x], dy[y, x]], axis=1) / here[:, None]
     before, after = (
@@ -126,21 +137,21 @@ class Segments:
     length: np.ndarray
     sides: np.ndarray
 
-    def alike(self, k: int, tolerance: float) -> np.ndarray:
+    def alike(self, k: int) -> np.ndarray:
         """Which have the colour of segment ``k`` on one side at least (an occluding edge keeps only one)."""
         gap = np.abs(self.sides - self.sides[k]).max(axis=2).min(axis=1)
-        return np.asarray(gap < tolerance)
+        return np.asarray(gap < ALIKE)
 
 
 def find_segments(
-    camera: Camera, number: int, image: np.ndarray, edgels: Edgels, axis: int, config: PlainConfig
+    camera: Camera, number: int, image: np.ndarray, edgels: Edgels, axis: int
 ) -> list[tuple[int, float, tuple[float, float], float, float, np.ndarray]]:
     """Rows of :class:`Segments` along ``axis`` in one photo."""
     position, across = edgels.position, edgels.across
     rays, along_image = lines_through(camera, position, axis)
     u, v = (axis + 1) % 3, (axis + 2) % 3
     size = np.hypot(rays[:, u], rays[:, v])
-    straight = np.abs((along_image * across).sum(axis=1)) < np.sin(np.radians(config.edge_deg))
+    straight = np.abs((along_image * across).sum(axis=1)) < np.sin(np.radians(EDGE_DEG))
     own = np.flatnonzero(straight & (size > LEAST_SLOPE * np.linalg.norm(rays, axis=1)))
     # How the bearing changes along ``across``, per pixel.
     step = np.pad(across / [camera.fx, camera.fy], [(0, 0), (0, 1)]) @ camera.rotation
@@ -152,25 +163,23 @@ def find_segments(
     last = np.searchsorted(bearing[own], bearing[own] + wide, side="right")
     used, result = np.zeros(len(own), dtype=bool), []
     for k in np.argsort(first - last, kind="stable"):
-        if last[k] - first[k] < config.segment_px:
+        if last[k] - first[k] < SEGMENT_PX:
             break
         group = np.arange(first[k], last[k])
         group = group[~used[group]]
-        if len(group) < config.segment_px:
+        if len(group) < SEGMENT_PX:
             continue
         group = group[np.argsort(rise[own[group]], kind="stable")]
         gap = np.linalg.norm(np.diff(position[own[group]], axis=0), axis=1)
-        for run in np.split(group, np.flatnonzero(gap > config.gap_px) + 1):
+        for run in np.split(group, np.flatnonzero(gap > GAP_PX) + 1):
             pixels = own[run]
             length = float(np.linalg.norm(position[pixels[-1]] - position[pixels[0]]))
-            if len(run) < config.segment_px or length < config.segment_px or len(run) < 0.6 * length:
+            if len(run) < SEGMENT_PX or length < SEGMENT_PX or len(run) < 0.6 * length:
                 continue
             used[run] = True
             ends = float(rise[pixels[0]]), float(rise[pixels[-1]])
             outward = np.sign(turn[pixels])[:, None] * across[pixels]
-            sides = np.stack(
-                [_colour(image, position[pixels] + s * config.side_px * outward) for s in (-1, 1)]
-            )
+            sides = np.stack([_colour(image, position[pixels] + s * SIDE_PX * outward) for s in (-1, 1)])
             angle, pixel = float(np.median(bearing[pixels])), float(np.abs(turn[pixels]).mean())
             result.append((number, angle, ends, pixel, length, sides))
     return result
@@ -192,29 +201,29 @@ def _colour(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def find_lines(
-    cameras: Sequence[Camera], images: Sequence[np.ndarray], edgels: Sequence[Edgels], config: PlainConfig
+    cameras: Sequence[Camera], images: Sequence[np.ndarray], edgels: Sequence[Edgels]
 ) -> list[Line]:
-    """Lines along the three axes that at least ``config.line_views`` photos show, from different directions."""
+    """Lines along the three axes that at least ``LINE_VIEWS`` photos show, from different directions."""
     positions = np.array([camera.position for camera in cameras])
     lines = []
     for axis in range(3):
         rows = [
             row
             for k, (camera, image) in enumerate(zip(cameras, images, strict=True))
-            for row in find_segments(camera, k, image, edgels[k], axis, config)
+            for row in find_segments(camera, k, image, edgels[k], axis)
         ]
         if rows:
             segments = Segments(*(np.array(column) for column in zip(*rows, strict=True)))
-            lines += _placed(segments, positions, axis, config)
+            lines += _placed(segments, positions, axis)
     return lines
 
 
-def _placed(segments: Segments, positions: np.ndarray, axis: int, config: PlainConfig) -> list[Line]:
+def _placed(segments: Segments, positions: np.ndarray, axis: int) -> list[Line]:
     """Lines where segments meet, the best supported first; each segment belongs to one."""
     eye = positions[segments.camera]
     across, along = eye[:, [(axis + 1) % 3, (axis + 2) % 3]], eye[:, axis]
     towards = np.stack([np.cos(segments.bearing), np.sin(segments.bearing)], axis=1)
-    guesses = [_met(k, segments, across, along, towards, config) for k in range(len(segments.camera))]
+    guesses = [_met(k, segments, across, along, towards) for k in range(len(segments.camera))]
     support = np.array([weight for weight, _ in guesses])
     free, lines = np.ones(len(support), dtype=bool), []
     for k in np.argsort(-support, kind="stable"):
@@ -223,11 +232,11 @@ def _placed(segments: Segments, positions: np.ndarray, axis: int, config: PlainC
         if not free[k]:
             continue
         distance = guesses[k][1]
-        alike = free & segments.alike(k, config.alike)
+        alike = free & segments.alike(k)
         start = across[k] + distance * towards[k], along[k] + distance * segments.rise[k]
         place, chosen = _fitted(alike, start, segments, across, along, towards)
         line = _extent(place, chosen, segments, across, along, axis)
-        if line is not None and len(line.views) >= config.line_views:
+        if line is not None and len(line.views) >= LINE_VIEWS:
             free[chosen] = False
             lines.append(line)
     return lines
@@ -239,13 +248,12 @@ def _met(
     across: np.ndarray,
     along: np.ndarray,
     towards: np.ndarray,
-    config: PlainConfig,
 ) -> tuple[float, float]:
     """How many segments of other photos meet segment ``k`` at one place, by weight, and at which distance [m]."""
     sine = towards[k, 0] * towards[:, 1] - towards[k, 1] * towards[:, 0]
     apart = across - across[k]
-    ok = (np.abs(sine) > np.sin(np.radians(config.meeting_deg))) & (segments.camera != segments.camera[k])
-    ok &= segments.alike(k, config.alike)
+    ok = (np.abs(sine) > np.sin(np.radians(MEETING_DEG))) & (segments.camera != segments.camera[k])
+    ok &= segments.alike(k)
     safe = np.where(ok, sine, 1.0)
     mine = (apart[:, 0] * towards[:, 1] - apart[:, 1] * towards[:, 0]) / safe
     theirs = (apart[:, 0] * towards[k, 1] - apart[:, 1] * towards[k, 0]) / safe

@@ -20,7 +20,7 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
 from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.snapping import find_patches, flattened, largest_first, simplified
+from warprrf.geometry.photos.snapping import MIN_PATCH_M2, find_patches, flattened, largest_first, simplified
 from warprrf.geometry.photos.stereo import mended
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -28,6 +28,16 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
 
+VIEWS = 120  # most depth maps that are fused, spread over all cameras
+ALPHA = 0.6  # a depth counts where at least so much light is blocked,
+DEPTH_SPREAD = (
+    0.05  # and where the blended depth and that of the dominant Gaussian differ by no more than this part
+)
+VOXEL_PIXELS = 4.0  # widest voxel, in pixels of the depth maps at their median range
+EDGE_TOLERANCE = 8.0
+"""A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
+it is linear in the image, in a corner it bends, across an occluding edge it jumps."""
+MIN_VIEWS = 2  # a surface is kept where at least this many depth maps saw it
 BLOCK_VOXELS, BLOCKS = 16, 20_000  # voxels along a block's side; blocks set aside at first, the grid grows
 
 
@@ -49,13 +59,13 @@ def fuse_gaussians(
     """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    chosen = _spread_out(len(cameras), config.surface.views)
+    chosen = _spread_out(len(cameras), VIEWS)
     views, depths = depth_maps(
         gaussians, [cameras[k] for k in chosen], config=config.surface, progress=report, device=device
     )
-    if photos is not None and config.stereo is not None:
+    if photos is not None and config.stereo:
         seen = photos.subset(chosen)
-        depths = mended(depths, views, seen, config=config.stereo, progress=report, device=device)
+        depths = mended(depths, views, seen, progress=report, device=device)
     return fuse_maps(views, depths, planes=planes, config=config, progress=report)
 
 
@@ -75,12 +85,12 @@ def fuse_maps(
     report("surface", 1, 4)
     patches = flattened(find_patches(mesh, planes, config.surface))
     report("surface", 2, 4)
-    if config.completion is not None:
-        patches = complete(patches, views, depths, planes=planes, config=config.completion)
+    if config.completion:
+        patches = complete(patches, views, depths, planes=planes)
     report("surface", 3, 4)
-    patches = simplified(patches, cell_m=config.surface.simplify_m)
+    patches = simplified(patches)
     report("surface", 4, 4)
-    return largest_first(patches, config.surface.min_patch_m2)
+    return largest_first(patches, MIN_PATCH_M2)
 
 
 def depth_maps(
@@ -100,8 +110,8 @@ def depth_maps(
         )
         out = render(gaussians, view, features=np.zeros((len(gaussians), 1), dtype=np.float32), device=device)
         with np.errstate(invalid="ignore"):
-            agree = np.abs(out.depth - out.peak) <= config.depth_spread * out.peak
-        depths.append(np.where(agree & (out.alpha >= config.alpha), out.depth, 0.0))
+            agree = np.abs(out.depth - out.peak) <= DEPTH_SPREAD * out.peak
+        depths.append(np.where(agree & (out.alpha >= ALPHA), out.depth, 0.0))
         views.append(view)
     progress("depth", len(cameras), len(cameras))
     return views, depths
@@ -119,7 +129,7 @@ def _with_voxels(
     pixel_m = [np.median(d[d > 0]) / v.fx for v, d in zip(views, depths, strict=True) if (d > 0).any()]
     if not pixel_m:
         return config
-    return replace(config, voxel_m=min(config.voxel_m, config.voxel_pixels * float(np.median(pixel_m))))
+    return replace(config, voxel_m=min(config.voxel_m, VOXEL_PIXELS * float(np.median(pixel_m))))
 
 
 def fuse_depth(
@@ -150,7 +160,7 @@ def fuse_depth(
             raise ValueError(f"cameras[{k}]: got a {camera.kind} camera, expected pinhole cameras")
         depth = check_array(f"depths[{k}]", given, (camera.height, camera.width), np.float64, finite=False)
         z = range_to_depth(np.where(np.isfinite(depth), depth, 0.0), camera)
-        z[(depth > config.max_range_m) | ~_smooth(z, config.edge_tolerance / camera.fx)] = 0.0
+        z[(depth > config.max_range_m) | ~_smooth(z, EDGE_TOLERANCE / camera.fx)] = 0.0
         if not (z > 0).any():
             continue
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(z, dtype=np.float32)))
@@ -161,7 +171,7 @@ def fuse_depth(
         blocks = grid.compute_unique_block_coordinates(image, lens, pose, *limits)
         grid.integrate(blocks, image, lens, pose, *limits)
         filled = True
-    raw = grid.extract_triangle_mesh(config.min_views - 0.5).to_legacy() if filled else None
+    raw = grid.extract_triangle_mesh(MIN_VIEWS - 0.5).to_legacy() if filled else None
     if raw is None or len(raw.triangles) == 0:
         raise ValueError("depths: no surface came out; are the maps ranges in metres and the poses right?")
     return _without_debris(_ordered(o3d, raw), config)

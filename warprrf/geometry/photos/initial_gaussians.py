@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 
 from warprrf.checks import check_array
 from warprrf.geometry.photos.cells import plane_mesh, visible_from
-from warprrf.geometry.photos.config import SweepConfig
 from warprrf.geometry.photos.planes import Plane, plane_axes
 from warprrf.geometry.photos.sweep import choose_views
 from warprrf.geometry.splats.camera import Camera
@@ -96,7 +95,7 @@ def _blocks(
         some = seen.any(axis=1)
         quarter = np.array([[-0.25, -0.25], [0.25, -0.25], [-0.25, 0.25], [0.25, 0.25]]) * plane.cell_m
         fine = centres[some, None, :] + quarter @ plane.axes
-        views = choose_views(centres[some], plane.normal, seen[some], cameras, SweepConfig())
+        views = choose_views(centres[some], plane.normal, seen[some], cameras)
         color = _median_colors(fine.reshape(-1, 3), np.repeat(views, 4, axis=0), cameras, images)
         key = np.insert(np.argwhere(plane.occupied)[some] // 2, 0, k, axis=1)
         cells.append((key, fine, color.reshape(-1, 4, 3)))

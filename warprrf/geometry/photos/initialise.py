@@ -9,7 +9,7 @@ import numpy as np
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.photos.cells import meeting, occupancy, seen_cells
 from warprrf.geometry.photos.completion.room_planes import directions
-from warprrf.geometry.photos.config import CompletionConfig, ReconstructionConfig
+from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.initial_gaussians import initial_gaussians
 from warprrf.geometry.photos.plain import plain_surfaces, with_plain
 from warprrf.geometry.photos.planes import Plane, aligned
@@ -54,7 +54,6 @@ def initialise(
         sparse.points,
         reprojection_error=sparse.reprojection_error,
         track_length=sparse.track_length,
-        max_reprojection_error=config.max_reprojection_error,
     )
     if keep.sum() < 3:  # a handful of photos: few points are seen three times
         keep[:] = True
@@ -68,8 +67,8 @@ def initialise(
     lines = eyes, np.repeat(points, sparse.track_length, axis=0)
     planes = occupancy(planes, points, *lines, config=config.planes)
     report("planes", 1, 6)
-    if config.sweep is not None and len(cameras) > 2 and planes:
-        photos = GreyPhotos.upload(list(cameras.values()), images, config.sweep, device)
+    if config.sweep and len(cameras) > 2 and planes:
+        photos = GreyPhotos.upload(list(cameras.values()), images, device)
         planes = proven_cells(planes, points, photos)
         report("planes", 2, 6)
         if level:
@@ -77,14 +76,14 @@ def initialise(
             for k, up in enumerate((True, False)):
                 levels += level_planes(planes, points, photos, lines, cell_m=config.planes.cell_m, up=up)
                 report("planes", 3 + k, 6)
-            planes = joined(planes, levels, config.sweep)
+            planes = joined(planes, levels)
     real = np.ones(len(points), dtype=bool)
-    axes = _axes(planes, config) if config.plain is not None else None
+    axes = _axes(planes) if config.plain else None
     if axes is not None:
-        plain = plain_surfaces(list(cameras.values()), images, axes, config.plain)
+        plain = plain_surfaces(list(cameras.values()), images, axes)
         reflected = plain.reflected(*lines)
         sight = lines[0][~reflected], lines[1][~reflected]
-        planes = with_plain(planes, plain.planes, points, sight, config.planes)
+        planes = with_plain(planes, plain.planes, points, sight)
         real = np.add.reduceat(reflected, sparse.track_start[:-1]) < 0.5 * sparse.track_length
     report("planes", 5, 6)
     planes = seen_cells(meeting(planes), list(sparse.cameras.values()))
@@ -101,9 +100,9 @@ def initialise(
     return planes, gaussians
 
 
-def _axes(planes: Sequence[Plane], config: ReconstructionConfig) -> np.ndarray | None:
+def _axes(planes: Sequence[Plane]) -> np.ndarray | None:
     """The three directions that most of the planes face along, shape ``(3, 3)``; None when there are none."""
     known = [plane for plane in planes if plane.occupied.any()]
     areas = np.array([plane.area() for plane in known])
     normals = np.array([plane.normal for plane in known])
-    return directions(normals, areas, float(areas.sum()), config.completion or CompletionConfig())
+    return directions(normals, areas, float(areas.sum()))

@@ -16,7 +16,7 @@ from warprrf.geometry.splats.camera import Camera
 
 CELL_M = 0.03  # one point for each cube of this side
 MOST_PIXELS = 400_000  # of all maps that points are made of
-VIEWS = 120  # maps that points are looked for in
+VIEWS = 120  # most maps that are used, spread over all
 NEAR_M, NEAR_SHARE = (
     0.02,
     0.02,
@@ -24,21 +24,18 @@ NEAR_M, NEAR_SHARE = (
 AGREE = 0.5  # least share of the points in a map's sight that it shows, over those that it looks through
 
 
-def range_maps(
-    sparse: SparseModel, files: Mapping[str, DepthFile], *, most: int
-) -> dict[str, tuple[Camera, np.ndarray]]:
+def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str, tuple[Camera, np.ndarray]]:
     """Cameras of about the size of their depth images, and Euclidean ranges [m], 0 where unknown; by photo.
 
     Args:
         sparse: cameras, and the lenses that photos and depth were taken with.
         files: depth images, by photo.
-        most: so many of them, spread over all.
 
     Raises:
         ValueError: if a file does not read, or has another shape than its photo.
     """
     names = [name for name in sparse.cameras if name in files]
-    chosen = np.linspace(0, len(names) - 1, min(len(names), most)).round().astype(int)
+    chosen = np.linspace(0, len(names) - 1, min(len(names), VIEWS)).round().astype(int)
     found = {}
     for name in (names[k] for k in chosen):
         depth, camera, lens = read_depth(files[name]), sparse.cameras[name], sparse.lenses[name]
@@ -69,7 +66,7 @@ def with_points(sparse: SparseModel, files: Mapping[str, DepthFile]) -> SparseMo
     Raises:
         ValueError: if the maps contradict one another: their unit or the poses are wrong.
     """
-    maps = range_maps(sparse, files, most=VIEWS)
+    maps = range_maps(sparse, files)
     names = list(maps)
     points, colors = _cloud(maps, sparse.photos)
     seen = np.zeros((len(points), len(maps)), dtype=bool)

@@ -18,11 +18,35 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from warprrf.geometry.photos.cells import PARALLEL
-from warprrf.geometry.photos.config import PlainConfig, PlaneConfig
-from warprrf.geometry.photos.edges import FARTHEST_M, Edgels, Line, find_edgels, find_lines, lines_through
+from warprrf.geometry.photos.cells import BEHIND_M as SEEN_BEHIND_M
+from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL
+from warprrf.geometry.photos.edges import (
+    EDGE_DEG,
+    FARTHEST_M,
+    SEGMENT_PX,
+    Edgels,
+    Line,
+    find_edgels,
+    find_lines,
+    lines_through,
+)
 from warprrf.geometry.photos.planes import Plane, dilate
 from warprrf.geometry.splats.camera import Camera
+
+SURE_VIEWS, LINE_M = 4, 0.4  # photos and length from which on an edge counts
+FLAT, PLAIN_PX = 0.006, 7  # a pixel is plain where none in a square of this side changes by more than this
+SHOWN_SHARE = 0.15  # where so much of an edge shows in a photo, all of it parts regions
+LEAST_SHARE = (
+    0.12  # photos with fewer plain pixels than this share, in a dozen of them, show no plain surface
+)
+REGION_PX, VOTES_PX = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
+SAME_M = 0.04  # an edge this close to a plane lies on it
+RIVAL = 0.8  # of the planes with at least this share of the most votes, the nearest has the region
+BEHIND_M = 0.15  # an edge, or a surface, this far behind a plane is behind it
+STRIDE, CELL_M = 4, 0.1  # cells, of this side, look up every so many-th pixel
+AGREEING, PIECE_M2 = 2, 0.1  # fewest photos that put a cell on its plane, and least area of a piece of one
+MIRROR_SHARE = 0.5  # a pane is a mirror when so much of what is seen through it alone has its twin before it,
+MIRROR_M = 10.0  # by length times views, which must come to this [m]
 
 
 class Height(NamedTuple):
@@ -83,7 +107,6 @@ def plain_surfaces(
     cameras: Sequence[Camera],
     images: Sequence[np.ndarray],
     axes: np.ndarray,
-    config: PlainConfig | None = None,
 ) -> PlainSurfaces:
     """Planes without features that photos prove by their edges, and mirrors.
 
@@ -91,45 +114,38 @@ def plain_surfaces(
         cameras: pinhole cameras.
         images: their photos, shape ``(H, W, 3)`` each, in [0, 1].
         axes: three perpendicular directions of the room, unit rows, right-handed, shape ``(3, 3)``.
-        config: settings.
     """
-    config = config or PlainConfig()
     turn = np.eye(4)
     turn[:3, :3] = axes.T
     cameras = [replace(c, world_to_camera=c.world_to_camera @ turn) for c in cameras]
     some = images[:: -(-len(images) // 12)] if images else []
-    if (
-        np.mean([_plain(find_edgels(image, config), config).mean() for image in some] or 0)
-        < config.least_share
-    ):
+    if np.mean([_plain(find_edgels(image)).mean() for image in some] or 0) < LEAST_SHARE:
         return PlainSurfaces([], [], axes)
-    edgels = [find_edgels(image, config) for image in images]
-    plain = [_plain(e, config) for e in edgels]
-    lines = find_lines(cameras, images, edgels, config)
-    lines = [x for x in lines if len(x.views) >= config.sure_views and x.high - x.low >= config.line_m]
-    panes, lines = _mirrors(lines, cameras, config)
-    heights = _heights(lines, config)
+    edgels = [find_edgels(image) for image in images]
+    plain = [_plain(e) for e in edgels]
+    lines = find_lines(cameras, images, edgels)
+    lines = [x for x in lines if len(x.views) >= SURE_VIEWS and x.high - x.low >= LINE_M]
+    panes, lines = _mirrors(lines, cameras)
+    heights = _heights(lines)
     if not heights:
         return PlainSurfaces([], panes, axes)
-    seen = [
-        _regions_on(heights, lines, *view, panes, config) for view in zip(cameras, edgels, plain, strict=True)
-    ]
+    seen = [_regions_on(heights, lines, *view, panes) for view in zip(cameras, edgels, plain, strict=True)]
     planes = [
         plane
         for number in range(len(heights))
         for side in (1, -1)
-        for plane in _agreed(number, side, heights, cameras, seen, config)
+        for plane in _agreed(number, side, heights, cameras, seen)
     ]
     return PlainSurfaces([_in_world(plane, axes) for plane in planes], panes, axes)
 
 
-def _plain(edgels: Edgels, config: PlainConfig) -> np.ndarray:
+def _plain(edgels: Edgels) -> np.ndarray:
     """The pixels of a photo near which nothing changes, shape ``(H, W)`` bool."""
-    return np.asarray(ndimage.maximum_filter(edgels.strength, config.plain_px) < config.plain)
+    return np.asarray(ndimage.maximum_filter(edgels.strength, PLAIN_PX) < FLAT)
 
 
-def _heights(lines: Sequence[Line], config: PlainConfig) -> list[Height]:
-    """Planes that the lines lie on, one for lines closer than ``config.same_m``, the best supported first."""
+def _heights(lines: Sequence[Line]) -> list[Height]:
+    """Planes that the lines lie on, one for lines closer than ``SAME_M``, the best supported first."""
     result = []
     for axis in range(3):
         own = [line for line in lines if line.axis != axis]
@@ -137,11 +153,11 @@ def _heights(lines: Sequence[Line], config: PlainConfig) -> list[Height]:
         weight = np.array([line.weight for line in own])
         left = np.ones(len(own), dtype=bool)
         while left.any():
-            near = (np.abs(place[:, None] - place) < config.same_m) & left & left[:, None]
+            near = (np.abs(place[:, None] - place) < SAME_M) & left & left[:, None]
             k = int((near @ weight).argmax())
             group = near[k]
             middle = float(np.average(place[group], weights=weight[group]))
-            group = left & (np.abs(place - middle) < config.same_m) | group
+            group = left & (np.abs(place - middle) < SAME_M) | group
             ends = np.array(
                 [
                     line.points(np.array([line.low, line.high]))
@@ -155,14 +171,12 @@ def _heights(lines: Sequence[Line], config: PlainConfig) -> list[Height]:
     return sorted(result, key=lambda h: -h.weight)
 
 
-def _mirrors(
-    lines: list[Line], cameras: Sequence[Camera], config: PlainConfig
-) -> tuple[list[Pane], list[Line]]:
+def _mirrors(lines: list[Line], cameras: Sequence[Camera]) -> tuple[list[Pane], list[Line]]:
     """Panes that show a reflection, and the lines that are none."""
     positions = np.array([camera.position for camera in cameras])
     panes: list[Pane] = []
-    for axis, height, _, (low, high) in _heights(lines, config):
-        if np.delete(high - low, axis).min() < config.line_m:  # a pane has edges on several sides
+    for axis, height, _, (low, high) in _heights(lines):
+        if np.delete(high - low, axis).min() < LINE_M:  # a pane has edges on several sides
             continue
         for side in (1, -1):
             pane = Pane(axis, height, side, low - 0.1, high + 0.1)
@@ -170,10 +184,10 @@ def _mirrors(
             through = [_only_through(pane, x, positions) for x in parts]
             shown = [x for x, only in zip(parts, through, strict=True) if only]
             total = sum(x.weight for x in shown)
-            twins = sum(x.weight for x in shown if _has_twin(pane, x, parts, config))
+            twins = sum(x.weight for x in shown if _has_twin(pane, x, parts))
             behind = sum(x.weight for x in parts if _is_behind(pane, x))
             # A mirror bounds the room: what lies behind it is seen through it alone.
-            if total > max(config.mirror_m, 0.8 * behind) and twins > config.mirror_share * total:
+            if total > max(MIRROR_M, 0.8 * behind) and twins > MIRROR_SHARE * total:
                 panes.append(pane)
                 lines = [x for x, only in zip(parts, through, strict=True) if not only]
     return panes, lines
@@ -200,7 +214,7 @@ def _only_through(pane: Pane, line: Line, positions: np.ndarray) -> bool:
     return bool(crossing.mean() > 0.8)
 
 
-def _has_twin(pane: Pane, line: Line, lines: Sequence[Line], config: PlainConfig) -> bool:
+def _has_twin(pane: Pane, line: Line, lines: Sequence[Line]) -> bool:
     """Whether the mirror image of a line is a line too, for half of its length at least."""
     low, high, at = line.low, line.high, line.at.copy()
     if line.axis == pane.axis:
@@ -208,7 +222,7 @@ def _has_twin(pane: Pane, line: Line, lines: Sequence[Line], config: PlainConfig
     else:
         k = (pane.axis - line.axis) % 3 - 1
         at[k] = 2 * pane.height - at[k]
-    alike = [x for x in lines if x.axis == line.axis and np.abs(x.at - at).max() < 2 * config.same_m]
+    alike = [x for x in lines if x.axis == line.axis and np.abs(x.at - at).max() < 2 * SAME_M]
     overlap = sum(max(0.0, min(high, x.high) - max(low, x.low)) for x in alike)
     return overlap > 0.5 * (high - low)
 
@@ -227,24 +241,23 @@ def _regions_on(
     edgels: Edgels,
     plain: np.ndarray,
     panes: Sequence[Pane],
-    config: PlainConfig,
 ) -> _View:
     """The plain regions of a photo, each on the plane that its border votes for."""
-    of_line, barrier = _shown(lines, camera, edgels, config)
+    of_line, barrier = _shown(lines, camera, edgels)
     region, count = ndimage.label(plain & ~ndimage.binary_dilation(barrier, np.ones((3, 3))))
     size = np.bincount(region.ravel(), minlength=count + 1)
     size[0] = 0
-    region = np.where(size[region] >= config.region_px, region, 0)
-    votes, weight = _votes(heights, lines, camera, edgels, of_line, region, config)
-    some = slice(config.stride // 2, None, config.stride)
+    region = np.where(size[region] >= REGION_PX, region, 0)
+    votes, weight = _votes(heights, lines, camera, edgels, of_line, region)
+    some = slice(STRIDE // 2, None, STRIDE)
     region, rays = region[some, some], camera.directions()[some, some]
     plane, ranges = np.full(region.shape, -1), np.zeros(region.shape)
-    for k in np.flatnonzero(votes.max(axis=1) >= config.votes_px):
+    for k in np.flatnonzero(votes.max(axis=1) >= VOTES_PX):
         own = region == k
         if not own.any():
             continue
         rivals = []
-        for number in np.flatnonzero(votes[k] >= config.rival * votes[k].max()).tolist():
+        for number in np.flatnonzero(votes[k] >= RIVAL * votes[k].max()).tolist():
             axis, height, *_ = heights[number]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = (height - camera.position[axis]) / rays[own][:, axis]
@@ -257,14 +270,12 @@ def _regions_on(
                 rivals.append((float(np.median(t[good])), weight[k, number], number, np.where(good, t, 0.0)))
         if rivals:
             nearest = min(rivals, key=lambda r: r[0])[0]
-            best = max((r for r in rivals if r[0] < nearest + config.behind_m), key=lambda r: r[1])
+            best = max((r for r in rivals if r[0] < nearest + BEHIND_M), key=lambda r: r[1])
             plane[own], ranges[own] = np.where(best[3] > 0, best[2], -1), best[3]
     return _View(plane, ranges)
 
 
-def _shown(
-    lines: Sequence[Line], camera: Camera, edgels: Edgels, config: PlainConfig
-) -> tuple[np.ndarray, np.ndarray]:
+def _shown(lines: Sequence[Line], camera: Camera, edgels: Edgels) -> tuple[np.ndarray, np.ndarray]:
     """The line that each edgel lies on (-1: none), and the pixels that part regions: lines, where enough of them shows
     in whole, else their shown parts with gaps bridged."""
     height, width = edgels.strength.shape
@@ -280,18 +291,16 @@ def _shown(
         x, y = pixels[inside].astype(int).T
         first = np.flatnonzero(np.concatenate([x[:1] == x[:1], (np.diff(x) != 0) | (np.diff(y) != 0)]))
         x, y = x[first], y[first]
-        if len(x) < config.segment_px / 2:
+        if len(x) < SEGMENT_PX / 2:
             continue
         near = place[row[y, x], column[y, x]]
         direction = lines_through(camera, np.stack([x, y], axis=1) + 0.5, line.axis)[1]
-        straight = np.abs((edgels.across[near] * direction).sum(axis=1)) < np.sin(
-            np.radians(2 * config.edge_deg)
-        )
+        straight = np.abs((edgels.across[near] * direction).sum(axis=1)) < np.sin(np.radians(2 * EDGE_DEG))
         on = (off[y, x] < 3.5) & straight
-        if on.sum() < config.segment_px / 2:
+        if on.sum() < SEGMENT_PX / 2:
             continue
         of_line[near[on]] = number
-        if on.mean() < config.shown_share:
+        if on.mean() < SHOWN_SHARE:
             on = ndimage.binary_closing(np.pad(on, 40), np.ones(40))[40:-40]
             x, y = x[on], y[on]
         barrier[y, x] = True
@@ -305,7 +314,6 @@ def _votes(
     edgels: Edgels,
     of_line: np.ndarray,
     region: np.ndarray,
-    config: PlainConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """For each region and plane: edgels of the border on the plane less those behind it, shape ``(regions, planes)``,
     and the same by the weight of the lines."""
@@ -331,7 +339,7 @@ def _votes(
     line_at /= np.maximum(np.linalg.norm(np.where(across, rays, 0.0), axis=1), 1e-9)
     for number, (a, height, worth, _) in enumerate(heights):
         with np.errstate(divide="ignore", invalid="ignore"):
-            lies_on = np.abs(place[:, a] - height) < config.same_m
+            lies_on = np.abs(place[:, a] - height) < SAME_M
             plane_at = (height - camera.position[a]) / rays[:, a]
             behind = ~lies_on & (plane_at > 0) & (line_at > 1.03 * plane_at + 0.1)
         score = lies_on.astype(float) - behind
@@ -346,32 +354,31 @@ def _agreed(
     heights: Sequence[Height],
     cameras: Sequence[Camera],
     seen: Sequence[_View],
-    config: PlainConfig,
 ) -> list[Plane]:
     """The plane with the cells that more photos put on it than see through it; none where those are few."""
     axis, height, _, bounds = heights[number]
-    some = config.stride // 2
+    some = STRIDE // 2
     hits = []
     for camera, view in zip(cameras, seen, strict=True):
         own = view.plane == number
         if side * (camera.position[axis] - height) > 0.1 and own.any():
             y, x = np.nonzero(own)
-            rays = lines_through(camera, np.stack([x, y], axis=1) * config.stride + some + 0.5, axis)[0]
+            rays = lines_through(camera, np.stack([x, y], axis=1) * STRIDE + some + 0.5, axis)[0]
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             hits.append(camera.position + view.range_m[own][:, None] * rays)
     if not hits:
         return []
     empty = Plane(
-        side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=config.cell_m, plain=True
+        side * np.eye(3)[axis], side * height, np.zeros(0, dtype=np.int64), cell_m=CELL_M, plain=True
     )
     uv = empty.to_plane(np.concatenate(hits))
     edges = empty.to_plane(bounds)  # a surface ends where its edges do
-    low = np.maximum(uv.min(axis=0), edges.min(axis=0) - config.cell_m)
-    high = np.minimum(uv.max(axis=0), edges.max(axis=0) + config.cell_m)
+    low = np.maximum(uv.min(axis=0), edges.min(axis=0) - CELL_M)
+    high = np.minimum(uv.max(axis=0), edges.max(axis=0) + CELL_M)
     if (low >= high).any():
         return []
-    low = np.floor(low / config.cell_m - 1) * config.cell_m
-    shape = np.ceil((high - low) / config.cell_m).astype(int) + 1
+    low = np.floor(low / CELL_M - 1) * CELL_M
+    shape = np.ceil((high - low) / CELL_M).astype(int) + 1
     plane = replace(empty, corner=low, occupied=np.ones(shape, dtype=bool))
     cells = plane.cells()
     yes, no = (np.zeros(len(cells), dtype=int) for _ in range(2))
@@ -382,16 +389,16 @@ def _agreed(
         with np.errstate(invalid="ignore"):
             inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
         own = np.flatnonzero(inside & (depth > 0.1))
-        x, y = (pixels[own] / config.stride).astype(int).T
+        x, y = (pixels[own] / STRIDE).astype(int).T
         y, x = np.minimum(y, view.plane.shape[0] - 1), np.minimum(x, view.plane.shape[1] - 1)
         here = view.plane[y, x] == number
         away = np.linalg.norm(cells[own] - camera.position, axis=1)
         yes[own] += here
-        no[own] += ~here & (view.range_m[y, x] > away + config.behind_m)
-    occupied = ((yes >= config.agreeing) & (yes > no)).reshape(shape)
+        no[own] += ~here & (view.range_m[y, x] > away + BEHIND_M)
+    occupied = ((yes >= AGREEING) & (yes > no)).reshape(shape)
     label, _ = ndimage.label(occupied)
     size = np.bincount(label.ravel())
-    occupied &= size[label] * config.cell_m**2 >= config.piece_m2
+    occupied &= size[label] * CELL_M**2 >= PIECE_M2
     return [replace(plane, occupied=occupied)] if occupied.any() else []
 
 
@@ -414,29 +421,28 @@ def with_plain(
     plain: Sequence[Plane],
     points: np.ndarray,
     sight: tuple[np.ndarray, np.ndarray],
-    config: PlaneConfig,
 ) -> list[Plane]:
     """``planes`` and ``plain`` ones, each cell with one of them: of planes that face alike and lie closer than
-    ``config.contested_m``, the one with points of its own there has it, else the plain one.
+    ``CONTESTED_M``, the one with points of its own there has it, else the plain one.
 
     Args:
         points: that the inliers of ``planes`` index, shape ``(P, 3)``.
         sight: lines of sight, from eyes to points, shape ``(L, 3)`` each: plain cells that some cross are none.
     """
-    plain = [replace(p, occupied=p.occupied & (p.seen_through(*sight, config.behind_m) < 2)) for p in plain]
+    plain = [replace(p, occupied=p.occupied & (p.seen_through(*sight, SEEN_BEHIND_M) < 2)) for p in plain]
     theirs = []
     for plane in planes:
         own = dilate(plane.count(points[plane.inliers]) > 0, 1)
-        theirs.append(replace(plane, occupied=plane.occupied & (own | ~_covered(plane, plain, config))))
-    mine = [replace(p, occupied=p.occupied & ~_covered(p, theirs, config)) for p in plain]
+        theirs.append(replace(plane, occupied=plane.occupied & (own | ~_covered(plane, plain))))
+    mine = [replace(p, occupied=p.occupied & ~_covered(p, theirs)) for p in plain]
     return theirs + [plane for plane in mine if plane.occupied.any()]
 
 
-def _covered(plane: Plane, others: Sequence[Plane], config: PlaneConfig) -> np.ndarray:
+def _covered(plane: Plane, others: Sequence[Plane]) -> np.ndarray:
     """Which cells of the grid lie close to a cell of ``others`` that faces alike, shape of ``occupied``."""
     cells = plane.cells(np.ones_like(plane.occupied))
     covered = np.zeros(len(cells), dtype=bool)
     for other in others:
         if other.normal @ plane.normal > PARALLEL:
-            covered |= (np.abs(other.distance(cells)) < config.contested_m) & other.covers(cells)
+            covered |= (np.abs(other.distance(cells)) < CONTESTED_M) & other.covers(cells)
     return covered.reshape(plane.occupied.shape)

@@ -19,6 +19,15 @@ from warprrf.cache import cached_property
 from warprrf.checks import check_array
 from warprrf.geometry.photos.config import PlaneConfig
 
+HYPOTHESES, SCORED_POINTS = (
+    192,
+    6000,
+)  # points tried as centres of planes in a round, and that each is scored on
+REFINED = 12  # hypotheses of a round that are refined before the best is chosen
+ECHO_M, ECHO_CELL_M = (
+    0.1,
+    0.3,
+)  # a plane this close behind a better one is its noise where both share cells of this size
 REFITS = 8  # of a hypothesis, from its neighbourhood outwards
 AROUND = np.ones((3, 3), dtype=bool)  # a cell and its eight neighbours
 
@@ -196,14 +205,14 @@ def _best_plane(
     points: np.ndarray, normals: np.ndarray, weight: np.ndarray, config: PlaneConfig, salt: int
 ) -> Plane | None:
     """The plane of most weight among hypotheses through single points, the best of them refined."""
-    seeds = drawn_by_place(points, weight, config.hypotheses, salt)
-    drawn = drawn_by_place(points, np.ones(len(points)), config.scored_points, salt)
+    seeds = drawn_by_place(points, weight, HYPOTHESES, salt)
+    drawn = drawn_by_place(points, np.ones(len(points)), SCORED_POINTS, salt)
     n, d = normals[seeds], (points[seeds] * normals[seeds]).sum(axis=1)
     near = np.abs(points[drawn] @ n.T - d) < 3 * config.distance_m
     score = weight[drawn] @ (near & (normals[drawn] @ n.T > config.cosine))
     best: Plane | None = None
     best_weight = 0.0
-    for k in np.argsort(-score, kind="stable")[: config.refined]:
+    for k in np.argsort(-score, kind="stable")[:REFINED]:
         normal, offset = n[k], float(d[k])
         # From the neighbourhood of the hypothesis outwards: its normal is good to a few degrees only.
         reach = np.linalg.norm(points - points[seeds[k]], axis=1)
@@ -272,10 +281,10 @@ def _echo(points: np.ndarray, plane: Plane, strong: Plane, config: PlaneConfig) 
     own = points[plane.inliers]
     if strong.normal @ plane.normal < np.cos(np.radians(10.0)):
         return False
-    if np.median(np.abs(strong.distance(own))) > config.echo_m:
+    if np.median(np.abs(strong.distance(own))) > ECHO_M:
         return False
     here, there = (
-        np.floor(p @ plane_axes(strong.normal).T / config.echo_cell_m).astype(np.int64)
+        np.floor(p @ plane_axes(strong.normal).T / ECHO_CELL_M).astype(np.int64)
         for p in (own, points[strong.inliers])
     )
     cells = {tuple(c) for c in here}

@@ -12,6 +12,8 @@ from warprrf.checks import check_array
 from warprrf.geometry.photos.config import PlaneConfig
 from warprrf.geometry.photos.planes import Plane, detect_planes
 
+MAX_REPROJECTION_ERROR = 1.0  # of a sparse point that is kept [pixels]
+SMALL_POINTS = 16  # fewest points of a small plane, looked for among those that the large ones leave
 NEIGHBOURS = 16  # that a point is compared with
 MIN_TRACK_LENGTH = 3  # photos that see a point which is kept
 DEVIATIONS = 2.5  # by which an outlier is farther from its neighbours than others
@@ -28,7 +30,6 @@ def clean_points(
     *,
     reprojection_error: ArrayLike | None = None,
     track_length: ArrayLike | None = None,
-    max_reprojection_error: float = 1.0,
 ) -> np.ndarray:
     """Which points to keep, shape ``(P,)`` bool: seen often enough, reprojected well, not far from all others.
 
@@ -44,7 +45,7 @@ def clean_points(
     keep = np.ones(len(points), dtype=bool)
     if reprojection_error is not None:
         error = check_array("reprojection_error", reprojection_error, (len(points),))
-        keep &= error <= max_reprojection_error
+        keep &= error <= MAX_REPROJECTION_ERROR
     if track_length is not None:
         keep &= check_array("track_length", track_length, (len(points),)) >= MIN_TRACK_LENGTH
     chosen = np.flatnonzero(keep)
@@ -102,16 +103,14 @@ def detect_room_planes(
         near = cKDTree(points[plane.inliers]).query(points)[0] < 0.3
         free &= ~(on & near & (plane.distance(viewpoints) > 0))
     rest = np.flatnonzero(free)
-    if len(rest) < config.small_points:
+    if len(rest) < SMALL_POINTS:
         return large
     again = estimate_normals(points[rest], viewpoints[rest], neighbour_count=10)
-    small = detect_planes(
-        points[rest], again, config=replace(config, min_points=config.small_points), seed=seed
-    )
+    small = detect_planes(points[rest], again, config=replace(config, min_points=SMALL_POINTS), seed=seed)
     compact = []
     for plane in small:
         own = points[rest[plane.inliers]]
         close = np.linalg.norm(own - np.median(own, axis=0), axis=1) < 1.5
-        if close.sum() >= config.small_points and close.mean() > 0.6:
+        if close.sum() >= SMALL_POINTS and close.mean() > 0.6:
             compact.append(replace(plane, inliers=rest[plane.inliers[close]]))
     return large + compact

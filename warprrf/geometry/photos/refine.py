@@ -21,6 +21,7 @@ from warprrf.device import DeviceLike, Progress, launch, resolve
 from warprrf.geometry.photos.config import RefineConfig
 from warprrf.geometry.photos.densify import (
     PARAMETERS,
+    PRUNE_OPACITY,
     STATISTICS,
     Arrays,
     densified,
@@ -39,6 +40,18 @@ from warprrf.steps import digest
 ENOUGH_TO_FILL = 100
 """Iterations from which on holes are filled: new Gaussians stand at a guessed depth until photos have moved them."""
 CHECKPOINT = "warprrf refinement 2"
+
+DENSIFY_UNTIL = 0.65  # of the iterations Gaussians are split and cloned
+FINE_FROM = 0.8  # until this share of the iterations photos with many pixels are made still smaller
+FULL_PIXELS = (
+    400_000  # fewer iterations take photos as they are if these have more, so that they take as long
+)
+SSIM_SHARE = 0.2  # weight of 1 - SSIM; L1 has the rest
+FINAL_MEAN_RATE = 4e-5  # metres a step at the end; exponential from that at the start
+SCALE_RATE, QUATERNION_RATE, OPACITY_RATE, COLOR_RATE = 5e-3, 2e-3, 3e-2, 5e-3
+"""Of the logarithms of scales, quaternions, logits of opacities and constant colours."""
+PLANE_DISTANCE_M, PLANE_ANGLE_RAD = 0.04, 0.6  # a Gaussian this close to a plane belongs to it
+PLANE_STRENGTH = 0.1  # share of the deviation from its plane removed after every step
 
 PARTS = 1000  # of the work: what progress counts, as iterations become slower when photos are compared larger
 OVERHEAD = 30_000  # pixels that would take as long as what every iteration does besides
@@ -92,7 +105,7 @@ class _Refinement:
         self, photos: PosedPhotos, config: RefineConfig, planes: Sequence[Plane], device: wp.Device
     ) -> None:
         self.config, self.planes, self.device = config, list(planes), device
-        self.loss = PhotoLoss(device, config.ssim_share)
+        self.loss = PhotoLoss(device, SSIM_SHARE)
         self.targets = Targets(photos, self.loss)
         self.exposures = Exposures(len(self.targets), config.fit_exposure)
         self.iteration = 0
@@ -108,14 +121,13 @@ class _Refinement:
 
     def on_planes(self, arrays: Arrays) -> Arrays:
         """``arrays`` with ``plane_of``, the nearest plane that each Gaussian lies on, -1 for none."""
-        c = self.config
-        best = np.full(len(arrays["means"]), c.plane_distance_m)
+        best = np.full(len(arrays["means"]), PLANE_DISTANCE_M)
         owner = np.full(len(best), -1, np.int32)
         means = arrays["means"].astype(np.float64)
         axis = rotations_of(arrays["quaternions"])[:, :, 2]
         for k, plane in enumerate(self.planes):
             distance = np.abs(plane.distance(means))
-            nearer = (distance < best) & (np.abs(axis @ plane.normal) > np.cos(c.plane_angle_rad))
+            nearer = (distance < best) & (np.abs(axis @ plane.normal) > np.cos(PLANE_ANGLE_RAD))
             nearer[nearer] = plane.covers(means[nearer])
             best[nearer], owner[nearer] = distance[nearer], k
         return {**arrays, "plane_of": owner}
@@ -162,7 +174,7 @@ class _Refinement:
         self.move()
         if self.iteration % 100 == 0 and not np.isfinite(score.numpy()).all():
             raise RuntimeError(f"refine: the loss became NaN at iteration {self.iteration}")
-        until = c.densify_until * c.iterations
+        until = DENSIFY_UNTIL * c.iterations
         if c.densify_from <= self.iteration <= until and self.iteration % c.densify_every == 0:
             rng = np.random.default_rng([c.seed, 2, self.iteration])
             left = 1 + int((until - self.iteration) // c.densify_every)
@@ -171,10 +183,10 @@ class _Refinement:
     def scale(self, iteration: int) -> int:
         """Side in pixels of the squares that photos are averaged over."""
         c, scale = self.config, self.config.downscale
-        in_full = (1 - c.full_from) * min(1.0, c.full_pixels / self.targets.pixels)
+        in_full = (1 - c.full_from) * min(1.0, FULL_PIXELS / self.targets.pixels)
         if iteration >= c.iterations - round(in_full * c.iterations):
             return 1
-        if iteration < c.fine_from * c.iterations:
+        if iteration < FINE_FROM * c.iterations:
             while self.targets.pixels > c.coarse_pixels * scale**2:
                 scale *= 2
         return scale
@@ -216,11 +228,11 @@ class _Refinement:
     def move(self) -> None:
         """One step of Adam on everything, then the pull towards planes."""
         c, t = self.config, self.iteration
-        mean_rate = c.mean_rate * (c.final_mean_rate / c.mean_rate) ** (t / c.iterations)
-        higher = [c.color_rate / 20] * (self.widths["sh"] - 3)  # the slower rate of the published method
+        mean_rate = c.mean_rate * (FINAL_MEAN_RATE / c.mean_rate) ** (t / c.iterations)
+        higher = [COLOR_RATE / 20] * (self.widths["sh"] - 3)  # the slower rate of the published method
         rates = {
-            "means": [mean_rate] * 3, "quaternions": [c.quaternion_rate] * 4, "log_scales": [c.scale_rate] * 3,
-            "logits": [c.opacity_rate], "sh": [c.color_rate] * 3 + higher,
+            "means": [mean_rate] * 3, "quaternions": [QUATERNION_RATE] * 4, "log_scales": [SCALE_RATE] * 3,
+            "logits": [OPACITY_RATE], "sh": [COLOR_RATE] * 3 + higher,
         }  # fmt: skip
         corrections = [1 / (1 - FIRST_DECAY**t), 1 / (1 - SECOND_DECAY**t)]
         for name, width in self.widths.items():
@@ -228,7 +240,7 @@ class _Refinement:
             moments = [self.state[f"first.{name}"], self.state[f"second.{name}"]]
             inputs = [width, rate, *corrections, self.gradients[name], *moments, self.state[name]]
             launch(optimize.adam, self.count, inputs, device=self.device)
-        strength = c.plane_strength if t < c.iterations else 1.0  # in the end exactly flat
+        strength = PLANE_STRENGTH if t < c.iterations else 1.0  # in the end exactly flat
         plane = [self.state["plane_of"], self.plane_table, strength, c.thickness_m]
         shape = [self.means, self.quaternions, self.log_scales]
         launch(optimize.pull_to_planes, self.count, [*plane, *shape], device=self.device)
@@ -237,7 +249,7 @@ class _Refinement:
         """The Gaussians, without those too faint to matter."""
         arrays = self.arrays()
         opacity, scales = opacity_and_scales(arrays)
-        keep = (opacity >= self.config.prune_opacity) & (scales.max(axis=1) <= self.config.max_scale_m)
+        keep = (opacity >= PRUNE_OPACITY) & (scales.max(axis=1) <= self.config.max_scale_m)
         sh = arrays["sh"].reshape(self.count, -1, 3)
         return Gaussians(arrays["means"], arrays["quaternions"], scales, opacity, sh)[keep]
 

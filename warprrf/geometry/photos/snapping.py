@@ -18,6 +18,11 @@ from warprrf.geometry.photos.config import PlaneConfig, SurfaceConfig
 from warprrf.geometry.photos.planes import Plane, detect_planes, drawn_by_place
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 
+PATCH_ANGLE_DEG = (
+    35.0  # the smoothed normal of a face of a patch differs from the plane's by no more than this
+)
+MIN_PATCH_M2 = 0.15  # smallest planar patch
+SIMPLIFY_M = 0.25  # flat parts are made of faces of about this size in the end
 LONGEST_MOVE_M = 0.15  # of a vertex to its plane
 ALIKE = 0.95  # cosine between the normals of planes that are nearly parallel
 FLAT_M = 1e-6  # faces of a snapped patch lie this near to its plane
@@ -41,8 +46,8 @@ def find_patches(
     if not planes:
         among_faces = PlaneConfig(
             distance_m=0.4 * config.patch_distance_m,
-            angle_deg=config.patch_angle_deg,
-            min_points=2 * config.min_patch_m2,
+            angle_deg=PATCH_ANGLE_DEG,
+            min_points=2 * MIN_PATCH_M2,
             max_planes=40,
         )
         drawn = (
@@ -54,10 +59,10 @@ def find_patches(
     best = np.full(len(centres), config.patch_distance_m)
     for k, plane in enumerate(planes):
         gap = np.abs(plane.distance(centres))
-        better = (gap < best) & (normals @ plane.normal > np.cos(np.radians(config.patch_angle_deg)))
+        better = (gap < best) & (normals @ plane.normal > np.cos(np.radians(PATCH_ANGLE_DEG)))
         label[better], best[better] = k, gap[better]
     piece = connected_pieces(mesh, label)
-    label[np.bincount(piece, weights=areas)[piece] < 0.2 * config.min_patch_m2] = -1
+    label[np.bincount(piece, weights=areas)[piece] < 0.2 * MIN_PATCH_M2] = -1
     return PlanarPatches.from_planes(
         mesh, label, [p.normal for p in planes], [p.offset for p in planes], tolerance_m=FLAT_M
     )
@@ -77,8 +82,8 @@ def scanned_patches(mesh: Mesh, config: SurfaceConfig | None = None) -> PlanarPa
         config: least size of a patch, and its distances.
     """
     config = config or SurfaceConfig()
-    patches = simplified(flattened(find_patches(_smoothed(mesh), config=config)), cell_m=config.simplify_m)
-    return replace(largest_first(patches, config.min_patch_m2), two_sided=True)
+    patches = simplified(flattened(find_patches(_smoothed(mesh), config=config)))
+    return replace(largest_first(patches, MIN_PATCH_M2), two_sided=True)
 
 
 def _smoothed(mesh: Mesh) -> Mesh:
@@ -126,7 +131,7 @@ def flattened(patches: PlanarPatches) -> PlanarPatches:
     return replace(patches, mesh=Mesh(vertices, mesh.faces))
 
 
-def simplified(patches: PlanarPatches, *, cell_m: float = 0.25) -> PlanarPatches:
+def simplified(patches: PlanarPatches, *, cell_m: float = SIMPLIFY_M) -> PlanarPatches:
     """``patches`` of their mesh with their insides, and the straight edges between two of them, made coarse.
 
     Vertices inside a flattened patch are gathered by cells of ``cell_m`` into one of their number, those on an edge of

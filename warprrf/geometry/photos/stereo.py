@@ -16,13 +16,23 @@ import warp as wp
 from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, launch, require, resolve
-from warprrf.geometry.photos.config import StereoConfig
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, match
 
 LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601
 GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, more changes what a window shows
+
+DOWNSCALE = 2  # photos are compared at the depth maps' size divided by this
+SOURCES = 3  # photos that one is compared with
+TURNS = 2  # how often planes are handed on between pixels
+SETTLED, PROVED = (
+    0.2,
+    0.6,
+)  # a depth of less cost (1 - correlation) stays as it is; one of more proves nothing
+GAIN = 0.05  # by which a new depth has to cost less than the old one
+CHECKED, AGREED = 8, 2  # maps of other photos that a depth is checked against, and how many must agree on it
+TOLERANCE = 0.02  # up to this part of the range two depths agree
 
 
 @dataclass(frozen=True)
@@ -61,7 +71,6 @@ def mended(
     views: Sequence[Camera],
     photos: PosedPhotos,
     *,
-    config: StereoConfig,
     progress: Progress,
     device: DeviceLike = None,
 ) -> list[np.ndarray]:
@@ -72,32 +81,30 @@ def mended(
         views: cameras of the photos, of any size.
         photos: one a view, in this order.
     """
-    cameras = [
-        v.resized(max(2, v.width // config.downscale), max(2, v.height // config.downscale)) for v in views
-    ]
+    cameras = [v.resized(max(2, v.width // DOWNSCALE), max(2, v.height // DOWNSCALE)) for v in views]
     coarse = [_sampled(depth, camera) for depth, camera in zip(depths, cameras, strict=True)]
     known = [depth[depth > 0] for depth in coarse]
     if sum(map(len, known)) == 0:
         return list(depths)
     near, far = np.percentile(np.concatenate(known), [0.5, 99.5])
     bounds = 1 / (1.6 * float(far)), 1 / (0.6 * float(near))
-    comparison = _Comparison.of(cameras, photos, bounds, config, device)
+    comparison = _Comparison.of(cameras, photos, bounds, device)
     maps = []
     for k, depth in enumerate(coarse):
         progress("stereo", k, len(coarse))
-        others = _companions(k, cameras, coarse, comparison.sharpness, config.sources)
+        others = _companions(k, cameras, coarse, comparison.sharpness, SOURCES)
         maps.append(comparison.map_of(k, depth, others))
     progress("stereo", len(coarse), len(coarse))
     ranges = [found.ranges() for found in maps]
     result = []
     for k, (view, depth) in enumerate(zip(views, depths, strict=True)):
-        others = _companions(k, cameras, coarse, np.ones(len(cameras)), config.checked)
+        others = _companions(k, cameras, coarse, np.ones(len(cameras)), CHECKED)
         pairs = [(cameras[s], ranges[s]) for s in others]
-        agreed, _ = _votes(ranges[k], cameras[k], pairs, config.tolerance)
+        agreed, _ = _votes(ranges[k], cameras[k], pairs, TOLERANCE)
         place, fine = maps[k].at(view)
-        right = (maps[k].better & (agreed >= config.agreed))[place]
-        _, crossed = _votes(coarse[k], cameras[k], pairs, 2 * config.tolerance)
-        wrong = (crossed >= config.agreed)[place]
+        right = (maps[k].better & (agreed >= AGREED))[place]
+        _, crossed = _votes(coarse[k], cameras[k], pairs, 2 * TOLERANCE)
+        wrong = (crossed >= AGREED)[place]
         result.append(np.where(right, fine, np.where(wrong, 0.0, depth)))
     return result
 
@@ -133,7 +140,6 @@ class _Comparison:
     kept: Sequence[np.ndarray]
     sharpness: np.ndarray
     bounds: tuple[float, float]
-    config: StereoConfig
     device: wp.Device
 
     @classmethod
@@ -142,7 +148,6 @@ class _Comparison:
         cameras: Sequence[Camera],
         photos: PosedPhotos,
         bounds: tuple[float, float],
-        config: StereoConfig,
         device: DeviceLike,
     ) -> _Comparison:
         """The photos at the sizes of ``cameras``."""
@@ -163,11 +168,11 @@ class _Comparison:
         blur = np.array([ndimage.laplace(g).var() for g in grey])  # small where a photo is blurred
         flat = wp.array(np.concatenate([g.ravel() for g in grey]), dtype=wp.float32, device=where)
         sharpness = np.clip(blur / max(float(np.median(blur)), 1e-12), 0.3, 1.5)
-        return cls(cameras, sizes, flat, kept, sharpness, bounds, config, where)
+        return cls(cameras, sizes, flat, kept, sharpness, bounds, where)
 
     def map_of(self, view: int, depth: np.ndarray, others: np.ndarray) -> _Map:
         """The map of one photo, from ``depth`` and comparison with ``others``."""
-        camera, config, device = self.cameras[view], self.config, self.device
+        camera, device = self.cameras[view], self.device
         first = self._start(depth, camera, view)
         nothing = np.zeros(depth.shape, dtype=bool)
         if len(others) < 2:
@@ -188,10 +193,10 @@ class _Comparison:
             wp.array(self.sizes[others], dtype=wp.vec3i, device=device), self.grey, planes, costs,
         ]  # fmt: skip
         before = np.zeros(0)
-        for number in range(-1, config.turns):
+        for number in range(-1, TURNS):
             for colour in (0, 1):
                 settings = [
-                    colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), config.settled,
+                    colour, number, view, 1 / camera.fx, wp.vec2(*self.bounds), SETTLED,
                     wp.vec3i(*map(int, self.sizes[view])),
                 ]  # fmt: skip
                 count = camera.height * ((camera.width + 1) // 2)
@@ -199,8 +204,8 @@ class _Comparison:
             if number < 0:
                 before = costs.numpy().reshape(depth.shape).copy()
         cost = costs.numpy().reshape(depth.shape)
-        proved = (cost < config.proved) & self.kept[view]
-        better = proved & ((cost < before - config.gain) | (depth <= 0))
+        proved = (cost < PROVED) & self.kept[view]
+        better = proved & ((cost < before - GAIN) | (depth <= 0))
         return _Map(camera, planes.numpy().reshape(first.shape).astype(np.float64), proved, better)
 
     def _start(self, depth: np.ndarray, camera: Camera, view: int) -> np.ndarray:

@@ -16,12 +16,21 @@ from scipy import ndimage
 
 from warprrf.device import DeviceLike, launch, resolve
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import PARALLEL, plane_mesh, visible_from
-from warprrf.geometry.photos.config import SweepConfig
+from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, plane_mesh, visible_from
 from warprrf.geometry.photos.planes import AROUND, Plane, dilate, plane_axes
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.photo_consistency import SIDE, patch_agreement
 
+VIEWS = 5  # photos compared
+MIN_ANGLE_DEG = 6.0  # between any two of them, seen from the patch: without parallax every height fits
+PATCH_M = 0.12  # side of a patch
+AGREES, DISAGREES = 0.6, 0.25  # mean correlation of a true patch, and of one that is certainly not
+CONTRAST = 0.012  # patches flatter than this part of white prove nothing
+STEP_M = 0.03  # between heights of the sweep; a patch shows a shift of that much
+REACH_M, LARGE_M2 = 2.5, 3.0  # a plane of this area is extended at most so far
+MIN_CELLS = 15  # of a plane found by the sweep
+SAME_PLANE_M = 0.008  # a piece this close to a known plane belongs to it
+UP_M2, DOWN_M2 = 0.3, 2.0  # least area of a new plane that faces up, or down
 FINE_M = 0.005  # a plane's height is settled in steps of this length
 
 
@@ -33,14 +42,12 @@ class GreyPhotos:
         cameras: pinhole cameras of one size.
         grey: all photos, flat float32.
         projections: rows of the 3x4 projection matrices, shape ``(cameras, 3)`` of vec4.
-        config: settings of the comparison.
         device: Warp device.
     """
 
     cameras: Sequence[Camera]
     grey: wp.array
     projections: wp.array
-    config: SweepConfig
     device: wp.Device
 
     @classmethod
@@ -48,7 +55,6 @@ class GreyPhotos:
         cls,
         cameras: Sequence[Camera],
         images: Sequence[np.ndarray],
-        config: SweepConfig | None = None,
         device: DeviceLike = None,
     ) -> GreyPhotos:
         """Photos ``(H, W, 3)`` in [0, 1] of ``cameras``."""
@@ -63,7 +69,6 @@ class GreyPhotos:
             cameras,
             wp.array(grey.ravel(), dtype=wp.float32, device=where),
             wp.array(rows, dtype=wp.vec4, device=where),
-            config or SweepConfig(),
             where,
         )
 
@@ -78,7 +83,7 @@ class GreyPhotos:
             n,
             [
                 wp.array(centres, dtype=wp.vec3, device=device), wp.vec3(*axes[0]), wp.vec3(*axes[1]),
-                self.config.patch_m / (SIDE - 1), wp.array(views, dtype=wp.int32, device=device), self.projections,
+                PATCH_M / (SIDE - 1), wp.array(views, dtype=wp.int32, device=device), self.projections,
                 self.grey, self.cameras[0].width, self.cameras[0].height, result, contrast,
             ],
             device=device,
@@ -87,25 +92,25 @@ class GreyPhotos:
 
 
 def choose_views(
-    points: np.ndarray, normal: np.ndarray, seen: np.ndarray, cameras: Sequence[Camera], config: SweepConfig
+    points: np.ndarray, normal: np.ndarray, seen: np.ndarray, cameras: Sequence[Camera]
 ) -> np.ndarray:
     """For each point on a plane of this ``normal`` the photos that show it largest among those that see it, no two from
     nearly the same direction.
 
     Returns:
-        Camera indices, shape ``(N, config.views)`` int32, -1 padded.
+        Camera indices, shape ``(N, VIEWS)`` int32, -1 padded.
     """
     line = np.array([c.position for c in cameras])[None] - points[:, None]
     distance = np.linalg.norm(line, axis=2)
     line /= np.maximum(distance, 1e-9)[..., None]
     worth = np.where(seen, line @ normal / distance**2, -1.0)  # pixels on a square metre
-    chosen = np.full((len(points), config.views), -1, dtype=np.int32)
+    chosen = np.full((len(points), VIEWS), -1, dtype=np.int32)
     rows = np.arange(len(points))
-    for k in range(config.views):
+    for k in range(VIEWS):
         best = worth.argmax(axis=1)
         good = worth[rows, best] > 0
         chosen[good, k] = best[good]
-        close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(np.radians(config.min_angle_deg))
+        close = np.einsum("nci,ni->nc", line, line[rows, best]) > np.cos(np.radians(MIN_ANGLE_DEG))
         worth = np.where(close, -1.0, worth)
     return chosen
 
@@ -132,8 +137,8 @@ def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos
     result = []
     for k, this in enumerate(scored):
         with np.errstate(invalid="ignore"):
-            yes, no = this.score > photos.config.agrees, this.score < photos.config.disagrees
-        lost, taken = _rivals(this, scored[:k] + scored[k + 1 :], photos.config.contested_m)
+            yes, no = this.score > AGREES, this.score < DISAGREES
+        lost, taken = _rivals(this, scored[:k] + scored[k + 1 :])
         grown = _majority(yes, 5) & ~this.before & ~taken
         kept = this.before & ~(_majority(no, 3) & ~dilate(this.own, 1)) & ~lost
         attached = _pieces(grown | kept, 6) & grown
@@ -142,8 +147,7 @@ def proven_cells(planes: Sequence[Plane], points: np.ndarray, photos: GreyPhotos
 
 
 def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: GreyPhotos) -> _Scored:
-    config = photos.config
-    reach = int(round(config.reach_m / plane.cell_m)) if plane.area() >= config.large_m2 else 2
+    reach = int(round(REACH_M / plane.cell_m)) if plane.area() >= LARGE_M2 else 2
     wide = plane.widened(reach)
     full = replace(wide, occupied=dilate(wide.occupied, reach))
     # Photos are chosen once for every 2 x 2 cells.
@@ -151,16 +155,16 @@ def _scored(plane: Plane, surface: Mesh | None, points: np.ndarray, photos: Grey
     key, group = np.unique(index // 2, axis=0, return_inverse=True)
     middle = full.to_world(full.corner + (2 * key + 1.0) * full.cell_m)
     seen = visible_from(surface, middle, full.normal, photos.cameras)
-    views = choose_views(middle, full.normal, seen, photos.cameras, config)[group.ravel()]
+    views = choose_views(middle, full.normal, seen, photos.cameras)[group.ravel()]
     agreement, contrast = photos.agreement(full.cells(), full.axes, views)
     score = np.full(full.occupied.shape, np.nan)
-    score[full.occupied] = np.where((contrast > config.contrast) & (views[:, 1] >= 0), agreement, np.nan)
+    score[full.occupied] = np.where((contrast > CONTRAST) & (views[:, 1] >= 0), agreement, np.nan)
     visible = np.zeros_like(full.occupied)
     visible[full.occupied] = np.asarray(seen.any(axis=1))[group.ravel()]
     return _Scored(full, wide.occupied, score, visible, full.count(points[plane.inliers]) > 0)
 
 
-def _rivals(this: _Scored, others: Sequence[_Scored], contested_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _rivals(this: _Scored, others: Sequence[_Scored]) -> tuple[np.ndarray, np.ndarray]:
     """Cells that a parallel plane close by has the better claim to, and cells that one holds already."""
     plane = this.plane
     lost, taken = (np.zeros_like(this.before) for _ in range(2))
@@ -170,7 +174,7 @@ def _rivals(this: _Scored, others: Sequence[_Scored], contested_m: float) -> tup
         if other.plane.normal @ plane.normal < PARALLEL:
             continue
         place, inside = other.plane.cell_of(cells)
-        held = inside & (np.abs(other.plane.distance(cells)) < contested_m) & other.before[place]
+        held = inside & (np.abs(other.plane.distance(cells)) < CONTESTED_M) & other.before[place]
         better = (np.nan_to_num(other.score[place], nan=unproven) > mine) | other.own[place]
         lost[plane.occupied] |= held & better
         taken[plane.occupied] |= held
@@ -194,11 +198,10 @@ def level_planes(
         cell_m: side of a cell.
         up: surfaces that face up; else those that face down.
     """
-    config = photos.config
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     eyes = np.array([c.position[2] for c in photos.cameras])
     bottom, top = (low[2], min(high[2], eyes.max())) if up else (max(low[2], eyes.min()), high[2])
-    levels = np.arange(bottom - 0.06, top + 0.06, config.step_m)
+    levels = np.arange(bottom - 0.06, top + 0.06, STEP_M)
     if len(levels) < 3:
         return []
     normal = np.array([0.0, 0.0, 1.0 if up else -1.0])
@@ -208,18 +211,18 @@ def level_planes(
     whole = Plane(normal, 0.0, nothing, FINE_M, corner, cell_m, np.ones(shape, dtype=bool))
     surface = plane_mesh(planes)
     agreement = _swept(whole, levels, surface, photos)
-    peak = _peaks(agreement, config.agrees) & ~_known(whole, levels, planes)
+    peak = _peaks(agreement, AGREES) & ~_known(whole, levels, planes)
     found: list[Plane] = []
     while True:
         votes = ndimage.convolve1d(peak.sum(axis=(1, 2)), [1, 1, 1], mode="constant")
         k = int(votes.argmax())
-        if votes[k] < config.min_cells:
+        if votes[k] < MIN_CELLS:
             return found
         band = slice(max(0, k - 1), k + 2)
         mask = peak[band].any(axis=0)
         peak[max(0, k - 2) : k + 3] &= ~mask
-        mask |= dilate(mask, 1) & (agreement[band].max(axis=0) > 0.8 * config.agrees)
-        pieces, count = ndimage.label(_pieces(mask, config.min_cells))
+        mask |= dilate(mask, 1) & (agreement[band].max(axis=0) > 0.8 * AGREES)
+        pieces, count = ndimage.label(_pieces(mask, MIN_CELLS))
         for number in range(1, count + 1):  # every connected piece has a height of its own
             piece = replace(whole, offset=float(levels[k] * normal[2]), occupied=pieces == number)
             level = _settled(piece, surface, photos)
@@ -243,11 +246,11 @@ def _swept(whole: Plane, levels: np.ndarray, surface: Mesh | None, photos: GreyP
         if k % 3 == 0:
             middle[:, 2] = levels[min(k + 1, len(levels) - 1)]
             seen = visible_from(surface, middle, whole.normal, photos.cameras, clearance_m=0.03)
-            views = choose_views(middle, whole.normal, seen, photos.cameras, photos.config)[group.ravel()]
+            views = choose_views(middle, whole.normal, seen, photos.cameras)[group.ravel()]
             some = np.flatnonzero(views[:, 2] >= 0)  # three photos at least
         cells[:, 2] = z
         value, contrast = photos.agreement(cells[some], whole.axes, views[some])
-        agreement[k, some] = np.where(contrast > photos.config.contrast, value, -1.0)
+        agreement[k, some] = np.where(contrast > CONTRAST, value, -1.0)
     return agreement.reshape(len(levels), *whole.occupied.shape)
 
 
@@ -279,7 +282,7 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
     centres = piece.cells()
     z = piece.offset * piece.normal[2]
     seen = visible_from(surface, centres, piece.normal, photos.cameras)
-    views = choose_views(centres, piece.normal, seen, photos.cameras, photos.config)
+    views = choose_views(centres, piece.normal, seen, photos.cameras)
     steps = np.arange(-0.05, 0.0501, FINE_M)
     scores = [float(photos.agreement(centres + [0, 0, step], piece.axes, views)[0].mean()) for step in steps]
     best = int(np.argmax(scores))
@@ -290,22 +293,19 @@ def _settled(piece: Plane, surface: Mesh | None, photos: GreyPhotos) -> Plane | 
     return replace(piece, offset=float(z * piece.normal[2]), occupied=_closed(piece.occupied))
 
 
-def joined(
-    planes: Sequence[Plane], levels: Sequence[Plane], config: SweepConfig | None = None
-) -> list[Plane]:
+def joined(planes: Sequence[Plane], levels: Sequence[Plane]) -> list[Plane]:
     """``planes`` and ``levels`` with pieces of one plane united; new planes need a least area, a larger one where they
     face down (seen from below, stripes on a wall pass for a soffit)."""
-    config = config or SweepConfig()
     result = list(planes)
     for level in sorted(levels, key=lambda p: -p.area()):
         for k, plane in enumerate(result):
-            near = np.abs(plane.distance(level.cells())).mean() < config.same_plane_m
+            near = np.abs(plane.distance(level.cells())).mean() < SAME_PLANE_M
             if near and plane.normal @ level.normal > np.cos(np.radians(1.0)):
                 result[k] = _united(plane, level)
                 break
         else:
             result.append(level)
-    least = [config.up_m2 if p.normal[2] > 0 else config.down_m2 for p in result[len(planes) :]]
+    least = [UP_M2 if p.normal[2] > 0 else DOWN_M2 for p in result[len(planes) :]]
     large = [p for p, area in zip(result[len(planes) :], least, strict=True) if p.area() >= area]
     return result[: len(planes)] + large
 

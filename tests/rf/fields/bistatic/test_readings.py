@@ -147,6 +147,24 @@ def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -
         field.at_frequency(-1.0)
 
 
+def test_carriers_are_fitted_together(scene: RadioScene) -> None:
+    """Roughness makes 1 - S^2 = exp(-(4 pi sigma_h / lambda)^2): half the carrier, its fourth root. What was measured at
+    one carrier serves the other."""
+    smoother = [replace(m, scattering=np.sqrt(1 - (1 - m.scattering**2) ** 0.25)) for m in scene.materials]
+    rooms = {F: scene, F / 2: replace(scene, materials=smoother)}
+    here, there = (
+        exact_spectra(room, RECEIVERS[own], transmitter=TX, frequency_hz=f, shape=SHAPE, sigma=SIGMA)
+        for own, (f, room) in zip((slice(1), slice(1, 6)), rooms.items(), strict=True)
+    )
+    alone, both = (RadioField.fit(scene, data, quick=True, mirror_order=2) for data in (here, [here, there]))
+    assert both.frequency_hz == F
+    for f, room in rooms.items():
+        truth = exact_spectra(room, RECEIVERS[6:], transmitter=TX, frequency_hz=f, shape=SHAPE, sigma=SIGMA)
+        one, two = (evaluate(truth, field.at_frequency(f).spectrum)["psnr_db"] for field in (alone, both))
+        assert two > one + 1.0
+        assert two > 30.0
+
+
 def test_directions_that_nobody_measured_do_not_count(scene: RadioScene, test: SpectrumDataset) -> None:
     whole = exact_spectra(scene, RECEIVERS[:5], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
     gain = whole.path_gain.copy()

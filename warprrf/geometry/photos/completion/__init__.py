@@ -26,10 +26,15 @@ from warprrf.geometry.photos.completion.room_planes import (
     known_levels,
     proven_levels,
 )
-from warprrf.geometry.photos.config import CompletionConfig
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.camera import Camera
+
+LEAST_SEEN = 0.7  # of the surface must be seen; else the photos cover too little for the rest to be inferred
+KEEP_M, KEEP_M2 = (
+    0.12,
+    0.3,
+)  # pieces of the old mesh this far from every known plane, and this large, are kept
 
 
 def complete(
@@ -38,7 +43,6 @@ def complete(
     depths: Sequence[np.ndarray],
     *,
     planes: Sequence[Plane] = (),
-    config: CompletionConfig | None = None,
 ) -> PlanarPatches:
     """The mesh of ``patches`` with holes closed, borders straightened and islands in the air removed.
 
@@ -46,7 +50,6 @@ def complete(
         patches: of the mesh, which is flattened onto them; patch k lies on ``planes[k]``.
         cameras, depths: what was seen: Euclidean range per pixel [m], 0 where unknown, each ``(height, width)``.
         planes: planes known beforehand; their occupied cells are evidence of their own.
-        config: sizes, tolerances and weights.
 
     Returns:
         The mesh with its patches, one for each plane and side; what was given when most of the mesh lies on no planes
@@ -55,30 +58,29 @@ def complete(
     Raises:
         ValueError: when the numbers of cameras and depth maps differ.
     """
-    config = config or CompletionConfig()
     if len(depths) != len(cameras):
         raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
     mesh = patches.mesh
-    axes = directions(patches.normal, patches.area, float(mesh.areas.sum()), config)
+    axes = directions(patches.normal, patches.area, float(mesh.areas.sum()))
     if axes is None or not len(cameras):
         return patches
-    levels, faces = known_levels(patches, planes, axes, config)
-    proven = proven_levels(planes, axes, levels, config)
-    claim_proven(mesh, faces, axes, proven, config)
+    levels, faces = known_levels(patches, planes, axes)
+    proven = proven_levels(planes, axes, levels)
+    claim_proven(mesh, faces, axes, proven)
 
-    grid = divide(mesh, axes, levels, config)
-    free, solid = votes(grid, mesh, faces, cameras, depths, config)
+    grid = divide(mesh, axes, levels)
+    free, solid = votes(grid, mesh, faces, cameras, depths)
     for plane, level in proven:
-        before, behind = vote_proven(grid, plane, level, config)
+        before, behind = vote_proven(grid, plane, level)
         free, solid = free + before, solid + behind
 
-    filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces, config), config)
+    filled = least_surface(grid, free, solid, closed_sides(grid, mesh, faces))
     if filled.all():
         return patches
     whole, known = surface_of(grid, filled, patches.tolerance_m)
-    if seen_share(grid, whole, solid, config) < config.least_seen:
+    if seen_share(grid, whole, solid) < LEAST_SEEN:
         return patches
-    return _with_rest(whole, known, patches, faces, config)
+    return _with_rest(whole, known, patches, faces)
 
 
 def _with_rest(
@@ -86,22 +88,21 @@ def _with_rest(
     known: np.ndarray,
     patches: PlanarPatches,
     faces: FaceLevels,
-    config: CompletionConfig,
 ) -> PlanarPatches:
     """The completed surface with round or oblique pieces of the old mesh in place of the steps made for them."""
     new, old = whole.mesh, patches.mesh
     centres = old.triangles.mean(axis=1)
     rest = faces.axis < 0
     if known.any():
-        rest[rest] = Mesh(new.vertices, new.faces[known]).distance(centres[rest]) > config.keep_m
+        rest[rest] = Mesh(new.vertices, new.faces[known]).distance(centres[rest]) > KEEP_M
     piece = connected_pieces(old, np.where(rest, 0, -1))
-    rest &= np.bincount(piece, weights=old.areas * rest)[piece] >= config.keep_m2
+    rest &= np.bincount(piece, weights=old.areas * rest)[piece] >= KEEP_M2
     if not rest.any():
         return whole
     stays = known.copy()
     if not known.all():
         steps = new.triangles[~known].mean(axis=1)
-        stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > config.keep_m
+        stays[~known] = Mesh(old.vertices, old.faces[rest]).distance(steps) > KEEP_M
     corners = np.concatenate([new.faces[stays], old.faces[rest] + len(new.vertices)])
     used, corners = np.unique(corners, return_inverse=True)
     own = patches.face_patch[rest]

@@ -12,9 +12,15 @@ from scipy.sparse import csgraph
 from warprrf.cache import cached_property
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion.room_planes import Level
-from warprrf.geometry.photos.config import CompletionConfig
 from warprrf.geometry.planar_patches import PlanarPatches
 
+CELL_M, MARGIN_M = 0.1, 0.3  # largest side of a box, and space kept around the mesh
+SURE_VOTES = 10.0  # votes that make half a certainty
+PRIOR = 0.3  # votes by which a box that nobody saw leans to solid
+LEAK = 0.05  # share of the lines of sight that go astray: so many votes of a neighbour count for nothing
+BEHIND = 2.0  # votes that a hit on a plane is worth: far more certain than a line of sight through a box
+TRUST = 0.6  # cost of a box that goes against all its votes, per square metre of its sides
+KNOWN = 0.4  # cost of a square metre of surface on a known plane; one where no plane is known costs 1
 CAPACITY = 10_000  # the flow is in whole numbers: so many for a square metre
 FINE_M = 0.002  # boxes are looked up in tables of this step: much faster than a search, and fine enough for evidence
 
@@ -66,7 +72,7 @@ class Grid:
         return np.bincount(index[index >= 0], minlength=int(np.prod(self.shape))).reshape(self.shape)
 
 
-def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level], config: CompletionConfig) -> Grid:
+def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level]) -> Grid:
     """Boxes between ``levels``, and between further planes where those are more than a cell apart."""
     corners = mesh.vertices[np.unique(mesh.faces)] @ axes.T
     grid = Grid(axes, [], [], [], [])
@@ -75,8 +81,8 @@ def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level], config: Comple
         # A few stray vertices must not blow up the space.
         low, high = np.quantile(corners[:, axis], [0.002, 0.998])
         stops = [level.height for level in own]
-        stops = [min([low, *stops]) - config.margin_m, *stops, max([high, *stops]) + config.margin_m]
-        steps = np.maximum(1, np.ceil(np.diff(stops) / config.cell_m).astype(int))
+        stops = [min([low, *stops]) - MARGIN_M, *stops, max([high, *stops]) + MARGIN_M]
+        steps = np.maximum(1, np.ceil(np.diff(stops) / CELL_M).astype(int))
         between = zip(stops[:-1], stops[1:], steps, strict=True)
         parts = [np.linspace(a, b, n + 1)[:-1] for a, b, n in between]
         height = np.append(np.concatenate(parts), stops[-1])
@@ -90,9 +96,7 @@ def divide(mesh: Mesh, axes: np.ndarray, levels: Sequence[Level], config: Comple
     return grid
 
 
-def least_surface(
-    grid: Grid, free: np.ndarray, solid: np.ndarray, closed: np.ndarray, config: CompletionConfig
-) -> np.ndarray:
+def least_surface(grid: Grid, free: np.ndarray, solid: np.ndarray, closed: np.ndarray) -> np.ndarray:
     """Which boxes are solid, shape ``grid.shape`` bool: the labels of least cost.
 
     Args:
@@ -110,25 +114,23 @@ def least_surface(
     cross = ndimage.generate_binary_structure(3, 1)
     cross[1, 1, 1] = False
     beside = ndimage.maximum_filter(free / volume, footprint=cross, mode="constant")
-    against = config.behind * solid + config.prior + config.leak * beside * volume
-    cost = config.trust * around * (free - against) / (free + against + config.sure_votes)
+    against = BEHIND * solid + PRIOR + LEAK * beside * volume
+    cost = TRUST * around * (free - against) / (free + against + SURE_VOTES)
     for a in range(3):
         for end, is_closed in zip((0, -1), closed[a], strict=True):
             rim = np.moveaxis(cost, a, 0)
             rim[end] = (-10 if is_closed else 10) * np.moveaxis(around, a, 0)[end]
-    return _minimum_cut(grid, cost, sides, config)
+    return _minimum_cut(grid, cost, sides)
 
 
-def _minimum_cut(
-    grid: Grid, cost: np.ndarray, sides: Sequence[np.ndarray], config: CompletionConfig
-) -> np.ndarray:
+def _minimum_cut(grid: Grid, cost: np.ndarray, sides: Sequence[np.ndarray]) -> np.ndarray:
     """Solid boxes of the cut between what costs to be solid (``cost`` > 0) and to be free (``cost`` < 0)."""
     size = cost.size
     number = np.arange(size).reshape(grid.shape)
     rows, columns, capacity = [], [], []
     for a in range(3):
         box, side = np.moveaxis(number, a, 0), np.moveaxis(sides[a], a, 0)
-        weight = np.where(grid.known[a][1:-1], config.known, 1.0)[:, None, None]
+        weight = np.where(grid.known[a][1:-1], KNOWN, 1.0)[:, None, None]
         rows.append(box[:-1].ravel())
         columns.append(box[1:].ravel())
         capacity.append(np.maximum(CAPACITY * weight * side[:-1], 1).ravel())

@@ -10,11 +10,17 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_topology import connected_pieces
 from warprrf.geometry.photos.completion.boxes import Grid
 from warprrf.geometry.photos.completion.room_planes import FaceLevels, Level
-from warprrf.geometry.photos.config import CompletionConfig
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.camera import Camera
 
+STRIDE = 5  # every so many-th row and column of the depth maps is used
+SNAP_M = 0.12  # a depth agrees with the mesh when both are this close
+SHY_M = 0.1  # a line of sight proves nothing this close to an end that lies on no plane
+STEP_M = 0.06  # spacing of samples along lines of sight
+BESIDE_M = 0.006  # a hit votes for the boxes this far before and behind its plane: within the thinnest board
+RIM_M, RIM_SHARE = 0.6, 0.25  # a side is closed when planes this near to it cover so much of it
+SEEN_PIECE = 0.1  # a flat piece of surface is seen when hits lie on so much of it
 RAYS_AT_ONCE = 20_000
 
 
@@ -24,16 +30,15 @@ def votes(
     faces: FaceLevels,
     cameras: Sequence[Camera],
     depths: Sequence[np.ndarray],
-    config: CompletionConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Votes for free and for solid, shape ``grid.shape`` each.
 
     A line of sight counts where its depth agrees with the mesh. It votes free at samples along it, and where it ends on
     a plane also right before the plane, and solid right behind.
     """
-    o, d, ranges = _lines_of_sight(cameras, depths, config.stride)
+    o, d, ranges = _lines_of_sight(cameras, depths, STRIDE)
     hit = mesh.cast(o, d)
-    agree = hit.valid & (np.abs(np.where(hit.valid, hit.t, 0.0) - ranges) < config.snap_m)
+    agree = hit.valid & (np.abs(np.where(hit.valid, hit.t, 0.0) - ranges) < SNAP_M)
     o, d, ranges, t, face = o[agree], d[agree], ranges[agree], hit.t[agree], hit.face[agree]
     axis, sign, height = faces.axis[face], faces.sign[face], faces.height[face]
     normal = sign[:, None] * grid.axes[axis]
@@ -41,18 +46,18 @@ def votes(
     on = (axis >= 0) & (cosine > 0.05)
     slope = np.where(on, cosine, 1.0)
     t_plane = (np.einsum("ni,ni->n", o, normal) - sign * height) / slope
-    on &= np.abs(t_plane - ranges) < config.snap_m / np.maximum(slope, 0.3)
-    end = np.where(on, t_plane - config.beside_m / slope, np.minimum(ranges, t) - config.shy_m)
+    on &= np.abs(t_plane - ranges) < SNAP_M / np.maximum(slope, 0.3)
+    end = np.where(on, t_plane - BESIDE_M / slope, np.minimum(ranges, t) - SHY_M)
     point = (o + t_plane[:, None] * d)[on]
-    free = grid.count(point + config.beside_m * normal[on]).astype(float)
-    solid = grid.count(point - config.beside_m * normal[on]).astype(float)
+    free = grid.count(point + BESIDE_M * normal[on]).astype(float)
+    solid = grid.count(point - BESIDE_M * normal[on]).astype(float)
     # A sample in the middle of each step along the line. Nothing is drawn: one line more or less changes one vote.
-    counts = np.ceil(np.maximum(end, 0) / config.step_m - 0.5).astype(np.int64)
+    counts = np.ceil(np.maximum(end, 0) / STEP_M - 0.5).astype(np.int64)
     for first in range(0, len(o), RAYS_AT_ONCE):
         count = counts[first : first + RAYS_AT_ONCE]
         ray = np.repeat(np.arange(first, first + len(count)), count)
         step = np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
-        free += grid.count(o[ray] + ((step + 0.5) * config.step_m)[:, None] * d[ray])
+        free += grid.count(o[ray] + ((step + 0.5) * STEP_M)[:, None] * d[ray])
     return free, solid
 
 
@@ -71,36 +76,34 @@ def _lines_of_sight(
     return o, d, ranges
 
 
-def vote_proven(
-    grid: Grid, plane: Plane, level: Level, config: CompletionConfig
-) -> tuple[np.ndarray, np.ndarray]:
+def vote_proven(grid: Grid, plane: Plane, level: Level) -> tuple[np.ndarray, np.ndarray]:
     """Four votes of each occupied cell for free space before it, and for a solid behind, shape ``grid.shape`` each."""
     quarter = np.array([[i, j] for i in (-0.25, 0.25) for j in (-0.25, 0.25)]) * plane.cell_m
     points = (plane.cells()[:, None] + quarter @ plane.axes).reshape(-1, 3)
     axis = grid.axes[level.axis]
     points += (level.height - points @ axis)[:, None] * axis
-    before = level.sign * config.beside_m * axis
+    before = level.sign * BESIDE_M * axis
     return grid.count(points + before), grid.count(points - before)
 
 
-def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels, config: CompletionConfig) -> np.ndarray:
+def closed_sides(grid: Grid, mesh: Mesh, faces: FaceLevels) -> np.ndarray:
     """Whether planes cover the lower and upper end of each direction, seen from within, shape ``(3, 2)`` bool."""
     closed = np.zeros((3, 2), dtype=bool)
     extent = [h[-1] - h[0] for h in grid.heights]
     for a in range(3):
         across = extent[(a + 1) % 3] * extent[(a + 2) % 3]
         for k, (end, sign) in enumerate(((grid.heights[a][0], 1), (grid.heights[a][-1], -1))):
-            own = (faces.axis == a) & (faces.sign == sign) & (np.abs(faces.height - end) < config.rim_m)
-            closed[a, k] = mesh.areas[own].sum() > config.rim_share * across
+            own = (faces.axis == a) & (faces.sign == sign) & (np.abs(faces.height - end) < RIM_M)
+            closed[a, k] = mesh.areas[own].sum() > RIM_SHARE * across
     return closed
 
 
-def seen_share(grid: Grid, patches: PlanarPatches, solid: np.ndarray, config: CompletionConfig) -> float:
+def seen_share(grid: Grid, patches: PlanarPatches, solid: np.ndarray) -> float:
     """Share of the surface's area in flat pieces that hits lie on, by the votes ``solid`` of the boxes behind."""
     mesh = patches.mesh
-    behind = grid.locate(mesh.triangles.mean(axis=1) - 0.5 * config.beside_m * mesh.face_normals)
+    behind = grid.locate(mesh.triangles.mean(axis=1) - 0.5 * BESIDE_M * mesh.face_normals)
     hit = (behind >= 0) & (solid.ravel()[behind] > 0)
     piece = connected_pieces(mesh, patches.face_patch)
     area = np.bincount(piece, weights=mesh.areas)
-    seen = np.bincount(piece, weights=mesh.areas * hit) > config.seen_piece * area
+    seen = np.bincount(piece, weights=mesh.areas * hit) > SEEN_PIECE * area
     return float(area[seen].sum() / area.sum())

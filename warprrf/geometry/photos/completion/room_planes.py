@@ -10,9 +10,18 @@ import numpy as np
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_topology import smoothed_normals
-from warprrf.geometry.photos.config import CompletionConfig
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
+
+ALIGNED_DEG = 4.0  # a plane this parallel to one of three perpendicular directions counts as parallel
+EXACT_DEG, STRONG_M2 = 0.1, 2.0
+"""A plane this parallel, with a proven area above the second, keeps its own tilt (0.1 degrees are 2 cm over 12 m): it is
+fitted better than the directions are."""
+LEAST_SHARE = 0.5  # of the mesh that has to lie on such planes; else it is no place of boxes
+SAME_SIDE_M = 0.035  # planes facing one way and closer than this are two fits of one surface
+BOARD_M = 0.012  # planes facing opposite ways can be closer, down to this: the two faces of a board
+GATHER_M2, GATHER_M = 0.08, 0.03  # so much area of left-over faces within so much height makes one more plane
+REACH_M = 0.12  # a face this close to a part of a plane that the photos proved belongs to it
 
 
 class Level(NamedTuple):
@@ -39,14 +48,12 @@ class FaceLevels:
         self.axis[faces], self.sign[faces], self.height[faces] = level[:3]
 
 
-def directions(
-    normals: np.ndarray, areas: np.ndarray, whole_m2: float, config: CompletionConfig
-) -> np.ndarray | None:
+def directions(normals: np.ndarray, areas: np.ndarray, whole_m2: float) -> np.ndarray | None:
     """Three perpendicular unit rows along which planes of these normals ``(P, 3)`` and areas [m^2] face, when they make
     up most of ``whole_m2``; None when there are none."""
     if not len(normals):
         return None
-    parallel = np.cos(np.radians(config.aligned_deg))
+    parallel = np.cos(np.radians(ALIGNED_DEG))
     alike = (np.abs(normals @ normals.T) > parallel) @ areas
     first = normals[alike.argmax()]
     across = np.where(np.abs(normals @ first) < np.sqrt(1 - parallel**2), alike, 0.0)
@@ -66,7 +73,7 @@ def directions(
         u, _, vt = np.linalg.svd(mean)
         axes = u @ vt
     on = areas[(np.abs(normals @ axes.T) > parallel).any(axis=1)].sum()
-    if on < config.least_share * whole_m2:
+    if on < LEAST_SHARE * whole_m2:
         return None
     main = np.abs(axes).argmax(axis=1)
     if len(set(main)) == 3:  # in the order and sense of the world axes
@@ -78,7 +85,7 @@ def directions(
 
 
 def known_levels(
-    patches: PlanarPatches, planes: Sequence[Plane], axes: np.ndarray, config: CompletionConfig
+    patches: PlanarPatches, planes: Sequence[Plane], axes: np.ndarray
 ) -> tuple[list[Level], FaceLevels]:
     """Levels of the patches that are parallel to the directions, the best supported first, and of the faces on them;
     then those on which other faces gather.
@@ -90,7 +97,7 @@ def known_levels(
     centres = mesh.triangles.mean(axis=1)
     candidates: list[tuple[float, Level, np.ndarray]] = []
     for k in np.flatnonzero(patches.area > 0).tolist():
-        axis, sign = _parallel_to(patches.normal[k], axes, config)
+        axis, sign = _parallel_to(patches.normal[k], axes)
         if axis < 0:
             continue
         faces = patches.faces(k)
@@ -101,43 +108,43 @@ def known_levels(
         proven = planes[k].area() if k < len(planes) else 0.0
         strength = proven or patches.area[k] / 3
         level = Level(axis, sign, height, axes[axis], height)
-        if abs(fit) > np.cos(np.radians(config.exact_deg)) and strength > config.strong_m2:
+        if abs(fit) > np.cos(np.radians(EXACT_DEG)) and strength > STRONG_M2:
             level = level._replace(normal=sign * patches.normal[k], offset=sign * patches.offset[k])
         candidates.append((strength, level, faces))
     chosen: list[Level] = []
     found = FaceLevels(np.full(count, -1), np.zeros(count, dtype=np.int64), np.zeros(count))
     for _, level, faces in sorted(candidates, key=lambda c: -c[0]):
-        twin = _twin(level, chosen, config)
+        twin = _twin(level, chosen)
         if twin is None:
             chosen.append(level)
         found.set(faces, (twin or level)._replace(sign=level.sign))
-    for level, faces in _gatherings(mesh, found, axes, list(chosen), config):
+    for level, faces in _gatherings(mesh, found, axes, list(chosen)):
         found.set(faces, level)
-        if _twin(level, chosen, config) is None:
+        if _twin(level, chosen) is None:
             chosen.append(level)
     return chosen, found
 
 
-def _parallel_to(normal: np.ndarray, axes: np.ndarray, config: CompletionConfig) -> tuple[int, int]:
+def _parallel_to(normal: np.ndarray, axes: np.ndarray) -> tuple[int, int]:
     """The direction that a plane crosses, -1 for none, and the sign of its seen side."""
     fit = axes @ normal
     axis = int(np.abs(fit).argmax())
-    if abs(fit[axis]) < np.cos(np.radians(config.aligned_deg)):
+    if abs(fit[axis]) < np.cos(np.radians(ALIGNED_DEG)):
         return -1, 0
     return axis, 1 if fit[axis] > 0 else -1
 
 
-def _twin(level: Level, others: Sequence[Level], config: CompletionConfig) -> Level | None:
+def _twin(level: Level, others: Sequence[Level]) -> Level | None:
     """The first of ``others`` that is the same surface."""
     for other in others:
-        gap = config.same_side_m if other.sign == level.sign else config.board_m
+        gap = SAME_SIDE_M if other.sign == level.sign else BOARD_M
         if other.axis == level.axis and abs(other.height - level.height) < gap:
             return other
     return None
 
 
 def _gatherings(
-    mesh: Mesh, found: FaceLevels, axes: np.ndarray, known: Sequence[Level], config: CompletionConfig
+    mesh: Mesh, found: FaceLevels, axes: np.ndarray, known: Sequence[Level]
 ) -> Iterator[tuple[Level, np.ndarray]]:
     """Levels on which the faces that no patch took gather, and their faces; known levels take theirs first."""
     facing = smoothed_normals(mesh, 3) @ axes.T
@@ -146,40 +153,40 @@ def _gatherings(
         for sign in (1, -1):
             own = np.flatnonzero((found.axis < 0) & (sign * facing[:, axis] > np.cos(np.radians(25.0))))
             for level in [d for d in known if (d.axis, d.sign) == (axis, sign)]:
-                near = np.abs(heights[own, axis] - level.height) < config.same_side_m
+                near = np.abs(heights[own, axis] - level.height) < SAME_SIDE_M
                 yield level, own[near]
                 own = own[~near]
             own = own[np.argsort(heights[own, axis], kind="stable")]
             x, area = heights[own, axis], mesh.areas[own]
-            last = np.searchsorted(x, x + config.gather_m, side="right")
+            last = np.searchsorted(x, x + GATHER_M, side="right")
             while len(own):
                 total = np.concatenate([[0.0], np.cumsum(area)])
                 gathered = total[last] - total[:-1]
                 k = int(gathered.argmax())
-                if gathered[k] < config.gather_m2:
+                if gathered[k] < GATHER_M2:
                     break
                 height = float(x[k : last[k]] @ area[k : last[k]] / gathered[k])
                 gap = np.abs(x - height)
                 yield (
                     Level(axis, sign, height, axes[axis], height),
-                    own[(gap < config.same_side_m) & (area > 0)],
+                    own[(gap < SAME_SIDE_M) & (area > 0)],
                 )
-                area = np.where(gap < 2 * config.same_side_m, 0.0, area)
+                area = np.where(gap < 2 * SAME_SIDE_M, 0.0, area)
 
 
 def proven_levels(
-    planes: Sequence[Plane], axes: np.ndarray, levels: Sequence[Level], config: CompletionConfig
+    planes: Sequence[Plane], axes: np.ndarray, levels: Sequence[Level]
 ) -> list[tuple[Plane, Level]]:
     """Planes with occupied cells, each with the level that it became."""
     result = []
     for plane in planes:
-        axis, sign = _parallel_to(plane.normal, axes, config)
+        axis, sign = _parallel_to(plane.normal, axes)
         if axis < 0 or not plane.occupied.any():
             continue
         height = float(plane.cells().mean(axis=0) @ axes[axis])
         near = [level for level in levels if level[:2] == (axis, sign)]
         gaps = [abs(level.height - height) for level in near]
-        if gaps and min(gaps) < config.same_side_m:
+        if gaps and min(gaps) < SAME_SIDE_M:
             result.append((plane, near[int(np.argmin(gaps))]))
     return result
 
@@ -189,13 +196,12 @@ def claim_proven(
     found: FaceLevels,
     axes: np.ndarray,
     proven: Sequence[tuple[Plane, Level]],
-    config: CompletionConfig,
 ) -> None:
     """Faces near occupied cells go to their plane, whichever plane they were snapped to."""
     facing = smoothed_normals(mesh, 3) @ axes.T
     centres = mesh.triangles.mean(axis=1)
     heights = centres @ axes.T
-    least = np.full(len(centres), config.reach_m)
+    least = np.full(len(centres), REACH_M)
     for plane, level in proven:
         gap = np.abs(heights[:, level.axis] - level.height)
         towards = level.sign * facing[:, level.axis] > np.cos(np.radians(35.0))
