@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from warprrf.checks import check_count, check_seed, checked
+from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
@@ -35,7 +37,7 @@ from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shar
 from warprrf.rf.fields.bistatic.response import Response, predict, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport, traced
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -289,6 +291,7 @@ def trace(
     *,
     mirror_order: int | None = None,
     sub_pixels: int | None = None,
+    client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> TrainingViews:
@@ -297,6 +300,7 @@ def trace(
     Args:
         mirror_order: most mirror reflections on a path; 3 by default, or as many as can be searched (2 in a city).
         sub_pixels: square root of the rays per pixel; 3 by default.
+        client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
         device: where rays are cast.
         progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
 
@@ -331,9 +335,9 @@ def trace(
             most = transport.images.affordable(receivers, terms.mirror_order)
             terms = replace(terms, mirror_order=most)
         found = transport.paths(receivers, terms.mirror_order, progress)
-        for r, k in enumerate(own):
-            mine = found.subset(np.flatnonzero(found.receiver == r))
-            views[k] = transport.view(receivers[r], terms, paths=mine)
+        parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        for r, view in each(partial(traced, transport.recipe, terms), parts, client):
+            views[own[r]] = transport.adopt(view)
             tell("transport", len(views), len(places))
     return TrainingViews(places, [views[k] for k in range(len(places))], time.perf_counter() - started)
 
@@ -370,6 +374,7 @@ def train(
     options: FitOptions,
     *,
     transport: TrainingViews | None = None,
+    client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Trained:
@@ -387,8 +392,9 @@ def train(
         # Places of a part of what was traced say where in the whole their readings are.
         transport = replace(transport, places=places)
     seen = transport or trace(
-        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
-    )
+        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, client=client, device=device,
+        progress=progress,
+    )  # fmt: skip
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
     if all(isinstance(one, Readings) and one.total for one in data):
         o = o.of_totals()
@@ -468,9 +474,13 @@ class _Training:
         self.transmitter = seen.places[0].transmitter if len(sources) == 1 else np.full(3, np.nan)
         rng = np.random.default_rng(options.seed)
         self.held = np.zeros(0, int)
+        chain = np.array([o.chain for o in self.observed])
+        # One place of each chain is never held out: without any its gain would not be known.
+        self.kept_always = [int(np.argmax(chain == k)) for k in range(len(self.chains))]
         if self.count >= self.choose.least_receivers:
             held = min(int(self.count * self.choose.held_out), self.choose.most_held_out)
-            self.held = np.sort(rng.permutation(self.count)[:held])
+            order = rng.permutation(self.count)
+            self.held = np.sort(order[~np.isin(order, self.kept_always)][:held])
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
         self.progress: Progress = progress or _silent
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
@@ -615,8 +625,10 @@ class _Training:
     # ------------------------------------------------------------------------------------------ choosing
 
     def _few(self, times: int) -> np.ndarray:
-        """Receivers that fits which only decide about a term learn from."""
-        return self.kept[: times * self.choose.most_to_choose]
+        """Receivers that fits which only decide about a term learn from, those of every chain among them."""
+        others = np.setdiff1d(self.kept, self.kept_always)
+        more = max(times * self.choose.most_to_choose - len(self.kept_always), 0)
+        return np.union1d(self.kept_always, others[:more]).astype(int)
 
     def _note(self, term: str, kept: bool, error: float) -> None:
         self.log.append({"term": term, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(error))})
@@ -797,7 +809,8 @@ class _Training:
         """Receivers that are held out in turn to learn errors."""
         folds = [self.held]
         if self.count <= self.choose.few_receivers:
-            folds += np.array_split(self.kept, max(len(self.kept) // max(len(self.held), 2), 2))
+            others = np.setdiff1d(self.kept, self.kept_always)
+            folds += np.array_split(others, max(len(others) // max(len(self.held), 2), 2))
         return folds
 
     # ------------------------------------------------------------------------------------------ fitting
