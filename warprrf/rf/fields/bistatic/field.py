@@ -429,7 +429,8 @@ class BistaticField(RadioField):
         progress: Progress | None = None,
     ) -> np.ndarray:
         """Where to measure next; see :meth:`RadioField.suggest`, and :mod:`warprrf.rf.fields.bistatic.suggest` for how."""
-        places, source = self.check_positions(check_array("candidates", candidates, (None, 3)))
+        given = check_array("candidates", candidates, (None, 3))
+        places, source = self.check_positions(given, name="candidates")
         check_count("n", n, 1, len(places))
         pointings = None
         if (arrival is None) != (receive_pattern is None):

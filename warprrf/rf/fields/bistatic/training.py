@@ -451,9 +451,13 @@ class _Training:
         self.transmitter = seen.places[0].transmitter if len(sources) == 1 else np.full(3, np.nan)
         rng = np.random.default_rng(options.seed)
         self.held = np.zeros(0, int)
+        chain = np.array([o.chain for o in self.observed])
+        # One place of each chain is never held out: without any its gain would not be known.
+        self.kept_always = [int(np.argmax(chain == k)) for k in range(len(self.chains))]
         if self.count >= self.choose.least_receivers:
             held = min(int(self.count * self.choose.held_out), self.choose.most_held_out)
-            self.held = np.sort(rng.permutation(self.count)[:held])
+            order = rng.permutation(self.count)
+            self.held = np.sort(order[~np.isin(order, self.kept_always)][:held])
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
         self.progress: Progress = progress or _silent
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
@@ -579,8 +583,10 @@ class _Training:
     # ------------------------------------------------------------------------------------------ choosing
 
     def _few(self, times: int) -> np.ndarray:
-        """Receivers that fits which only decide about a term learn from."""
-        return self.kept[: times * self.choose.most_to_choose]
+        """Receivers that fits which only decide about a term learn from, those of every chain among them."""
+        others = np.setdiff1d(self.kept, self.kept_always)
+        more = max(times * self.choose.most_to_choose - len(self.kept_always), 0)
+        return np.union1d(self.kept_always, others[:more]).astype(int)
 
     def _note(self, term: str, kept: bool, error: float) -> None:
         self.log.append({"term": term, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(error))})
@@ -761,7 +767,8 @@ class _Training:
         """Receivers that are held out in turn to learn errors."""
         folds = [self.held]
         if self.count <= self.choose.few_receivers:
-            folds += np.array_split(self.kept, max(len(self.kept) // max(len(self.held), 2), 2))
+            others = np.setdiff1d(self.kept, self.kept_always)
+            folds += np.array_split(others, max(len(others) // max(len(self.held), 2), 2))
         return folds
 
     # ------------------------------------------------------------------------------------------ fitting
