@@ -429,7 +429,8 @@ class BistaticField(RadioField):
         progress: Progress | None = None,
     ) -> np.ndarray:
         """Where to measure next; see :meth:`RadioField.suggest`, and :mod:`warprrf.rf.fields.bistatic.suggest` for how."""
-        places, source = self.check_positions(check_array("candidates", candidates, (None, 3)))
+        given = check_array("candidates", candidates, (None, 3))
+        places, source = self.check_positions(given, name="candidates")
         check_count("n", n, 1, len(places))
         pointings = None
         if (arrival is None) != (receive_pattern is None):
@@ -440,13 +441,24 @@ class BistaticField(RadioField):
             check_gains("receive_pattern", receive_pattern)
             angles = check_array("arrival", arrival, (len(places), 2))
             pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
-        transport = self.transport(source).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
-        floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
+        sensitivity, unknowns = self._sensitivity(source)
+        measured = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
         return suggest(
-            Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material), places, n,
-            measured=np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on,
-            pointings=pointings, progress=progress,
-        )  # fmt: skip
+            sensitivity, unknowns, places, n, measured=measured, pointings=pointings, progress=progress
+        )
+
+    def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
+        """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard
+        deviation [dB], shape ``(E,)``; see :mod:`warprrf.rf.fields.bistatic.suggest`."""
+        sensitivity, unknowns = self._sensitivity(self.transmitter)
+        places = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
+        variance = unknowns.variance(sensitivity.precision(places, progress=progress))
+        return uncertainty.NEPER * np.sqrt(variance[: len(self.surface.element_area)])
+
+    def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:
+        transport = self.transport(transmitter).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
+        floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
+        return Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material)
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked, several at a time."""

@@ -69,6 +69,12 @@ class Parameters:
         """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
         return self.weight.sum(axis=1) * fresnel_curves().even(self.log_excess)[0]
 
+    @property
+    def log_smooth(self) -> np.ndarray:
+        """ln of what each group mirrors of all that it mirrors and scatters, ``(G,)``: -(4 pi sigma_h / lambda)^2 of a
+        surface of rms height sigma_h (Ament 1953)."""
+        return self.log_mirror - np.log(self.weight.sum(axis=1) + np.exp(self.log_mirror))
+
     def take(self, index: np.ndarray) -> Parameters:
         """The rows ``index``: of materials to those of groups, say."""
         return replace(
@@ -86,7 +92,7 @@ class Parameters:
             return self
         scattered = self.weight.sum(axis=1)
         both = scattered + np.exp(self.log_mirror)
-        log_smooth = ratio**2 * (self.log_mirror - np.log(both))
+        log_smooth = ratio**2 * self.log_smooth
         grown = np.log(np.maximum(-np.expm1(log_smooth), 1e-12) * both / scattered)
         return replace(
             self, log_weight=np.maximum(self.log_weight + grown[:, None], -MOST_NEPERS),
