@@ -214,7 +214,7 @@ class _Responses:
 
         with peak_memory(self.device) as peak, clock.over(0):
             found = self.field.cfr(
-                self.places, BAND_HZ, diffuse="random_phase", max_paths=self.max_paths,
+                self.places, BAND_HZ, diffuse="random_phase", method="dense", max_paths=self.max_paths,
                 store=attempt.folder / "responses.nc", progress=tell, **ARRAYS,
             )  # fmt: skip
         done = len(self.places) - told[0] + AT_ONCE if told else 0  # by this attempt
