@@ -247,8 +247,7 @@ class Mesh:
     @cached_property
     def distinct_faces(self) -> np.ndarray:
         """Faces of which no earlier one has the same three corners, however wound, shape ``(K,)``."""
-        corner = np.sort(self.welded_faces, axis=1)
-        return np.sort(np.unique(corner, axis=0, return_index=True)[1])
+        return np.unique(self.first_at_place)
 
     @cached_property
     def center(self) -> np.ndarray:

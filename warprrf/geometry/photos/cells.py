@@ -117,9 +117,7 @@ def visible_from(
     normals = np.broadcast_to(normal, points.shape)
     seen = np.zeros((len(points), len(cameras)), dtype=bool)
     for c, camera in enumerate(cameras):
-        uv, depth = camera.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (depth > 0.05) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+        inside, _ = camera.sees(points, 0.05)
         seen[:, c] = inside & (((camera.position - points) * normals).sum(axis=1) > 0)
     if surface is not None and seen.any():
         positions = np.array([camera.position for camera in cameras])

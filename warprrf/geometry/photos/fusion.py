@@ -19,6 +19,7 @@ from warprrf.geometry import o3d as o3d_package
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
+from warprrf.geometry.photos.photo_files import spread
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.snapping import MIN_PATCH_M2, find_patches, flattened, largest_first, simplified
 from warprrf.geometry.photos.stereo import mended
@@ -59,7 +60,7 @@ def fuse_gaussians(
     """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    chosen = _spread_out(len(cameras), VIEWS)
+    chosen = spread(range(len(cameras)), VIEWS)
     views, depths = depth_maps(
         gaussians, [cameras[k] for k in chosen], config=config.surface, progress=report, device=device
     )
@@ -115,11 +116,6 @@ def depth_maps(
         views.append(view)
     progress("depth", len(cameras), len(cameras))
     return views, depths
-
-
-def _spread_out(count: int, most: int) -> list[int]:
-    """At most so many of ``count`` numbers, evenly spread."""
-    return [int(k) for k in np.linspace(0, count - 1, min(count, most)).round()]
 
 
 def _with_voxels(

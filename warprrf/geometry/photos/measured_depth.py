@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warprrf.geometry.photos.photo_files import read_photo
+from warprrf.geometry.photos.photo_files import read_photo, spread
 from warprrf.geometry.photos.poses import DepthFile, read_depth
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.photos.undistort import stored_pixels
@@ -34,10 +34,8 @@ def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str,
     Raises:
         ValueError: if a file does not read, or has another shape than its photo.
     """
-    names = [name for name in sparse.cameras if name in files]
-    chosen = np.linspace(0, len(names) - 1, min(len(names), VIEWS)).round().astype(int)
     found = {}
-    for name in (names[k] for k in chosen):
+    for name in spread((name for name in sparse.cameras if name in files), VIEWS):
         depth, camera, lens = read_depth(files[name]), sparse.cameras[name], sparse.lenses[name]
         height, width = depth.shape
         if abs(width / height / (lens.width / lens.height) - 1) > 0.02:
@@ -128,9 +126,6 @@ def _cloud(
 
 def _compared(points: np.ndarray, view: Camera, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Range of each point from a camera, and that measured at its pixel, 0 where it is out of sight or unknown."""
-    uv, depth = view.project(points)
-    inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [view.width, view.height]).all(axis=1)
-    there = np.zeros(len(points))
-    columns, rows = uv[inside].astype(int).T
-    there[inside] = measured[rows, columns]
+    inside, place = view.sees(points)
+    there = np.where(inside, measured[place[:, 0], place[:, 1]], 0.0)
     return np.linalg.norm(points - view.position, axis=1), there

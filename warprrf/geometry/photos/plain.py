@@ -285,10 +285,8 @@ def _shown(lines: Sequence[Line], camera: Camera, edgels: Edgels) -> tuple[np.nd
     of_line, barrier = np.full(len(edgels.position), -1), np.zeros((height, width), dtype=bool)
     for number, line in enumerate(lines):
         along = np.linspace(line.low, line.high, int((line.high - line.low) / 0.01) + 2)
-        pixels, depth = camera.project(line.points(along))
-        with np.errstate(invalid="ignore"):
-            inside = (depth > 0.1) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-        x, y = pixels[inside].astype(int).T
+        inside, pixels = camera.sees(line.points(along), 0.1)
+        y, x = pixels[inside].T
         first = np.flatnonzero(np.concatenate([x[:1] == x[:1], (np.diff(x) != 0) | (np.diff(y) != 0)]))
         x, y = x[first], y[first]
         if len(x) < SEGMENT_PX / 2:
@@ -385,11 +383,9 @@ def _agreed(
     for camera, view in zip(cameras, seen, strict=True):
         if side * (camera.position[axis] - height) < 0.1:
             continue
-        pixels, depth = camera.project(cells)
-        with np.errstate(invalid="ignore"):
-            inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-        own = np.flatnonzero(inside & (depth > 0.1))
-        x, y = (pixels[own] / STRIDE).astype(int).T
+        inside, pixels = camera.sees(cells, 0.1)
+        own = np.flatnonzero(inside)
+        y, x = pixels[own].T // STRIDE
         y, x = np.minimum(y, view.plane.shape[0] - 1), np.minimum(x, view.plane.shape[1] - 1)
         here = view.plane[y, x] == number
         away = np.linalg.norm(cells[own] - camera.position, axis=1)

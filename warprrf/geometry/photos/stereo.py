@@ -240,7 +240,7 @@ def _companions(
     angle = np.degrees(np.arccos(np.clip(np.einsum("cpi,pi->cp", line, line[view]), -1, 1)))
     good = np.exp(-0.5 * (np.log(np.maximum(angle, 0.1) / GOOD_ANGLE_DEG) / 0.7) ** 2)
     good *= np.minimum(distance / distance[view], distance[view] / np.maximum(distance, 1e-9))
-    inside = np.array([_inside(c, points)[0] for c in cameras])
+    inside = np.array([c.sees(points)[0] for c in cameras])
     worth = np.where(inside.mean(axis=1) > 0.3, (good * inside).mean(axis=1), 0.0) * weight
     worth[view] = 0.0
     chosen: list[int] = []
@@ -253,14 +253,6 @@ def _companions(
     return np.array(chosen, dtype=np.int64)
 
 
-def _inside(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which points a camera has in its image, and their rows and columns there, shape ``(N, 2)``."""
-    uv, z = camera.project(points)
-    uv = np.nan_to_num(uv, nan=-1.0)
-    inside = (z > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    return inside, np.where(inside[:, None], uv[:, ::-1], 0).astype(int)
-
-
 def _votes(
     depth: np.ndarray, camera: Camera, others: Sequence[tuple[Camera, np.ndarray]], tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -269,7 +261,7 @@ def _votes(
     known = depth > 0
     points = camera.position + depth[known][:, None] * camera.directions()[known]
     for other, ranges in others:
-        inside, place = _inside(other, points)
+        inside, place = other.sees(points)
         seen = np.where(inside, ranges[place[:, 0], place[:, 1]], 0.0)
         distance = np.linalg.norm(points - other.position, axis=1)
         agreed[known] += (seen > 0) & (np.abs(seen - distance) < tolerance * distance)

@@ -17,6 +17,7 @@ from scipy import ndimage
 from warprrf.device import require
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.config import PlaneConfig
+from warprrf.geometry.photos.photo_files import spread
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel, transformed
@@ -99,10 +100,8 @@ def vertical_of_edges(
         cameras: by photo.
         photo: reads a photo by its name, ``(H, W, 3)`` in [0, 1].
     """
-    names = list(cameras)
     held = held_up(list(cameras.values()))
-    chosen = np.linspace(0, len(names) - 1, min(len(names), PHOTOS)).round().astype(int)
-    normals = np.concatenate([_edge_planes(photo(names[k]), cameras[names[k]]) for k in chosen])
+    normals = np.concatenate([_edge_planes(photo(name), cameras[name]) for name in spread(cameras, PHOTOS)])
     normals = normals[np.abs(normals @ held) < np.sin(np.radians(NEAR_DEG))]
     if len(normals) < 100:
         return held, False
