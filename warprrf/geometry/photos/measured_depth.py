@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warprrf.geometry.photos.cells import in_frame
 from warprrf.geometry.photos.photo_files import read_photo, spread
 from warprrf.geometry.photos.poses import DepthFile, read_depth
 from warprrf.geometry.photos.sparse import SparseModel
@@ -126,6 +127,6 @@ def _cloud(
 
 def _compared(points: np.ndarray, view: Camera, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Range of each point from a camera, and that measured at its pixel, 0 where it is out of sight or unknown."""
-    inside, place = view.sees(points)
+    inside, place = in_frame(view, points)
     there = np.where(inside, measured[place[:, 0], place[:, 1]], 0.0)
     return np.linalg.norm(points - view.position, axis=1), there

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from warprrf.geometry.photos.cells import BEHIND_M as SEEN_BEHIND_M
-from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL
+from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, in_frame
 from warprrf.geometry.photos.edges import (
     EDGE_DEG,
     FARTHEST_M,
@@ -285,7 +285,7 @@ def _shown(lines: Sequence[Line], camera: Camera, edgels: Edgels) -> tuple[np.nd
     of_line, barrier = np.full(len(edgels.position), -1), np.zeros((height, width), dtype=bool)
     for number, line in enumerate(lines):
         along = np.linspace(line.low, line.high, int((line.high - line.low) / 0.01) + 2)
-        inside, pixels = camera.sees(line.points(along), 0.1)
+        inside, pixels = in_frame(camera, line.points(along), 0.1)
         y, x = pixels[inside].T
         first = np.flatnonzero(np.concatenate([x[:1] == x[:1], (np.diff(x) != 0) | (np.diff(y) != 0)]))
         x, y = x[first], y[first]
@@ -383,7 +383,7 @@ def _agreed(
     for camera, view in zip(cameras, seen, strict=True):
         if side * (camera.position[axis] - height) < 0.1:
             continue
-        inside, pixels = camera.sees(cells, 0.1)
+        inside, pixels = in_frame(camera, cells, 0.1)
         own = np.flatnonzero(inside)
         y, x = pixels[own].T // STRIDE
         y, x = np.minimum(y, view.plane.shape[0] - 1), np.minimum(x, view.plane.shape[1] - 1)

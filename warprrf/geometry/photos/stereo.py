@@ -16,6 +16,7 @@ import warp as wp
 from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, launch, require, resolve
+from warprrf.geometry.photos.cells import in_frame
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, match
@@ -240,7 +241,7 @@ def _companions(
     angle = np.degrees(np.arccos(np.clip(np.einsum("cpi,pi->cp", line, line[view]), -1, 1)))
     good = np.exp(-0.5 * (np.log(np.maximum(angle, 0.1) / GOOD_ANGLE_DEG) / 0.7) ** 2)
     good *= np.minimum(distance / distance[view], distance[view] / np.maximum(distance, 1e-9))
-    inside = np.array([c.sees(points)[0] for c in cameras])
+    inside = np.array([in_frame(c, points)[0] for c in cameras])
     worth = np.where(inside.mean(axis=1) > 0.3, (good * inside).mean(axis=1), 0.0) * weight
     worth[view] = 0.0
     chosen: list[int] = []
@@ -261,7 +262,7 @@ def _votes(
     known = depth > 0
     points = camera.position + depth[known][:, None] * camera.directions()[known]
     for other, ranges in others:
-        inside, place = other.sees(points)
+        inside, place = in_frame(other, points)
         seen = np.where(inside, ranges[place[:, 0], place[:, 1]], 0.0)
         distance = np.linalg.norm(points - other.position, axis=1)
         agreed[known] += (seen > 0) & (np.abs(seen - distance) < tolerance * distance)

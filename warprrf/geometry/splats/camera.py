@@ -142,16 +142,6 @@ class Camera:
         uv = np.stack([(azimuth + np.pi) * self.width / (2 * np.pi), zenith * self.height / np.pi], axis=-1)
         return uv, distance
 
-    def sees(self, points: ArrayLike, nearest_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Which world points ``(N, 3)`` have a pixel and lie deeper than ``nearest_m``, shape ``(N,)`` bool; and the row
-        and column of each, shape ``(N, 2)`` int, 0 for the others."""
-        uv, depth = self.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (
-                (depth > nearest_m) & (uv >= 0).all(axis=1) & (uv < (self.width, self.height)).all(axis=1)
-            )
-        return inside, np.where(inside[:, None], uv[:, ::-1], 0).astype(int)
-
 
 def check_camera(cam: object) -> None:
     """Raise TypeError unless ``cam`` is a :class:`Camera`."""
