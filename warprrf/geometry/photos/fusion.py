@@ -31,9 +31,7 @@ from warprrf.geometry.splats.render import render
 
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
 ALPHA = 0.6  # a depth counts where at least so much light is blocked,
-DEPTH_SPREAD = (
-    0.05  # and where the blended depth and that of the dominant Gaussian differ by no more than this part
-)
+DEPTH_SPREAD = 0.05  # and where blended depth and dominant Gaussian differ by no more than this part
 VOXEL_PIXELS = 4.0  # widest voxel, in pixels of the depth maps at their median range
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane

@@ -18,10 +18,8 @@ from warprrf.geometry.splats.camera import Camera
 CELL_M = 0.03  # one point for each cube of this side
 MOST_PIXELS = 400_000  # of all maps that points are made of
 VIEWS = 120  # most maps that are used, spread over all
-NEAR_M, NEAR_SHARE = (
-    0.02,
-    0.02,
-)  # a map shows a point that it measures this near to, or within this part of its range
+NEAR_M = 0.02  # a map shows a point that it measures this near to,
+NEAR_SHARE = 0.02  # or within this part of its range
 AGREE = 0.5  # least share of the points in a map's sight that it shows, over those that it looks through
 
 

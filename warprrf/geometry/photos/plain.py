@@ -36,9 +36,7 @@ from warprrf.geometry.splats.camera import Camera
 SURE_VIEWS, LINE_M = 4, 0.4  # photos and length from which on an edge counts
 FLAT, PLAIN_PX = 0.006, 7  # a pixel is plain where none in a square of this side changes by more than this
 SHOWN_SHARE = 0.15  # where so much of an edge shows in a photo, all of it parts regions
-LEAST_SHARE = (
-    0.12  # photos with fewer plain pixels than this share, in a dozen of them, show no plain surface
-)
+LEAST_SHARE = 0.12  # a dozen photos with fewer plain pixels than this share show no plain surface
 REGION_PX, VOTES_PX = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
 SAME_M = 0.04  # an edge this close to a plane lies on it
 RIVAL = 0.8  # of the planes with at least this share of the most votes, the nearest has the region

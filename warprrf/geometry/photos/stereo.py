@@ -27,10 +27,8 @@ GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, mor
 DOWNSCALE = 2  # photos are compared at the depth maps' size divided by this
 SOURCES = 3  # photos that one is compared with
 TURNS = 2  # how often planes are handed on between pixels
-SETTLED, PROVED = (
-    0.2,
-    0.6,
-)  # a depth of less cost (1 - correlation) stays as it is; one of more proves nothing
+SETTLED = 0.2  # a depth of less cost (one minus a correlation) stays as it is
+PROVED = 0.6  # depths of more cost prove nothing
 GAIN = 0.05  # by which a new depth has to cost less than the old one
 CHECKED, AGREED = 8, 2  # maps of other photos that a depth is checked against, and how many must agree on it
 TOLERANCE = 0.02  # up to this part of the range two depths agree

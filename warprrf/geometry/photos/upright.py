@@ -25,18 +25,14 @@ from warprrf.geometry.splats.camera import Camera
 
 PHOTOS = 40  # looked at for edges, spread over all
 EDGE_PIXELS = 480  # about the longer side of a photo while its edges are looked for
-STRAIGHT, CONTRAST = (
-    0.9,
-    0.01,
-)  # least coherence of gradients round a pixel of an edge, and least slope [white/pixel]
+STRAIGHT = 0.9  # least coherence of gradients round a pixel of an edge
+CONTRAST = 0.01  # least slope there [white/pixel]
 NEAR_DEG = 25.0  # the vertical is this near to the photos' own up
 WINDOWS_DEG = (12, 8, 5, 3, 2, 1.5, 1, 0.7, 0.5, 0.5, 0.5)  # standard deviations of the window, in turn
 PROVEN = 1.3  # density of edges within 1 degree of the vertical over that from 4 to 10 degrees; of clutter: 1
 PLANE_DEG = (4.0, 2.0, 1.0, 0.7, 0.7)  # of the window for planes, in turn
-FLOOR_M, FLOOR_SHARE = (
-    0.05,
-    0.1,
-)  # thickness of a level surface; least points of a floor, over those of the largest level
+FLOOR_M = 0.05  # thickness of a level surface
+FLOOR_SHARE = 0.1  # least points of a floor, over those of the largest level
 BELOW_SHARE = 0.01  # of all points may lie beneath a floor
 
 
