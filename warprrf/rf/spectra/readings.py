@@ -70,6 +70,7 @@ class Readings:
         name: by which a report tells these readings from others.
         azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
             from line of sight and mirrors. Give readings whose zeros differ as several data sets.
+        position_std_m: standard deviation of each coordinate of the receivers [m]; above 0 a fit finds where they stood.
 
     Raises:
         TypeError, ValueError: naming the argument.
@@ -98,6 +99,7 @@ class Readings:
     air: Air | None = None
     name: str = "readings"
     azimuth_known: bool = True
+    position_std_m: float = 0.0
 
     def __post_init__(self) -> None:
         power = check_array("power", self.power, (None,), finite=False)
@@ -144,6 +146,12 @@ class Readings:
         if not self.azimuth_known and self.arrival is None:
             raise ValueError(
                 "azimuth_known: got False without arrival; expected the azimuths whose zero is to be found"
+            )
+        check_number("position_std_m", self.position_std_m, 0.0, 1.0)
+        if self.position_std_m > 0 and self.total:
+            raise ValueError(
+                "position_std_m: got readings of power alone, which say nothing of where they were taken; expected "
+                "directions or delays"
             )
         if self.samples is not None:
             check_count("samples", self.samples)
