@@ -11,10 +11,14 @@ mended where it is started.
 
 from __future__ import annotations
 
+import copyreg
 import importlib
 import os
 import tempfile
+import threading
+import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -35,7 +39,41 @@ DeviceLike: TypeAlias = str | wp.Device | None
 """A Warp device or its name (``"cpu"``, ``"cuda:0"``); ``None``: Warp's preferred one, CUDA where there is a GPU."""
 
 Progress = Callable[[str, int, int], None]
-"""``progress(stage, done, total)``: called by long work; the library itself never prints."""
+"""``progress(stage, done, total)``: called by long work; the library itself never prints.
+
+Stages come one after the other. ``done`` never falls within one, and starts above zero where an earlier run's work is
+kept; the last call of a stage has ``done == total``. What shows it makes seconds of it with :class:`TimeLeft`.
+"""
+
+RECENT_S = 15.0  # the rate is that of so many seconds
+
+
+class TimeLeft:
+    """Seconds left of a stage, by its recent rate, for all that shows progress: bars, JSON lines, the viewer.
+
+    A callback stays three plain arguments, which anybody can write and call; only who shows it needs a clock. What an
+    earlier run did does not count, as the rate is of differences. Nor does the first step once there is a second one:
+    it may have compiled kernels.
+    """
+
+    def __init__(self) -> None:
+        self._stage: str | None = None
+        self._known: deque[tuple[float, int]] = deque()  # times and counts, the oldest first
+
+    def __call__(self, stage: str, done: int, total: int) -> float | None:
+        """Seconds until ``done`` is ``total``; None while nothing tells."""
+        now, known = time.monotonic(), self._known
+        if stage != self._stage or done < known[-1][1]:
+            self._stage = stage
+            known.clear()
+        known.append((now, done))
+        while len(known) > 3 and known[2][0] <= now - RECENT_S:
+            known.popleft()
+        then, before = known[1 if len(known) > 2 else 0]
+        if done >= total:
+            return 0.0
+        return None if done <= before else (total - done) * (now - then) / (done - before)
+
 
 # Below this many indices a launch is cheaper on one thread than split (a launch costs about 15 us).
 MIN_SPLIT = 256
@@ -57,10 +95,31 @@ def resolve(device: DeviceLike = None) -> wp.Device:
         raise ValueError(f"device: got {device!r}, expected one of {known}") from error
 
 
-@cache
+_own = threading.local()
+
+
 def threads() -> int:
-    """CPU threads that one launch is split over: ``WARPRRF_THREADS`` if set, else the cores this process may use."""
+    """CPU threads that one launch is split over: ``WARPRRF_THREADS`` if set, else the cores this process may use, or one
+    within :func:`one_thread`."""
+    return _threads(getattr(_own, "alone", False))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Launches of this thread stay on it, unless ``WARPRRF_THREADS`` is set: others work beside it."""
+    before = getattr(_own, "alone", False)
+    _own.alone = True
+    try:
+        yield
+    finally:
+        _own.alone = before
+
+
+@cache
+def _threads(alone: bool) -> int:
     wanted = os.environ.get("WARPRRF_THREADS")
+    if wanted is None and alone:
+        return 1
     if wanted is None:
         return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if not wanted.isdigit() or int(wanted) < 1:
@@ -172,6 +231,13 @@ def require(module: str, extra: str) -> ModuleType:
             raise
         raise ImportError(f'{module} is not installed: pip install "warprrf[{extra}]"') from error
 
+
+def _uploaded(values: Any, dtype: Any, device: str) -> wp.array:
+    return wp.array(values, dtype=dtype, device=device)
+
+
+copyreg.pickle(wp.array, lambda a: (_uploaded, (a.numpy(), a.dtype, str(a.device))))
+# Warp's arrays have no pickles of their own, which workers of a cluster need.
 
 _NO_CUDA = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 

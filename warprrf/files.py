@@ -55,10 +55,7 @@ def write_atomically(
     try:
         write(partial)
         if seal:
-            with partial.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            with partial.open("ab") as file:
-                file.write(_SEAL + digest.encode() + b"\n")
+            end_with_seal(partial)
         os.replace(partial, path)
     except OSError as error:
         if error.errno is not None and error.filename in (None, str(partial)):
@@ -66,6 +63,14 @@ def write_atomically(
         raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def end_with_seal(path: Path) -> None:
+    """Write the checksum of a file to its end, for :func:`check_seal`."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    with path.open("ab") as file:
+        file.write(_SEAL + digest.encode() + b"\n")
 
 
 def partial_path(path: str | os.PathLike[str]) -> Path:

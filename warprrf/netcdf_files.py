@@ -7,19 +7,22 @@ order is refused. The checksum tells damage before HDF5 sees it; what others wro
 
 from __future__ import annotations
 
+import fcntl
 import io
 import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
 from warprrf.device import require
-from warprrf.files import MOST_INFLATED, check_seal, write_bytes
+from warprrf.files import MOST_INFLATED, check_seal, end_with_seal, partial_path, write_bytes
 
 _CHUNK_BYTES = 2_000_000  # of packed variables, several rows to a chunk
+_FINISHED = "finished"  # variable of a store: which rows are there
 _SAME_PLACE = 1e-6  # of coordinates, in their unit
 
 
@@ -57,6 +60,14 @@ class Axis:
     period: float | None = None
 
 
+@dataclass(frozen=True)
+class Room:
+    """Room for an array that a :class:`Store` fills row by row: its shape and type."""
+
+    shape: tuple[int, ...]
+    dtype: Any
+
+
 XYZ = Axis(lambda _: np.array(["x", "y", "z"]))
 
 
@@ -79,31 +90,178 @@ def write(
     Raises:
         OSError: naming ``path``, if the system does not take it.
     """
-    h5netcdf, h5py = require("h5netcdf", extra="all"), require("h5py", extra="all")
     data = io.BytesIO()
-    with h5netcdf.File(data, "w") as file:
-        sizes = {
-            d: n for k, a in arrays.items() for d, n in zip(variables[k].dimensions, a.shape, strict=True)
-        }
-        file.dimensions = sizes
-        for name, axis in axes.items():
-            places = axis.expected(sizes[name])
-            kind = h5py.string_dtype() if places.dtype.kind == "U" else places.dtype
-            file.create_variable(name, (name,), kind, data=places.astype(kind))
-            if axis.unit is not None:
-                file.variables[name].attrs["units"] = axis.unit
-        for name, array in arrays.items():
-            it, packing = variables[name], {}
-            if it.packed and array.size:
-                rows = max(1, min(len(array), _CHUNK_BYTES // array[0].nbytes))
-                packing = {"compression": "gzip", "compression_opts": level, "shuffle": True}
-                packing["chunks"] = (rows, *array.shape[1:])
-            made = file.create_variable(name, it.dimensions, array.dtype, data=array, **packing)
-            for key, value in {**({} if it.unit is None else {"units": it.unit}), **it.about}.items():
-                made.attrs[key] = value
-        for key, value in attributes.items():
-            file.attrs[key] = int(value) if isinstance(value, bool | np.bool_) else value
+    with require("h5netcdf", extra="all").File(data, "w") as file:
+        _fill(file, arrays, variables, axes, attributes, level)
     write_bytes(path, data.getbuffer(), seal=True)
+
+
+def _fill(
+    file: Any,
+    arrays: Mapping[str, Any],
+    variables: Mapping[str, Variable],
+    axes: Mapping[str, Axis],
+    attributes: Mapping[str, Any],
+    level: int = 4,
+) -> None:
+    h5py = require("h5py", extra="all")
+    sizes = {d: n for k, a in arrays.items() for d, n in zip(variables[k].dimensions, a.shape, strict=True)}
+    file.dimensions = sizes
+    for name, axis in axes.items():
+        places = axis.expected(sizes[name])
+        kind = h5py.string_dtype() if places.dtype.kind == "U" else places.dtype
+        file.create_variable(name, (name,), kind, data=places.astype(kind))
+        if axis.unit is not None:
+            file.variables[name].attrs["units"] = axis.unit
+    for name, array in arrays.items():
+        it, how, data = variables[name], dict[str, Any](), array
+        if isinstance(array, Room):  # in one piece and there from the start, so that its place never changes
+            how["dcpl"], data = h5py.h5p.create(h5py.h5p.DATASET_CREATE), None
+            how["dcpl"].set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+            how["dcpl"].set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+        elif it.packed and array.size:
+            rows = max(1, min(len(array), _CHUNK_BYTES // array[0].nbytes))
+            how = {"compression": "gzip", "compression_opts": level, "shuffle": True}
+            how["chunks"] = (rows, *array.shape[1:])
+        made = file.create_variable(name, it.dimensions, array.dtype, data=data, **how)
+        for key, value in {**({} if it.unit is None else {"units": it.unit}), **it.about}.items():
+            made.attrs[key] = value
+    for key, value in attributes.items():
+        file.attrs[key] = int(value) if isinstance(value, bool | np.bool_) else value
+
+
+class Store:
+    """A NetCDF-4 file whose arrays are filled row by row, as a context manager: whole or not there.
+
+    HDF5 lays it out with the first rows, as ``NAME.unfinished``; rows are then written past it into their places, so that a
+    kill leaves the file sound and a full disk is an error of the system's. Who comes again goes on; with the last row it
+    is sealed and gets its name. One process at a time works on it.
+
+    Args:
+        path: of the file.
+        known: arrays that are written at once.
+        variables: what these and the rows' are.
+        attributes: of the file; ``key`` among them, by which a store is known.
+        count: rows that it will have.
+
+    Attributes:
+        missing: which rows are not there yet, shape ``(count,)``.
+
+    Raises:
+        ValueError: naming ``path``, on entering: for a file of another key, none of these, a damaged one, or one that
+            another process is at work on.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        known: Mapping[str, np.ndarray],
+        variables: Mapping[str, Variable],
+        attributes: Mapping[str, Any],
+        count: int,
+    ) -> None:
+        self.path, self._unfinished = Path(path), Path(f"{os.fspath(path)}.unfinished")
+        self._known, self._variables, self._attributes = known, variables, attributes
+        self.missing = np.ones(count, bool)
+        self._places: dict[str, tuple[int, Room]] = {}
+        self._file: IO[bytes] | None = None
+
+    def __enter__(self) -> Store:
+        if self.path.exists():
+            if not check_seal(self.path):
+                raise ValueError(f"store: {self.path} is no finished store; name another file, or remove it")
+            self._find(self.path)
+            self.missing[:] = False
+        elif self._unfinished.exists():
+            self._find(self._unfinished)
+            self._open(self._unfinished)
+            self.missing = self._mapped(self._unfinished, _FINISHED) == 0
+        return self
+
+    def __exit__(self, kind: object, *error: object) -> None:
+        if self._file is None:
+            return
+        with self._file:
+            if kind is None and not self.missing.any():
+                end_with_seal(self._unfinished)
+                os.replace(self._unfinished, self.path)
+
+    def put(self, rows: np.ndarray, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write ``rows`` (K,) of every array, ``(K, ...)`` each; they count once they are on the disk."""
+        if self._file is None:
+            self._lay_out(arrays)
+        for held in arrays, {_FINISHED: np.ones(len(rows), np.int8)}:
+            for name, array in held.items():
+                place, room = self._places[name]
+                values = np.ascontiguousarray(array, room.dtype)
+                for row, value in zip(rows.tolist(), values, strict=True):
+                    self._stream.seek(place + row * value.nbytes)
+                    self._stream.write(value.tobytes())
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+        self.missing[rows] = False
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The arrays of the finished file, which stay on the disk."""
+        return {name: self._mapped(self.path, name) for name in self._places}
+
+    @property
+    def _stream(self) -> IO[bytes]:
+        if self._file is None:
+            raise RuntimeError("a store is written within its with statement")
+        return self._file
+
+    def _mapped(self, path: Path, name: str) -> np.ndarray:
+        place, room = self._places[name]
+        return np.memmap(path, room.dtype, "r", place, room.shape)
+
+    def _lay_out(self, arrays: Mapping[str, np.ndarray]) -> None:
+        count = len(self.missing)
+        rooms: dict[str, Any] = {n: Room((count, *a.shape[1:]), a.dtype) for n, a in arrays.items()}
+        rooms |= {**self._known, _FINISHED: Room((count,), np.dtype(np.int8))}
+        variables = {
+            **self._variables,
+            _FINISHED: Variable((self._variables[next(iter(arrays))].dimensions[0],)),
+        }
+        partial = partial_path(self._unfinished)
+        try:
+            with require("h5netcdf", extra="all").File(partial, "w") as file:
+                _fill(file, rooms, variables, {}, self._attributes)
+            self._find(partial)
+            self._open(partial)  # and lock it, before anybody sees it
+            os.link(partial, self._unfinished)
+        except FileExistsError as error:
+            raise ValueError(f"store: another process is at work on {self.path}; wait for it") from error
+        finally:
+            partial.unlink(missing_ok=True)
+
+    def _open(self, path: Path) -> None:
+        self._file = path.open("r+b")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"store: another process is at work on {self.path}; wait for it") from error
+
+    def _find(self, path: Path) -> None:
+        """Where rows are in a file that was laid out."""
+        h5py = require("h5py", extra="all")
+        try:
+            with h5py.File(path, "r", locking=False) as file:
+                same = (
+                    file.attrs.get("key") == self._attributes["key"]
+                    and file[_FINISHED].shape == self.missing.shape
+                )
+                for name, held in file.items():
+                    place = held.id.get_offset() if isinstance(held, h5py.Dataset) else None
+                    if place is not None:
+                        self._places[name] = place, Room(held.shape, held.dtype)
+        except (OSError, KeyError) as error:
+            raise ValueError(f"store: {path} is no store of ours: {error}; name another file") from error
+        if not same:
+            raise ValueError(
+                f"store: {path} holds answers of another field, other places or other options; name another file, or "
+                "remove it"
+            )
 
 
 def read(

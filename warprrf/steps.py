@@ -191,9 +191,15 @@ class Steps:
         return dict(known["figures"])
 
     def arrays(
-        self, name: str, make: Callable[[], Mapping[str, Any]], *, version: int, inputs: Iterable[Any]
+        self,
+        name: str,
+        make: Callable[[], Mapping[str, Any]] | None,
+        *,
+        version: int,
+        inputs: Iterable[Any],
     ) -> dict[str, np.ndarray]:
-        """Arrays of step ``name``, kept in ``NAME.npz``: those on file if they are of this key, else what ``make`` returns.
+        """Arrays of step ``name``, kept in ``NAME.npz``: those on file if they are of this key, else what ``make`` returns;
+        without ``make`` none.
 
         For small steps, of which a job has many: neither figures nor time are recorded; a damaged file is made again.
         """
@@ -205,6 +211,8 @@ class Steps:
                 found = {}
             if str(found.pop("key", "")) == key:
                 return found
+        if make is None:
+            return {}
         made = {n: np.asarray(a) for n, a in make().items()}
         write_arrays(path, {"key": np.array(key), **made}, compress=False)
         return made

@@ -8,13 +8,11 @@ their checkpoint.
 
 from __future__ import annotations
 
-import os
 import platform
 import resource
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache, partial
@@ -29,7 +27,8 @@ from benchmarks.evaluation.protocol import Run, Setting, shown_receivers, truth_
 from benchmarks.machine import processor_name
 from benchmarks.methods import AFTER, METHODS, Fitted, Task, score
 from benchmarks.report import Row
-from warprrf.device import Progress, require, resolve, threads
+from warprrf.cluster import connected, each
+from warprrf.device import Progress, resolve, threads
 from warprrf.files import write_arrays
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
@@ -228,7 +227,7 @@ def sweep(
         setting: where everything lies.
         steps: where finished runs are kept, pictures in ``runs/``.
         scheduler: address of a running dask scheduler, such as ``"tcp://lab:8786"``.
-        workers: processes of a local cluster otherwise; 0 works in this process, without dask.
+        workers: processes of a local cluster otherwise, which share the cores; 0 works in this process, without dask.
         progress: called with ``"runs"``.
         work: what carries out one run; :func:`execute` but for tests.
 
@@ -240,18 +239,6 @@ def sweep(
     tell = progress or (lambda stage, done, total: None)
     found: dict[Run, Row] = {}
 
-    def keep(run: Run, result: Callable[[Progress], Result]) -> None:
-        def make(attempt: Attempt) -> Row:
-            try:
-                row, arrays = result(attempt.progress)
-            except Exception as error:
-                raise RuntimeError(f"{run.key}: {type(error).__name__}: {error}") from error
-            write_arrays(steps.folder / pictures_of(run), arrays)
-            return row
-
-        found[run] = steps.run(run.key, make, **_known(run, setting))
-        tell("runs", len(found), len(everything))
-
     for run in everything:
         kept = steps.kept(run.key, **_known(run, setting))
         if kept is not None:
@@ -260,14 +247,17 @@ def sweep(
     pending = [run for run in everything if run not in found]
     # What takes another run's seconds comes after that run.
     parts = [[r for r in pending if (r.method in AFTER) == late] for late in (False, True)]
-    if workers == 0 and scheduler is None:
+    with connected(scheduler, workers if pending else 0) as client:
+        do = partial(_named, work, setting, () if client is not None else (tell,))
         for part in parts:
-            for run in part:
-                keep(run, partial(work, run, setting, _budget(run, found)))
-    elif pending:
-        with _cluster(scheduler, workers) as client:
-            for part in parts:
-                _there(client, [(run, _budget(run, found)) for run in part], setting, work, keep)
+            jobs = [(run, _budget(run, found)) for run in part]
+            for k, (row, arrays) in each(do, jobs, client):
+                found[part[k]] = steps.run(
+                    part[k].key,
+                    partial(_keep, steps.folder, part[k], row, arrays),
+                    **_known(part[k], setting),
+                )
+                tell("runs", len(found), len(everything))
     return {run: found[run] for run in everything}
 
 
@@ -287,43 +277,16 @@ def _budget(run: Run, found: dict[Run, Row]) -> float | None:
     return None if other is None else float(other["transport_s"]) + float(other["fit_s"])
 
 
-def _there(
-    client: Any, jobs: list[tuple[Run, float | None]], setting: Setting, work: Execute, keep: Any
-) -> None:
-    distributed = require("distributed", extra="cluster")
-    futures = {}
-    for place, (run, budget) in enumerate(jobs):
-        # One prefix for all keys: dask would else hand out small groups of other prefixes first, and runs of one set of
-        # receivers would not meet what was traced for them. The first asked for is the first done.
-        name = f"run-{place}-{time.time_ns()}"
-        futures[client.submit(work, run, setting, budget, key=name, pure=False, priority=-place)] = run
+def _named(
+    work: Execute, setting: Setting, progress: tuple[Any, ...], job: tuple[Run, float | None]
+) -> Result:
+    """Carry out a run; an error names it."""
     try:
-        for future in distributed.as_completed(list(futures), loop=client.loop):
-            keep(futures[future], lambda progress, future=future: future.result())
-            future.release()
-    finally:
-        client.cancel(list(futures))
+        return work(job[0], setting, job[1], *progress)
+    except Exception as error:
+        raise RuntimeError(f"{job[0].key}: {type(error).__name__}: {error}") from error
 
 
-@contextmanager
-def _cluster(scheduler: str | None, workers: int) -> Iterator[Any]:
-    """A client of the scheduler, or of a local cluster whose processes share the cores."""
-    distributed = require("distributed", extra="cluster")
-    if scheduler is not None:
-        with distributed.Client(scheduler, set_as_default=False) as client:
-            yield client
-        return
-    share = str(max(1, (os.cpu_count() or 1) // workers))
-    environment = {"WARPRRF_THREADS": share, "OMP_NUM_THREADS": share} if workers > 1 else {}
-    with (
-        distributed.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            memory_limit=0,  # a run may need what the machine has: no worker is stopped for it
-            dashboard_address=None,
-            env=environment,
-            silence_logs="ERROR",
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client
+def _keep(folder: Path, run: Run, row: Row, arrays: dict[str, np.ndarray], _: Attempt) -> Row:
+    write_arrays(folder / pictures_of(run), arrays)
+    return row

@@ -1,11 +1,14 @@
 """What the viewer says of a receiver is what the library says."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from golden import make
 
 import warprrf as wr
-from warprrf.viewer import answers
+from warprrf.rf.fields.bistatic.suggest import OWN, SHARED
+from warprrf.viewer import answers, room
 from warprrf.viewer.subject import Subject
 
 RECEIVER = make.TRANSMITTER + [2.0, 0.3, -1.0]
@@ -16,10 +19,9 @@ def field():
     return make.bistatic()
 
 
-def asked(source, transmitters=(make.TRANSMITTER,), mirror_order=3):
-    return answers.answer(
-        source, RECEIVER, transmitters, mirror_order=mirror_order, frequency_hz=make.CARRIER_HZ
-    )
+def asked(source, transmitters=(make.TRANSMITTER,), mirror_order=3, frequency_hz=make.CARRIER_HZ):
+    wish = answers.Asked(frequency_hz, mirror_order)
+    return answers.answer(answers.as_asked(source, wish), RECEIVER, transmitters, wish)
 
 
 def test_an_answer_is_the_fields_own(field):
@@ -55,9 +57,10 @@ def test_a_scene_without_a_field_has_mirror_paths():
 
 def test_legs_of_a_path_are_as_long_as_its_delay_says(field):
     paths = asked(field).paths[0]
-    legs = answers.segments(paths)
-    length = np.nansum(np.linalg.norm(legs[:, :, 1] - legs[:, :, 0], axis=-1), axis=1)
-    np.testing.assert_allclose(length, paths.tau * 299792458.0, rtol=1e-6)
+    for k in range(len(paths.gain)):
+        legs = answers.legs(paths, k)
+        length = np.linalg.norm(legs[:, 1] - legs[:, 0], axis=1).sum()
+        assert length == pytest.approx(paths.tau[k] * 299792458.0, rel=1e-6)
 
 
 def test_a_delay_profile_holds_the_power_of_all_paths(field):
@@ -68,9 +71,9 @@ def test_a_delay_profile_holds_the_power_of_all_paths(field):
 
 def test_the_best_beam_gains_what_select_beams_promises(field):
     paths = asked(field).paths
-    beam = answers.best_beam(paths, 4, 0.3)
+    beam, lobe, directions = answers.best_beam(paths, 4, 0.3)
     choice = wr.channel.select_beams(paths[0], rx_array=wr.PlanarArray(4, 4, orientation=(0.3, 0.0, 0.0)))
-    assert beam["gain_db"] == pytest.approx(10 * np.log10(choice.gain[0] / paths[0].power.sum()), abs=1e-6)
+    assert beam == pytest.approx(10 * np.log10(choice.gain[0] / paths[0].power.sum()), abs=1e-6)
 
 
 def test_truth_is_told_only_where_it_was_measured(field):
@@ -84,6 +87,68 @@ def test_truth_is_told_only_where_it_was_measured(field):
         and wrong["total_db"] == 0
         and wrong["psnr_db"] > 100
     )
+
+
+def test_another_carrier_is_that_of_the_field_carried_over(field):
+    found = asked(field, frequency_hz=140e9)
+    np.testing.assert_array_equal(
+        found.spectrum.path_gain, field.at_frequency(140e9).spectrum(RECEIVER).path_gain
+    )
+    assert found.frequency_hz == 140e9 and found.paths[0].frequency_hz == 140e9
+    assert asked(field, frequency_hz=field.frequency_hz + 1e6).frequency_hz == field.frequency_hz
+
+
+def test_the_strongest_paths_of_two_transmitters_are_listed_together(field):
+    found = asked(field, [make.TRANSMITTER, make.TRANSMITTER + [0.4, 0.2, -0.2]]).paths
+    listed = answers.strongest(found, 10)
+    powers = [p.power[k] for p, k in listed]
+    assert powers == sorted(np.concatenate([p.power for p in found]), reverse=True)[:10]
+    kind, gain, delay, *_ = answers.described(*listed[0])
+    assert kind == "los" and gain == f"{10 * np.log10(powers[0]):.1f} dB"
+    length = np.linalg.norm(listed[0][0].transmitter - RECEIVER)
+    assert delay == f"{length / 299792458.0 * 1e9:.2f} ns"
+
+
+def test_a_click_finds_the_path_that_it_is_aimed_at(field):
+    paths = asked(field).paths[0]
+    legs, eye = [answers.legs(paths, k) for k in range(len(paths.gain))], np.array([2.0, 0.5, 9.0])
+    for k in np.flatnonzero(paths.kind == "mirror")[:3]:
+        aim = 0.3 * legs[k][0, 0] + 0.7 * legs[k][0, 1]
+        near, angle = answers.nearest_path([legs[k], legs[0]], eye, aim - eye)
+        assert near == 0 and angle < np.deg2rad(0.5)
+    assert answers.nearest_path(legs, eye, np.array([0.0, 0.0, 1.0]))[1] > np.deg2rad(90)
+
+
+def test_readings_made_of_a_fields_own_paths_have_no_error_but_the_one_put_in(field):
+    places = np.array([RECEIVER, RECEIVER + [0.3, 0.1, 0.0]])
+    power = np.array([field.paths(place).power.sum() for place in places])
+    wrong = np.array([2.0, -3.0])
+    readings = wr.Readings(field.transmitter, places, power / 10 ** (wrong / 10), field.frequency_hz, 1e-20)
+    np.testing.assert_allclose(answers.reading_errors(field, readings), wrong, atol=1e-6)
+    unknown = wr.Readings(
+        field.transmitter, places, power / 10 ** (wrong / 10), field.frequency_hz, 1e-20, chain=["a", "a"]
+    )
+    np.testing.assert_allclose(answers.reading_errors(field, unknown), [2.5, -2.5], atol=1e-6)
+    quiet = wr.Readings(field.transmitter, places, power, field.frequency_hz, [1e-20, 10 * power[1]])
+    assert np.isnan(answers.reading_errors(field, quiet)).tolist() == [False, True]
+
+
+def test_what_is_learned_of_surfaces_is_shown_on_them(field):
+    surface, p = field.surface, field.parameters
+    smooth = np.exp(p.log_mirror) / (np.exp(p.log_mirror) + p.weight.sum(axis=1))
+    height_m = 1e-3 * room.learned(field, "roughness")
+    np.testing.assert_allclose(
+        np.exp(-((4 * np.pi * height_m / field.wavelength_m) ** 2)), smooth[surface.group], rtol=1e-6
+    )
+    gamma = (1 - np.sqrt(1 + np.exp(p.log_excess))) / (1 + np.sqrt(1 + np.exp(p.log_excess)))
+    wanted = 10 * np.log10(np.exp(p.log_mirror) * gamma**2)
+    np.testing.assert_allclose(room.learned(field, "reflection"), wanted[surface.group], atol=0.05)
+    known = field.gain_std_db()
+    unmeasured = dataclasses.replace(field, fitted_on=None).gain_std_db()
+    prior = 10 / np.log(10) * np.hypot(SHARED[0], OWN[0])
+    np.testing.assert_allclose(unmeasured, prior)
+    assert (known <= unmeasured).all() and known.min() < 0.5 * prior
+    assert room.learned(field, "uncertainty").shape == (len(surface.mesh.faces),)
 
 
 def test_things_are_sorted_by_what_they_are(tmp_path, field):

@@ -9,6 +9,7 @@ import pytest
 from golden import make
 
 import warprrf as wr
+from warprrf.viewer import answers
 
 CHROMIUM = (shutil.which("chromium"), shutil.which("chromedriver"))
 browsed = pytest.mark.skipif(
@@ -110,26 +111,133 @@ def test_an_address_that_is_none_is_refused(given, said):
         wr.view(make.room_mesh()[0], **given)
 
 
-def test_a_notebook_shows_the_page(viewer):
-    assert viewer.url in viewer._repr_html_() and viewer.url.startswith("http://127.0.0.1:")
+def test_a_carrier_that_is_slid_is_asked_and_said_to_be_carried_over(viewer):
+    viewer._channel.carrier.value = 140.0
+    assert viewer.wait().frequency_hz == 140e9 and "carried over to 140 GHz" in viewer.message
+    viewer._channel.carrier.value = make.CARRIER_HZ / 1e9
+    assert viewer.wait().frequency_hz == make.CARRIER_HZ and "carried over" not in viewer.message
+
+
+def test_errors_at_measured_places_are_listed_worst_first(viewer):
+    ds, survey = viewer.subject.spectra, viewer._survey
+    survey.errors()
+    viewer._page.wait()
+    wanted = [
+        answers.errors(viewer.subject.field.spectrum(r), ds[k])["psnr_db"] for k, r in enumerate(ds.receivers)
+    ]
+    listed = [float(button.label.split()[0]) for button in survey.listed]
+    np.testing.assert_allclose(listed, np.sort(wanted)[: len(listed)], atol=0.06)
+
+
+def test_places_to_measure_next_are_those_that_the_field_suggests(viewer):
+    survey, field = viewer._survey, viewer.subject.field
+    survey.suggest()
+    viewer._page.wait()
+    assert len(survey.listed) == 3, viewer.message
+    first = np.array([float(x) for x in survey.listed[0].label[5:-2].split(",")])
+    places = survey.candidates(field)
+    np.testing.assert_allclose(first, places[field.suggest(places, 1)[0]], atol=0.006)
+
+
+def test_a_click_on_a_path_chooses_it_and_one_beside_all_does_not(viewer):
+    viewer.receiver = RECEIVER
+    found = viewer.wait()
+    listed, rays = answers.strongest(found.paths, 5), viewer._rays
+    kind = [str(p.kind[k]) for p, k in listed]
+    assert kind[0] == "los" and rays.label.startswith("los ")
+    mirror = kind.index("mirror")
+    leg = answers.legs(*listed[mirror])[0]
+    eye = np.array([2.0, 0.5, 9.0])
+    rays.click(eye, np.array([0.0, 0.0, 1.0]))
+    assert rays.label.startswith("los ")
+    rays.click(eye, 0.4 * leg[0] + 0.6 * leg[1] - eye)
+    assert rays.label.startswith("mirror ") and answers.described(*listed[mirror])[1] in rays.label
+
+
+@browsed
+def test_a_notebook_shows_the_page(viewer, page, tmp_path):
+    from IPython.core.formatters import DisplayFormatter
+
+    shown = DisplayFormatter().format(viewer)[0]["text/html"]
+    assert viewer.url in shown and viewer.url.startswith("http://127.0.0.1:")
+    (tmp_path / "cell.html").write_text(shown)
+    before, here = len(viewer.clients), page.current_window_handle
+    page.switch_to.new_window("tab")
+    page.get(f"file://{tmp_path / 'cell.html'}")
+    _until(lambda: len(viewer.clients) == before + 1, 60)
+    page.close()
+    page.switch_to.window(here)
+    _until(lambda: len(viewer.clients) == before, 60)
+
+
+@browsed
+def test_pointing_at_a_ring_in_the_spectrum_tells_its_path(viewer, page):
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.by import By
+
+    viewer.receiver = RECEIVER
+    (paths,) = viewer.wait().paths
+    kind, gain, delay, *_ = answers.described(paths, int(paths.power.argmax()))
+    _until(lambda: page.find_elements(By.CSS_SELECTOR, ".wr .mark"), 60)
+    time.sleep(1)  # the last drag's figures are replaced by these
+    ring, tip = (page.find_elements(By.CSS_SELECTOR, f".wr .{name}")[0] for name in ("mark", "tip"))
+    assert not tip.is_displayed()
+    ActionChains(page).move_to_element(ring).perform()
+    _until(tip.is_displayed, 10)
+    assert tip.text.startswith(f"{kind}: {gain}, {delay}")
+
+
+@browsed
+def test_a_saved_page_shows_the_room_and_its_figures_without_a_server(viewer, page, tmp_path):
+    from selenium.common.exceptions import TimeoutException
+    from selenium.webdriver.common.by import By
+
+    def drawn():
+        try:
+            return _picture(page)[:, : page.get_window_size()["width"] // 2].std() > 5.0
+        except TimeoutException:  # a busy machine draws its first frame in software for many seconds
+            return False
+
+    viewer.receiver = RECEIVER
+    viewer.wait()
+    viewer.save(tmp_path / "page.html")
+    here = page.current_window_handle
+    page.switch_to.new_window("tab")
+    page.get(f"file://{tmp_path / 'page.html'}")
+    _until(lambda: page.find_elements(By.TAG_NAME, "canvas"), 60)
+    _until(drawn, 120)
+    assert "path gain" in page.find_element(By.CSS_SELECTOR, "p.wr").text
+    assert page.find_element(By.CSS_SELECTOR, ".wr img").get_property("naturalWidth") == make.SHAPE[1]
+    page.close()
+    page.switch_to.window(here)
 
 
 @browsed
 def test_a_drag_in_the_browser_changes_spectrum_and_picture(viewer, page):
-    from selenium.webdriver.common.action_chains import ActionChains
-
     viewer.receiver = RECEIVER
     viewer.wait()
     time.sleep(3)
     before, start = _panel(page), viewer.receiver
     x, y = _pixel(viewer, page, viewer.receiver + [0.35, 0.0, 0.0])  # the arrow along x
-    ActionChains(page).move_by_offset(x, y).click_and_hold().move_by_offset(40, 0).pause(0.3).move_by_offset(
+    _at(page, x, y).click_and_hold().move_by_offset(40, 0).pause(0.3).move_by_offset(
         20, 0
     ).release().perform()
     _until(lambda: not np.allclose(viewer.receiver, start), 30)
     found = viewer.wait()
     np.testing.assert_array_equal(found.receiver, viewer.receiver)
     _until(lambda: np.abs(_panel(page) - before).mean() > 1.0, 30)  # another spectrum, other figures
+
+
+@browsed
+def test_a_click_in_the_browser_chooses_the_path_under_it(viewer, page):
+    viewer.receiver = RECEIVER
+    listed = answers.strongest(viewer.wait().paths, 5)
+    time.sleep(2)
+    assert viewer._rays.label.startswith("los ")
+    paths, k = next(path for path in listed if path[0].kind[path[1]] == "mirror")
+    leg = answers.legs(paths, k)[0]
+    _at(page, *_pixel(viewer, page, 0.3 * leg[0] + 0.7 * leg[1])).click().perform()
+    _until(lambda: answers.described(paths, k)[1] in viewer._rays.label, 30)
 
 
 @browsed
@@ -146,6 +254,15 @@ def test_a_thousand_updates_leave_memory_as_it_is(viewer, page):
     update(1000)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     assert grown < 30, f"{grown:.0f} MB more"
+
+
+def _at(page, x, y):
+    """The mouse at a pixel, from wherever it was."""
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    actions = ActionChains(page)
+    actions.w3c_actions.pointer_action.move_to_location(x, y)
+    return actions
 
 
 def _pixel(viewer, page, point):

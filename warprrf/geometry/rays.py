@@ -271,9 +271,8 @@ class EmbreeScene:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> None:
         self._o3d = o3d.load()
-        self._threads = _device.threads()
         self._kept = None if len(kept) == len(faces) else kept.astype(np.int32)
-        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=_device.threads())
         tensor = self._o3d.core.Tensor.from_numpy
         self._scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces[kept].astype(np.uint32)))
 
@@ -294,7 +293,7 @@ class EmbreeScene:
         return hit
 
     def _threads_for(self, rays: np.ndarray) -> int:
-        return min(self._threads, 1 + len(rays) // _RAYS_A_THREAD)
+        return min(_device.threads(), 1 + len(rays) // _RAYS_A_THREAD)
 
 
 def choose_backend(backend: str, device: wp.Device, count: int) -> str:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from warprrf.cache import Cache, making
 from warprrf.checks import check_array, check_count, check_number, check_seed, checked
+from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import as_mesh
-from warprrf.rf.em.absorption import Gas, air_of
+from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
@@ -50,6 +54,7 @@ def simulate(
     roles: Sequence[str] | NDArray[np.str_] | None = None,
     floor: float | None = None,
     workspace: str | os.PathLike[str] | None = None,
+    client: Any = None,
     progress: Progress | None = None,
     device: DeviceLike = None,
 ) -> SpectrumDataset:
@@ -74,7 +79,8 @@ def simulate(
         roles: "train" or "test" for each receiver, shape ``(R,)``; an eighth is for test by default.
         floor: N0 [linear]; median over views of the view's maximum, less 60 dB, by default.
         workspace: Folder that keeps each finished receiver, so that a killed run goes on where it stopped.
-        progress: Called as ``progress("simulate", done, total)``.
+        client: A ``dask.distributed.Client`` whose workers compute, to the same bits; this process by default.
+        progress: Called as ``progress("simulate", done, total)``; what ``workspace`` holds is done from the start.
         device: Where our own kernels run.
 
     Raises:
@@ -105,26 +111,22 @@ def simulate(
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
     common |= {"shape": check_shape(shape), "beam_sigma_rad": beam_sigma_rad}
     versions = _versions(engine)
-    running: ExactEngine | SionnaEngine | None = None
-
-    def receive(point: np.ndarray) -> ReceivedPaths:
-        nonlocal running
-        if running is None and engine == "exact":
-            running = ExactEngine(scene, **common, gas=air, device=device)
-        elif running is None:
-            running = SionnaEngine(scene, **common, sampling=sampling, gas=air, device=device)
-        return running.receive(point)
-
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver = (sampling, _versions(engine, solver_only=True)) if engine == "sionna" else None
     inputs = digest(engine, common, air, surfaces, solver)
-    results: list[ReceivedPaths] = []
-    for k, point in enumerate(points):
-        if progress is not None:
-            progress("simulate", k, len(points))
-        results.append(receive(point) if workspace is None else _kept(workspace, inputs, point, receive))
-    if progress is not None:
-        progress("simulate", len(points), len(points))
+    results: dict[int, Any] = {}  # ReceivedPaths
+    if workspace is not None:
+        known = {k: _kept(workspace, inputs, point) for k, point in enumerate(points)}
+        results = {k: held for k, held in known.items() if held is not None}
+    tell = progress or (lambda *_: None)
+    tell("simulate", len(results), len(points))
+    missing = [k for k in range(len(points)) if k not in results]
+    receiver = _Receiver(engine, scene, common, None if engine == "exact" else sampling, air, device)
+    for at, found in each(receiver, [points[k] for k in missing], client):
+        k = missing[at]
+        results[k] = found if workspace is None else _kept(workspace, inputs, points[k], found)
+        tell("simulate", len(results), len(points))
+    received = [results[k] for k in range(len(points))]
     settings = {"depth": depth, "samples": samples, "refraction": int(refraction)}
     if engine == "exact":
         settings = {"depth": 1, "sub_pixels": SUB_PIXELS}
@@ -132,10 +134,10 @@ def simulate(
         receivers=points,
         transmitter=source,
         frequency_hz=frequency,
-        path_gain=np.stack([r.path_gain.astype(np.float32) for r in results]),
-        delay_s=np.stack([r.delay_s for r in results]),
-        aod=np.stack([r.aod.astype(np.float32) for r in results]),
-        line_of_sight=np.array([r.line_of_sight for r in results]),
+        path_gain=np.stack([r.path_gain.astype(np.float32) for r in received]),
+        delay_s=np.stack([r.delay_s for r in received]),
+        aod=np.stack([r.aod.astype(np.float32) for r in received]),
+        line_of_sight=np.array([r.line_of_sight for r in received]),
         beam_sigma_rad=beam_sigma_rad,
         engine=engine,
         seed=seed,
@@ -214,17 +216,40 @@ def _versions(engine: str, solver_only: bool = False) -> dict[str, str]:
     return found
 
 
-def _kept(
-    workspace: str | os.PathLike[str],
-    inputs: str,
-    point: np.ndarray,
-    receive: Callable[[np.ndarray], ReceivedPaths],
-) -> ReceivedPaths:
-    """What ``receive`` returns for ``point``, in single precision, from the file of an earlier run if there is one."""
+@dataclass(frozen=True)
+class _Receiver:
+    """What a receiver (3,) gets; a pickle holds how the engine is built."""
 
-    def make() -> dict[str, np.ndarray]:
-        found = receive(point)
-        return {
+    engine: str
+    scene: Scene
+    common: dict[str, Any]
+    sampling: Sampling | None
+    air: Air | None
+    device: DeviceLike
+    _running: Cache = field(default_factory=lambda: Cache(1))
+
+    def __call__(self, point: np.ndarray) -> ReceivedPaths:
+        if self.sampling is None:
+            return self._running.get("engine", self._exact).receive(point)
+        with making:  # Sionna RT's scene holds the receiver: one thread at a time
+            return self._running.get("engine", self._sionna).receive(point)
+
+    def _exact(self) -> ExactEngine:
+        return ExactEngine(self.scene, **self.common, gas=self.air, device=self.device)
+
+    def _sionna(self) -> SionnaEngine:
+        return SionnaEngine(
+            self.scene, **self.common, sampling=self.sampling, gas=self.air, device=self.device
+        )
+
+
+def _kept(
+    workspace: str | os.PathLike[str], inputs: str, point: np.ndarray, found: ReceivedPaths | None = None
+) -> ReceivedPaths | None:
+    """What is on file for ``point``, in single precision: what an earlier run left there, else what was ``found``."""
+    made = None
+    if found is not None:
+        made = {
             "path_gain": found.path_gain.astype(np.float32),
             "delay_s": found.delay_s,
             "aod": found.aod.astype(np.float32),
@@ -232,10 +257,12 @@ def _kept(
             "kinds": np.array(list(found.totals)),
             "totals": np.array(list(found.totals.values())),
         }
-
     with Steps(workspace, shared=True) as steps:
         name = digest(inputs, point)[:24]
+        make: Any = None if made is None else partial(dict, made)
         held = steps.arrays(name, make, version=REVISION, inputs=[inputs, point])
+    if not held:
+        return None
     return ReceivedPaths(
         path_gain=held["path_gain"],
         delay_s=held["delay_s"],

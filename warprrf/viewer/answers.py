@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.beams import dft_codebook
@@ -19,10 +19,15 @@ from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import angle_deg, psnr, strongest_direction, unit_image
+from warprrf.rf.spectra.readings import Readings, path_weights
 from warprrf.rf.spectra.spectrum import Spectrum, directions_from_angles
 
+Source = RadioField | Scene | Mesh
 AT_M = 0.005
 """A receiver that stands no farther from a measured one has its truth."""
+CARRIER_STEP_HZ = 0.1e9
+"""Carriers that differ by less than half of it are one."""
+MOST_PATHS = 200
 
 
 @dataclass(frozen=True)
@@ -33,12 +38,14 @@ class Answer:
         receiver: position [m], shape ``(3,)``.
         paths: from each transmitter, strongest first.
         spectrum: of all transmitters, powers added; None without a field.
+        frequency_hz: carrier [Hz].
         seconds: that it took.
     """
 
     receiver: np.ndarray
     paths: tuple[Paths, ...]
     spectrum: Spectrum | None
+    frequency_hz: float
     seconds: float
 
     @property
@@ -51,16 +58,33 @@ class Answer:
         return 10.0 * float(np.log10(max(total, 1e-300)))
 
 
-def answer(
-    source: RadioField | Scene | Mesh,
-    receiver: np.ndarray,
-    transmitters: Sequence[np.ndarray],
-    *,
-    mirror_order: int,
-    frequency_hz: float,
-    max_paths: int = 200,
-) -> Answer:
-    """Ask a field for spectrum and paths, or trace mirror paths of a scene or a mesh.
+@dataclass(frozen=True)
+class Asked:
+    """What is asked for.
+
+    Attributes:
+        frequency_hz: carrier [Hz].
+        mirror_order: most reflections on a mirror path.
+        uncertainty: also ask how wrong the spectrum may be, where the field knows that.
+    """
+
+    frequency_hz: float
+    mirror_order: int
+    uncertainty: bool = False
+
+
+def as_asked(source: Source, asked: Asked) -> Source:
+    """A bistatic field with fewer mirrors or at another carrier; anything else as it is."""
+    if not isinstance(source, BistaticField):
+        return source
+    if abs(asked.frequency_hz - source.frequency_hz) > 0.5 * CARRIER_STEP_HZ:
+        source = source.at_frequency(asked.frequency_hz)
+    order = min(asked.mirror_order, source.terms.mirror_order)
+    return replace(source, terms=replace(source.terms, mirror_order=order))
+
+
+def answer(source: Source, receiver: np.ndarray, transmitters: Sequence[np.ndarray], asked: Asked) -> Answer:
+    """Ask a field (:func:`as_asked`) for spectrum and paths, or trace mirror paths of a scene or a mesh.
 
     Raises:
         ValueError: for a place that ``source`` does not hold at.
@@ -69,20 +93,18 @@ def answer(
     spectra, paths = [], []
     for transmitter in transmitters:
         if isinstance(source, BistaticField):
-            asked = source
-            if mirror_order < source.terms.mirror_order:
-                asked = replace(source, terms=replace(source.terms, mirror_order=mirror_order))
-            view = asked.view(receiver, transmitter)
-            spectra.append(asked.spectrum(receiver, transmitter, view=view))
-            paths.append(asked.paths(receiver, transmitter, max_paths, view=view))
+            view = source.view(receiver, transmitter)
+            told = asked.uncertainty and source.errors is not None and len(transmitters) == 1
+            spectra.append(source.spectrum(receiver, transmitter, view=view, uncertainty=told))
+            paths.append(source.paths(receiver, transmitter, MOST_PATHS, view=view))
         elif isinstance(source, RadioField):
             spectra.append(source.spectrum(receiver, transmitter))
-            paths.append(source.paths(receiver, transmitter, max_paths))
+            paths.append(source.paths(receiver, transmitter, MOST_PATHS))
         else:
             paths.append(
                 trace_paths(
-                    source, transmitter=transmitter, receivers=receiver, frequency_hz=frequency_hz,
-                    mirror_order=mirror_order,
+                    source, transmitter=transmitter, receivers=receiver, frequency_hz=asked.frequency_hz,
+                    mirror_order=asked.mirror_order,
                 )
             )  # fmt: skip
     spectrum = None
@@ -91,7 +113,8 @@ def answer(
         spectrum = spectra[0] if len(spectra) == 1 else replace(
             spectra[0], path_gain=gains.sum(axis=0, dtype=np.float64), delay_s=None, aod=None
         )  # fmt: skip
-    return Answer(receiver, tuple(paths), spectrum, time.perf_counter() - start)
+    carrier = source.frequency_hz if isinstance(source, RadioField) else asked.frequency_hz
+    return Answer(receiver, tuple(paths), spectrum, carrier, time.perf_counter() - start)
 
 
 def measured_here(ds: SpectrumDataset | None, receiver: np.ndarray) -> int | None:
@@ -117,29 +140,70 @@ def errors(predicted: Spectrum, truth: Spectrum) -> dict[str, float]:
     }
 
 
-def segments(paths: Paths) -> np.ndarray:
-    """Legs of the paths of one receiver from transmitter to receiver, shape ``(L, D + 1, 2, 3)`` [m]; NaN past the last."""
-    count, depth = paths.vertices.shape[:2]
-    if paths.transmitter is None or paths.receiver is None:
-        raise ValueError("paths: got paths that do not say where they start and end, expected both")
-    ends = np.broadcast_to(paths.receiver, (count, 3))
-    points = np.empty((count, depth + 2, 3))
-    points[:, 0] = paths.transmitter
-    points[:, 1:-1] = np.where(np.isnan(paths.vertices), ends[:, None], paths.vertices)
-    points[:, -1] = ends
-    legs = np.stack([points[:, :-1], points[:, 1:]], axis=2)
-    legs[(legs[:, :, 0] == legs[:, :, 1]).all(axis=-1)] = np.nan
-    return legs
+def legs(paths: Paths, index: int) -> np.ndarray:
+    """Legs of one path from transmitter to receiver [m], shape ``(D + 1, 2, 3)``."""
+    met = paths.vertices[index]
+    points = np.array([paths.transmitter, *met[np.isfinite(met[:, 0])], paths.receiver], dtype=np.float64)
+    return np.stack([points[:-1], points[1:]], axis=1)
 
 
-def described(paths: Paths, index: int) -> str:
-    """One path in words: kind, gain, delay, angles of arrival and departure."""
+def strongest(found: Sequence[Paths], count: int) -> list[tuple[Paths, int]]:
+    """Up to ``count`` paths of all transmitters, each with its index, strongest first."""
+    owner = np.repeat(np.arange(len(found)), [len(p.gain) for p in found])
+    index = np.concatenate([np.arange(len(p.gain)) for p in found])
+    order = np.argsort(-np.concatenate([p.power for p in found]), kind="stable")[:count]
+    return [(found[owner[k]], int(index[k])) for k in order]
+
+
+def described(paths: Paths, index: int) -> tuple[str, str, str, str, str]:
+    """One path in words: kind, gain, delay, zenith and azimuth of arrival, and of departure."""
     degrees = [float(np.rad2deg(getattr(paths, n)[index])) for n in ("theta_r", "phi_r", "theta_t", "phi_t")]
     gain = 10.0 * np.log10(max(float(paths.power[index]), 1e-300))
     return (
-        f"{paths.kind[index]}: {gain:.1f} dB, {paths.tau[index] * 1e9:.2f} ns, "
-        f"arrives from {degrees[0]:.0f}° / {degrees[1]:.0f}°, sent to {degrees[2]:.0f}° / {degrees[3]:.0f}°"
-    )
+        str(paths.kind[index]), f"{gain:.1f} dB", f"{paths.tau[index] * 1e9:.2f} ns",
+        f"{degrees[0]:.0f}°, {degrees[1]:.0f}°", f"{degrees[2]:.0f}°, {degrees[3]:.0f}°",
+    )  # fmt: skip
+
+
+def nearest_path(each: Sequence[np.ndarray], origin: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
+    """Which of the paths with :func:`legs` ``each`` a ray passes nearest to as seen from its ``origin``, and the angle
+    between the two [rad]."""
+    unit, angles = direction / np.linalg.norm(direction), [np.inf]
+    for start, end in ((own[:, :1], own[:, 1:]) for own in each):
+        toward = start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start) - origin
+        along = toward @ unit
+        angles.append(np.arctan2(np.linalg.norm(toward - along[..., None] * unit, axis=-1), along).min())
+    nearest = int(np.argmin(angles))
+    return nearest - 1, float(angles[nearest])
+
+
+def reading_errors(field: RadioField, readings: Readings, progress: Progress | None = None) -> np.ndarray:
+    """What ``field`` predicts over what was read [dB], shape ``(N,)``; NaN where nothing was, or both are below the floor.
+
+    The gain of a measuring chain is not known: each chain's median error is taken off.
+
+    Raises:
+        ValueError: for azimuths that count from an unknown zero, or a place that ``field`` does not hold at.
+    """
+    if not readings.azimuth_known:
+        raise ValueError("readings: their azimuths count from an unknown zero, expected azimuth_known=True")
+    power, ends = np.empty(len(readings)), np.column_stack([readings.transmitters, readings.receivers])
+    links, own = np.unique(ends, axis=0, return_inverse=True)
+    for k, link in enumerate(links):
+        rows, paths = np.flatnonzero(own.reshape(-1) == k), field.paths(link[3:], link[:3])
+        arrival = directions_from_angles(paths.theta_r, paths.phi_r)
+        departure = directions_from_angles(paths.theta_t, paths.phi_t)
+        power[rows] = path_weights(readings, rows, arrival, departure, paths.tau) @ paths.power
+        if progress is not None:
+            progress("readings", k + 1, len(links))
+    floor = 10.0 * np.log10(np.asarray(readings.floor))
+    predicted = 10.0 * np.log10(np.maximum(power, 1e-300))
+    error = np.maximum(predicted, floor) - np.maximum(readings.expected_db, floor)
+    error[np.isnan(readings.power) | (predicted <= floor) & (readings.power <= readings.floor)] = np.nan
+    chain = np.asarray(readings.chain)
+    for name in np.unique(chain[chain != ""]):
+        error[chain == name] -= np.nanmedian(error[chain == name])
+    return error
 
 
 def delay_profile(
@@ -155,16 +219,11 @@ def delay_profile(
     return (first + np.arange(taps) / bandwidth_hz) * 1e9, 10.0 * np.log10(np.maximum(total, 1e-300))
 
 
-def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> dict[str, Any]:
-    """The receiver's best beam of a DFT codebook, without pilots.
-
-    Args:
-        paths: that arrive.
-        size: rows and columns of the array.
-        azimuth_rad: that the array faces.
+def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """The best beam of the DFT codebook of an array of ``size`` squared that faces ``azimuth_rad``, without pilots.
 
     Returns:
-        ``gain_db`` over one isotropic antenna, and the beam's power gain ``lobe`` (K, M) along ``directions`` (K, M, 3).
+        What it gains over one isotropic antenna [dB], and its power gain (K, M) along directions (K, M, 3).
     """
     codebook = dft_codebook(PlanarArray(size, size, orientation=(azimuth_rad, 0.0, 0.0)))
     arrival = np.concatenate([directions_from_angles(p.theta_r, p.phi_r) for p in paths])
@@ -174,8 +233,5 @@ def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> dict[str
     zenith, azimuth = np.meshgrid(np.linspace(0, np.pi, 61), np.linspace(-np.pi, np.pi, 121), indexing="ij")
     directions = directions_from_angles(zenith, azimuth)
     lobe = np.abs(codebook.amplitude(directions.reshape(-1, 3))[best]) ** 2
-    return {
-        "gain_db": 10.0 * float(np.log10(max(received[best] / max(power.sum(), 1e-300), 1e-300))),
-        "directions": directions,
-        "lobe": lobe.reshape(zenith.shape),
-    }
+    gain_db = 10.0 * float(np.log10(max(received[best] / max(power.sum(), 1e-300), 1e-300)))
+    return gain_db, lobe.reshape(zenith.shape), directions

@@ -1,13 +1,31 @@
-"""Colours and shapes of what a viewer draws."""
+"""Colours, shapes and small HTML figures of what a viewer draws."""
 
 from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf.geometry.splats.gaussians import Gaussians
 
+Image = tuple[str, np.ndarray, float, float, str]
+"""Title, values (H, W) [dB], lowest and highest that are told apart, colour map."""
 GREY = (200, 200, 205)
+STYLE = """<style>
+.wr{font:12px/1.4 sans-serif;padding:0 10px 8px;color:#333} .wr .title{font-weight:600;margin-top:4px}
+.wr img{width:100%;display:block;aspect-ratio:2;image-rendering:pixelated} .wr .image{position:relative}
+.wr .ends{display:flex;justify-content:space-between;color:#777;font-size:11px} .wr .bar{height:8px}
+.wr .mark{position:absolute;width:14px;height:14px;margin:-7px;border-radius:7px;border:1.5px solid #ffffffa0}
+.wr .mark:hover{border-color:#fff;background:#ffffff60} .wr .mark:hover+.tip{display:block}
+.wr .tip{display:none;position:absolute;left:0;right:0;top:100%;z-index:9;background:#222;color:#fff;padding:4px 8px}
+.wr table{width:100%;border-collapse:collapse} .wr th{color:#777}
+.wr td,.wr th{text-align:right;padding:1px 4px;font-weight:400}
+.wr i{display:inline-block;width:10px;height:10px;margin-right:4px}
+</style>"""
 
 
 def coloured(values: np.ndarray, low: float, high: float, name: str = "viridis") -> np.ndarray:
@@ -19,17 +37,90 @@ def coloured(values: np.ndarray, low: float, high: float, name: str = "viridis")
     return found
 
 
-def panorama(image_db: np.ndarray, low: float, high: float, width: int = 720) -> np.ndarray:
-    """A dB image (H, W) as a picture, each pixel a square."""
-    times = max(1, width // image_db.shape[1])
-    return np.repeat(np.repeat(coloured(image_db, low, high), times, axis=0), times, axis=1)
+def png(image: np.ndarray) -> bytes:
+    """A picture (H, W, 3) uint8 as a PNG file."""
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(image).save(data, format="PNG")
+    return data.getvalue()
+
+
+def figure(title: str, content: str) -> str:
+    """HTML of ``content`` in the page's style, below a title."""
+    return f'{STYLE}<div class="wr"><div class="title">{html.escape(title)}</div>{content}</div>'
+
+
+def _spread(texts: Iterable[str]) -> str:
+    return '<div class="ends">' + "".join(f"<span>{text}</span>" for text in texts) + "</div>"
+
+
+def colour_bar(low: float, high: float, unit: str, name: str = "viridis") -> str:
+    """HTML of the colours from ``low`` to ``high``."""
+    steps = ",".join("rgb({},{},{})".format(*c) for c in coloured(np.linspace(0, 1, 9), 0, 1, name))
+    ends = _spread(f"{value:.4g} {unit}" for value in (low, 0.5 * (low + high), high))
+    return f'<div class="bar" style="background:linear-gradient(90deg,{steps})"></div>{ends}'
+
+
+def legend(names: Sequence[str]) -> str:
+    """HTML of names with their :func:`named_colours`."""
+    colours = named_colours(np.arange(len(names)))
+    square = '<i style="background:rgb({},{},{})"></i>{} &emsp;'
+    return "".join(square.format(*c, html.escape(n)) for n, c in zip(names, colours, strict=True))
+
+
+def panorama(image: Image, marks: Sequence[tuple[float, float, str]] = (), *, scale: bool = True) -> str:
+    """HTML of an image over azimuth and zenith.
+
+    Args:
+        image: its title, values (H, W) [dB], their range, and a colour map.
+        marks: zenith and azimuth [rad] of small rings, each with the text that appears while the mouse is over it.
+        scale: whether azimuths and colours are told below it.
+    """
+    title, values, *colours = image
+    data = base64.b64encode(png(coloured(values, *colours))).decode()
+    rings = "".join(
+        f'<div class="mark" style="left:{50.0 + azimuth * 50.0 / np.pi:.2f}%;top:{zenith * 100.0 / np.pi:.2f}%"></div>'
+        f'<div class="tip">{html.escape(text)}</div>'
+        for zenith, azimuth, text in marks
+    )
+    low, high, name = colours
+    ends = _spread(("azimuth -180°", "-90°", "0°", "90°", "180°"))
+    below = ends + colour_bar(low, high, "dB", name) if scale else ""
+    return (
+        f'<div class="title">{html.escape(title)}</div>'
+        f'<div class="image"><img src="data:image/png;base64,{data}">{rings}</div>{below}'
+    )
+
+
+def sheet(caption: str, images: Sequence[Image], view: np.ndarray | None = None) -> bytes:
+    """A PNG file of images as :func:`panorama` takes them, below what the browser shows (H, W, 3)."""
+    figures = _device.require("matplotlib.figure", extra="view")
+    drawing = figures.Figure(
+        figsize=(9.0, 3.5 * len(images) + (6.8 if view is not None else 0.5)), layout="constrained"
+    )
+    drawing.suptitle(caption, fontsize=10)
+    heights = [3.5] * len(images) if view is None else [6.5] + [3.5] * len(images)
+    axes = list(drawing.subplots(len(heights), height_ratios=heights, squeeze=False).flat) if heights else []
+    if view is not None:
+        axes[0].imshow(view)
+        axes.pop(0).axis("off")
+    for ax, (title, values, low, high, name) in zip(axes, images, strict=True):
+        shown = ax.imshow(values, extent=(-180, 180, 180, 0), vmin=low, vmax=high, cmap=name, aspect="auto")
+        drawing.colorbar(shown, ax=ax, label="dB")
+        ax.set(title=title, xlabel="azimuth [degrees]", ylabel="zenith [degrees]")
+    data = io.BytesIO()
+    drawing.savefig(data, format="png", dpi=110)
+    return data.getvalue()
 
 
 def named_colours(index: np.ndarray) -> np.ndarray:
     """A colour (..., 3) uint8 for each index (...), neighbours in index far apart in hue."""
     import colorsys
 
-    hues = [colorsys.hsv_to_rgb((0.61803399 * k) % 1.0, 0.5, 0.9) for k in range(int(index.max()) + 1)]
+    hues = [
+        colorsys.hsv_to_rgb((0.61803399 * k) % 1.0, 0.5, 0.9) for k in range(int(index.max(initial=-1)) + 1)
+    ]
     return np.round(np.array(hues) * 255).astype(np.uint8)[index]
 
 

@@ -22,6 +22,7 @@ from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 
+CARRIER_HZ = 300e9  # where nothing says another
 KINDS = "a Reconstruction, Gaussians, Mesh, Scene, RadioField, SpectrumDataset or Readings, or a file of one"
 
 
@@ -106,6 +107,22 @@ class Subject:
         if self.scene is not None and self.scene.transmitters:
             return np.asarray(next(iter(self.scene.transmitters.values())), dtype=np.float64)
         return None
+
+    @property
+    def carrier_hz(self) -> float:
+        """That of the field, or of what was measured [Hz]."""
+        for known in (self.field, self.spectra, self.readings):
+            if known is not None:
+                return float(known.frequency_hz)
+        return CARRIER_HZ
+
+    @property
+    def places(self) -> np.ndarray:
+        """Where it was measured, shape ``(K, 3)`` [m]."""
+        for known in (self.spectra, self.readings):
+            if known is not None:
+                return np.unique(np.atleast_2d(np.asarray(known.receivers, dtype=np.float64)), axis=0)
+        return np.zeros((0, 3))
 
 
 _KINDS: dict[str, type] = {

@@ -51,7 +51,7 @@ class PathArrays:
         jones: Polarised complex gain, shape ``(..., 2, 2)``: received over transmitted, both along zenith and azimuth
             unit vectors; NaN for paths without, None if no path has it. 0 where padded.
         frequency_hz: Carrier that ``gain`` and ``jones`` hold at [Hz]; None if not known.
-        transmitter: Position [m], shape ``(3,)``; None if not known.
+        transmitter: Position [m], shape ``(3,)``, or of each receiver ``(R, 3)``; None if not known.
         receiver: Position ``(3,)`` or positions ``(R, 3)`` [m]; None if not known.
         air: The air whose absorption (ITU-R P.676) is in ``gain`` and ``jones``; None for none.
     """
@@ -119,7 +119,10 @@ class PathArrays:
         if not -len(self.gain) <= receiver < len(self.gain):
             raise ValueError(f"receiver: got {receiver}, expected one of {len(self.gain)}")
         point = None if self.receiver is None else self.receiver[receiver]
-        return replace(self._taken(receiver), receiver=point)
+        source = self.transmitter
+        if source is not None and source.ndim == 2:
+            source = source[receiver]
+        return replace(self._taken(receiver), receiver=point, transmitter=source)
 
     def _taken(self, index: int | slice | np.ndarray) -> Self:
         """Every array at ``index``."""
@@ -274,10 +277,10 @@ class PathArrays:
         return cls(**joined, **_common(parts), receiver=parts[0].receiver)
 
     @classmethod
-    def stack(cls, parts: Sequence[Self]) -> Self:
-        """Paths of several receivers, padded to the longest list: arrays ``(R, L)``."""
+    def stack(cls, parts: Sequence[Self], length: int = 0) -> Self:
+        """Paths of several receivers, padded to the longest list or to ``length``: arrays ``(R, L)``."""
         _check_parts(parts)
-        length = max((len(p.gain) for p in parts), default=0)
+        length = max(length, *(len(p.gain) for p in parts))
         stacked: dict[str, Any] = {
             name: np.stack([_padded(a, 0, length, _PADDING[name]) for a in arrays])
             for name, arrays in _columns(parts).items()
@@ -285,7 +288,13 @@ class PathArrays:
         receiver = None
         if all(p.receiver is not None for p in parts):
             receiver = np.stack([np.asarray(p.receiver) for p in parts])
-        return cls(**stacked, **_common(parts), receiver=receiver)
+        sources = [p.transmitter for p in parts if p.transmitter is not None]
+        common = _common([replace(p, transmitter=None) for p in parts])
+        if sources and len(sources) == len(parts) and not all(np.array_equal(s, sources[0]) for s in sources):
+            common["transmitter"] = np.stack(sources)
+        elif sources:
+            common["transmitter"] = sources[0]
+        return cls(**stacked, **common, receiver=receiver)
 
 
 def points_along(transmitter: np.ndarray, vertices: np.ndarray, receiver: np.ndarray) -> np.ndarray:

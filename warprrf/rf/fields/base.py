@@ -8,29 +8,44 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Self
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import version
+from typing import Any, ClassVar, Self, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
-from warprrf.checks import LARGEST_M, check_array, check_number, check_positive, check_type, checked
-from warprrf.device import DeviceLike, Progress
+from warprrf.checks import (
+    LARGEST_M,
+    check_array,
+    check_count,
+    check_number,
+    check_positive,
+    check_type,
+    checked,
+)
+from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh
+from warprrf.netcdf_files import Variable
+from warprrf.rf.channel.response import LinkOptions as LinkEnds
+from warprrf.rf.channel.response import frequency_response
 from warprrf.rf.em.absorption import Air, Gas
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
+from warprrf.rf.fields.batches import Batch, Delivery
 from warprrf.rf.fields.data import Data
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
-from warprrf.rf.paths.path_set import Paths
+from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
 from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
+from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 """Attributes of every model that are numbers, under these names in the header of a file."""
-CARRIERS_HZ = (1e3, 1e16)
 NARROWEST_BEAM_RAD = 1e-4
 
 
@@ -121,6 +136,10 @@ class RadioField(ABC):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one safetensors file, in one go."""
+        tensor_files.write(path, *self._whole())
+
+    def _whole(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Tensors and header of its file."""
         tensors, header = self._taken_apart()
         tensors["transmitter"] = self.transmitter
         for name in ("fitted_on", "fitted_under"):
@@ -130,7 +149,7 @@ class RadioField(ABC):
             "model": self.model,
             "report": self.report,
         }
-        tensor_files.write(path, tensors, header | ({} if self.air is None else self.air.attributes))
+        return tensors, header | ({} if self.air is None else self.air.attributes)
 
     @abstractmethod
     def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -162,34 +181,152 @@ class RadioField(ABC):
         """The spatial spectrum at ``rx`` (3,) [m]."""
 
     def spectra(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, progress: Progress | None = None
+        self,
+        receivers: ArrayLike,
+        transmitters: ArrayLike | None = None,
+        *,
+        store: str | os.PathLike[str] | None = None,
+        client: Any = None,
+        progress: Progress | None = None,
     ) -> np.ndarray:
         """Path gain of the spectra at many receivers: what :meth:`spectrum` says of each, without delays and departures.
 
         Args:
-            rx: positions [m], shape ``(R, 3)``.
-            transmitter: as for :meth:`spectrum`.
+            receivers: positions [m], shape ``(R, 3)``.
+            transmitters: position ``(3,)``, or one for each receiver ``(R, 3)`` [m]; the fitted one by default.
+            store: a NetCDF-4 file that is written as answers come, in the place of memory; a call that was killed goes on
+                where it stopped. Until the last answer its name ends in ``.unfinished``.
+            client: a ``dask.distributed.Client`` whose workers compute, to the same bits; this process by default.
             progress: called as ``progress("spectra", done, total)``.
 
         Returns:
-            Path gain [linear], shape ``(R, H, W)``, float32.
+            Path gain [linear], shape ``(R, H, W)``, float32; that of a store stays on the disk.
 
         Raises:
-            ValueError: as for :meth:`spectrum`.
+            ValueError: as for :meth:`spectrum`, and for a ``store`` of something else.
+
+        Example::
+
+            gain = field.spectra(receivers, store="spectra.nc", client=distributed.Client("lab:8786"))
         """
-        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
-        found = np.empty((len(receivers), *self.shape), np.float32)
-        for k, receiver in enumerate(receivers):
-            found[k] = self.spectrum(receiver, source).path_gain
-            if progress is not None:
-                progress("spectra", k + 1, len(receivers))
-        return found
+        batch = self._batch("spectra", receivers, transmitters)
+        variables = {"path_gain": Variable(("receiver", "zenith", "azimuth"), "1")}
+        delivery = Delivery(store, client, progress)
+        found = batch.gather(partial(_spectra, self), variables, {}, self._known_by(batch), delivery)
+        return found["path_gain"]
+
+    def paths(
+        self,
+        receivers: ArrayLike,
+        transmitters: ArrayLike | None = None,
+        max_paths: int | None = None,
+        *,
+        store: str | os.PathLike[str] | None = None,
+        client: Any = None,
+        progress: Progress | None = None,
+    ) -> Paths:
+        """Propagation paths: line of sight, mirrors, and one diffuse path per pixel above the floor.
+
+        The sum of ``|gain|^2`` equals the spectrum's sum: what pixels below the floor hold is shared among the diffuse
+        paths in proportion.
+
+        Args:
+            receivers: one position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded [m].
+            transmitters: as for :meth:`spectra`.
+            max_paths: keep the strongest only (the sum is then what they carry).
+            store: as for :meth:`spectra`, with room for ``max_paths``; :meth:`Paths.load` reads it.
+            client, progress: as for :meth:`spectra`.
+
+        Raises:
+            ValueError: as for :meth:`spectra`, for a ``max_paths`` below 1, and for a store without one.
+        """
+        if max_paths is not None:
+            check_count("max_paths", max_paths)
+        batch = self._batch("paths", receivers, transmitters)
+        work, delivery = partial(_paths, self, max_paths), Delivery(store, client, progress)
+        if store is None:
+            found: dict[int, Paths] = {}
+            for rows, several in batch.each(work, delivery):
+                found |= zip(rows.tolist(), several, strict=True)
+            return found[0] if np.ndim(receivers) == 1 else Paths.stack([found[k] for k in sorted(found)])
+        if max_paths is None:
+            raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
+        source = batch.transmitters if len(batch.groups()) > 1 else batch.transmitters[0]
+        known, attributes = ends_and_attributes(batch.receivers, source, self.frequency_hz, self.air)
+        attributes |= self._known_by(batch, max_paths)
+        batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes, delivery)
+        return Paths.load(store)
+
+    def cfr(
+        self,
+        receivers: ArrayLike,
+        frequencies_hz: ArrayLike,
+        transmitters: ArrayLike | None = None,
+        *,
+        max_paths: int | None = None,
+        store: str | os.PathLike[str] | None = None,
+        client: Any = None,
+        progress: Progress | None = None,
+        **response: Unpack[ResponseOptions],
+    ) -> np.ndarray:
+        """Channel frequency responses at many receivers, from their :meth:`paths`, which are not kept.
+
+        Args:
+            receivers: positions [m], shape ``(R, 3)``.
+            frequencies_hz: absolute [Hz], shape ``(F,)``.
+            transmitters: as for :meth:`spectra`.
+            max_paths: as for :meth:`paths`.
+            store, client, progress: as for :meth:`spectra`.
+            response: as for :meth:`Paths.cfr`: ``tx_array``, ``rx_array``, ``diffuse``, ...
+
+        Returns:
+            Shape ``(R, M, N, F)``, complex64: M receiving and N transmitting ports; that of a store stays on the disk.
+
+        Raises:
+            ValueError: as for :meth:`spectra` and :meth:`Paths.cfr`.
+        """
+        f = check_array("frequencies_hz", frequencies_hz, (None,))
+        if unknown := set(response) - set(ResponseOptions.__annotations__):
+            raise TypeError(f"cfr: got {', '.join(sorted(unknown))}, expected options of Paths.cfr")
+        ports = [a.ports for a in (response.get("tx_array"), response.get("rx_array")) if a is not None]
+        batch = self._batch("cfr", receivers, transmitters, 8 * len(f) * int(np.prod(ports)))
+        variables = {
+            "cfr": Variable(("receiver", "receiving_port", "transmitting_port", "frequency"), "1"),
+            "frequency": Variable(("frequency",), "Hz"),
+        }
+        key = self._known_by(batch, f, max_paths, response)
+        work, delivery = partial(_cfr, self, f, max_paths, response), Delivery(store, client, progress)
+        return batch.gather(work, variables, {"frequency": f}, key, delivery)["cfr"]
+
+    def _batch(
+        self, stage: str, receivers: ArrayLike, transmitters: ArrayLike | None, row_bytes: int = 0
+    ) -> Batch:
+        """What is asked of many receivers, once the field holds there."""
+        places = np.atleast_2d(check_receivers("receivers", receivers))
+        sources = check_array("transmitters", self.transmitter if transmitters is None else transmitters)
+        if sources.shape not in ((3,), places.shape):
+            raise ValueError(
+                f"transmitters: got shape {sources.shape}, expected (3,) or one for each receiver, {places.shape}"
+            )
+        batch = Batch(stage, places, np.broadcast_to(sources, places.shape), row_bytes)
+        for source, own in batch.groups():
+            self.check_positions(places[own], source, name="receivers")
+        return batch
+
+    def _known_by(self, batch: Batch, *options: Any) -> dict[str, str]:
+        """What tells a store of these answers from others."""
+        tensors, header = self._whole()
+        del header["report"]
+        asked = batch.stage, batch.receivers, batch.transmitters, str(resolve(self.device)), options
+        return {"answers": batch.stage, "key": digest(version("warprrf"), tensors, header, asked)}
+
+    def _trace_spectra(self, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
+        """:meth:`spectra` at positions (K, 3) that were checked."""
+        return np.stack([self.spectrum(receiver, transmitter).path_gain for receiver in receivers])
 
     @abstractmethod
-    def paths(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
-    ) -> Paths:
-        """Propagation paths at ``rx`` (3,) or (R, 3) [m]."""
+    def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
+        """:meth:`paths` at a position (3,) that was checked."""
 
     def links(
         self,
@@ -199,6 +336,7 @@ class RadioField(ABC):
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         shape: tuple[int, int] | None = None,
         mirror_order: int | None = None,
+        client: Any = None,
         progress: Progress | None = None,
     ) -> Links:
         """Total and best path gain, delay spread and best-beam gain at ``rx`` (R, 3) [m], without spectra.
@@ -213,13 +351,15 @@ class RadioField(ABC):
             shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models.
             mirror_order: most reflections on a mirror path of a ``bistatic`` field, if fewer than it was fitted with:
                 chains of three mirrors take most of the time and carry little.
+            client: as for :meth:`spectra`.
             progress: called as ``progress("links", done, total)``.
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for a beam width that is not positive.
         """
         receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
-        return self.trace_links(receivers, source, LinkOptions(beam_sigma_rad, shape, mirror_order, progress))
+        options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, progress)
+        return self.trace_links(receivers, source, options)
 
     def suggest(
         self,
@@ -258,18 +398,19 @@ class RadioField(ABC):
         raise ValueError(f"suggest: got a field of model {self.model!r}, expected 'bistatic'")
 
     def check_positions(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "rx"
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``rx`` (3,) or (R, 3) and ``transmitter`` (3,), by default the fitted one, if the field holds there [m].
+        """``rx`` (3,) or (R, 3) and ``transmitter`` (3,), by default the fitted one, if the field holds there [m]; errors
+        call the first ``name``.
 
         Raises:
             ValueError: for a place that is not finite, outside the scene, on a surface, in another solid than the air
                 of the fitted transmitter, or a receiver within the transmitter's reactive near field.
         """
-        receivers = check_receivers("rx", rx)
+        receivers = check_receivers(name, rx)
         source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
         check_positions(
-            self.mesh, source, receivers, SPEED_OF_LIGHT / self.frequency_hz, names=("transmitter", "rx"),
+            self.mesh, source, receivers, SPEED_OF_LIGHT / self.frequency_hz, names=("transmitter", name),
             known=self.transmitter, device=self.device,
         )  # fmt: skip
         return receivers, source
@@ -280,12 +421,8 @@ class RadioField(ABC):
             raise ValueError(
                 f"mirror_order: got {options.mirror_order!r}, but a field of model {self.model!r} has no mirrors"
             )
-        search = BeamSearch(
-            check_shape(options.shape or self.shape), options.beam_sigma_rad, device=self.device
-        )
-        return options.in_batches(
-            receivers, 1, lambda some: links_of([self.paths(r, transmitter) for r in some], search)
-        )
+        shape, sigma = check_shape(options.shape or self.shape), options.beam_sigma_rad
+        return options.in_batches(receivers, 1, partial(_links, self, transmitter, shape, sigma))
 
     def radio_map(
         self, height: float, cell: float = 0.25, transmitter: ArrayLike | None = None, **options: Any
@@ -331,3 +468,50 @@ class RadioField(ABC):
             raise ValueError(f"transmitter: got {self.transmitter}, expected at most {LARGEST_M:g} m")
         if self.air is not None:
             self.air.loss_per_m(self.frequency_hz)
+
+
+class ResponseOptions(LinkEnds, total=False):
+    """What :func:`frequency_response` takes besides paths and frequencies.
+
+    Attributes:
+        amplitude: "carrier" or "friis".
+        method: "dense", "grid" or "auto".
+    """
+
+    amplitude: str
+    method: str
+
+
+Part = tuple[np.ndarray, np.ndarray]
+"""Receivers (K, 3) and their transmitter (3,)."""
+
+
+def _spectra(field: RadioField, part: Part) -> dict[str, np.ndarray]:
+    return {"path_gain": field._trace_spectra(*part)}
+
+
+def _paths(field: RadioField, max_paths: int | None, part: Part) -> list[Paths]:
+    return [field._trace_paths(receiver, part[1], max_paths) for receiver in part[0]]
+
+
+def _path_arrays(work: Callable[[Part], list[Paths]], length: int, part: Part) -> dict[str, np.ndarray]:
+    return arrays_of(Paths.stack(work(part), length))
+
+
+def _cfr(
+    field: RadioField, f: np.ndarray, max_paths: int | None, options: Any, part: Part
+) -> dict[str, np.ndarray]:
+    """Each receiver's paths and then its response, in single precision: paths of many would fill the memory."""
+    found = [
+        frequency_response(paths, f, **options).astype(np.complex64)
+        for receiver in part[0]
+        for paths in _paths(field, max_paths, (receiver[None], part[1]))
+    ]
+    return {"cfr": np.stack(found)}
+
+
+def _links(
+    field: RadioField, transmitter: np.ndarray, shape: tuple[int, int], sigma: float, receivers: np.ndarray
+) -> Links:
+    search = BeamSearch(shape, sigma, device=field.device)
+    return links_of([field.paths(receiver, transmitter) for receiver in receivers], search)

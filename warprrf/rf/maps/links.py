@@ -16,10 +16,11 @@ import numpy as np
 
 from warprrf.brief import one_line
 from warprrf.checks import check_positive, checked
+from warprrf.cluster import each
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
 from warprrf.rf.paths.path_set import Paths
-from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     check_shape,
@@ -64,12 +65,14 @@ class LinkOptions:
             array of 2 / (pi sigma^2) elements half a wavelength apart (522 at 2 degrees).
         shape: rows and columns of the grid that rays fill; None for the model's default.
         mirror_order: most reflections on a mirror path, 0 to 3; None for the field's own.
+        client: a ``dask.distributed.Client`` whose workers compute; this process by default.
         progress: called as ``progress("links", done, total)``.
     """
 
     beam_sigma_rad: float = BEAM_SIGMA_RAD
     shape: tuple[int, int] | None = None
     mirror_order: int | None = None
+    client: Any = None
     progress: Progress | None = None
 
     def __post_init__(self) -> None:
@@ -84,14 +87,13 @@ class LinkOptions:
 
     def in_batches(self, receivers: np.ndarray, batch: int, trace: Callable[[np.ndarray], Links]) -> Links:
         """Links of ``receivers`` (R, 3), at most ``batch`` of them at a time."""
-        parts = []
-        for first in range(0, len(receivers), batch):
-            if self.progress is not None:
-                self.progress("links", first, len(receivers))
-            parts.append(trace(receivers[first : first + batch]))
-        if self.progress is not None:
-            self.progress("links", len(receivers), len(receivers))
-        return Links.joined(parts)
+        parts = [receivers[first : first + batch] for first in range(0, len(receivers), batch)]
+        found, done, tell = dict[int, Links](), 0, self.progress or (lambda *_: None)
+        tell("links", 0, len(receivers))
+        for k, links in each(trace, parts, self.client):
+            found[k], done = links, done + len(parts[k])
+            tell("links", done, len(receivers))
+        return Links.joined([found[k] for k in sorted(found)])
 
 
 def directivity(sigma: float, cosine: Any = 1.0) -> np.ndarray:
@@ -114,7 +116,7 @@ class BeamSearch:
 
     def __init__(self, shape: tuple[int, int], sigma: float, *, device: Any = None) -> None:
         self.shape, self.sigma = shape, sigma
-        self._beam = BeamOperator(shape, sigma, device=device)
+        self._beam = beam_operator(shape, sigma, device)
         self._density = 4.0 * np.pi / pixel_solid_angles(shape)[:, None]
 
     def __call__(

@@ -153,7 +153,7 @@ _UNITS = {
 _FLAGS = {
     "flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": "none los mirror diffuse",
 }  # fmt: skip
-_VARIABLES = {
+PATH_VARIABLES = {
     "vertices": Variable(
         (*_SEVERAL, "vertex", "xyz"), "m", {"long_name": "interaction points from the transmitter on"}
     ),
@@ -166,6 +166,7 @@ _VARIABLES = {
     "jones_imag": Variable(_MATRIX, "1", optional=True),
     "receiver_position": Variable(("receiver", "xyz"), "m", optional=True),
     "transmitter_position": Variable(("xyz",), "m", optional=True),
+    "transmitter_positions": Variable(("receiver", "xyz"), "m", optional=True),
 }
 _ARRAYS = {
     "gain_real": Expected("R L"),
@@ -179,32 +180,49 @@ _ARRAYS = {
     **{name: Expected("R L", -7.0, 7.0, nan=True) for name in list(_UNITS)[1:]},
     "receiver_position": lengths("R 3"),
     "transmitter_position": lengths("3"),
+    "transmitter_positions": lengths("R 3"),
 }
 """What the arrays in a file must be: R receivers, L paths, D interactions."""
+
+
+def arrays_of(paths: PathArrays) -> dict[str, np.ndarray]:
+    """Arrays of paths of several receivers as a file holds them."""
+    codes = sum(k * (paths.kind == name) for k, name in enumerate(KINDS))
+    arrays = {
+        "vertices": paths.vertices,
+        "kind": np.asarray(codes, dtype=np.int8),
+        "valid": paths.valid.astype(np.int8),
+        **{name: getattr(paths, name) for name in _UNITS},
+    }
+    for name, values in (("gain", paths.gain), ("jones", paths.jones)):
+        if values is not None:
+            arrays |= {f"{name}_real": values.real, f"{name}_imag": values.imag}
+    return arrays
+
+
+def ends_and_attributes(
+    receiver: np.ndarray | None, transmitter: np.ndarray | None, frequency_hz: float | None, air: Air | None
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """What a file holds of several receivers' paths besides :func:`arrays_of`."""
+    several = "transmitter_position"
+    if transmitter is not None and transmitter.ndim == 2:
+        several = "transmitter_positions"
+    ends = {"receiver_position": receiver, several: transmitter}
+    attributes: dict[str, Any] = {"format": _FORMAT, "single_receiver": 0}
+    if frequency_hz is not None:
+        attributes["frequency_hz"] = frequency_hz
+    known = {name: np.asarray(array) for name, array in ends.items() if array is not None}
+    return known, attributes | ({} if air is None else air.attributes)
 
 
 def write_paths(path: str | os.PathLike[str], paths: PathArrays) -> None:
     """Write ``paths`` to a NetCDF-4 file, whole or not at all."""
     several = paths.as_several()
-    codes = sum(k * (several.kind == name) for k, name in enumerate(KINDS))
-    arrays = {
-        "vertices": several.vertices,
-        "kind": np.asarray(codes, dtype=np.int8),
-        "valid": several.valid.astype(np.int8),
-        "receiver_position": several.receiver,
-        "transmitter_position": several.transmitter,
-    }
-    for name, values in (("gain", several.gain), ("jones", several.jones)):
-        if values is not None:
-            arrays |= {f"{name}_real": values.real, f"{name}_imag": values.imag}
-    arrays |= {name: getattr(several, name) for name in _UNITS}
-    attributes: dict[str, Any] = {"format": _FORMAT, "single_receiver": int(not paths.batched)}
-    if several.frequency_hz is not None:
-        attributes["frequency_hz"] = several.frequency_hz
-    if several.air is not None:
-        attributes |= several.air.attributes
-    known = {name: np.asarray(array) for name, array in arrays.items() if array is not None}
-    netcdf_files.write(path, known, _VARIABLES, {}, attributes)
+    ends, attributes = ends_and_attributes(
+        several.receiver, several.transmitter, several.frequency_hz, several.air
+    )
+    attributes["single_receiver"] = int(not paths.batched)
+    netcdf_files.write(path, arrays_of(several) | ends, PATH_VARIABLES, {}, attributes)
 
 
 def read_paths(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
@@ -214,7 +232,7 @@ def read_paths(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
         OSError: naming the file, if it cannot be read.
         ValueError: naming it, if it is damaged, or holds something else.
     """
-    held, attributes = netcdf_files.read(path, _VARIABLES, {})
+    held, attributes = netcdf_files.read(path, PATH_VARIABLES, {})
     with named(path, "damaged, or no paths"):
         if attributes.get("format") != _FORMAT:
             raise ValueError(f"it holds {attributes.get('format')!r}, expected {_FORMAT!r}")
@@ -227,7 +245,7 @@ def read_paths(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bool]:
             "valid": held["valid"].astype(bool),
             "jones": held["jones_real"] + 1j * held["jones_imag"] if "jones_real" in held else None,
             "frequency_hz": None if carrier is None else check_positive("frequency_hz", carrier),
-            "transmitter": held.get("transmitter_position"),
+            "transmitter": held.get("transmitter_position", held.get("transmitter_positions")),
             "receiver": held.get("receiver_position"),
             "air": Air.from_attributes(attributes),
             **{name: held[name] for name in _UNITS},

@@ -12,6 +12,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.fit import Reading, Target
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters
 from warprrf.rf.fields.bistatic.measured import WeighedPaths, read
 from warprrf.rf.fields.bistatic.render import path_powers
@@ -76,6 +77,26 @@ def test_its_jacobian_is_that_of_differences(field: BistaticField) -> None:
         ) / 0.04
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.02  # that of permittivity is a table's
         assert np.abs(row - slope).max() <= allowed * np.abs(slope).max() + 1e-5 * values.max()
+
+
+def test_the_jacobian_at_another_carrier_is_that_of_differences(field: BistaticField) -> None:
+    view = field.view(RX)
+    profile = delay_profile(view)
+    response = respond(view, profile, field.terms, field.floor)
+    reading = Reading(response, Target(np.zeros(len(response.offset))), ratio=0.6)
+    groups, lobes = field.parameters.log_weight.shape
+    layout = Layout(groups, lobes, indirect=True, gain=True)
+    rng = np.random.default_rng(5)
+    x = layout.pack(replace(field.parameters, log_indirect=np.full(groups, -3.0)))
+    x += rng.normal(0.0, 0.4, layout.size)
+    error, table, index = reading.linearised(layout.unpack(x), layout)
+    whole = np.zeros((layout.size, len(error)))
+    whole[index] = table
+    for place in range(layout.size):
+        step = 0.02 * (np.arange(layout.size) == place)
+        slope = (reading.error_db(layout.unpack(x + step)) - reading.error_db(layout.unpack(x - step))) / 0.04
+        allowed = 0.1 if place % layout.stride == layout.lobes else 0.01  # that of permittivity is a table's
+        assert np.abs(whole[place] - slope).max() <= allowed * np.abs(slope).max() + 1e-4
 
 
 def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() -> None:

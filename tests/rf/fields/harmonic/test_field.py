@@ -158,7 +158,7 @@ def test_doubling_every_distance_quarters_the_power_only_with_lengths(
 def test_moving_the_transmitter_changes_power_by_the_squared_ratio_of_lengths(truth: HarmonicField) -> None:
     elsewhere = np.array([1.4, 3.2, 0.9])
     here, there = truth.spectrum(BLOCKED), truth.spectrum(BLOCKED, transmitter=elsewhere)
-    paths = [truth.paths(BLOCKED), truth.paths(BLOCKED, transmitter=elsewhere)]
+    paths = [truth.paths(BLOCKED), truth.paths(BLOCKED, elsewhere)]
     assert all((p.kind == "diffuse").all() for p in paths)
     ratio = (here.delay_s / there.delay_s) ** 2
     assert there.path_gain == pytest.approx(ratio * here.path_gain, rel=1e-4)

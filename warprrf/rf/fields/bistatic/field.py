@@ -15,6 +15,7 @@ function of both directions and of the path's lengths, the field holds for a tra
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -29,7 +30,7 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.itu import assumed_permittivity
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
@@ -51,7 +52,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import check_gains
+from warprrf.rf.spectra.readings import check_gains, check_turned
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 
 
@@ -149,6 +150,7 @@ class BistaticField(RadioField):
         *,
         options: FitOptions | None = None,
         transport: TrainingViews | None = None,
+        client: Any = None,
         device: DeviceLike = None,
         progress: Progress | None = None,
         **settings: Any,
@@ -157,11 +159,12 @@ class BistaticField(RadioField):
 
         Args:
             geometry: Reconstruction, Scene (its materials name the groups, nothing else is taken from them) or Mesh.
-            ds: training set: spectra, readings, or a list of them, of one carrier. The field's own transmitter is the first.
+            ds: training set: spectra, readings, or a list of them. The field's own transmitter and carrier are the first.
                 Without any receiver the field is what is known beforehand.
             model: ``"bistatic"``.
             options: what is modelled and how it is fitted.
             transport: what :func:`warprrf.rf.fields.bistatic.training.trace` found for exactly these receivers.
+            client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
             settings: attributes of :class:`warprrf.rf.fields.bistatic.training.FitOptions`, in place of those of
@@ -175,7 +178,9 @@ class BistaticField(RadioField):
         chosen, data = FitOptions.of(options, settings), as_list(ds)
         if not any(map(len, data)):
             return cls._unmeasured(geometry, data, chosen, device)
-        found = train(geometry, data, chosen, transport=transport, device=device, progress=progress)
+        found = train(
+            geometry, data, chosen, transport=transport, client=client, device=device, progress=progress
+        )
         frame = Frame.of(data)
         ends = np.concatenate([np.column_stack([transmitters_of(one), one.receivers]) for one in data])
         ends = ends[np.sort(np.unique(ends, axis=0, return_index=True)[1])]
@@ -272,7 +277,7 @@ class BistaticField(RadioField):
 
             field_140 = field_300.at_frequency(140e9)
         """
-        ratio = check_frequency(frequency_hz) / self.frequency_hz
+        ratio = check_number("frequency_hz", frequency_hz, *CARRIERS_HZ) / self.frequency_hz
         fall = 20.0 * float(np.log10(ratio))
         return replace(
             self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
@@ -316,44 +321,33 @@ class BistaticField(RadioField):
 
     def paths(
         self,
-        rx: ArrayLike,
-        transmitter: ArrayLike | None = None,
+        receivers: ArrayLike,
+        transmitters: ArrayLike | None = None,
         max_paths: int | None = None,
         *,
+        store: str | os.PathLike[str] | None = None,
+        client: Any = None,
+        progress: Progress | None = None,
         view: ReceiverView | None = None,
     ) -> Paths:
-        """Propagation paths at ``rx``: line of sight, mirrors, and one diffuse path per pixel above the floor.
+        """Propagation paths; see :meth:`RadioField.paths`.
 
-        The sum of ``|gain|^2`` equals the spectrum's sum: what pixels below the floor hold is shared among the diffuse
-        paths in proportion. A diffuse path goes over the point that the pixel's strongest ray hits; light that came
-        over more surfaces has no path of its own and is counted to that.
-
-        Args:
-            rx: receiver position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded.
-            transmitter: as for :meth:`spectrum`.
-            max_paths: keep the strongest only (the sum is then what they carry).
-            view: what the one receiver sees, if it was traced before (:meth:`view`).
-
-        Raises:
-            ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
+        A diffuse path goes over the point that the pixel's strongest ray hits; light that came over more surfaces has no
+        path of its own and is counted to that. ``view`` is what one receiver sees, if it was traced before (:meth:`view`).
         """
-        if max_paths is not None:
-            check_count("max_paths", max_paths)
-        if view is not None:
-            return paths_of(view, self.render(view), self.floor, self.air, max_paths)
-        positions, source = self.check_positions(rx, transmitter)
-        found = []
-        for position in np.atleast_2d(positions):
-            view = self.transport(source).view(position, self.terms)
-            found.append(paths_of(view, self.render(view), self.floor, self.air, max_paths))
-        return found[0] if positions.ndim == 1 else Paths.stack(found)
+        if view is None:
+            return super().paths(
+                receivers, transmitters, max_paths, store=store, client=client, progress=progress
+            )
+        return paths_of(view, self.render(view), self.floor, self.air, max_paths)
 
-    def spectra(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, progress: Progress | None = None
-    ) -> np.ndarray:
-        """Path gain of the spectra at ``rx`` (R, 3); see :meth:`RadioField.spectra`. Several receivers are traced at once."""
-        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
-        transport = self.transport(source)
+    def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
+        view = self.transport(transmitter).view(receiver, self.terms)
+        return paths_of(view, self.render(view), self.floor, self.air, max_paths)
+
+    def _trace_spectra(self, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
+        """Several receivers are traced at once."""
+        transport = self.transport(transmitter)
         sent, found = self.sent_radiance(transport), np.empty((len(receivers), *self.shape), np.float32)
         batch = max(1, RAYS_AT_A_TIME // len(transport.grid.directions))
         for first in range(0, len(receivers), batch):
@@ -362,8 +356,6 @@ class BistaticField(RadioField):
             found[first : first + batch] = images(
                 view, powers, powers.single + powers.further.by_ray(), self._beam
             )
-            if progress is not None:
-                progress("spectra", min(first + batch, len(receivers)), len(receivers))
         return found
 
     def array_spectrum(
@@ -437,7 +429,8 @@ class BistaticField(RadioField):
         progress: Progress | None = None,
     ) -> np.ndarray:
         """Where to measure next; see :meth:`RadioField.suggest`, and :mod:`warprrf.rf.fields.bistatic.suggest` for how."""
-        places, source = self.check_positions(check_array("candidates", candidates, (None, 3)))
+        given = check_array("candidates", candidates, (None, 3))
+        places, source = self.check_positions(given, name="candidates")
         check_count("n", n, 1, len(places))
         pointings = None
         if (arrival is None) != (receive_pattern is None):
@@ -446,15 +439,26 @@ class BistaticField(RadioField):
             )
         if arrival is not None and receive_pattern is not None:
             check_gains("receive_pattern", receive_pattern)
-            angles = check_array("arrival", arrival, (len(places), 2))
+            angles = check_turned("arrival", arrival, len(places))
             pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
-        transport = self.transport(source).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
-        floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
+        sensitivity, unknowns = self._sensitivity(source)
+        measured = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
         return suggest(
-            Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material), places, n,
-            measured=np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on,
-            pointings=pointings, progress=progress,
-        )  # fmt: skip
+            sensitivity, unknowns, places, n, measured=measured, pointings=pointings, progress=progress
+        )
+
+    def gain_std_db(self, progress: Progress | None = None) -> np.ndarray:
+        """How far the gain of what each element of the surface scatters is known after spectra at ``fitted_on``: standard
+        deviation [dB], shape ``(E,)``; see :mod:`warprrf.rf.fields.bistatic.suggest`."""
+        sensitivity, unknowns = self._sensitivity(self.transmitter)
+        places = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
+        variance = unknowns.variance(sensitivity.precision(places, progress=progress))
+        return uncertainty.NEPER * np.sqrt(variance[: len(self.surface.element_area)])
+
+    def _sensitivity(self, transmitter: np.ndarray) -> tuple[Sensitivity, Unknowns]:
+        transport = self.transport(transmitter).on_grid(SUGGEST_SHAPE, 1, mirror_sub_pixels=1)
+        floor = self.floor * np.prod(self.shape) / np.prod(SUGGEST_SHAPE)
+        return Sensitivity(transport, self.materials, floor), Unknowns.of(transport, self.material)
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked, several at a time."""

@@ -86,11 +86,13 @@ class Reading:
         response: of the N readings, in units of the floor N0.
         target: what was read.
         chain: measuring chain whose unknown gain they hold, -1 where the gain is known, or :data:`OWN_GAIN`.
+        ratio: carrier of the readings over that of the parameters.
     """
 
     response: Response
     target: Target
     chain: int = -1
+    ratio: float = 1.0
 
     def tied(self, material: np.ndarray) -> Reading:
         """The same by materials instead of groups; ``material`` (G,) is that of each group."""
@@ -100,14 +102,22 @@ class Reading:
         """Of the measuring chain, or of these readings, where ``power`` (N,) is predicted."""
         return gain_of(self.chain, p, self.target, power)
 
+    def power(self, p: Parameters) -> np.ndarray:
+        """Prediction without the chain's gain, in units of the floor, shape ``(N,)``."""
+        return predict(self.response, p.at_ratio(self.ratio))
+
     def error_db(self, p: Parameters) -> np.ndarray:
         """Prediction less what was read, as it counts [dB], shape ``(N,)``."""
-        power = predict(self.response, p)
+        power = self.power(p)
         return self.target.error(self.gain(p, power) * power)
 
     def linearised(self, p: Parameters, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """:meth:`error_db` ``(N,)``, its derivatives ``(C, N)`` float32, and the places of those parameters ``(C,)``."""
-        power, table, index = jacobian(self.response, p, layout)
+        power, table, index = jacobian(self.response, p.at_ratio(self.ratio), layout)
+        if self.ratio != 1.0:
+            slopes = layout.slopes_at_ratio(p, self.ratio)[index]
+            index = np.unique(slopes.indices)
+            table = np.asarray(slopes[:, index].T @ table)
         gain = self.gain(p, power)
         if self.chain == OWN_GAIN:  # what changes all alike changes nothing
             known = (
@@ -326,7 +336,7 @@ def _first_gain(readings: Sequence[Reading], start: Parameters, chain: int) -> f
     """ln of the gain that makes the chain's readings agree with what ``start`` predicts, in the median of their power."""
     ratio = [np.zeros(0)]
     for r in readings:
-        read, expected = np.expm1(r.target.db / NEPER), predict(r.response, start)
+        read, expected = np.expm1(r.target.db / NEPER), r.power(start)
         known = (read > 0) & (expected > 0) & (True if r.target.censored is None else ~r.target.censored)
         if r.chain == chain:
             ratio.append(np.log(read[known] / expected[known]))

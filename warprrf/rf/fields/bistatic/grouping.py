@@ -109,13 +109,13 @@ def _costs(readings: Sequence[Reading], p: Parameters, owner: np.ndarray) -> np.
     ``owner`` is the material of each unit now.
     """
     curves, fit = fresnel_curves(), GroupFit()
-    count = len(p.log_excess)
+    common, count = p, len(p.log_excess)
     alpha = curves.at(curves.coordinates, p.log_excess)[0]
-    mix = (p.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
-    share = p.scattered_share.astype(np.float32)
     out = np.zeros((len(owner), count))
     for reading in readings:
-        r = reading.response
+        r, p = reading.response, common.at_ratio(reading.ratio)
+        mix = (p.weight[:, :, None] * alpha[:, None, :]).reshape(count, -1).astype(np.float32)
+        share = p.scattered_share.astype(np.float32)
         power = predict(r.tied(owner), p)
         gain = reading.gain(p, power)
         power, gain = gain * power, gain * p.gain

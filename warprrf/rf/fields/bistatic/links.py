@@ -8,7 +8,9 @@ rms: total path gain 0.04 dB, best beam of 2 degrees 0.4 dB (30 x 60: 0.05 and 0
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +50,13 @@ class LinkTracer:
         shape: tuple[int, int],
     ) -> None:
         terms, self._sent = materials.terms, sent
+        self._arguments = (
+            transport.recipe,
+            materials,
+            sent,
+            replace(options, client=None, progress=None),
+            shape,
+        )
         if options.mirror_order is not None:
             terms = replace(terms, mirror_order=min(terms.mirror_order, options.mirror_order))
         self._materials = replace(materials, terms=terms)
@@ -57,6 +66,9 @@ class LinkTracer:
         # a path's pixel is one of the field's spectrum
         self._finer = self._shape[0] * self._shape[1] / (shape[0] * shape[1])
         self.batch = max(1, RAYS_AT_A_TIME // len(self._transport.grid.directions))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _again, self._arguments
 
     def __call__(self, receivers: np.ndarray) -> Links:
         """Links of at most :attr:`batch` receivers (R, 3)."""
@@ -98,3 +110,7 @@ class LinkTracer:
         way = view.receivers[:, None] - view.transport.transmitter + range_m[..., None] * grid.directions
         delay = (np.sqrt(np.einsum("rkx,rkx->rk", way, way)) + range_m) / SPEED_OF_LIGHT
         return whole.reshape(count, -1), delay
+
+
+def _again(recipe: Callable[[], Transport], *others: Any) -> LinkTracer:
+    return LinkTracer(recipe(), *others)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse import block_diag, bsr_matrix, csr_matrix, identity
 
 from warprrf.checks import Expected, check_arrays, check_number
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -68,6 +69,12 @@ class Parameters:
         """Share of power that each group scatters under even light, ``(G,)``: lobe weights times 2 int F cos dcos."""
         return self.weight.sum(axis=1) * fresnel_curves().even(self.log_excess)[0]
 
+    @property
+    def log_smooth(self) -> np.ndarray:
+        """ln of what each group mirrors of all that it mirrors and scatters, ``(G,)``: -(4 pi sigma_h / lambda)^2 of a
+        surface of rms height sigma_h (Ament 1953)."""
+        return self.log_mirror - np.log(self.weight.sum(axis=1) + np.exp(self.log_mirror))
+
     def take(self, index: np.ndarray) -> Parameters:
         """The rows ``index``: of materials to those of groups, say."""
         return replace(
@@ -81,9 +88,11 @@ class Parameters:
         What is not scattered, exp(-(4 pi sigma_h / lambda)^2) (Ament 1953), is raised to the square of the ratio; the sum
         of both shares, the mix of lobes and the permittivity stay.
         """
+        if ratio == 1.0:
+            return self
         scattered = self.weight.sum(axis=1)
         both = scattered + np.exp(self.log_mirror)
-        log_smooth = ratio**2 * (self.log_mirror - np.log(both))
+        log_smooth = ratio**2 * self.log_smooth
         grown = np.log(np.maximum(-np.expm1(log_smooth), 1e-12) * both / scattered)
         return replace(
             self, log_weight=np.maximum(self.log_weight + grown[:, None], -MOST_NEPERS),
@@ -185,6 +194,25 @@ class Layout:
             table[:, n + 2].copy() if self.indirect else np.full(self.groups, -np.inf),
             float(vector[self.common_gain]) if self.gain else 0.0, vector[self.first_chain :].copy(),
         )  # fmt: skip
+
+    def slopes_at_ratio(self, p: Parameters, ratio: float) -> csr_matrix:
+        """Derivatives of the vector of ``p.at_ratio(ratio)`` (rows) to that of ``p`` (columns)."""
+        weight, mirror, n = p.weight, np.exp(p.log_mirror), self.lobes
+        scattered = weight.sum(axis=1)
+        both = scattered + mirror
+        share, own = np.zeros((2, self.groups, self.stride))  # of ln both, and of ln mirror
+        share[:, :n], share[:, n + 1] = weight / both[:, None], mirror / both
+        own[:, n + 1] = 1.0
+        smooth = ratio**2 * (own - share)
+        fall = 1.0 / np.maximum(np.expm1(-(ratio**2) * (p.log_mirror - np.log(both))), 1e-12)
+        grown = share - fall[:, None] * smooth
+        grown[:, :n] -= weight / scattered[:, None]
+        table = np.tile(np.eye(self.stride), (self.groups, 1, 1))
+        table[:, n + 1] = smooth + share
+        for row in (*range(n), *range(n + 2, self.stride)):
+            table[:, row] += grown
+        groups = bsr_matrix((table, np.arange(self.groups), np.arange(self.groups + 1)))
+        return block_diag([groups, identity(self.size - groups.shape[0])], format="csr")
 
 
 def mirror_share(p: Parameters, group: np.ndarray, cosine: np.ndarray) -> np.ndarray:

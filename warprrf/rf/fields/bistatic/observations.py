@@ -75,7 +75,7 @@ def as_list(data: Data) -> list[Measured]:
 
     Raises:
         TypeError: for anything else.
-        ValueError: for none, or different carriers.
+        ValueError: for none.
     """
     several: list[Measured] = []
     for one in data if isinstance(data, list | tuple) else [data]:
@@ -86,11 +86,6 @@ def as_list(data: Data) -> list[Measured]:
         several.append(one)
     if not several:
         raise ValueError("ds: got an empty list, expected a SpectrumDataset, Readings, or several of them")
-    carriers = sorted({float(one.frequency_hz) for one in several})
-    if len(carriers) > 1:
-        raise ValueError(
-            f"ds: got carriers of {', '.join(f'{f / 1e9:g}' for f in carriers)} GHz, expected one: fit a field for each"
-        )
     return several
 
 

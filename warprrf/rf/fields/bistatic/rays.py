@@ -106,7 +106,7 @@ class RayGrid:
         self.device = _device.resolve(device)
         self.directions, self.solid_angle = sub_pixel_directions(shape, sub_pixels)
         self.device_directions = wp.array(self.directions, dtype=wp.vec3d, device=self.device)
-        self._solid_angle = wp.array(self.solid_angle, dtype=wp.float32, device=self.device)
+        self.device_solid_angle = wp.array(self.solid_angle, dtype=wp.float32, device=self.device)
         self.half_width = 0.5 * np.pi / (shape[0] * sub_pixels**2)
 
     def transmittance(self, length_m: ArrayLike) -> np.ndarray | float:
@@ -117,7 +117,10 @@ class RayGrid:
         """What the grid's rays from ``receivers``, (3,) or (O, 3), hit."""
         origins = np.asarray(receivers, float).reshape(-1, 3)
         return self._hit(
-            origins, self.device_directions, self._solid_angle, len(origins) * len(self.device_directions)
+            origins,
+            self.device_directions,
+            self.device_solid_angle,
+            len(origins) * len(self.device_directions),
         )
 
     def hit_along(self, origins: np.ndarray, directions: np.ndarray, solid_angle: np.ndarray) -> Hits:

@@ -122,6 +122,18 @@ class Sensitivity:
         slope = NEPER * (gain @ table) / (gain @ total + self.floor)[:, None]
         return summed, csr_matrix(np.where(slope > LEAST_DB, (slope / READING_ERROR_DB) ** 2, 0.0))
 
+    def precision(
+        self, places: np.ndarray, pointings: Pointings | None = None, progress: Progress | None = None
+    ) -> np.ndarray:
+        """With which readings at all of ``places`` (R, 3) tell the gains [1/neper^2], shape ``(U,)``."""
+        surface = self.transport.surface
+        known = np.zeros(2 * len(surface.element_area) + surface.groups)
+        for k, place in enumerate(places):
+            known += np.asarray(self.of(place, pointings)[1].sum(axis=0)).ravel()
+            if progress is not None:
+                progress("suggest", k + 1, len(places))
+        return known
+
 
 def suggest(
     sensitivity: Sensitivity,
@@ -142,8 +154,10 @@ def suggest(
         progress: called with the stage ``"suggest"``.
     """
     places, own = np.unique(candidates, axis=0, return_inverse=True)
-    unknown, total = len(unknowns.material), len(places) + len(measured)
-    square, known = np.zeros(unknown), np.zeros(unknown)  # of predictions' derivatives; precision beforehand
+    total, square = (
+        len(places) + len(measured),
+        np.zeros(len(unknowns.material)),
+    )  # of predictions' derivatives
     told: dict[int, csr_matrix] = {}
     for k, place in enumerate(places):
         mine = np.flatnonzero(own.reshape(-1) == k)
@@ -155,10 +169,8 @@ def suggest(
             progress("suggest", k + 1, total)
     if pointings is not None:
         pointings = replace(pointings, toward=np.unique(pointings.toward, axis=0))
-    for k, place in enumerate(measured):
-        known += np.asarray(sensitivity.of(place, pointings)[1].sum(axis=0)).ravel()
-        if progress is not None:
-            progress("suggest", len(places) + k + 1, total)
+    after = None if progress is None else lambda stage, done, _: progress(stage, len(places) + done, total)
+    known = sensitivity.precision(measured, pointings, after)
     return _greedy(told, square, unknowns, known, n)
 
 

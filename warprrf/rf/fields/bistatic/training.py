@@ -5,16 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from warprrf.checks import check_count, check_seed, checked
+from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
-from warprrf.rf.fields.bistatic.azimuth import with_azimuths
 from warprrf.rf.fields.bistatic.fit import (
     NEPER,
     OWN_GAIN,
@@ -28,14 +29,15 @@ from warprrf.rf.fields.bistatic.fit import (
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
-from warprrf.rf.fields.bistatic.observations import Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.observations import Frame, Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
 from warprrf.rf.fields.bistatic.response import Response, predict, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.terms import Terms
-from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
+from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport, traced
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -289,6 +291,7 @@ def trace(
     *,
     mirror_order: int | None = None,
     sub_pixels: int | None = None,
+    client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> TrainingViews:
@@ -297,6 +300,7 @@ def trace(
     Args:
         mirror_order: most mirror reflections on a path; 3 by default, or as many as can be searched (2 in a city).
         sub_pixels: square root of the rays per pixel; 3 by default.
+        client: a ``dask.distributed.Client`` whose workers trace, to the same bits; this process by default.
         device: where rays are cast.
         progress: called with the stages ``"patches"``, ``"mirrors"`` and ``"transport"``.
 
@@ -331,9 +335,9 @@ def trace(
             most = transport.images.affordable(receivers, terms.mirror_order)
             terms = replace(terms, mirror_order=most)
         found = transport.paths(receivers, terms.mirror_order, progress)
-        for r, k in enumerate(own):
-            mine = found.subset(np.flatnonzero(found.receiver == r))
-            views[k] = transport.view(receivers[r], terms, paths=mine)
+        parts = [(receivers[r], found.subset(np.flatnonzero(found.receiver == r))) for r in range(len(own))]
+        for r, view in each(partial(traced, transport.recipe, terms), parts, client):
+            views[own[r]] = transport.adopt(view)
             tell("transport", len(views), len(places))
     return TrainingViews(places, [views[k] for k in range(len(places))], time.perf_counter() - started)
 
@@ -370,12 +374,13 @@ def train(
     options: FitOptions,
     *,
     transport: TrainingViews | None = None,
+    client: Any = None,
     device: DeviceLike = None,
     progress: Progress | None = None,
 ) -> Trained:
     """Fit materials to what ``ds`` holds; arguments and errors as for :meth:`BistaticField.fit`."""
     data = as_list(ds)
-    o = options.decided(float(data[0].frequency_hz))
+    o = options.decided(Frame.of(data).frequency_hz)
     if transport is not None and options.sub_pixels is None:
         o = replace(o, sub_pixels=None)  # it is what the rays were traced with, quick or not
     for one in data:
@@ -387,8 +392,9 @@ def train(
         # Places of a part of what was traced say where in the whole their readings are.
         transport = replace(transport, places=places)
     seen = transport or trace(
-        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, device=device, progress=progress
-    )
+        geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, client=client, device=device,
+        progress=progress,
+    )  # fmt: skip
     o = replace(o, sub_pixels=seen.transport.grid.sub_pixels)
     if all(isinstance(one, Readings) and one.total for one in data):
         o = o.of_totals()
@@ -399,8 +405,31 @@ def train(
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
         data, zeros = with_azimuths(data, seen.places, seen.views)
-        found = _Training(seen, data, o, progress).run()
-    return replace(found, report=found.report | {"azimuth_zero_deg": zeros})
+        training = _Training(seen, data, o, progress)
+        found = training.run()
+        offsets = training.offsets(found.materials)
+        if offsets:
+            data = [
+                moved(one, offsets[k]) if isinstance(one, Readings) and k in offsets else one
+                for k, one in enumerate(data)
+            ]
+            seen = trace(
+                geometry,
+                data,
+                mirror_order=o.mirror_order,
+                sub_pixels=o.sub_pixels,
+                device=device,
+                progress=progress,
+            )
+            found = _Training(seen, data, o, progress).run()
+    told = {
+        "azimuth_zero_deg": zeros,
+        "position_offset_m": {
+            data[k].name: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
+            for k, own in offsets.items()
+        },
+    }
+    return replace(found, report=found.report | told)
 
 
 def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
@@ -408,6 +437,10 @@ def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
     direct = (response.path_group < 0).all(axis=1)
     power = response.path_power[direct] @ response.path[direct]
     return np.asarray(power / np.maximum(predict(response, p), np.maximum(power, 1e-300)))
+
+
+Lit = Callable[[int], tuple[Materials, np.ndarray | None]]
+"""From a place to the materials at its carrier, and what elements send on under its transmitter."""
 
 
 @dataclass(frozen=True)
@@ -429,9 +462,10 @@ class _Training:
         options: FitOptions,
         progress: Progress | None,
     ) -> None:
-        self.seen, self.options, self.choose = seen, options, options.selection
+        self.seen, self.data, self.options, self.choose = seen, data, options, options.selection
         self.started = time.perf_counter()
         self.surface, self.count, self.views = seen.surface, len(seen.places), list(seen.views)
+        self.frequency_hz = Frame.of(data).frequency_hz
         self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
         self.material = self.surface.material
         self.observed, self.chains = observe(data, seen.places, self.views, options.groups.noise_db)
@@ -440,9 +474,13 @@ class _Training:
         self.transmitter = seen.places[0].transmitter if len(sources) == 1 else np.full(3, np.nan)
         rng = np.random.default_rng(options.seed)
         self.held = np.zeros(0, int)
+        chain = np.array([o.chain for o in self.observed])
+        # One place of each chain is never held out: without any its gain would not be known.
+        self.kept_always = [int(np.argmax(chain == k)) for k in range(len(self.chains))]
         if self.count >= self.choose.least_receivers:
             held = min(int(self.count * self.choose.held_out), self.choose.most_held_out)
-            self.held = np.sort(rng.permutation(self.count)[:held])
+            order = rng.permutation(self.count)
+            self.held = np.sort(order[~np.isin(order, self.kept_always)][:held])
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
         self.progress: Progress = progress or _silent
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
@@ -461,7 +499,8 @@ class _Training:
             one = data[observed.place.data]
             if isinstance(one, Readings) and not one.total:
                 part = part.trusted(1.0 + KNOWN_BETTER * _line_of_sight_share(response, start))
-            self.readings.append(Reading(response, part, observed.chain))
+            ratio = float(observed.place.frequency_hz / self.frequency_hz)
+            self.readings.append(Reading(response, part, observed.chain, ratio))
             self.progress("fit", r, (1 + self.steps) * self.count)
         self.log: list[dict[str, Any]] = []
 
@@ -515,13 +554,32 @@ class _Training:
     def _unexplained(self, materials: Materials) -> list[np.ndarray]:
         """Of each place the readings of tables that the fit misses by more than :attr:`Selection.unexplained` of their
         standard deviations."""
-        sent, sd, found = self._sent(materials), self.options.groups.noise_db, []
+        lit, sd, found = self._lit(materials), self.options.groups.noise_db, []
         for k, observed in enumerate(self.observed):
             rows = np.zeros(0, int)
             if isinstance(observed.measured, WeighedPaths):
-                error = observed.target.error(self._predicted(materials, sent, k)) / sd
+                error = observed.target.error(self._predicted(lit, k)) / sd
                 rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
             found.append(rows)
+        return found
+
+    def offsets(self, materials: Materials) -> dict[int, list[tuple[Place, np.ndarray]]]:
+        """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
+        lit, found = self._lit(materials), {}
+        for k, observed in enumerate(self.observed):
+            one, place = self.data[observed.place.data], observed.place
+            if not isinstance(one, Readings) or one.position_std_m == 0:
+                continue
+            (here, sent), view = lit(k), self._view(k, materials.terms)
+            powers = path_powers(view, here, sent)
+            total = np.maximum(read(view, observed.measured, powers), 0.0) / observed.floor
+            direct = powers.mirror / observed.floor
+            gain = gain_of(observed.chain, here.parameters, observed.target, total)
+            other = np.maximum(total - direct @ observed.measured.of_paths(view), 0.0)
+            offset = position_offset(
+                one, place, view, observed.target, gain * other, gain * direct, self.options.groups
+            )
+            found.setdefault(place.data, []).append((place, offset))
         return found
 
     def _leave_out(self, wrong: Sequence[np.ndarray]) -> None:
@@ -567,8 +625,10 @@ class _Training:
     # ------------------------------------------------------------------------------------------ choosing
 
     def _few(self, times: int) -> np.ndarray:
-        """Receivers that fits which only decide about a term learn from."""
-        return self.kept[: times * self.choose.most_to_choose]
+        """Receivers that fits which only decide about a term learn from, those of every chain among them."""
+        others = np.setdiff1d(self.kept, self.kept_always)
+        more = max(times * self.choose.most_to_choose - len(self.kept_always), 0)
+        return np.union1d(self.kept_always, others[:more]).astype(int)
 
     def _note(self, term: str, kept: bool, error: float) -> None:
         self.log.append({"term": term, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(error))})
@@ -666,8 +726,8 @@ class _Training:
 
     def _image_error(self, materials: Materials, places: np.ndarray) -> float:
         """Mean loss of all readings of ``places`` [dB^2]."""
-        sent = self._sent(materials)
-        errors = [self.observed[r].target.error(self._predicted(materials, sent, r)) for r in places]
+        lit = self._lit(materials)
+        errors = [self.observed[r].target.error(self._predicted(lit, r)) for r in places]
         return float(np.mean([self._losses(r, e).mean() for r, e in zip(places, errors, strict=True)]))
 
     def _losses(self, place: int, error: np.ndarray) -> np.ndarray:
@@ -676,24 +736,26 @@ class _Training:
             return error**2
         return huber(error, self.options.groups.huber_db)[0]
 
-    def _predicted(
-        self, materials: Materials, sent: Callable[[ReceiverView], np.ndarray | None], place: int
-    ) -> np.ndarray:
-        """All that is read at a place, in units of its floor, shape ``(N,)``."""
-        observed, view = self.observed[place], self._view(place, materials.terms)
-        power = read(view, observed.measured, path_powers(view, materials, sent(view)))
+    def _predicted(self, lit: Lit, place: int) -> np.ndarray:
+        """All that is read at a place under what :meth:`_lit` gave, in units of its floor, shape ``(N,)``."""
+        observed = self.observed[place]
+        materials, sent = lit(place)
+        view = self._view(place, materials.terms)
+        power = read(view, observed.measured, path_powers(view, materials, sent))
         power = np.maximum(power, 0.0) / observed.floor
         return np.asarray(gain_of(observed.chain, materials.parameters, observed.target, power) * power)
 
-    def _sent(self, materials: Materials) -> Callable[[ReceiverView], np.ndarray | None]:
-        """What elements send on under the transmitter of a view; computed once for each."""
-        known: dict[int, np.ndarray | None] = {}
+    def _lit(self, materials: Materials) -> Lit:
+        """Materials at the carrier of a place, and what elements send on under its transmitter; computed once for each."""
+        known: dict[int, tuple[Materials, np.ndarray | None]] = {}
 
-        def of(view: ReceiverView) -> np.ndarray | None:
-            key = id(view.transport)
-            if key not in known:
-                known[key] = sent_radiance(view.transport, materials)
-            return known[key]
+        def of(place: int) -> tuple[Materials, np.ndarray | None]:
+            transport = self.views[place].transport
+            if id(transport) not in known:
+                parameters = materials.parameters.at_ratio(self.readings[place].ratio)
+                here = replace(materials, parameters=parameters)
+                known[id(transport)] = here, sent_radiance(transport, here)
+            return known[id(transport)]
 
         return of
 
@@ -718,8 +780,8 @@ class _Training:
                 if residual:
                     terms = replace(best.terms, residual=True)
                     materials = replace(bare, terms=terms, residual=self._residual(bare, kept))
-                sent = self._sent(materials)
-                found += [self._predicted(materials, sent, r) for r in held]
+                lit = self._lit(materials)
+                found += [self._predicted(lit, r) for r in held]
         errors = {
             one: [self.observed[r].target.error(x) for r, x in zip(order, found, strict=True)]
             for one, found in power.items()
@@ -747,7 +809,8 @@ class _Training:
         """Receivers that are held out in turn to learn errors."""
         folds = [self.held]
         if self.count <= self.choose.few_receivers:
-            folds += np.array_split(self.kept, max(len(self.kept) // max(len(self.held), 2), 2))
+            others = np.setdiff1d(self.kept, self.kept_always)
+            folds += np.array_split(others, max(len(others) // max(len(self.held), 2), 2))
         return folds
 
     # ------------------------------------------------------------------------------------------ fitting
@@ -786,8 +849,7 @@ class _Training:
         if not terms.after_first_bounce:
             return limited
         # Radiance of the groups themselves is fitted, so it is left out of what is fixed.
-        known = self._materials(replace(terms, indirect=False, residual=False), fit)
-        sent = self._sent(known)
+        lit = self._lit(self._materials(replace(terms, indirect=False, residual=False), fit))
         return [
             replace(
                 reading,
@@ -795,8 +857,7 @@ class _Training:
                     reading.response,
                     self._view(r, terms),
                     self.measured[r],
-                    known,
-                    sent(self.views[r]),
+                    *lit(r),
                     self.observed[r].floor,
                     follow=follow,
                 ),
@@ -811,20 +872,16 @@ class _Training:
 
     def _residual(self, materials: Materials, chosen: np.ndarray) -> np.ndarray:
         """Gains of surface cells over ``materials``, shape ``(2, X)``."""
-        sent = self._sent(materials)
+        lit = self._lit(materials)
         shares = []
         for r in chosen:
-            view, observed, p = self._view(r, materials.terms), self.observed[r], materials.parameters
+            view, observed, (here, sent) = self._view(r, materials.terms), self.observed[r], lit(r)
             power = np.zeros(0)
             if observed.chain == OWN_GAIN:
-                power = (
-                    read(view, observed.measured, path_powers(view, materials, sent(view))) / observed.floor
-                )
-            gain = gain_of(observed.chain, p, observed.target, power)
+                power = read(view, observed.measured, path_powers(view, here, sent)) / observed.floor
+            gain = gain_of(observed.chain, here.parameters, observed.target, power)
             shares.append(
-                shares_of(
-                    view, materials, sent(view), observed.measured, observed.floor / gain, observed.target
-                )
+                shares_of(view, here, sent, observed.measured, observed.floor / gain, observed.target)
             )
         found = fit_residual(shares, self.surface, self.options.residuals)
         self._stepped()

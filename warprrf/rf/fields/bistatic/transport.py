@@ -8,13 +8,16 @@ reflection, and the geometry of light that comes over mirrors. How surfaces illu
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from warprrf.cache import Cache
-from warprrf.device import DeviceLike, Progress
+from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.elements import LIFT_M, ElementLinks
 from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M, MirrorIllumination, MirrorLight
@@ -128,6 +131,7 @@ class Transport:
         self.surface, self.grid, self.beam_sigma_rad = surface, grid, beam_sigma_rad
         self.mirror_sub_pixels = mirror_sub_pixels
         self.transmitter = np.array(transmitter, np.float64)
+        self.frequency_hz = frequency_hz
         self.wavelength_m = SPEED_OF_LIGHT / frequency_hz
         self._tracing = grid
         self._made = Cache(8)
@@ -147,13 +151,23 @@ class Transport:
     ) -> Transport:
         """That of a grid of ``shape`` with ``sub_pixels`` squared rays a pixel; the last few are kept."""
         place = np.asarray(transmitter, np.float64).tobytes()
-        key = surface, place, frequency_hz, shape, sub_pixels, beam_sigma_rad, loss_per_m, str(device)
+        where = str(resolve(device))
+        key = surface, place, frequency_hz, shape, sub_pixels, beam_sigma_rad, loss_per_m, where
 
         def make() -> Transport:
             grid = RayGrid(surface, shape, sub_pixels, loss_per_m=loss_per_m, device=device)
             return cls(surface, transmitter, frequency_hz, grid, beam_sigma_rad)
 
         return _TRACED.get(key, make)
+
+    @property
+    def recipe(self) -> Callable[[], Transport]:
+        """Makes the same again, in another process: it holds the surface, not what was traced."""
+        g = self._tracing
+        return partial(
+            Transport.of, self.surface, self.transmitter, self.frequency_hz, g.shape, g.sub_pixels,
+            beam_sigma_rad=self.beam_sigma_rad, loss_per_m=g.loss_per_m, device=str(g.device),
+        )  # fmt: skip
 
     def on_grid(self, shape: tuple[int, int], sub_pixels: int, mirror_sub_pixels: int) -> Transport:
         """The same for receivers with other rays and no beams; what belongs to the transmitter is shared."""
@@ -205,6 +219,14 @@ class Transport:
         light = self.grid.light(hits, self.transmitter)
         return self.complete(ReceiverView(self, places, hits, light, found, beams), terms)
 
+    def adopt(self, view: ReceiverView) -> ReceiverView:
+        """What :func:`traced` found, as a view of this transport."""
+        own: dict[str, Any] = {
+            "directions": self.grid.device_directions,
+            "solid_angle": self.grid.device_solid_angle,
+        }
+        return replace(view, transport=self, hits=replace(view.hits, **own))
+
     def complete(self, view: ReceiverView, terms: Terms) -> ReceiverView:
         """``view`` with what ``terms`` want and it lacks."""
         if not terms.diffuse:
@@ -241,3 +263,12 @@ class Transport:
         air = np.broadcast_to(grid.transmittance(first_hits.range_m.numpy()[ray]), len(ray))
         light = grid.light(hits, self.transmitter)
         return MirrorShown(ray // grid.sub_pixels**2 * per_pixel, s.group[face], cosine, air, hits, light)
+
+
+def traced(
+    recipe: Callable[[], Transport], terms: Terms, part: tuple[np.ndarray, MirrorPaths]
+) -> ReceiverView:
+    """What a receiver (3,) of known line of sight and mirror paths sees, without what all receivers share."""
+    view = recipe().view(part[0], terms, paths=part[1])
+    none: dict[str, Any] = {"directions": None, "solid_angle": None}
+    return replace(view, transport=None, hits=replace(view.hits, **none))  # type: ignore[arg-type]

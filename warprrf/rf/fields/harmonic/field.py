@@ -31,7 +31,6 @@ from warprrf.checks import (
     Expected,
     check_array,
     check_arrays,
-    check_count,
     check_number,
     check_positive,
     checked,
@@ -206,10 +205,10 @@ class HarmonicField(RadioField):
         return replace(self, air=air)
 
     def check_positions(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None
+        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "rx"
     ) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`RadioField.check_positions`; ValueError also for another transmitter of an ``rf3dgs`` field."""
-        receivers, source = super().check_positions(rx, transmitter)
+        receivers, source = super().check_positions(rx, transmitter, name=name)
         if self.options.model == "rf3dgs" and not np.array_equal(source, self.transmitter):
             raise ValueError(
                 f"transmitter: got {source.tolist()}, but an rf3dgs field holds only for the one it was fitted for, "
@@ -234,41 +233,17 @@ class HarmonicField(RadioField):
         receiver, source = self.check_positions(check_array("rx", rx, (3,)), transmitter)
         return self._look(receiver, source, transport).spectrum
 
-    def paths(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, max_paths: int | None = None
-    ) -> Paths:
-        """Propagation paths at ``rx``: line of sight where the mesh lets the transmitter be seen, and one diffuse path
-        per pixel above the floor.
-
-        The sum of ``|gain|^2`` equals the spectrum's sum: what pixels below the floor hold is spread over the diffuse
-        paths in proportion to their power (at least one is kept to carry it). With ``line_of_sight="explicit"`` the
-        ``los`` path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's
-        direction, merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre.
-
-        Args:
-            rx: receiver position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded.
-            transmitter: as for :meth:`spectrum`.
-            max_paths: keep the strongest only (the sum is then what they carry).
-
-        Raises:
-            ValueError: as for :meth:`spectrum`, and for a ``max_paths`` below 1.
-        """
-        if max_paths is not None:
-            check_count("max_paths", max_paths)
-        positions, source = self.check_positions(rx, transmitter)
-        found = [
-            replace(
-                paths_of(
-                    self._look(position, source, None),
-                    beam_sigma_rad=self.beam_sigma_rad,
-                    frequency_hz=self.frequency_hz,
-                    max_paths=max_paths,
-                ),
-                air=self.air,
-            )
-            for position in np.atleast_2d(positions)
-        ]
-        return found[0] if positions.ndim == 1 else Paths.stack(found)
+    def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
+        """At least one diffuse path is kept to carry what is below the floor. With ``line_of_sight="explicit"`` the ``los``
+        path carries Friis gain; without, the power of the pixels within 3 beam sigmas of the transmitter's direction,
+        merged. Direction and delay of ``los`` are exact; a diffuse path arrives from its pixel's centre."""
+        found = paths_of(
+            self._look(receiver, transmitter, None),
+            beam_sigma_rad=self.beam_sigma_rad,
+            frequency_hz=self.frequency_hz,
+            max_paths=max_paths,
+        )
+        return replace(found, air=self.air)
 
     def _taken_apart(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         tensors = {f"layer/{name}": table for name, table in self.layers.items()}

@@ -1,0 +1,185 @@
+"""Many receivers at once: the same answers whatever computes them, in memory or in a file that survives a kill."""
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+
+import warprrf as wr
+from warprrf.rf.fields import batches
+
+TX = np.array([0.8, 0.9, 2.2])
+OTHER = TX + [0.4, 0.2, -0.3]
+PLACES = np.array(
+    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1]]
+)
+F = np.linspace(299e9, 301e9, 5)
+ARRAYS = {"tx_array": wr.PlanarArray(1, 2), "rx_array": wr.PlanarArray(3, 1), "diffuse": "random_phase"}
+
+
+def fitted() -> wr.RadioField:
+    mesh, part = joined(
+        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+    )
+    stuff = [SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)]
+    scene = RadioScene(mesh, part, stuff)
+    ds = exact_spectra(scene, PLACES[:3], transmitter=TX, frequency_hz=300e9, shape=(12, 24), sigma=0.15)
+    return wr.RadioField.fit(scene, ds, quick=True)
+
+
+@pytest.fixture(scope="module")
+def field() -> wr.RadioField:
+    return fitted()
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "AT_ONCE", 2)
+
+
+def answers(field: wr.RadioField, folder: Path | None = None, **how: Any) -> list[np.ndarray]:
+    """Spectra, responses and gains of paths at all places."""
+
+    def store(name: str) -> dict[str, Any]:
+        return how if folder is None else how | {"store": folder / name}
+
+    paths = field.paths(PLACES, max_paths=7, **store("paths.nc"))
+    return [
+        field.spectra(PLACES, **store("spectra.nc")), field.cfr(PLACES, F, **ARRAYS, **store("cfr.nc")), paths.gain,
+        paths.vertices,
+    ]  # fmt: skip
+
+
+def test_many_receivers_get_what_each_gets(field: wr.RadioField) -> None:
+    spectra, cfr, gain, _ = answers(field)
+    for k, place in enumerate(PLACES):
+        np.testing.assert_allclose(
+            spectra[k], field.spectrum(place).path_gain, rtol=1e-6, atol=1e-6 * spectra[k].max()
+        )
+        paths = field.paths(place)
+        np.testing.assert_allclose(
+            cfr[k], paths.cfr(F, **ARRAYS), rtol=1e-5, atol=1e-6 * np.abs(cfr[k]).max()
+        )
+        np.testing.assert_array_equal(gain[k], paths.gain[:7])
+    assert cfr.dtype == np.complex64
+    assert cfr.shape == (6, 3, 2, 5)
+
+
+def test_every_receiver_may_have_its_own_transmitter(field: wr.RadioField, tmp_path: Path) -> None:
+    own = np.array([TX, OTHER, TX, OTHER, OTHER, TX])
+    spectra, paths = field.spectra(PLACES, own), field.paths(PLACES, own, 5, store=tmp_path / "paths.nc")
+    cfr = field.cfr(PLACES, F, own, diffuse="power")
+    for k, (place, source) in enumerate(zip(PLACES, own, strict=True)):
+        np.testing.assert_allclose(
+            spectra[k], field.spectrum(place, source).path_gain, rtol=1e-6, atol=1e-6 * spectra[k].max()
+        )
+        alone = field.paths(place, source, 5)
+        np.testing.assert_array_equal(paths[k].gain, alone.gain)
+        np.testing.assert_array_equal(paths[k].transmitter, source)
+        np.testing.assert_allclose(cfr[k], field.paths(place, source).cfr(F, diffuse="power"), rtol=1e-5)
+    again = field.paths(PLACES, own, 5)
+    np.testing.assert_array_equal(again.transmitter, own)
+    with pytest.raises(ValueError, match=r"transmitters: got shape \(2, 3\)"):
+        field.spectra(PLACES, own[:2])
+    with pytest.raises(ValueError, match=r"receivers\[1\].*outside"):
+        field.spectra([PLACES[0], PLACES[0] + 50.0])
+
+
+def test_a_store_holds_the_same_bits_and_is_known_again(field: wr.RadioField, tmp_path: Path) -> None:
+    for a, b, c in zip(answers(field), answers(field, tmp_path), answers(field, tmp_path), strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(a, c)
+    xarray = pytest.importorskip("xarray")
+    with xarray.open_dataset(tmp_path / "cfr.nc", engine="h5netcdf") as held:
+        np.testing.assert_array_equal(held.cfr, field.cfr(PLACES, F, **ARRAYS))
+        np.testing.assert_array_equal(held.frequency, F)
+    assert {file.suffix for file in tmp_path.iterdir()} == {".nc"}  # nothing is left beside them
+
+
+def test_a_store_of_something_else_is_refused(field: wr.RadioField, tmp_path: Path) -> None:
+    file = tmp_path / "spectra.nc"
+    field.spectra(PLACES, store=file)
+    before = file.read_bytes()
+    for ask in (
+        lambda: field.spectra(PLACES[:5], store=file), lambda: field.spectra(PLACES, OTHER, store=file),
+        lambda: field.cfr(PLACES, F, diffuse="power", store=file),
+        lambda: replace(field, floor=2 * field.floor).spectra(PLACES, store=file),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="store: .*another field, other places or other options"):
+            ask()
+    assert file.read_bytes() == before
+    file.write_bytes(before[:5000] + b"?" + before[5001:])
+    with pytest.raises(ValueError, match="checksum"):
+        field.spectra(PLACES, store=file)
+    file.write_text("mine")
+    with pytest.raises(ValueError, match="no finished store"):
+        field.spectra(PLACES, store=file)
+    with pytest.raises(ValueError, match="max_paths"):
+        field.paths(PLACES, store=tmp_path / "paths.nc")
+
+
+def test_what_was_begun_is_continued_and_never_taken_for_whole(
+    field: wr.RadioField, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, file = field.spectra(PLACES), tmp_path / "spectra.nc"
+
+    def stop(_: str, done: int, __: int) -> None:
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        field.spectra(PLACES, store=file, progress=stop)
+    assert not file.exists()
+    unfinished = Path(f"{file}.unfinished")
+    with pytest.raises(ValueError, match="another field"):
+        field.spectra(PLACES, OTHER, store=file)
+    asked: list[int] = []
+    trace = type(field)._trace_spectra
+
+    def counted(self: Any, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
+        asked.append(len(receivers))
+        return trace(self, receivers, transmitter)
+
+    monkeypatch.setattr(type(field), "_trace_spectra", counted)
+    np.testing.assert_array_equal(field.spectra(PLACES, store=file), whole)
+    assert asked == [2]  # the other four were there
+    assert file.exists()
+    assert not unfinished.exists()
+
+
+KILLED = """
+import sys, numpy as np, warprrf as wr
+from warprrf.rf.fields import batches
+batches.AT_ONCE = 2
+field, places = wr.RadioField.load(sys.argv[1]), np.load(sys.argv[2])
+def tell(stage, done, total):
+    print(done, flush=True)
+    if done >= 4:
+        input()
+field.spectra(places, store=sys.argv[3], progress=tell)
+"""
+
+
+def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_path: Path) -> None:
+    field.save(tmp_path / "field.safetensors")
+    field = wr.RadioField.load(tmp_path / "field.safetensors")
+    np.save(tmp_path / "places.npy", PLACES)
+    names = [str(tmp_path / name) for name in ("field.safetensors", "places.npy", "spectra.nc")]
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED, *names], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        assert [child.stdout.readline() for _ in range(2)] == ["2\n", "4\n"]
+        with pytest.raises(ValueError, match="another process is at work"):
+            field.spectra(PLACES, store=names[2])
+        os.kill(child.pid, signal.SIGKILL)
+    told: list[int] = []
+    found = field.spectra(PLACES, store=names[2], progress=lambda _, done, __: told.append(done))
+    np.testing.assert_array_equal(found, field.spectra(PLACES))
+    assert told == [6]

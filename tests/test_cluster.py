@@ -1,0 +1,102 @@
+"""Workers of a cluster: the bits of one process, whatever happens to a worker."""
+
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from golden import make
+
+import warprrf as wr
+from warprrf import device
+from warprrf.cluster import connected, each
+from warprrf.device import threads
+from warprrf.rf.fields import batches
+from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.fields.bistatic.transport import Transport
+
+PLACES = make.places(9)
+F = np.linspace(299e9, 301e9, 4)
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Any]:
+    pytest.importorskip("distributed")
+    with connected(None, 2) as client:
+        client.wait_for_workers(2)
+        yield client
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "AT_ONCE", 2)
+
+
+def same(a: Any, b: Any) -> None:
+    """The same bits, in arrays and in what is made of arrays."""
+    if isinstance(a, (np.ndarray, wp.array)):
+        np.testing.assert_array_equal(*(x.numpy() if isinstance(x, wp.array) else x for x in (a, b)))
+    elif isinstance(a, list):
+        for one, other in zip(a, b, strict=True):
+            same(one, other)
+    elif is_dataclass(a):
+        for name in (one.name for one in fields(a)):
+            same(getattr(a, name), getattr(b, name))
+    else:
+        assert a == b or isinstance(a, Transport) or (a != a and b != b)
+
+
+def test_every_verb_gives_the_bits_of_one_process(client: Any, tmp_path: Path) -> None:
+    scene, field, ds = make.room(), make.bistatic(), make.spectra()
+    how = {"transmitter": ds.transmitter, "frequency_hz": ds.frequency_hz, "shape": (12, 24)}
+    link = {"max_paths": 20, "diffuse": "random_phase"}
+    for verb in (
+        partial(wr.simulate, scene, receivers=PLACES[:3], **how), partial(field.spectra, PLACES),
+        partial(field.paths, PLACES), partial(field.cfr, PLACES, F, **link),
+        partial(field.radio_map, 1.2, 0.5), lambda client=None: trace(scene, ds, client=client).views,
+    ):  # fmt: skip
+        same(verb(client=client), verb())
+    workspace = {"receivers": PLACES[:3], "workspace": tmp_path, **how}
+    same(wr.simulate(scene, client=client, **workspace), wr.simulate(scene, **workspace))
+
+
+def test_a_killed_worker_changes_no_bit(client: Any, tmp_path: Path) -> None:
+    field = make.bistatic()
+    workers, killed = list(client.run(os.getpid).values()), []
+
+    def kill(stage: str, done: int, total: int) -> None:
+        if not killed:
+            killed.append(workers[0])
+            os.kill(workers[0], signal.SIGKILL)
+
+    found = field.spectra(PLACES, store=tmp_path / "spectra.nc", client=client, progress=kill)
+    same(np.asarray(found), field.spectra(PLACES))
+    assert killed
+    assert killed[0] not in client.run(os.getpid).values()
+
+
+def test_a_task_takes_one_thread_and_its_error_comes_back(
+    client: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert dict(each(lambda k: (k, threads()), range(20), client)) == {k: (k, 1) for k in range(20)}
+    with pytest.raises(ZeroDivisionError):
+        dict(each(partial(divmod, 7), [1, 0, 2], client))
+    assert [k for k, _ in each(str, range(3))] == [0, 1, 2]  # in order, without a cluster
+
+
+def test_a_task_takes_one_thread_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.delenv("WARPRRF_THREADS", raising=False)
+    device._threads.cache_clear()
+    with distributed.Client(
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
+    ) as client:
+        assert dict(each(lambda k: (k, threads()), range(4), client)) == {k: (k, 1) for k in range(4)}
+    assert threads() == len(os.sched_getaffinity(0))
+    device._threads.cache_clear()

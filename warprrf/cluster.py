@@ -1,0 +1,102 @@
+"""One piece of work in many parts, in this process or on the workers of a dask cluster: the one module that knows dask.
+
+The parts are the same either way, and so is what each gives, to the bit on processors of one kind: every part runs on one
+thread of BLAS, and nothing else depends on the number of threads. What parts share is sent to the scheduler once and from
+there to each worker once. A worker that dies loses nothing: dask gives its parts to others.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from warprrf.device import one_thread, require
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+_LEAST = 8  # parts under way at once, also while a cluster has no worker yet
+
+
+def each(
+    work: Callable[[Part], Result], parts: Sequence[Part], client: Any = None
+) -> Iterator[tuple[int, Result]]:
+    """The number and result of ``work(part)`` for each of ``parts``: in order here, as they are ready on a cluster.
+
+    Args:
+        work: with all that it holds it is what parts share; on a cluster it is pickled, and its modules must be there.
+        parts: small, because each is sent by itself. At most twice as many as the cluster has threads are under way.
+        client: a ``dask.distributed.Client``; None works in this process. A worker's task takes one of its threads; the
+            variable ``WARPRRF_THREADS`` of a worker gives each task more.
+
+    Raises:
+        Exception: what ``work`` raises; parts under way are given up.
+        ImportError: without dask.distributed, where it is needed.
+    """
+    if client is None:
+        for k, part in enumerate(parts):
+            with threadpool_limits(1, user_api="blas"):
+                found = work(part)
+            yield k, found
+        return
+    distributed, dask = require("distributed", extra="cluster"), require("dask", extra="cluster")
+    code = require("distributed.protocol.pickle", extra="cluster")
+    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
+        # The scheduler keeps the bytes: if every worker that holds the object dies, another makes it again.
+        shared = client.submit(code.loads, code.dumps(work), pure=False)
+    waiting, running = iter(enumerate(parts)), dict[Any, int]()
+    ready = distributed.as_completed(loop=client.loop)
+    try:
+        while True:
+            room = max(_LEAST, 2 * sum(client.nthreads().values())) - len(running)
+            for k, part in islice(waiting, max(room, 0)):
+                future = client.submit(_run, shared, part, pure=False, priority=-k)  # first come, first done
+                running[future] = k
+                ready.add(future)
+            if not running:
+                return
+            future = next(ready)
+            yield running.pop(future), future.result()
+    finally:
+        client.cancel([*running, shared])
+
+
+def _run(work: Callable[[Part], Result], part: Part) -> Result:
+    """A part, on a worker."""
+    with one_thread(), threadpool_limits(1, user_api="blas"):
+        return work(part)
+
+
+@contextmanager
+def connected(scheduler: str | None, workers: int) -> Iterator[Any]:
+    """A client of the scheduler at an address, or of a local cluster of processes that share the cores; None for none.
+
+    Raises:
+        ImportError: without dask.distributed, where it is needed.
+    """
+    if scheduler is None and workers == 0:
+        yield None
+        return
+    distributed = require("distributed", extra="cluster")
+    if scheduler is not None:
+        with distributed.Client(scheduler, set_as_default=False) as client:
+            yield client
+        return
+    share = str(max(1, (os.cpu_count() or 1) // workers))
+    with (
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,  # a part may need what the machine has: no worker is stopped for it
+            dashboard_address=None,
+            env={"WARPRRF_THREADS": share, "OMP_NUM_THREADS": share},
+            silence_logs="ERROR",
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

@@ -1,0 +1,111 @@
+"""The page itself: its server, its lines of text, what is hidden, and slow work with a bar."""
+
+from __future__ import annotations
+
+import io
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import redirect_stdout
+
+import numpy as np
+
+from warprrf import device as _device
+from warprrf.checks import check_count, check_type
+from warprrf.device import Progress
+
+
+class _GivenUp(Exception):  # noqa: N818
+    """Raised in background work that nobody waits for any more."""
+
+
+class Page:
+    """One page of one server.
+
+    Attributes:
+        server, gui, scene: viser's.
+        tabs: that panels put their elements in.
+        url: where it is.
+        message: what its first line says.
+        hidden: names of what is not shown.
+
+    Raises:
+        ValueError, TypeError: for a host or port that is none.
+    """
+
+    def __init__(self, host: str, port: int, bounds: np.ndarray) -> None:
+        check_type("host", host, str)
+        check_count("port", port, 1, 65535)
+        try:
+            with socket.create_server((host, 0)):
+                pass
+        except OSError as error:
+            raise ValueError(f"host: got {host!r}, expected an address of this machine ({error})") from error
+        viser = _device.require("viser", extra="view")
+        with redirect_stdout(io.StringIO()):  # viser prints where it is
+            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.gui, self.scene = self.server.gui, self.server.scene
+        self.url = f"http://{host}:{self.server.get_port()}"
+        self.message = ""
+        self.hidden = {"cameras"}
+        self._closed = False
+        self._background: threading.Thread | None = None
+        middle, size = bounds.mean(axis=0), float(np.linalg.norm(bounds[1] - bounds[0]))
+        self.scene.set_up_direction("+z")
+        # Its share button would send the scene through somebody else's machine.
+        self.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.gui.main_panel.dock_right()
+        self.server.initial_camera.position = tuple(middle + size * np.array([-0.15, -0.42, 0.5]))
+        self.server.initial_camera.look_at = tuple(middle)
+        self._status = self.gui.add_markdown("")
+        self.tabs = self.gui.add_tab_group()
+
+    def say(self, message: str) -> None:
+        """Write ``message`` (Markdown) at the top of the page."""
+        self.message = self._status.content = message
+
+    def show(self, name: str, visible: bool) -> bool:
+        """Show or hide what is drawn under ``name``; False if nothing is drawn there yet."""
+        (self.hidden.discard if visible else self.hidden.add)(name)
+        handle = self.scene.get_handle_by_name(f"/{name}")
+        if handle is not None:
+            handle.visible = visible
+        return handle is not None
+
+    def in_background(self, work: Callable[[Progress], None]) -> None:
+        """Run ``work(progress)`` in a thread of its own, with a bar; one at a time."""
+        if self._background is not None and self._background.is_alive():
+            self.say("The bar shows what is still computed; try again when it is gone.")
+            return
+        bar = self.gui.add_progress_bar(0.0, order=0.0)
+
+        def progress(_stage: str, done: int, total: int) -> None:
+            if self._closed:
+                raise _GivenUp
+            bar.value = 100.0 * done / max(total, 1)
+
+        def run() -> None:
+            try:
+                work(progress)
+            except _GivenUp:
+                return
+            except ValueError as error:
+                self.say(f"**{error}**")
+            finally:
+                if not self._closed:
+                    bar.remove()
+
+        self._background = threading.Thread(target=run, name="warprrf-view-slow", daemon=True)
+        self._background.start()
+
+    def wait(self) -> None:
+        """Wait for work in the background."""
+        if self._background is not None:
+            self._background.join()
+
+    def close(self) -> None:
+        """Give up what is computed, and take the page down."""
+        self._closed = True
+        self.wait()
+        with redirect_stdout(io.StringIO()):
+            self.server.stop()
