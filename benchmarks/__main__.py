@@ -7,10 +7,10 @@ import importlib
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 from benchmarks.runner import Benchmark, add_options, run_command
 from warprrf import cli
+from warprrf.cli.output import Output
 
 NAMES = {
     "lobby": ("benchmarks.lobby.pipeline", "the main job: photos -> geometry -> radio -> evaluation"),
@@ -86,11 +86,11 @@ def _define(add: Callable[..., argparse.ArgumentParser], name: str, whole: bool)
     add_options(add(name, partial(_run, one), line, one.help), one)
 
 
-def _run(one: Benchmark, args: argparse.Namespace, bars: Any) -> None:
-    run_command(one, args, bars)
+def _run(one: Benchmark, args: argparse.Namespace, out: Output) -> None:
+    run_command(one, args, out)
 
 
-def _nothing(args: argparse.Namespace, bars: Any) -> None:
+def _nothing(args: argparse.Namespace, out: Output) -> None:
     """Stands for the commands that were not asked for."""
 
 

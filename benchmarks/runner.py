@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import Report
+from warprrf.cli.output import Output
 from warprrf.device import Progress
 
 
@@ -100,15 +101,16 @@ def add_options(parser: argparse.ArgumentParser, benchmark: Benchmark) -> None:
         parser.add_argument(f"--{one.name.replace('_', '-')}", **named)
 
 
-def run_command(benchmark: Benchmark, args: argparse.Namespace, progress: Any) -> None:
-    """Run ``benchmark`` with parsed options, and print what it found and where it lies."""
+def run_command(benchmark: Benchmark, args: argparse.Namespace, out: Output) -> None:
+    """Run ``benchmark`` with parsed options, and say what it found and where it lies."""
     asked = {one.name: getattr(args, one.name) for one in fields(benchmark.config) if "help" in one.metadata}
     asked = {name: tuple(value) if isinstance(value, list) else value for name, value in asked.items()}
-    job = Job(Path(args.out), args.seed, args.device, args.fresh, progress)
+    job = Job(Path(args.out), args.seed, args.device, args.fresh, out)
+    out.resumes(job.out)
     report = benchmark.run(benchmark.config(**asked), job)
     if report is None:
         return
-    report.write(job.out)
-    progress.close()
-    print(report.summary)
-    print(f"\n{report.page(job.out)}: tables and pictures; {report.name}.json: every figure")
+    figures = report.write(job.out)
+    page, data = report.page(job.out), job.out / f"{report.name}.json"
+    text = f"{report.summary}\n\n{page}: tables and pictures; {data.name}: every figure"
+    out.result(text, files=[page, data], figures=figures)

@@ -4,29 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import warprrf as wr
-from benchmarks.data import DATA, Truth
+from benchmarks import measurements
+from benchmarks.data import DATA
 from benchmarks.machine import machine
 from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
-from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.training import trace
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.training import TrainingViews, trace
+from warprrf.steps import Attempt, Steps
 
 HELP = """\
 Fields on the reconstruction of `make lobby` are fitted to spectra of no receiver, of one to ten drawn at random, and
 to three that the field suggests: all from no measurement, or two after a first random one. Truth is Sionna RT's; the test
-receivers score.
+receivers score. Each fit is kept as soon as it is finished.
 
 examples:
   python -m benchmarks suggest
   python -m benchmarks suggest --every 4 --draws 3     a first look, in minutes
 """
+FIT_VERSION, CHOICE_VERSION = 1, 1
+"""Counted up by hand when fits, or suggestions, come out differently."""
 POOL = 60  # candidates: training receivers
+SUB_PIXELS = 1  # square root of the rays per pixel; 3, the fit's default, takes twice the time
+FIGURES = ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db")
 COLUMNS = (
     ("readings", "spectra of", "{}"), ("draws", "draws", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
     ("psnr_std_db", "spread [dB]", "{:.2f}"), ("psnr_least_db", "least [dB]", "{:.2f}"),
@@ -46,7 +52,6 @@ class Options:
         draws: random sets of each size.
         counts: their sizes.
         quick: quick fits in the place of default ones.
-        sub_pixels: square root of the rays per pixel.
     """
 
     reconstruction: str = option("runs/lobby/reconstruction", "folder of the geometry")
@@ -55,9 +60,63 @@ class Options:
     draws: int = option(10, "random sets of each size")
     counts: tuple[int, ...] = option((1, 2, 3, 5, 6, 10), "their sizes")
     quick: bool = option(False, "quick fits in the place of default ones")
-    sub_pixels: int = option(
-        1, "square root of the rays per pixel; 3, the fit's default, takes twice the time"
-    )
+
+
+class Fits:
+    """Fields on some of the candidates, and their figures, which are kept.
+
+    Attributes:
+        lobby: the room and its test receivers.
+        pool: spectra of the candidates.
+    """
+
+    def __init__(self, options: Options, job: Job, steps: Steps) -> None:
+        common = {name: getattr(options, name) for name in ("reconstruction", "spectra", "every")}
+        self.lobby = measurements.Lobby(measurements.Options(**common), job, steps)
+        self.pool, self.quick = self.lobby.ds.split(POOL)[0], options.quick
+
+    @cached_property
+    def seen(self) -> TrainingViews:
+        """What the candidates see."""
+        lobby = self.lobby
+        return trace(
+            lobby.surface,
+            self.pool,
+            sub_pixels=SUB_PIXELS,
+            device=lobby.job.device,
+            progress=lobby.job.progress,
+        )
+
+    def field(self, chosen: Sequence[int]) -> BistaticField:
+        """Fitted to the candidates ``chosen``."""
+        part, seen = self.pool.subset(chosen), self.seen.subset(chosen) if len(chosen) else None
+        return self.lobby.fit(part, transport=seen, quick=self.quick, sub_pixels=SUB_PIXELS)
+
+    def scored(self, chosen: Sequence[int]) -> dict[str, Any]:
+        """Figures of :meth:`field`."""
+        own = sorted(chosen)
+        return self._kept(
+            "fit", FIT_VERSION, own, lambda: self.lobby.scored(self.field(own), self.lobby.test)
+        )
+
+    def suggested(self, measured: Sequence[int], n: int, among: np.ndarray) -> list[int]:
+        """``n`` of the candidates ``among``, by the field fitted to ``measured``."""
+
+        def make() -> dict[str, Any]:
+            found = self.field(measured).suggest(
+                self.pool.receivers[among], n, progress=self.lobby.job.progress
+            )
+            return {"chosen": among[found].tolist()}
+
+        return list(self._kept("choice", CHOICE_VERSION, [*measured, -n, *among], make)["chosen"])
+
+    def _kept(self, kind: str, version: int, of: Sequence[int], make: Any) -> dict[str, Any]:
+        def step(attempt: Attempt) -> dict[str, Any]:
+            return dict(make())
+
+        inputs = [self.lobby.key, self.quick, SUB_PIXELS]
+        name = "-".join([kind, *map(str, of)])
+        return self.lobby.steps.run(name, step, version=version, inputs=inputs)
 
 
 def run(options: Options, job: Job) -> Report:
@@ -66,54 +125,38 @@ def run(options: Options, job: Job) -> Report:
     Raises:
         FileNotFoundError, ValueError: as the reconstruction and the spectra do.
     """
-    truth = Truth.load(Path(options.spectra), (POOL,), options.every)
-    pool, test = truth.train(POOL), truth.test
-    surface = Surface.of(wr.Reconstruction.load(options.reconstruction))
-    rng = np.random.default_rng(job.seed)
-    orders = [rng.permutation(len(pool)) for _ in range(options.draws)]
     rows: list[dict[str, Any]] = []
-    nothing = pool.subset([])
-    unmeasured = wr.RadioField.fit(surface, nothing, device=job.device)
-    seen = trace(surface, pool, sub_pixels=options.sub_pixels, device=job.device)
 
-    def fitted(chosen: Sequence[int] | np.ndarray) -> wr.RadioField:
-        part = pool.subset(np.asarray(chosen, int))
-        transport = seen.subset(chosen)
-        return wr.RadioField.fit(surface, part, transport=transport, device=job.device, quick=options.quick)
-
-    def add(name: str, fields: Iterable[wr.RadioField]) -> None:
-        each: list[dict[str, Any]] = []
-        for field in fields:
+    def add(name: str, sets: Iterable[Sequence[int]]) -> None:
+        each = []
+        for chosen in sets:
             job.progress(name, len(each), options.draws)
-            each.append(wr.evaluate(test, field.spectrum))
-        row: dict[str, Any] = {"readings": name, "draws": len(each)}
-        for key in ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db"):
-            row[key] = float(np.mean([one[key] for one in each]))
+            each.append(fits.scored(chosen))
+        row = {key: float(np.mean([one[key] for one in each])) for key in FIGURES}
         psnr = [one["psnr_db"] for one in each]
-        rows.append(row | {"psnr_std_db": float(np.std(psnr)), "psnr_least_db": float(np.min(psnr))})
+        spread = {"psnr_std_db": float(np.std(psnr)), "psnr_least_db": float(np.min(psnr))}
+        rows.append({"readings": name, "draws": len(each), **row, **spread})
 
-    add("no receiver", [unmeasured])
-    add("3 suggested from none", [fitted(unmeasured.suggest(pool.receivers, 3))])
-    for count in options.counts:
-        add(f"{count} random", (fitted(order[:count]) for order in orders))
-    begun = ((order[0], fitted(order[:1])) for order in orders)
-    add(
-        "1 random and 2 suggested",
-        (fitted([first, *field.suggest(pool.receivers, 2)]) for first, field in begun),
-    )
-    kind = "quick" if options.quick else "default"
+    with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
+        fits = Fits(options, job, steps)
+        rng, every = np.random.default_rng(job.seed), np.arange(POOL)
+        orders = [rng.permutation(POOL).tolist() for _ in range(options.draws)]
+        add("no receiver", [[]])
+        for count in options.counts:
+            add(f"{count} random", (order[:count] for order in orders))
+        add("3 suggested from none", [fits.suggested([], 3, every)])
+        add(
+            "3 suggested of half of them",
+            (fits.suggested([], 3, np.sort(order[: POOL // 2])) for order in orders),
+        )
+        add("1 random and 2 suggested", ([k, *fits.suggested([k], 2, every)] for k, *_ in orders))
+    test = fits.lobby.test
     head = (
-        f"Lobby from photos, Sionna RT's truth with three bounces, {kind} fits, {len(pool)} candidates, "
-        f"{len(test)} test receivers."
+        f"Lobby from photos, Sionna RT's truth with three bounces, {'quick' if options.quick else 'default'} fits, "
+        f"{POOL} candidates, {len(test)} test receivers."
     )
-    about = {"quick": options.quick, "sub_pixels": options.sub_pixels}
-    figures = {
-        "machine": machine(job.device),
-        **about,
-        "test": len(test),
-        "candidates": len(pool),
-        "rows": rows,
-    }
+    about = {"quick": options.quick, "sub_pixels": SUB_PIXELS, "test": len(test), "candidates": POOL}
+    figures = {"machine": machine(job.device), **about, "rows": rows}
     return Report("suggest", figures, f"{head}\n\n{columns_table(COLUMNS, rows)}")
 
 

@@ -38,7 +38,6 @@ HEAVY = (
     "pandas",
     "PIL",
     "skimage",
-    "tqdm",
     "viser",
 )
 

@@ -16,7 +16,9 @@ import importlib
 import os
 import tempfile
 import threading
+import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -37,7 +39,41 @@ DeviceLike: TypeAlias = str | wp.Device | None
 """A Warp device or its name (``"cpu"``, ``"cuda:0"``); ``None``: Warp's preferred one, CUDA where there is a GPU."""
 
 Progress = Callable[[str, int, int], None]
-"""``progress(stage, done, total)``: called by long work; the library itself never prints."""
+"""``progress(stage, done, total)``: called by long work; the library itself never prints.
+
+Stages come one after the other. ``done`` never falls within one, and starts above zero where an earlier run's work is
+kept; the last call of a stage has ``done == total``. What shows it makes seconds of it with :class:`TimeLeft`.
+"""
+
+RECENT_S = 15.0  # the rate is that of so many seconds
+
+
+class TimeLeft:
+    """Seconds left of a stage, by its recent rate, for all that shows progress: bars, JSON lines, the viewer.
+
+    A callback stays three plain arguments, which anybody can write and call; only who shows it needs a clock. What an
+    earlier run did does not count, as the rate is of differences. Nor does the first step once there is a second one:
+    it may have compiled kernels.
+    """
+
+    def __init__(self) -> None:
+        self._stage: str | None = None
+        self._known: deque[tuple[float, int]] = deque()  # times and counts, the oldest first
+
+    def __call__(self, stage: str, done: int, total: int) -> float | None:
+        """Seconds until ``done`` is ``total``; None while nothing tells."""
+        now, known = time.monotonic(), self._known
+        if stage != self._stage or done < known[-1][1]:
+            self._stage = stage
+            known.clear()
+        known.append((now, done))
+        while len(known) > 3 and known[2][0] <= now - RECENT_S:
+            known.popleft()
+        then, before = known[1 if len(known) > 2 else 0]
+        if done >= total:
+            return 0.0
+        return None if done <= before else (total - done) * (now - then) / (done - before)
+
 
 # Below this many indices a launch is cheaper on one thread than split (a launch costs about 15 us).
 MIN_SPLIT = 256

@@ -26,6 +26,8 @@ IGNORED = ("self", "progress", "ax", "args", "kwargs")
 MISSING = inspect.Parameter.empty
 UNCHECKED = ("RadioField.trace_links",)
 """What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
+BISTATIC = ("array_spectrum", "at_frequency")
+"""Methods that a bistatic field has beside those of every ``RadioField``."""
 SERVERS = ("view",)
 """What starts a server for each call: tests/viewer has its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
@@ -50,7 +52,8 @@ def public() -> dict[str, Callable[..., Any]]:
         for method in vars_of(value):
             if callable(getattr(value, method)) and f"{name}.{method}" not in UNCHECKED:
                 found[f"{name}.{method}"] = getattr(value, method)
-    return found
+    of_bistatic = wr.RadioField.models["bistatic"]
+    return found | {f"RadioField.{method}": getattr(of_bistatic, method) for method in BISTATIC}
 
 
 def vars_of(kind: type) -> Iterator[str]:
@@ -128,6 +131,13 @@ def _array_spectra(p: Place) -> dict[str, Any]:
 def _spectra(p: Place) -> dict[str, Any]:
     ds = p.train.subset([0, 1, 2])
     return {name: getattr(ds, name) for name in ds.__dataclass_fields__}
+
+
+def _with_nan(values: np.ndarray) -> np.ndarray:
+    """``values``, one of which is not known."""
+    found = values.copy()
+    found.flat[0] = np.nan
+    return found
 
 
 def _warp(p: Place) -> dict[str, Any]:
@@ -229,7 +239,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Mesh.look_around": _on(lambda p: p.mesh, points=POINTS, directions=TOWARDS, device="cpu"),
     "Mesh.on_device": _on(lambda p: p.mesh, device="cpu"),
     "Mesh.visible": _on(lambda p: p.mesh, a=POINTS, b=POINTS[::-1].copy(), device="cpu"),
-    "Mesh.winding_number": _on(lambda p: p.mesh, points=POINTS),
     "Reconstruction": lambda p: {"gaussians": p.gaussians, "mesh": p.mesh, "cameras": {"0.png": p.camera}},
     "Reconstruction.from_files": lambda p: {"ply": p.folder / "splats.ply", "mesh": p.mesh, "device": "cpu"},
     "Reconstruction.load": lambda p: {"folder": p.folder / "reconstruction"},
@@ -289,12 +298,17 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "SpectrumDataset.export_exr": _on(lambda p: p.train, path="one.exr", index=0),
     "SpectrumDataset.from_spectra": lambda p: {
-        k: v for k, v in _spectra(p).items() if k not in ("range_db", "polarisation")
+        k: _with_nan(v) if k in ("delay_s", "aod") else v
+        for k, v in _spectra(p).items() if k not in ("range_db", "polarisation")
     },
     "SpectrumDataset.load": lambda p: {"path": p.folder / "spectra.nc"},
     "SpectrumDataset.save": _on(lambda p: p.train, path="saved.nc"),
     "SpectrumDataset.split": _on(lambda p: p.spectra, n_train=4),
     "SpectrumDataset.subset": _on(lambda p: p.spectra, indices=np.array([0, 3])),
+    "RadioField.array_spectrum": _on(
+        lambda p: p.field, rx=POINTS[0], array=wr.PlanarArray(2, 2), directions=TOWARDS, transmitter=TRANSMITTER + 0.1,
+    ),
+    "RadioField.at_frequency": _on(lambda p: p.field, frequency_hz=140e9),
     "RadioField.check_positions": _on(lambda p: p.field, rx=POINTS),
     "RadioField.fit": lambda p: {
         "geometry": p.scene, "ds": p.train, "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False,

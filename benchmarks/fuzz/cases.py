@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 import traceback
 import warnings
@@ -188,7 +189,7 @@ def drawn(place: Place, count: int, number: int, only: str = "") -> list[Case]:
     cases: list[Case] = []
     known = choices(place)
     for target in targets():
-        if only not in target or not (target.startswith(FILE) or known[target]):
+        if not re.search(only, target) or not (target.startswith(FILE) or known[target]):
             continue
         quiet = settings(
             max_examples=count, database=None, deadline=None, phases=[Phase.generate],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ ValueError, TypeError, OSError or ImportError that names the argument or the fil
 
 examples:
   python -m benchmarks fuzz --minutes 60
-  python -m benchmarks fuzz --minutes 1 --only "file: splats" --fresh
+  python -m benchmarks fuzz --minutes 1 --only "file: splats|Gaussians" --fresh
   python -m benchmarks fuzz --again 'Mesh.cast: [["origins", "nan"]]'     one case, in this process
 """
 BATCH = 200
@@ -40,13 +41,13 @@ class Options:
 
     Attributes:
         minutes: how long.
-        only: part of a target's name.
+        only: regular expression that a target's name has in it.
         again: a case as a report states it.
         workers: processes.
     """
 
     minutes: float = option(60.0, "how long, earlier runs not counted")
-    only: str = option("", "only targets whose name has this in it")
+    only: str = option("", "only targets whose name has this regular expression in it")
     again: str = option("", "try one case, as the report states it, in this process")
     workers: int = option(threads(), "processes that try cases")
 
@@ -65,7 +66,7 @@ def _case(text: str) -> cases.Case:
 
 def stream(place: Place, seed: int, only: str) -> Iterator[cases.Case]:
     """All cases in their order: each argument replaced by everything and as many drawn ones, then drawn ones for ever."""
-    single = cases.shuffled((case for case in cases.singles(place) if only in case.target), seed)
+    single = cases.shuffled((case for case in cases.singles(place) if re.search(only, case.target)), seed)
     for k in itertools.count(seed * 1_000_000):
         drawn = cases.drawn(place, DRAWN, k, only)
         yield from itertools.chain.from_iterable(

@@ -1,7 +1,8 @@
 """The command line: every step of the library as a command.
 
 `main` parses, calls one public function and writes what came back; nothing is computed here. Bad input ends with one
-line on standard error and status 2 (`--debug` shows the traceback instead), an interrupt with 130.
+line on standard error and status 2 (`--debug` shows the traceback instead), Ctrl-C with 130. With `--json` all of it is
+one JSON object a line on standard output; see :class:`~warprrf.cli.output.Output`.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import warprrf as wr
-from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add
+from warprrf.cli.output import INTERRUPTED, Output
 from warprrf.cli.steps import add_evaluate, add_fit, add_reconstruct, add_relevance, add_simulate, add_suggest
 from warprrf.cli.views import add_map, add_render, add_twin, add_view
 
@@ -31,7 +32,10 @@ a walk through:
   warprrf view room field.safetensors              in the browser: drag a receiver
   warprrf twin field.safetensors -o twin           scene.xml and materials.json for Sionna RT
 
-Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples.
+Metres, seconds, hertz, world z up. `warprrf COMMAND --help` explains each with examples. With --json, standard output
+holds one JSON object a line and nothing else: {"event": "progress", "stage", "done", "total", "seconds_left"}, one
+{"event": "result", "files", figures ...} or {"event": "error", "message", "status"}. Ctrl-C ends a command at once
+with status 130; what reconstruct, simulate and fit have finished is kept, and the same command goes on from there.
 """
 
 _NEGATIVE = re.compile(r"-[.\d][-+.,\deE]*")  # numbers such as -1, -1e-3 and -1,4,1.5
@@ -45,20 +49,32 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> int:
     """Run one command of ``parser`` (see :func:`make_parser`) and return its exit status."""
     words = sys.argv[1:] if argv is None else argv
-    # A space before a number that is negative keeps argparse from taking it for an option; whoever reads it drops it.
-    args = parser.parse_args([f" {word}" if _NEGATIVE.fullmatch(word) else word for word in words])
+    out, debug = Output(parser.prog, lines="--json" in words), False
     try:
-        with Bars(quiet=args.quiet) as bars:
-            args.command(args, bars)
+        # A space before a number that is negative keeps argparse from taking it for an option; whoever reads it drops it.
+        args = parser.parse_args([f" {word}" if _NEGATIVE.fullmatch(word) else word for word in words])
+        out, debug = Output(parser.prog, args.json, args.quiet), args.debug
+        with out.speaking():
+            args.command(args, out)
+            out.close()
     except KeyboardInterrupt:
-        print(f"{parser.prog}: interrupted; what is finished is kept", file=sys.stderr)
-        return 130
-    except (ValueError, TypeError, OSError, ImportError, MemoryError) as error:
-        if args.debug:
+        out.interrupted()
+        return INTERRUPTED
+    except Exception as error:
+        bad = isinstance(error, (ValueError, TypeError, OSError, ImportError, MemoryError))
+        if out.lines or (bad and not debug):
+            out.error(f"error: {_one_line(error)}", 2 if bad else 1)
+        if debug or not bad:
             raise
-        print(f"{parser.prog}: error: {_one_line(error)}", file=sys.stderr)
         return 2
     return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """Words that it cannot take are bad input as any other: one line, or JSON."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message} (see {self.prog} --help)")
 
 
 def _one_line(error: Exception) -> str:
@@ -97,10 +113,13 @@ def make_parser(
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("--seed", type=int, default=0, help="every random choice follows from it (default 0)")
     common.add_argument("--device", default=None, help="cpu or cuda:0 (default: the GPU where there is one)")
-    common.add_argument("--quiet", action="store_true", help="no progress bars")
+    common.add_argument("--quiet", action="store_true", help="no progress")
+    common.add_argument(
+        "--json", action="store_true", help="progress, result and errors as JSON, an object a line"
+    )
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=prog,
         description=description,
         epilog=epilog,

@@ -12,8 +12,8 @@ import numpy as np
 
 import warprrf as wr
 from warprrf.checks import check_count
-from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import (
+    OF_TABLES,
     Add,
     add_mesh_options,
     add_out,
@@ -27,7 +27,9 @@ from warprrf.cli.inputs import (
     read_readings,
     read_receivers,
     read_scale,
+    refuse,
 )
+from warprrf.cli.output import Output
 from warprrf.cli.tables import table
 from warprrf.files import write_json, write_text
 from warprrf.geometry.photos.config import LENSES, ReconstructionConfig
@@ -71,7 +73,7 @@ def add_reconstruct(add: Add) -> None:
     )
 
 
-def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
+def _reconstruct(args: argparse.Namespace, out: Output) -> None:
     """Photos -> cameras, Gaussians, mesh and planar patches.
 
     The photos go through structure from motion (SIFT, matching, mapping), then Gaussians are optimised against them and
@@ -91,6 +93,7 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
     photos = existing(args.photos)
     scale = None if args.scale is None else read_scale(args.scale)
     workspace = args.workspace or Path(args.out) / "workspace"
+    out.resumes(workspace)
     reconstruction = wr.reconstruct(
         photos,
         workspace=workspace,
@@ -101,16 +104,19 @@ def _reconstruct(args: argparse.Namespace, bars: Bars) -> None:
         up=args.up,
         config=ReconstructionConfig(lens=args.lens, max_pixels=args.max_pixels),
         seed=args.seed,
-        progress=bars,
+        progress=out,
         device=args.device,
     )
     reconstruction.save(args.out)
     report = Path(args.out) / "report.html"
-    reconstruction.report(report, progress=bars, device=args.device)
-    print(
-        f"{args.out}: {len(reconstruction.cameras)} cameras, {len(reconstruction.gaussians.means)} Gaussians, "
-        f"{len(reconstruction.mesh.faces)} triangles; see {report}"
-    )
+    reconstruction.report(report, progress=out, device=args.device)
+    found = {
+        "cameras": len(reconstruction.cameras),
+        "Gaussians": len(reconstruction.gaussians.means),
+        "triangles": len(reconstruction.mesh.faces),
+    }
+    text = ", ".join(f"{count} {name}" for name, count in found.items())
+    out.result(f"{args.out}: {text}; see {report}", files=[args.out, report], **found)
 
 
 def add_simulate(add: Add) -> None:
@@ -140,7 +146,7 @@ def add_simulate(add: Add) -> None:
     sim.add_argument("--gas", action="store_true", help="absorption by standard air (ITU-R P.676)")
 
 
-def _simulate(args: argparse.Namespace, bars: Bars) -> None:
+def _simulate(args: argparse.Namespace, out: Output) -> None:
     """Radio spectra of a scene at given receivers.
 
     `exact` evaluates line of sight, mirror reflections and one diffuse bounce without sampling noise, on Warp's mesh rays.
@@ -154,6 +160,7 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
       warprrf simulate data/lobby/scene.xml -o many.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
     """
     unfinished = Path(f"{args.out}.receivers")
+    out.resumes(unfinished)
     dataset = wr.simulate(
         load_scene(args.scene, args),
         transmitter=np.array(args.transmitter, dtype=np.float64),
@@ -168,12 +175,15 @@ def _simulate(args: argparse.Namespace, bars: Bars) -> None:
         gas=args.gas,
         seed=args.seed,
         workspace=unfinished,
-        progress=bars,
+        progress=out,
         device=args.device,
     )
     dataset.save(args.out)
     shutil.rmtree(unfinished)  # the finished receivers of a killed run are not needed any more
-    print(f"{args.out}: {len(dataset)} spectra of {args.shape[0]} x {args.shape[1]} pixels, {args.engine}")
+    out.result(
+        f"{args.out}: {len(dataset)} spectra of {args.shape[0]} x {args.shape[1]} pixels, {args.engine}",
+        files=[args.out], spectra=len(dataset), shape=args.shape, engine=args.engine,
+    )  # fmt: skip
 
 
 def add_fit(add: Add) -> None:
@@ -215,7 +225,7 @@ def add_fit(add: Add) -> None:
     )
 
 
-def _fit(args: argparse.Namespace, bars: Bars) -> None:
+def _fit(args: argparse.Namespace, out: Output) -> None:
     """A radio field from geometry and measured spectra.
 
     Geometry stays frozen; blending weights are computed once per receiver, then the radio part is fitted on them.
@@ -232,6 +242,11 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
       warprrf fit room.glb horn.csv -o field.safetensors --carrier 300e9 --noise-floor-db -120 --horn-deg 10
     """
     geometry = load_geometry(args.geometry, args.mesh, args)
+    tables = [Path(path).suffix.lower() == ".csv" for path in args.measurements]
+    if not any(tables):
+        refuse(args, OF_TABLES, "no table of received power (CSV) is given")
+    if all(tables):
+        refuse(args, ["train"], "no file of spectra is given")
     data = [_training_set(path, args) for path in args.measurements]
     options: dict[str, Any] = {}
     if args.relevance is not None:
@@ -247,17 +262,20 @@ def _fit(args: argparse.Namespace, bars: Bars) -> None:
         data[0] if len(data) == 1 else data,
         model=args.model,
         seed=args.seed,
-        progress=bars,
+        progress=out,
         device=args.device,
         **options,
     )
     field.save(args.out)
     places = sum(len(np.unique(one.receivers, axis=0)) for one in data)
-    print(f"{args.out}: {args.model} fitted on {places} receivers")
-    for name, chain in field.report.get("chains", {}).items():
-        print(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
-    for name, rows in field.report.get("unexplained", {}).items():
-        print(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
+    chains, wrong = (field.report.get(name, {}) for name in ("chains", "unexplained"))
+    lines = [f"{args.out}: {args.model} fitted on {places} receivers"]
+    for name, chain in chains.items():
+        lines.append(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
+    for name, rows in wrong.items():
+        lines.append(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
+    found = {"model": args.model, "receivers": places, "chains": chains, "unexplained": wrong}
+    out.result("\n".join(lines), files=[args.out], **found)
 
 
 def _training_set(path: str, args: argparse.Namespace) -> wr.SpectrumDataset | wr.Readings:
@@ -288,7 +306,7 @@ def add_suggest(add: Add) -> None:
     add_scene_options(sug)
 
 
-def _suggest(args: argparse.Namespace, bars: Bars) -> None:
+def _suggest(args: argparse.Namespace, out: Output) -> None:
     """Where to measure next: the candidates whose spectra lower the expected error most.
 
     A field knows where it was fitted. Before any measurement surfaces are taken for what ITU-R P.2040 says of building
@@ -298,21 +316,24 @@ def _suggest(args: argparse.Namespace, bars: Bars) -> None:
       warprrf suggest room.glb candidates.csv -n 3 --transmitter 13.6 11.2 2.5 --carrier 300e9
       warprrf suggest field.safetensors candidates.csv -n 3 -o next.csv
     """
-    places, source = read_receivers(args.candidates), existing(args.source)
+    places, source = read_receivers(args.candidates, "candidates"), existing(args.source)
     if source.suffix == ".safetensors":
+        own = ("transmitter", "carrier", "mesh", "unit", "up", "simplify", "materials")
+        refuse(args, own, f"{source} is a field, which has its own")
         field = wr.RadioField.load(source, device=args.device)
     else:
         for flag in ("transmitter", "carrier"):
             if getattr(args, flag) is None:
                 raise ValueError(f"--{flag}: {source} needs it, it is no field")
         nothing = wr.SpectrumDataset.empty(transmitter=args.transmitter, frequency_hz=args.carrier)
-        field = wr.RadioField.fit(load_geometry(args.source, args.mesh, args), nothing, device=args.device)
-    chosen = places[field.suggest(places, args.n, progress=bars)]
-    bars.close()
-    rows = "\n".join(",".join(f"{x:g}" for x in place) for place in chosen)
-    print(rows)
+        field = wr.RadioField.fit(
+            load_geometry(args.source, args.mesh, args), nothing, device=args.device, progress=out
+        )
+    chosen = places[field.suggest(places, args.n, progress=out)]
+    rows = "\n".join(",".join(f"{x:.12g}" for x in place) for place in chosen)
     if args.out:
         write_text(args.out, f"x,y,z\n{rows}\n")
+    out.result(rows, files=[args.out] if args.out else [], places=chosen)
 
 
 def add_evaluate(add: Add) -> None:
@@ -330,7 +351,7 @@ def add_evaluate(add: Add) -> None:
     add_out(eva, "JSON file of the figures", required=False)
 
 
-def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
+def _evaluate(args: argparse.Namespace, out: Output) -> None:
     """A field's errors on receivers it was not fitted on.
 
     Whole receivers are held out, the same for every method; beside the field stand lookups that know no geometry (nearest
@@ -360,14 +381,13 @@ def _evaluate(args: argparse.Namespace, bars: Bars) -> None:
         known = (lookups.nearest, lookups.idw, lookups.constant, lookups.mean)
         methods |= {lookup.name: lookup for lookup in (build(train) for build in known)}
     figures: dict[str, dict[str, Any]] = {}
-    for count, (name, predictor) in enumerate(methods.items()):
-        bars("evaluate", count, len(methods))
-        figures[name] = metrics.evaluate(test, predictor)
-    bars("evaluate", len(methods), len(methods))
-    bars.close()
-    print(table(figures))
+    for name, predictor in methods.items():
+        figures[name] = metrics.evaluate(
+            test, predictor, progress=lambda _, *count, name=name: out(f"evaluate {name}", *count)
+        )
     if args.out:
         write_json(args.out, figures)
+    out.result(table(figures), files=[args.out] if args.out else [], methods=figures)
 
 
 def add_relevance(add: Add) -> None:
@@ -391,7 +411,7 @@ def add_relevance(add: Add) -> None:
     add_scene_options(rel)
 
 
-def _relevance(args: argparse.Namespace, bars: Bars) -> None:
+def _relevance(args: argparse.Namespace, out: Output) -> None:
     """What each effect is worth in a scene, and the smallest model.
 
     Each effect is left out of the full model in turn: line of sight, mirrors, diffuse bounces, lobes, what no receiver
@@ -424,13 +444,12 @@ def _relevance(args: argparse.Namespace, bars: Bars) -> None:
         wr.RadioField.load(source) if fitted else load_geometry(args.source, args.mesh, args),
         receivers=receivers,
         tolerance_db=args.tolerance,
-        progress=bars,
+        progress=out,
         device=args.device,
         **given,
     )
-    bars.close()
-    print(found.table())
-    if args.out:
-        found.save(args.out)
-        text = found.table() + "\n"
-        write_text(Path(args.out).with_suffix(".md"), text)
+    files = [Path(args.out), Path(args.out).with_suffix(".md")] if args.out else []
+    if files:
+        found.save(files[0])
+        write_text(files[1], found.table() + "\n")
+    out.result(found.table(), files=files, **found.to_dict())

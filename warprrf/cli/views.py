@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from warprrf.cli.bars import Bars
 from warprrf.cli.inputs import Add, add_out, add_point, existing
+from warprrf.cli.output import Output
 from warprrf.cli.tables import aligned
 from warprrf.device import require
 from warprrf.files import write_arrays, write_atomically
@@ -32,7 +32,7 @@ def add_render(add: Add) -> None:
     ren.add_argument("--field-of-view", type=float, default=75.0, help="horizontal, degrees (default 75)")
 
 
-def _render(args: argparse.Namespace, bars: Bars) -> None:
+def _render(args: argparse.Namespace, out: Output) -> None:
     """A picture from Gaussians, or a spectrum from a radio field.
 
     examples:
@@ -47,7 +47,8 @@ def _render(args: argparse.Namespace, bars: Bars) -> None:
         spectrum = wr.RadioField.load(source).spectrum(np.array(args.receiver, dtype=np.float64))
         _write_spectrum(spectrum, Path(args.out))
         total = 10.0 * np.log10(max(float(np.sum(spectrum.path_gain, dtype=np.float64)), 1e-300))
-        print(f"{args.out}: total path gain {total:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}")
+        text = f"{args.out}: total path gain {total:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
+        out.result(text, files=[args.out], total_path_gain_db=total)
         return
     if args.position is None or args.look_at is None:
         raise ValueError(
@@ -60,7 +61,8 @@ def _render(args: argparse.Namespace, bars: Bars) -> None:
 
     pixels = np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
     write_atomically(args.out, lambda path: Image.fromarray(pixels).save(path))
-    print(f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians")
+    text = f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians"
+    out.result(text, files=[args.out], Gaussians=len(gaussians.means))
 
 
 def _write_spectrum(spectrum: wr.Spectrum, path: Path) -> None:
@@ -113,7 +115,7 @@ def add_view(add: Add) -> None:
     viewer.add_argument("--no-browser", action="store_true", help="only say where the page is")
 
 
-def _view(args: argparse.Namespace, bars: Bars) -> None:
+def _view(args: argparse.Namespace, out: Output) -> None:
     """Everything in the browser: drag a receiver, see its spectrum, paths, delays and errors.
 
     Ctrl-C ends it.
@@ -123,7 +125,7 @@ def _view(args: argparse.Namespace, bars: Bars) -> None:
       warprrf view room.glb field.safetensors
     """
     viewer = wr.view(*args.things, host=args.host, port=args.port)
-    print(f"{viewer.url}   (Ctrl-C ends it)", flush=True)
+    out.result(f"{viewer.url}   (Ctrl-C ends it)", url=viewer.url)
     if not args.no_browser:
         webbrowser.open(viewer.url)
     try:
@@ -159,7 +161,7 @@ def add_map(add: Add) -> None:
     )
 
 
-def _map(args: argparse.Namespace, bars: Bars) -> None:
+def _map(args: argparse.Namespace, out: Output) -> None:
     """A field's radio map over the floor plan.
 
     Total path gain, the strongest path's gain, delay spread and the SNR of the receiver's best beam, at the centres of
@@ -184,17 +186,19 @@ def _map(args: argparse.Namespace, bars: Bars) -> None:
         bandwidth_hz=args.bandwidth,
         noise_figure_db=args.noise_figure,
         mirror_order=args.mirror_order,
-        progress=bars,
+        progress=out,
     )
-    bars.close()
+    files = [path] if path.suffix == ".png" else [path, path.with_suffix(".png")]
     if path.suffix == ".nc":
         found.save(path)
-    found.picture(path.with_suffix(".png"))
+    found.picture(files[-1])
     gain, snr = (found.shown(name)[found.free] for name in ("total_path_gain", "best_beam_snr_db"))
-    print(
+    figures = {"median_total_path_gain_db": np.median(gain), "median_best_beam_snr_db": np.median(snr)}
+    out.result(
         f"{path}: {found.free.sum()} cells in the air of {found.free.size}; median total path gain "
-        f"{np.median(gain):.1f} dB, median SNR of the best beam {np.median(snr):.1f} dB, lowest {snr.min():.1f} dB"
-    )
+        f"{np.median(gain):.1f} dB, median SNR of the best beam {np.median(snr):.1f} dB, lowest {snr.min():.1f} dB",
+        files=files, cells=found.free.size, cells_in_air=found.free.sum(), **figures, lowest_best_beam_snr_db=snr.min(),
+    )  # fmt: skip
 
 
 def add_twin(add: Add) -> None:
@@ -204,7 +208,7 @@ def add_twin(add: Add) -> None:
     add_out(twin, "folder of the twin: new, empty or an earlier twin's")
 
 
-def _twin(args: argparse.Namespace, bars: Bars) -> None:
+def _twin(args: argparse.Namespace, out: Output) -> None:
     """A field's digital twin: a scene for Sionna RT.
 
     Writes the reconstructed mesh with the fitted materials as scene.xml, materials.json and meshes/. `sionna.rt.load_scene`
@@ -228,11 +232,14 @@ def _twin(args: argparse.Namespace, bars: Bars) -> None:
                 f"{group.lobe_error_db:.2f}",
             ]
         )
-    print(aligned(rows))
-    print(
+    errors = {name: getattr(twin, f"{name}_error_db") for name in ("scattering", "mirror", "lobe")}
+    lines = [
+        aligned(rows),
         f"\n{twin.xml}: {len(twin.groups)} materials; rms errors of the projection over area: scattered power "
-        f"{twin.scattering_error_db:.2f} dB, mirrored power {twin.mirror_error_db:.2f} dB, lobes "
-        f"{twin.lobe_error_db:.2f} dB"
+        f"{errors['scattering']:.2f} dB, mirrored power {errors['mirror']:.2f} dB, lobes {errors['lobe']:.2f} dB",
+        *(f"left out: {line}" for line in twin.left_out),
+    ]
+    figures = {f"{name}_error_db": value for name, value in errors.items()}
+    out.result(
+        "\n".join(lines), files=[args.out], materials=len(twin.groups), **figures, left_out=twin.left_out
     )
-    for line in twin.left_out:
-        print(f"left out: {line}")

@@ -80,7 +80,7 @@ def simulate(
         floor: N0 [linear]; median over views of the view's maximum, less 60 dB, by default.
         workspace: Folder that keeps each finished receiver, so that a killed run goes on where it stopped.
         client: A ``dask.distributed.Client`` whose workers compute, to the same bits; this process by default.
-        progress: Called as ``progress("simulate", done, total)``.
+        progress: Called as ``progress("simulate", done, total)``; what ``workspace`` holds is done from the start.
         device: Where our own kernels run.
 
     Raises:

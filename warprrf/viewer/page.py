@@ -64,10 +64,6 @@ class Page:
         """Write ``message`` (Markdown) at the top of the page."""
         self.message = self._status.content = message
 
-    def visible(self, name: str) -> bool:
-        """Whether what is called ``name`` is shown."""
-        return name not in self.hidden
-
     def show(self, name: str, visible: bool) -> bool:
         """Show or hide what is drawn under ``name``; False if nothing is drawn there yet."""
         (self.hidden.discard if visible else self.hidden.add)(name)
@@ -75,12 +71,6 @@ class Page:
         if handle is not None:
             handle.visible = visible
         return handle is not None
-
-    def remove(self, name: str) -> None:
-        """Take what is drawn under ``name`` off the page."""
-        handle = self.scene.get_handle_by_name(f"/{name}")
-        if handle is not None:
-            handle.remove()
 
     def in_background(self, work: Callable[[Progress], None]) -> None:
         """Run ``work(progress)`` in a thread of its own, with a bar; one at a time."""
@@ -108,10 +98,10 @@ class Page:
         self._background = threading.Thread(target=run, name="warprrf-view-slow", daemon=True)
         self._background.start()
 
-    def wait(self, timeout_s: float | None = None) -> None:
+    def wait(self) -> None:
         """Wait for work in the background."""
         if self._background is not None:
-            self._background.join(timeout_s)
+            self._background.join()
 
     def close(self) -> None:
         """Give up what is computed, and take the page down."""

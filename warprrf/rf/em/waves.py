@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 from warprrf.checks import check_alike, check_array, checked
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
+CARRIERS_HZ = (1e3, 1e16)
+"""Carriers that a field may have."""
 
 
 def check_frequency(frequency_hz: ArrayLike | None) -> float:

@@ -32,7 +32,7 @@ from warprrf.netcdf_files import Variable
 from warprrf.rf.channel.response import LinkOptions as LinkEnds
 from warprrf.rf.channel.response import frequency_response
 from warprrf.rf.em.absorption import Air, Gas
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.batches import Batch, Delivery
 from warprrf.rf.fields.data import Data
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
@@ -46,7 +46,6 @@ from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 """Attributes of every model that are numbers, under these names in the header of a file."""
-CARRIERS_HZ = (1e3, 1e16)
 NARROWEST_BEAM_RAD = 1e-4
 
 

@@ -70,6 +70,7 @@ class Readings:
         name: by which a report tells these readings from others.
         azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
             from line of sight and mirrors. Give readings whose zeros differ as several data sets.
+        position_std_m: standard deviation of each coordinate of the receivers [m]; above 0 a fit finds where they stood.
 
     Raises:
         TypeError, ValueError: naming the argument.
@@ -98,6 +99,7 @@ class Readings:
     air: Air | None = None
     name: str = "readings"
     azimuth_known: bool = True
+    position_std_m: float = 0.0
 
     def __post_init__(self) -> None:
         power = check_array("power", self.power, (None,), finite=False)
@@ -131,7 +133,7 @@ class Readings:
                     f"{pattern}: it goes with {turned}, got one of the two; expected both or neither"
                 )
             if value is not None:
-                fields[turned] = check_array(turned, value, (count, 2))
+                fields[turned] = check_turned(turned, value, count)
                 check_gains(pattern, gain)
         if (self.delay_s is None) != (self.bandwidth_hz is None):
             raise ValueError(
@@ -145,17 +147,23 @@ class Readings:
             raise ValueError(
                 "azimuth_known: got False without arrival; expected the azimuths whose zero is to be found"
             )
+        check_number("position_std_m", self.position_std_m, 0.0, 1.0)
+        if self.position_std_m > 0 and self.total:
+            raise ValueError(
+                "position_std_m: got readings of power alone, which say nothing of where they were taken; expected "
+                "directions or delays"
+            )
         if self.samples is not None:
             check_count("samples", self.samples)
         if self.window not in WINDOWS:
             raise ValueError(f"window: got {self.window!r}, expected one of {', '.join(WINDOWS)}")
-        chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=str)
-        if chain.shape != (count,):
-            raise ValueError(f"chain: got shape {chain.shape}, expected a name for each of {count} readings")
+        chain = np.full(count, "") if self.chain is None else np.asarray(self.chain, dtype=object)
+        if chain.shape != (count,) or not all(isinstance(name, str) for name in chain):
+            raise ValueError(f"chain: got {self.chain!r:.200}, expected a name for each of {count} readings")
         std = check_array("std_db", self.std_db)
         if std.shape not in ((), (count,)) or (std < 0).any():
             raise ValueError(f"std_db: got {self.std_db!r}, expected one number or {count}, at least 0")
-        fields |= {"chain": chain, "std_db": np.broadcast_to(std, (count,)).copy()}
+        fields |= {"chain": chain.astype(str), "std_db": np.broadcast_to(std, (count,)).copy()}
         for name, value in fields.items():
             object.__setattr__(self, name, value)
 
@@ -223,12 +231,12 @@ class Readings:
             settings: other arguments of :class:`Readings`.
 
         Raises:
-            KeyError: naming columns that are missing.
+            ValueError: naming columns that are missing.
         """
         names = set(map(str, table))
         missing = sorted({*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db"} - names)
         if missing:
-            raise KeyError(
+            raise ValueError(
                 f"table: lacks the columns {', '.join(missing)}; it has {', '.join(sorted(names))}"
             )
 
@@ -252,7 +260,9 @@ class Readings:
         if "std_db" in names:
             found["std_db"] = column("std_db")
         if "chain" in names:
-            found["chain"] = np.asarray(table["chain"]).astype(str)
+            cells = np.ravel(np.asarray(table["chain"], dtype=object))
+            none = [c is None or (isinstance(c, float) and np.isnan(c)) for c in cells]  # as pandas has it
+            found["chain"] = np.where(none, "", cells.astype(str))
         return cls(**found, **settings)
 
     @classmethod
@@ -270,11 +280,9 @@ class Readings:
             raise FileNotFoundError(f"path: there is no file {file}")
         try:
             table = pandas.read_csv(file, keep_default_na=True, dtype={"chain": str})
-            if "chain" in table:
-                table["chain"] = table["chain"].fillna("")
             return cls.from_table(table, **settings)
-        except (KeyError, TypeError, ValueError, UnicodeError) as error:
-            raise ValueError(f"path: {file}: {error.args[0] if error.args else error}") from error
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"path: {file}: {error}") from error
 
 
 def path_weights(
@@ -316,6 +324,21 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     angle = np.linspace(0.0, np.pi, 20_001)
     mean = 0.5 * np.trapezoid(shape(angle) * np.sin(angle), angle)
     return lambda off: shape(np.asarray(off)) / mean
+
+
+def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    """Zeniths and azimuths (count, 2) [rad] that antennas are turned to.
+
+    Raises:
+        ValueError: for another shape, or zeniths that are none.
+    """
+    angles = check_array(name, value, (count, 2))
+    wrong = angles[np.abs(angles[:, 0] - np.pi / 2) > np.pi / 2 + 1e-6, 0]
+    if len(wrong):
+        raise ValueError(
+            f"{name}: got a zenith of {wrong[0]:g}, expected 0 to pi (elevations from -90 to 90 degrees)"
+        )
+    return angles
 
 
 def check_gains(name: str, pattern: Pattern) -> None:

@@ -30,7 +30,7 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.itu import assumed_permittivity
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
@@ -52,7 +52,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import check_gains
+from warprrf.rf.spectra.readings import check_gains, check_turned
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 
 
@@ -277,7 +277,7 @@ class BistaticField(RadioField):
 
             field_140 = field_300.at_frequency(140e9)
         """
-        ratio = check_frequency(frequency_hz) / self.frequency_hz
+        ratio = check_number("frequency_hz", frequency_hz, *CARRIERS_HZ) / self.frequency_hz
         fall = 20.0 * float(np.log10(ratio))
         return replace(
             self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
@@ -431,7 +431,8 @@ class BistaticField(RadioField):
         progress: Progress | None = None,
     ) -> np.ndarray:
         """Where to measure next; see :meth:`RadioField.suggest`, and :mod:`warprrf.rf.fields.bistatic.suggest` for how."""
-        places, source = self.check_positions(check_array("candidates", candidates, (None, 3)))
+        given = check_array("candidates", candidates, (None, 3))
+        places, source = self.check_positions(given, name="candidates")
         check_count("n", n, 1, len(places))
         pointings = None
         if (arrival is None) != (receive_pattern is None):
@@ -440,7 +441,7 @@ class BistaticField(RadioField):
             )
         if arrival is not None and receive_pattern is not None:
             check_gains("receive_pattern", receive_pattern)
-            angles = check_array("arrival", arrival, (len(places), 2))
+            angles = check_turned("arrival", arrival, len(places))
             pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
         sensitivity, unknowns = self._sensitivity(source)
         measured = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on

@@ -1,0 +1,274 @@
+"""Long work says how far it is, in one way; commands say it as bars or JSON; Ctrl-C ends them and loses nothing."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from places import ROOT
+
+import warprrf as wr
+from warprrf import cli
+from warprrf.cli.output import Output
+from warprrf.device import TimeLeft
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_time_left_follows_the_recent_rate(clock: list[float]) -> None:
+    left, said = TimeLeft(), []
+    for now, done in ((0, 900), (30, 901), (32, 902), (34, 903), (44, 908), (54, 909)):
+        clock[0] = now
+        said.append(left("refine", done, 1000))
+    # What an earlier run did tells nothing; the first step, which compiles, counts only while it is the only one.
+    assert said[:4] == [None, 99 * 30.0, 98 * 2.0, 97 * 2.0]
+    # 7 steps in 14 s since the first one, then 6 in the 20 s since the newest count that is 15 s old.
+    assert said[4:] == pytest.approx([92 * 2.0, 91 * 20.0 / 6.0])
+    assert left("refine", 1000, 1000) == 0.0
+    assert left("report", 1, 2) is None  # another stage has a rate of its own
+    assert left("report", 1, 2) is None  # and none while it stands still
+
+
+def test_a_log_gets_a_line_every_half_minute_and_a_terminal_one_line_that_moves(
+    clock: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drawn(terminal: bool) -> str:
+        stream = io.StringIO()
+        monkeypatch.setattr(stream, "isatty", lambda: terminal)
+        monkeypatch.setattr(sys, "stderr", stream)
+        out = Output("warprrf")
+        for now, done in ((0, 900), (10, 901), (40, 910)):
+            clock[0] = now
+            out("refine", done, 1000)
+        out("report", 0, 2)
+        out.error("error: no", 2)
+        return stream.getvalue()
+
+    bar = (
+        f"refine:  90%|{'#' * 18}  | 900/1000 [00:00<?]",
+        f"refine:  91%|{'#' * 18}  | 910/1000 [00:40<05:00]",
+    )
+    assert drawn(False).splitlines() == [
+        *bar,
+        f"report:   0%|{' ' * 20}| 0/2 [00:00<?]",
+        "warprrf: error: no",
+    ]
+    moving = drawn(True)
+    assert moving.count("\n") == 3 and moving.count("\r") == 4 and bar[1] in moving  # 901 is drawn there too
+
+
+# ------------------------------------------------------------------------------------------------------------ JSON
+
+
+def events(text: str) -> list[dict[str, Any]]:
+    """Standard output of a command with --json: strict JSON, an object a line, and nothing else."""
+
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
+
+
+def check_told(rows: list[tuple[str, int, int]], stages: list[str]) -> None:
+    """Stages come in order, each once; ``done`` never falls, and ends at ``total``."""
+    assert list(dict.fromkeys(stage for stage, _, _ in rows)) == stages
+    for stage in stages:
+        places = [k for k, row in enumerate(rows) if row[0] == stage]
+        counts = [rows[k][1:] for k in places]
+        assert places == list(range(places[0], places[-1] + 1)), stage
+        assert [done for done, _ in counts] == sorted(done for done, _ in counts), stage
+        assert len({total for _, total in counts}) == 1 and counts[-1][0] == counts[-1][1], stage
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene, a hundred receivers and what is made of them by the tests below, in order."""
+    folder = tmp_path_factory.mktemp("room")
+    (folder / "room.xml").write_text(
+        '<scene version="3.0.0"><bsdf type="itu-radio-material" id="it"><string name="type" value="concrete"/></bsdf>'
+        '<shape type="cube"><ref id="it"/><boolean name="flip_normals" value="true"/></shape></scene>'
+    )
+    places = np.random.default_rng(1).uniform(-0.8, 0.8, (100, 3))
+    np.savetxt(folder / "receivers.csv", places, delimiter=",")
+    np.savetxt(folder / "few.csv", places[:20], delimiter=",")
+    return folder
+
+
+COMMANDS = {
+    "simulate room.xml -o x.nc --transmitter 0.7 0.7 0.9 --receivers receivers.csv --shape 8 16": (
+        ["simulate"], ["x.nc"], {"spectra": 100, "shape": [8, 16], "engine": "exact"},
+    ),
+    "fit room.xml x.nc -o f.safetensors --quick --train 20": (
+        ["patches", "mirrors", "transport", "fit"], ["f.safetensors"], {"model": "bistatic", "receivers": 20},
+    ),
+    "evaluate f.safetensors x.nc --train 20 -o e.json": (
+        [f"evaluate {name}" for name in ("bistatic", "nearest", "idw", "constant", "mean")], ["e.json"], {},
+    ),
+    "suggest f.safetensors receivers.csv -n 2 -o next.csv": (["suggest"], ["next.csv"], {}),
+    "map f.safetensors -o m.nc --cell 0.5 --height 0": (["links"], ["m.nc", "m.png"], {"cells": 16, "cells_in_air": 16}),
+    "twin f.safetensors -o twin": ([], ["twin"], {"materials": 1}),
+    "render f.safetensors --receiver 0.2 0.2 0.1 -o r.npz": ([], ["r.npz"], {}),
+    "relevance room.xml --spectra x.nc --most 2 -o rel.json": (
+        ["relevance"], ["rel.json", "rel.md"], {"receivers": 2},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_json_holds_progress_and_one_result(
+    command: str, room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stages, files, figures = COMMANDS[command]
+    monkeypatch.chdir(room)
+    assert cli.main([*command.split(), "--json", "--device", "cpu"]) == 0
+    said = events(capsys.readouterr().out)
+    *told, result = said
+    assert {one["event"] for one in told} <= {"progress"} and result.pop("event") == "result"
+    check_told([(one["stage"], one["done"], one["total"]) for one in told], stages)
+    assert all(one["seconds_left"] == 0 for one in told if one["done"] == one["total"])
+    assert result.pop("files") == files and all((room / file).exists() for file in files)
+    assert figures.items() <= result.items() and (figures or result)
+
+
+BAD = {
+    "fit none none.nc -o f": "none: no such file or folder",
+    "fit": "required: geometry, measurements, -o/--out (see warprrf fit --help)",
+    "simulate room.xml -o x.nc --transmitter 0 0 0 --receivers 1,1,nan": "receivers",
+}
+
+
+@pytest.mark.parametrize("command", BAD)
+def test_errors_are_json_too(
+    command: str, room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(room)
+    assert cli.main([*command.split(), "--json", "--quiet"]) == 2
+    (one,) = events(capsys.readouterr().out)
+    assert one["event"] == "error" and one["status"] == 2 and BAD[command] in one["message"]
+
+
+def test_a_bug_is_json_and_a_traceback(
+    room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*args: object, **options: object) -> None:
+        print("a stranger's word")
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(wr, "simulate", fail)
+    words = ["simulate", str(room / "room.xml"), "-o", str(room / "y.nc"), "--transmitter", "0", "0", "0"]
+    with pytest.raises(RuntimeError):
+        cli.main([*words, "--receivers", "2,2,2", "--json"])
+    said = capsys.readouterr()
+    assert events(said.out) == [{"event": "error", "message": "error: a bug", "status": 1}]
+    assert said.err == "a stranger's word\n"
+
+
+# ------------------------------------------------------------------------------------------------------------ Ctrl-C
+
+
+def interrupted(words: list[str], when: str, folder: Path, file: str = "*") -> tuple[str, float]:
+    """What a real process says on SIGINT, sent once it has told ``when`` and made ``file``, and how long it takes to end."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", *words, "--json", "--device", "cpu"], cwd=folder, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert process.stdout is not None
+    for line in process.stdout:
+        if when in line:
+            break
+    else:
+        raise AssertionError(process.communicate())
+    while not list(folder.glob(file)):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    start = time.monotonic()
+    out, err = process.communicate(timeout=60)
+    took = time.monotonic() - start
+    assert process.returncode == 130, err
+    assert "Traceback" not in err
+    last = events(out)[-1]
+    assert last["status"] == 130 and last["event"] == "error"
+    return last["message"], took
+
+
+def test_simulate_goes_on_where_ctrl_c_ended_it(
+    room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(room)
+    words = "simulate room.xml --transmitter 0.7 0.7 0.9 --receivers few.csv --shape 45 90".split()
+    message, took = interrupted(["warprrf", *words, "-o", "i.nc"], '"simulate"', room, "i.nc.receivers/*.npz")
+    assert (
+        message == "interrupted; finished work is kept in i.nc.receivers, the same command goes on from there"
+    )
+    assert took < 3.0 and not Path("i.nc").exists()
+    kept = len(list(Path("i.nc.receivers").glob("*.npz")))
+    assert 0 < kept < 20
+    for name in ("i.nc", "whole.nc"):
+        assert cli.main([*words, "-o", name, "--device", "cpu", "--json"]) == 0
+        first = events(capsys.readouterr().out)[0]
+        assert first["done"] == (kept if name == "i.nc" else 0)
+    one, whole = wr.SpectrumDataset.load("i.nc"), wr.SpectrumDataset.load("whole.nc")
+    np.testing.assert_array_equal(one.path_gain, whole.path_gain)
+    np.testing.assert_array_equal(one.delay_s, whole.delay_s)
+    assert not Path("i.nc.receivers").exists()
+
+
+def test_reconstruct_goes_on_where_ctrl_c_ended_it(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    for photo in sorted((ROOT / "data/lobby/photos").iterdir())[:8]:
+        (tmp_path / "photos" / photo.name).symlink_to(photo)
+    message, took = interrupted(["warprrf", "reconstruct", "photos", "-o", "room"], '"matching"', tmp_path)
+    assert "finished work is kept in room/workspace, the same command goes on from there" in message
+    assert took < 3.0
+    told: list[str] = []
+
+    def enough(stage: str, done: int, total: int) -> None:
+        told.append(stage)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        wr.reconstruct(tmp_path / "photos", workspace=tmp_path / "room/workspace", progress=enough)
+    assert told == ["matching"]  # features are there
+
+
+@pytest.mark.parametrize(
+    ("words", "when", "kept"),
+    [
+        ("warprrf fit room.xml x.nc -o none --model rf3dgs+", '"transport"', "nothing is kept"),
+        ("benchmarks lobby --out lobby --data {data}", '"features"', "finished work is kept in lobby"),
+    ],
+)
+def test_ctrl_c_ends_long_work_at_once(words: str, when: str, kept: str, room: Path) -> None:
+    message, took = interrupted(words.format(data=ROOT / "data/lobby").split(), when, room)
+    assert kept in message and took < 3.0 and not (room / "none").exists()
+
+
+STUCK = """
+import ctypes, sys
+from warprrf import cli
+def stuck(args, out):
+    out("stuck", 0, 1)
+    lock = ctypes.create_string_buffer(64)  # a mutex of zeros is open; who locks it twice waits for ever
+    [ctypes.CDLL(None).pthread_mutex_lock(lock) for _ in range(2)]
+sys.exit(cli.run(cli.make_parser("stuck", "", "", [lambda add: add("stuck", stuck, "is stuck", "")])))
+"""
+
+
+def test_ctrl_c_ends_native_code_that_does_not_listen(tmp_path: Path) -> None:
+    (tmp_path / "stuck.py").write_text(STUCK)
+    message, took = interrupted(["stuck", "stuck"], '"stuck"', tmp_path)
+    assert message == "interrupted; nothing is kept" and 0.9 < took < 3.0
