@@ -223,7 +223,7 @@ class RaySearch:
             # Most segments are free, and to find out that nothing is met at all takes half as long as what is met.
             which = np.flatnonzero(self._embree.blocked(rays))
         inner, start = length[which] - clearance, rows(a, which)
-        way = rows(b, which) - start
+        way = (rows(b, which) - start)[: len(which)]
         t, _ = self.nearest(start, way, reach=inner, clearance=clearance, device=device, backend=chosen)
         free[which] = t >= inner
         return free
