@@ -350,12 +350,14 @@ class BistaticField(RadioField):
         transport = self.transport(transmitter)
         sent, found = self.sent_radiance(transport), np.empty((len(receivers), *self.shape), np.float32)
         batch = max(1, RAYS_AT_A_TIME // len(transport.grid.directions))
+        paths = transport.paths(
+            receivers, self.terms.mirror_order
+        )  # chains of mirrors are searched once for all
         for first in range(0, len(receivers), batch):
-            view = transport.view(receivers[first : first + batch], self.terms)
+            some = np.arange(first, min(first + batch, len(receivers)))
+            view = transport.view(receivers[some], self.terms, paths=paths.of(some))
             powers = path_powers(view, self.materials, sent)
-            found[first : first + batch] = images(
-                view, powers, powers.single + powers.further.by_ray(), self._beam
-            )
+            found[some] = images(view, powers, powers.single + powers.further.by_ray(), self._beam)
         return found
 
     def array_spectrum(
