@@ -133,7 +133,7 @@ class Readings:
                     f"{pattern}: it goes with {turned}, got one of the two; expected both or neither"
                 )
             if value is not None:
-                fields[turned] = check_array(turned, value, (count, 2))
+                fields[turned] = check_turned(turned, value, count)
                 check_gains(pattern, gain)
         if (self.delay_s is None) != (self.bandwidth_hz is None):
             raise ValueError(
@@ -324,6 +324,21 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     angle = np.linspace(0.0, np.pi, 20_001)
     mean = 0.5 * np.trapezoid(shape(angle) * np.sin(angle), angle)
     return lambda off: shape(np.asarray(off)) / mean
+
+
+def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    """Zeniths and azimuths (count, 2) [rad] that antennas are turned to.
+
+    Raises:
+        ValueError: for another shape, or zeniths that are none.
+    """
+    angles = check_array(name, value, (count, 2))
+    wrong = angles[np.abs(angles[:, 0] - np.pi / 2) > np.pi / 2 + 1e-6, 0]
+    if len(wrong):
+        raise ValueError(
+            f"{name}: got a zenith of {wrong[0]:g}, expected 0 to pi (elevations from -90 to 90 degrees)"
+        )
+    return angles
 
 
 def check_gains(name: str, pattern: Pattern) -> None:

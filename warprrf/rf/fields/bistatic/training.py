@@ -414,22 +414,16 @@ def train(
                 for k, one in enumerate(data)
             ]
             seen = trace(
-                geometry,
-                data,
-                mirror_order=o.mirror_order,
-                sub_pixels=o.sub_pixels,
-                device=device,
+                geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, client=client, device=device,
                 progress=progress,
-            )
+            )  # fmt: skip
             found = _Training(seen, data, o, progress).run()
+    names = training.names
     told = {
-        "azimuth_zero_deg": zeros,
-        "position_offset_m": {
-            data[k].name: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
-            for k, own in offsets.items()
-        },
+        names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
+        for k, own in offsets.items()
     }
-    return replace(found, report=found.report | told)
+    return replace(found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": told})
 
 
 def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
@@ -565,7 +559,8 @@ class _Training:
 
     def offsets(self, materials: Materials) -> dict[int, list[tuple[Place, np.ndarray]]]:
         """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
-        lit, found = self._lit(materials), {}
+        lit = self._lit(materials)
+        found: dict[int, list[tuple[Place, np.ndarray]]] = {}
         for k, observed in enumerate(self.observed):
             one, place = self.data[observed.place.data], observed.place
             if not isinstance(one, Readings) or one.position_std_m == 0:
