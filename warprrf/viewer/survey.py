@@ -39,6 +39,7 @@ class Survey:
 
     Attributes:
         map, suggest, errors, reading_errors: what the buttons do, as far as the subject allows.
+        height: of map and suggestions [m].
         legend, listed: what was computed last in HTML, and buttons of the places that it named.
     """
 
@@ -61,7 +62,7 @@ class Survey:
             gui.add_markdown("A map needs a field.")
             return
         height = np.median(subject.places[:, 2]) if len(subject.places) else subject.bounds[0, 2] + HEIGHT_M
-        self._height = gui.add_number("height [m]", round(float(height), 2), step=0.1)
+        self.height = gui.add_number("height [m]", round(float(height), 2), step=0.1)
         self._cell = gui.add_number("cell [m]", 0.5, min=0.05, step=0.05)
         self._quantity = gui.add_dropdown("quantity", tuple(QUANTITIES.values()))
         self.map = self._add("compute the map", self._map)
@@ -117,7 +118,7 @@ class Survey:
 
     def _map(self, field: RadioField, progress: Progress) -> None:
         found = field.radio_map(
-            float(self._height.value), float(self._cell.value), self._transmitters()[0], progress=progress
+            float(self.height.value), float(self._cell.value), self._transmitters()[0], progress=progress
         )
         quantity = next(name for name, text in QUANTITIES.items() if text == self._quantity.value)
         value = found.shown(quantity)
@@ -132,6 +133,7 @@ class Survey:
         self._page.scene.add_image(
             "/map", np.dstack([picture, seen]), width, height,
             position=(float(found.x.mean()), float(found.y.mean()), floor), wxyz=(0.0, 1.0, 0.0, 0.0),
+            visible="map" not in self._page.hidden,
         )  # fmt: skip
         title = f"{self._quantity.value} at {found.height_m:g} m"
         self._explain(title, pictures.colour_bar(low, high, ""), "map")
@@ -142,14 +144,14 @@ class Survey:
         if not isinstance(mesh, Mesh):
             raise ValueError("field: got one without a mesh, expected one that knows walls from air")
         axes = [np.arange(a + 0.5 * CANDIDATE_M, b, CANDIDATE_M) for a, b in mesh.bounds[:, :2].T]
-        places = np.stack(np.meshgrid(*axes, [float(self._height.value)]), axis=-1).reshape(-1, 3)
+        places = np.stack(np.meshgrid(*axes, [float(self.height.value)]), axis=-1).reshape(-1, 3)
         places = places[in_the_air(mesh, places, field.transmitter, device=field.device)]
         return np.asarray(places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M])
 
     def _suggest(self, field: RadioField, progress: Progress) -> None:
         places = self.candidates(field)
         if not len(places):
-            raise ValueError(f"height: no place at {self._height.value:g} m is in the air")
+            raise ValueError(f"height: no place at {self.height.value:g} m is in the air")
         count = min(int(self._count.value), len(places))
         chosen = places[field.suggest(places, count, progress=progress)]
         self._mark("suggested", chosen, SUGGESTED, 0.2)
