@@ -165,6 +165,19 @@ def test_the_mesh_is_coloured_by_what_is_chosen_and_the_scale_says_so(viewer):
     room.colouring.value = "plain"
 
 
+def test_spectra_are_not_compared_with_what_was_measured_at_another_carrier(viewer):
+    viewer.receiver = viewer.subject.spectra.receivers[0]
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images] == ["spectrum", "truth", "spectrum less truth"]
+    viewer._channel.carrier.value = 140.0
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images] == ["spectrum"]
+    viewer._survey.errors()
+    viewer._page.wait()
+    assert f"expected that of what was measured, {make.CARRIER_HZ / 1e9:g} GHz" in viewer.message
+    viewer._channel.carrier.value = make.CARRIER_HZ / 1e9
+
+
 def test_what_cannot_be_computed_is_said_on_the_page(viewer):
     viewer._survey.height.value = 1000.0
     viewer._survey.map()

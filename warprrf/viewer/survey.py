@@ -11,7 +11,9 @@ from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.maps.radio_map import QUANTITIES, in_the_air
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
+from warprrf.rf.spectra.readings import Readings
 from warprrf.viewer import answers, pictures
 from warprrf.viewer.page import Page
 from warprrf.viewer.subject import Subject
@@ -164,6 +166,7 @@ class Survey:
         truth = self._subject.spectra
         if truth is None:
             return
+        _check_carrier(field, truth)
         found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
         worst = np.argsort(psnr)[:WORST]
@@ -179,6 +182,7 @@ class Survey:
         readings = self._subject.readings
         if readings is None:
             return
+        _check_carrier(field, readings)
         error = answers.reading_errors(field, readings, progress)
         places, own = np.unique(readings.receivers, axis=0, return_inverse=True)
         each = [error[own.reshape(-1) == k] for k in range(len(places))]
@@ -196,6 +200,12 @@ class Survey:
             pictures.colour_bar(0.0, READING_DB, "dB", "RdYlGn_r"),
         )
         self._list(readings.receivers[worst], labels)
+
+
+def _check_carrier(field: RadioField, measured: SpectrumDataset | Readings) -> None:
+    if abs(field.frequency_hz - measured.frequency_hz) > 0.5 * answers.CARRIER_STEP_HZ:
+        asked, known = (f"{one.frequency_hz / 1e9:g} GHz" for one in (field, measured))
+        raise ValueError(f"carrier: got {asked}, expected that of what was measured, {known}")
 
 
 def _rms(error: np.ndarray) -> float:
