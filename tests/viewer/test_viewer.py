@@ -102,6 +102,7 @@ def test_what_is_shown_is_saved_as_one_page_and_as_a_picture(viewer, tmp_path):
     ("given", "said"),
     [
         ({"host": "192.0.2.1"}, "host: got '192.0.2.1'"),
+        ({"host": ""}, "host: got ''"),
         ({"port": 0}, "port: got 0"),
         ({"port": 2.5}, "port: got 2.5"),
     ],

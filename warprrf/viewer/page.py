@@ -35,6 +35,8 @@ class Page:
 
     def __init__(self, host: str, port: int, bounds: np.ndarray) -> None:
         check_type("host", host, str)
+        if not host:  # which sockets take for every address of the machine
+            raise ValueError("host: got '', expected an address of this machine; 0.0.0.0 means all of them")
         check_count("port", port, 1, 65535)
         try:
             with socket.create_server((host, 0)):

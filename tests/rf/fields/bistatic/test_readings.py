@@ -129,6 +129,27 @@ def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene: RadioScene
         replace(turned, arrival=None, receive_pattern=None, azimuth_known=False)
 
 
+def test_receivers_that_stood_elsewhere_are_found(scene: RadioScene, turned: Readings) -> None:
+    rng = np.random.default_rng(2)
+    away = 0.08 * rng.normal(size=(6, 3)).clip(-1.5, 1.5)
+    count = len(turned) // 6
+    said = replace(turned, receivers=turned.receivers + np.repeat(away, count, axis=0))
+    field = RadioField.fit(scene, replace(said, position_std_m=0.08, name="away"), quick=True)
+    found = field.report["position_offset_m"]["away"]
+    np.testing.assert_allclose([place for place, _ in found], RECEIVERS[:6] + away)
+    left = away + [offset for _, offset in found]
+    sight = RECEIVERS[:6] - TX
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+
+    def across(error: np.ndarray) -> float:  # powers say little of how far away a receiver is
+        return float(np.sqrt(((error - (error * sight).sum(axis=1, keepdims=True) * sight) ** 2).mean()))
+
+    assert across(left) < 0.5 * across(away)
+    np.testing.assert_allclose(field.fitted_on, RECEIVERS[:6] + away)
+    with pytest.raises(ValueError, match="position_std_m: got readings of power alone"):
+        replace(turned, arrival=None, receive_pattern=None, position_std_m=0.05)
+
+
 def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -> None:
     """A mirror's share exp(-(4 pi sigma_h / lambda)^2) is found again, the sum of both shares stays, and so does what
     free space gives: the square of the wavelength."""

@@ -16,7 +16,6 @@ from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
-from warprrf.rf.fields.bistatic.azimuth import with_azimuths
 from warprrf.rf.fields.bistatic.fit import (
     NEPER,
     OWN_GAIN,
@@ -31,6 +30,7 @@ from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import Frame, Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
@@ -405,8 +405,25 @@ def train(
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
         data, zeros = with_azimuths(data, seen.places, seen.views)
-        found = _Training(seen, data, o, progress).run()
-    return replace(found, report=found.report | {"azimuth_zero_deg": zeros})
+        training = _Training(seen, data, o, progress)
+        found = training.run()
+        offsets = training.offsets(found.materials)
+        if offsets:
+            data = [
+                moved(one, offsets[k]) if isinstance(one, Readings) and k in offsets else one
+                for k, one in enumerate(data)
+            ]
+            seen = trace(
+                geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, client=client, device=device,
+                progress=progress,
+            )  # fmt: skip
+            found = _Training(seen, data, o, progress).run()
+    names = training.names
+    told = {
+        names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
+        for k, own in offsets.items()
+    }
+    return replace(found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": told})
 
 
 def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
@@ -439,7 +456,7 @@ class _Training:
         options: FitOptions,
         progress: Progress | None,
     ) -> None:
-        self.seen, self.options, self.choose = seen, options, options.selection
+        self.seen, self.data, self.options, self.choose = seen, data, options, options.selection
         self.started = time.perf_counter()
         self.surface, self.count, self.views = seen.surface, len(seen.places), list(seen.views)
         self.frequency_hz = Frame.of(data).frequency_hz
@@ -538,6 +555,26 @@ class _Training:
                 error = observed.target.error(self._predicted(lit, k)) / sd
                 rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
             found.append(rows)
+        return found
+
+    def offsets(self, materials: Materials) -> dict[int, list[tuple[Place, np.ndarray]]]:
+        """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
+        lit = self._lit(materials)
+        found: dict[int, list[tuple[Place, np.ndarray]]] = {}
+        for k, observed in enumerate(self.observed):
+            one, place = self.data[observed.place.data], observed.place
+            if not isinstance(one, Readings) or one.position_std_m == 0:
+                continue
+            (here, sent), view = lit(k), self._view(k, materials.terms)
+            powers = path_powers(view, here, sent)
+            total = np.maximum(read(view, observed.measured, powers), 0.0) / observed.floor
+            direct = powers.mirror / observed.floor
+            gain = gain_of(observed.chain, here.parameters, observed.target, total)
+            other = np.maximum(total - direct @ observed.measured.of_paths(view), 0.0)
+            offset = position_offset(
+                one, place, view, observed.target, gain * other, gain * direct, self.options.groups
+            )
+            found.setdefault(place.data, []).append((place, offset))
         return found
 
     def _leave_out(self, wrong: Sequence[np.ndarray]) -> None:
