@@ -167,6 +167,8 @@ def spoilt(readings: wr.Readings, seed: int) -> Iterator[tuple[str, wr.Readings,
     own = own.reshape(-1)
     moved = readings.receivers + (0.05 / np.sqrt(3.0) * rng.normal(size=places.shape))[own]
     yield "horn, places off by 5 cm rms", replace(readings, receivers=moved), none
+    searched = replace(readings, receivers=moved, position_std_m=0.05 / np.sqrt(3.0))
+    yield "horn, places off by 5 cm rms and searched", searched, none
     if readings.arrival is not None:
         turn = np.radians(3.0) * rng.normal(size=len(places))[own]
         turned = readings.arrival + np.stack([0 * turn, turn], 1)

@@ -30,7 +30,7 @@ examples:
 """
 FLAGS = (
     "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--window-size=1300,800",
+    "--window-size=1400,1000",
 )  # fmt: skip
 LINE = np.array([[4.0, 4.5, 1.5], [11.0, 4.0, 1.5]])  # that the receiver is moved along, past a wall's end
 FRAMES = 16
@@ -136,17 +136,27 @@ def _browsed(viewer: Any, page: Any, options: Options, job: Job) -> dict[str, An
             time.sleep(1.0)
             frames.append(page.get_screenshot_as_png())
         job.progress("browser", k + 1, FRAMES)
-    if frames:
-        _save(frames, Path(options.pictures or "."))
+    if options.pictures is not None:
+        viewer.receiver = _held_out(viewer)
+        viewer.wait()
+        time.sleep(10.0)
+        _save(page.get_screenshot_as_png(), frames, Path(options.pictures))
     return {"page_opens_s": opened, "browser_frame_median_ms": float(np.median(times))}
 
 
-def _save(frames: list[bytes], folder: Path) -> None:
+def _held_out(viewer: Any) -> np.ndarray:
+    """The measured place nearest to the middle of the line that the field was not fitted to, or else the middle."""
+    middle, ds = LINE.mean(axis=0), viewer.subject.spectra
+    free = [] if ds is None else ds.receivers[~viewer.subject.field.was_fitted_on(ds)]
+    return min(free, key=lambda place: float(np.linalg.norm(place - middle)), default=middle)
+
+
+def _save(still: bytes, frames: list[bytes], folder: Path) -> None:
     from PIL import Image
 
-    pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     folder.mkdir(parents=True, exist_ok=True)
-    pictures[len(pictures) // 2].save(folder / "viewer.png", optimize=True)
+    Image.open(io.BytesIO(still)).convert("RGB").quantize(256).save(folder / "viewer.png", optimize=True)
+    pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     small = [p.resize((p.width // 2, p.height // 2), Image.Resampling.LANCZOS) for p in pictures]
     small[0].save(
         folder / "viewer.webp", save_all=True, append_images=small[1:], duration=250, loop=0, quality=60

@@ -44,7 +44,7 @@ CALLS: dict[str, tuple[Callable[..., object], dict[str, object]]] = {
     "cast": (GROUND.cast, {"origins": PLACE, "directions": PLACE}),
     "visible": (GROUND.visible, {"a": PLACE, "b": [[0.0, 0, 2]], "clearance": 1e-4}),
     "closest": (GROUND.closest, {"points": PLACE}),
-    "winding_number": (GROUND.winding_number, {"points": PLACE}),
+    "look_around": (GROUND.look_around, {"points": PLACE, "directions": PLACE}),
     "cross_section": (GROUND.cross_section, {"height": 1.0}),
     "taps": (lambda **k: _paths().taps(**k), {"bandwidth_hz": 1e9, "l_min": 0, "l_max": 3}),
     "cfr": (lambda **k: _paths().cfr(**k), {"frequencies_hz": [3e11]}),

@@ -149,6 +149,7 @@ def test_runs_as_a_module(module: str) -> None:
 
 SIMULATE = ["simulate", "{scene}", "-o", "{tmp}/x.nc", "--transmitter", "2", "3", "3", "--receivers"]
 RENDER = ["render", "-o", "{tmp}/x.png"]
+CARRIER = ["--carrier", "300e9"]
 BAD = {
     "no photos": (["reconstruct", "{tmp}/none", "-o", "{tmp}/out"], "none"),
     "no scene": ([word.replace("{scene}", "none.xml") for word in SIMULATE] + ["2,2,1"], "none.xml"),
@@ -202,6 +203,44 @@ BAD = {
         ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
         ".ply",
     ),
+    "horn of no table": (
+        ["fit", "{scene}", "{tmp}/bad.nc", "-o", "{tmp}/f.safetensors", "--horn-deg", "10"],
+        "--horn-deg",
+    ),
+    "part of a table": (
+        ["fit", "{scene}", "{tmp}/horn.csv", "-o", "{tmp}/f.safetensors", "--train", "3"],
+        "--train",
+    ),
+    "floor that is no number": (
+        [
+            "fit",
+            "{scene}",
+            "{tmp}/horn.csv",
+            "-o",
+            "{tmp}/f.safetensors",
+            *CARRIER,
+            "--noise-floor-db",
+            "4000",
+        ],
+        "--noise-floor-db",
+    ),
+    "horn that looks through its own foot": (
+        [
+            "fit",
+            "{scene}",
+            "{tmp}/horn.csv",
+            "-o",
+            "{tmp}/f.safetensors",
+            *CARRIER,
+            "--noise-floor-db",
+            "-120",
+            "--horn-deg",
+            "10",
+        ],
+        "zenith of -1.91986",
+    ),
+    "carrier of a field": (["suggest", "{tmp}/bad.safetensors", "2,2,1", *CARRIER], "--carrier"),
+    "candidates that are no numbers": (["suggest", "{scene}", "2,2,up"], "candidates"),
     "suggest without a carrier": (
         ["suggest", "{scene}", "2,2,1", "--transmitter", "13.6", "11.2", "2.5"],
         "--carrier",
@@ -277,6 +316,9 @@ def test_bad_input_is_one_line_and_status_2(
     (tmp_path / "deep.json").write_text("[" * 100_000)
     np.save(tmp_path / "c.npy", np.ones((2, 3), complex))
     (tmp_path / "words.txt").write_text("these are, words\n")
+    (tmp_path / "horn.csv").write_text(
+        "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db\n13,11,2.5,7,4,1.5,0,200,-90\n"
+    )
     (tmp_path / "bad.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0notjson!")
     (tmp_path / "bad.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     (tmp_path / "bad.ply").write_bytes(

@@ -239,7 +239,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Mesh.look_around": _on(lambda p: p.mesh, points=POINTS, directions=TOWARDS, device="cpu"),
     "Mesh.on_device": _on(lambda p: p.mesh, device="cpu"),
     "Mesh.visible": _on(lambda p: p.mesh, a=POINTS, b=POINTS[::-1].copy(), device="cpu"),
-    "Mesh.winding_number": _on(lambda p: p.mesh, points=POINTS),
     "Reconstruction": lambda p: {"gaussians": p.gaussians, "mesh": p.mesh, "cameras": {"0.png": p.camera}},
     "Reconstruction.from_files": lambda p: {"ply": p.folder / "splats.ply", "mesh": p.mesh, "device": "cpu"},
     "Reconstruction.load": lambda p: {"folder": p.folder / "reconstruction"},

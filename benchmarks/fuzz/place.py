@@ -120,9 +120,8 @@ class Place:
             last_point=rng.uniform(0.5, 3.0, (10, 4, 3)), gain=rng.normal(size=(10, 4)) * (1e-3 + 1e-3j),
             rays=np.full(10, 3), csi=rng.normal(size=10) * (1e-3 + 1e-3j), line_of_sight=np.ones(10, bool),
         )  # fmt: skip
-        for suffix in ("ply", "obj"):
-            write_mesh(meshes / f"mesh.{suffix}", self.mesh.vertices, self.mesh.faces)
-        for suffix in ("stl", "glb"):
+        write_mesh(meshes / "mesh.ply", self.mesh.vertices, self.mesh.faces)
+        for suffix in ("obj", "stl", "glb"):
             trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False).export(
                 meshes / f"mesh.{suffix}"
             )

@@ -47,6 +47,7 @@ FOUND = [
     ("Mesh.look_around", ("directions", "as bool"), ("points", "no rows")),
     ("Paths.taps", ("center_hz", "huge")),
     ("Paths.select", ("chosen", "2^63")),
+    ("RadioField.at_frequency", ("frequency_hz", "tiny")),
     ("RadioField.fit", ("relevance", "text")),
     ("RadioField.links", ("shape", "with inf")),
     ("RadioField.load", ("path", "no text")),

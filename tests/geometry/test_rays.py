@@ -271,6 +271,16 @@ def test_many_rays_meet_what_each_meets_alone(length):
     np.testing.assert_array_equal(seen, mesh.visible(origin, end, backend="warp", device="cpu"))
 
 
+@pytest.mark.parametrize("backend", ["warp", "embree"])
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_point_sees_itself_and_no_points_see_nothing(backend, count):
+    mesh = Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([[0, 1, 2]]))
+    point = np.full((count, 3), 2.0)
+    for a in (point, point[0]):
+        assert mesh.visible(a, point, backend=backend, device="cpu").tolist() == [True] * count
+    assert len(mesh.visible(point[0], point[:0], backend=backend, device="cpu")) == 0
+
+
 @pytest.mark.parametrize("ask", ["cast", "visible", "distance"])
 def test_a_fresh_mesh_answers_several_threads_as_one(ask, where):
     d = directions(4_000, seed=17)

@@ -11,6 +11,7 @@ from told import check_told
 from views import look
 
 import warprrf as wr
+from warprrf import tensor_files
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.photos import sparse
@@ -286,7 +287,8 @@ def test_damaged_files_are_refused_and_survive_a_failed_save(whole, tmp_path):
 
 
 def test_a_file_of_an_older_format_says_what_to_do(tmp_path):
-    files.write(tmp_path / "reconstruction.safetensors", {"means": np.zeros((1, 3))}, {"format": 1})
+    old = {"means": np.zeros((1, 3))}
+    tensor_files.write(tmp_path / "reconstruction.safetensors", old, {"format": 1}, None)
     with pytest.raises(ValueError, match="format 1, this version reads 2; make it again"):
         Reconstruction.load(tmp_path)
 

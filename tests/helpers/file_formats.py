@@ -87,11 +87,11 @@ def splats(folder: Path) -> Path:
     return folder / "splats.ply"
 
 
-def mesh_file(folder: Path, suffix: str = ".ply") -> Path:
+def mesh_file(folder: Path) -> Path:
     """A box with texture coordinates."""
-    path = folder / f"box{suffix}"
+    path = folder / "box.ply"
     vertices, faces = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
-    write_mesh(path, vertices, faces, uv=vertices[:, :2] / 7.0 if suffix == ".ply" else None)
+    write_mesh(path, vertices, faces, uv=vertices[:, :2] / 7.0)
     return path
 
 
@@ -212,7 +212,6 @@ MAKERS: dict[str, tuple[Maker, str]] = {
     "exr": (exr, "read_exr"),
     "splats": (splats, "read_splats"),
     "mesh ply": (mesh_file, "read_mesh_file"),
-    "mesh obj": (lambda folder: mesh_file(folder, ".obj"), "read_mesh_file"),
     "twin xml": (twin_xml, "read_scene"),
     "twin materials": (twin_materials, "read_scene"),
 }

@@ -126,7 +126,11 @@ def test_surfaces_stand_where_mitsuba_puts_them(tmp_path: Path) -> None:
 
     mitsuba = select_variant()
     write_mesh(tmp_path / "box.ply", *box_mesh([0, 0, 0], [1, 2, 3]))
-    write_mesh(tmp_path / "box.obj", *box_mesh([0, 0, 0], [1, 2, 3]))
+    vertices, faces = box_mesh([0, 0, 0], [1, 2, 3])
+    lines = [f"v {x} {y} {z}\n" for x, y, z in vertices] + [
+        f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces
+    ]
+    (tmp_path / "box.obj").write_text("".join(lines))
     shapes = [
         f'<shape type="{kind}" id="{kind}{k}">{file}<transform name="to_world">{transform}</transform>'
         '<bsdf type="diffuse" id="itu_wood"/></shape>'

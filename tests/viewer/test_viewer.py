@@ -102,6 +102,7 @@ def test_what_is_shown_is_saved_as_one_page_and_as_a_picture(viewer, tmp_path):
     ("given", "said"),
     [
         ({"host": "192.0.2.1"}, "host: got '192.0.2.1'"),
+        ({"host": ""}, "host: got ''"),
         ({"port": 0}, "port: got 0"),
         ({"port": 2.5}, "port: got 2.5"),
     ],
@@ -112,9 +113,9 @@ def test_an_address_that_is_none_is_refused(given, said):
 
 
 def test_a_carrier_that_is_slid_is_asked_and_said_to_be_carried_over(viewer):
-    viewer._channel._carrier.value = 140.0
+    viewer._channel.carrier.value = 140.0
     assert viewer.wait().frequency_hz == 140e9 and "carried over to 140 GHz" in viewer.message
-    viewer._channel._carrier.value = make.CARRIER_HZ / 1e9
+    viewer._channel.carrier.value = make.CARRIER_HZ / 1e9
     assert viewer.wait().frequency_hz == make.CARRIER_HZ and "carried over" not in viewer.message
 
 
@@ -134,7 +135,7 @@ def test_places_to_measure_next_are_those_that_the_field_suggests(viewer):
     survey.suggest()
     viewer._page.wait()
     assert len(survey.listed) == 3, viewer.message
-    first = np.array([float(x) for x in survey.listed[0].label[3:-2].split(",")])
+    first = np.array([float(x) for x in survey.listed[0].label[5:-2].split(",")])
     places = survey.candidates(field)
     np.testing.assert_allclose(first, places[field.suggest(places, 1)[0]], atol=0.006)
 
@@ -146,7 +147,7 @@ def test_a_click_on_a_path_chooses_it_and_one_beside_all_does_not(viewer):
     kind = [str(p.kind[k]) for p, k in listed]
     assert kind[0] == "los" and rays.label.startswith("los ")
     mirror = kind.index("mirror")
-    leg = answers.segments(listed[mirror][0])[listed[mirror][1], 0]
+    leg = answers.legs(*listed[mirror])[0]
     eye = np.array([2.0, 0.5, 9.0])
     rays.click(eye, np.array([0.0, 0.0, 1.0]))
     assert rays.label.startswith("los ")
@@ -189,7 +190,14 @@ def test_pointing_at_a_ring_in_the_spectrum_tells_its_path(viewer, page):
 
 @browsed
 def test_a_saved_page_shows_the_room_and_its_figures_without_a_server(viewer, page, tmp_path):
+    from selenium.common.exceptions import TimeoutException
     from selenium.webdriver.common.by import By
+
+    def drawn():
+        try:
+            return _picture(page)[:, : page.get_window_size()["width"] // 2].std() > 5.0
+        except TimeoutException:  # a busy machine draws its first frame in software for many seconds
+            return False
 
     viewer.receiver = RECEIVER
     viewer.wait()
@@ -198,7 +206,7 @@ def test_a_saved_page_shows_the_room_and_its_figures_without_a_server(viewer, pa
     page.switch_to.new_window("tab")
     page.get(f"file://{tmp_path / 'page.html'}")
     _until(lambda: page.find_elements(By.TAG_NAME, "canvas"), 60)
-    _until(lambda: _picture(page)[:, : page.get_window_size()["width"] // 2].std() > 5.0, 60)
+    _until(drawn, 120)
     assert "path gain" in page.find_element(By.CSS_SELECTOR, "p.wr").text
     assert page.find_element(By.CSS_SELECTOR, ".wr img").get_property("naturalWidth") == make.SHAPE[1]
     page.close()
@@ -228,7 +236,7 @@ def test_a_click_in_the_browser_chooses_the_path_under_it(viewer, page):
     time.sleep(2)
     assert viewer._rays.label.startswith("los ")
     paths, k = next(path for path in listed if path[0].kind[path[1]] == "mirror")
-    leg = answers.segments(paths)[k, 0]
+    leg = answers.legs(paths, k)[0]
     _at(page, *_pixel(viewer, page, 0.3 * leg[0] + 0.7 * leg[1])).click().perform()
     _until(lambda: answers.described(paths, k)[1] in viewer._rays.label, 30)
 

@@ -77,6 +77,9 @@ def add_readings_options(parser: argparse.ArgumentParser) -> None:
     own.add_argument("--bandwidth", type=float, metavar="HZ", help="of the sounder, for delays")
 
 
+OF_TABLES = ("carrier", "noise_floor_db", "horn_deg", "tx_horn_deg", "bandwidth")
+
+
 def read_readings(path: Path, args: argparse.Namespace) -> wr.Readings:
     """A table of received power."""
     for flag in ("carrier", "noise_floor_db"):
@@ -86,6 +89,8 @@ def read_readings(path: Path, args: argparse.Namespace) -> wr.Readings:
         name: None if width is None else wr.horn(np.radians(width))
         for name, width in (("receive_pattern", args.horn_deg), ("transmit_pattern", args.tx_horn_deg))
     }
+    if abs(args.noise_floor_db) > 1000.0:
+        raise ValueError(f"--noise-floor-db: got {args.noise_floor_db:g}, expected -1000 to 1000")
     return wr.Readings.load(
         path, frequency_hz=args.carrier, floor=10.0 ** (args.noise_floor_db / 10.0), bandwidth_hz=args.bandwidth,
         name=path.stem, **horns,
@@ -104,7 +109,14 @@ def read_scale(words: Sequence[str]) -> float | tuple[str, str, float]:
     return (photos[0], photos[1], length) if photos else length
 
 
-def read_receivers(values: Sequence[str]) -> np.ndarray:
+def refuse(args: argparse.Namespace, flags: Sequence[str], reason: str) -> None:
+    """Raise for options among ``flags`` that were given and would change nothing."""
+    for flag in flags:
+        if getattr(args, flag) is not None:
+            raise ValueError(f"--{flag.replace('_', '-')}: got {getattr(args, flag)!r}, but {reason}")
+
+
+def read_receivers(values: Sequence[str], name: str = "--receivers") -> np.ndarray:
     """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
     if len(values) == 1 and "," not in values[0]:
         path = existing(values[0])
@@ -120,10 +132,10 @@ def read_receivers(values: Sequence[str]) -> np.ndarray:
         rows = np.array([word.split(",") for word in values], dtype=np.float64)
     except ValueError as error:
         raise ValueError(
-            f"--receivers: got {' '.join(values)!r}, expected numbers x,y,z in metres or one CSV/NPY file"
+            f"{name}: got {' '.join(values)!r}, expected numbers x,y,z in metres or one CSV/NPY file"
         ) from error
     if rows.shape[1] != 3:
-        raise ValueError(f"--receivers: got {values[0]!r}, expected x,y,z in metres or one CSV/NPY file")
+        raise ValueError(f"{name}: got {values[0]!r}, expected x,y,z in metres or one CSV/NPY file")
     return rows
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.inputs import (
+    OF_TABLES,
     Add,
     add_mesh_options,
     add_out,
@@ -26,6 +27,7 @@ from warprrf.cli.inputs import (
     read_readings,
     read_receivers,
     read_scale,
+    refuse,
 )
 from warprrf.cli.output import Output
 from warprrf.cli.tables import table
@@ -240,6 +242,11 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
       warprrf fit room.glb horn.csv -o field.safetensors --carrier 300e9 --noise-floor-db -120 --horn-deg 10
     """
     geometry = load_geometry(args.geometry, args.mesh, args)
+    tables = [Path(path).suffix.lower() == ".csv" for path in args.measurements]
+    if not any(tables):
+        refuse(args, OF_TABLES, "no table of received power (CSV) is given")
+    if all(tables):
+        refuse(args, ["train"], "no file of spectra is given")
     data = [_training_set(path, args) for path in args.measurements]
     options: dict[str, Any] = {}
     if args.relevance is not None:
@@ -309,8 +316,10 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
       warprrf suggest room.glb candidates.csv -n 3 --transmitter 13.6 11.2 2.5 --carrier 300e9
       warprrf suggest field.safetensors candidates.csv -n 3 -o next.csv
     """
-    places, source = read_receivers(args.candidates), existing(args.source)
+    places, source = read_receivers(args.candidates, "candidates"), existing(args.source)
     if source.suffix == ".safetensors":
+        own = ("transmitter", "carrier", "mesh", "unit", "up", "simplify", "materials")
+        refuse(args, own, f"{source} is a field, which has its own")
         field = wr.RadioField.load(source, device=args.device)
     else:
         for flag in ("transmitter", "carrier"):
@@ -321,7 +330,7 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
             load_geometry(args.source, args.mesh, args), nothing, device=args.device, progress=out
         )
     chosen = places[field.suggest(places, args.n, progress=out)]
-    rows = "\n".join(",".join(f"{x:g}" for x in place) for place in chosen)
+    rows = "\n".join(",".join(f"{x:.12g}" for x in place) for place in chosen)
     if args.out:
         write_text(args.out, f"x,y,z\n{rows}\n")
     out.result(rows, files=[args.out] if args.out else [], places=chosen)

@@ -1,15 +1,13 @@
-"""Geometry on disk: Gaussians, planes, and a mesh with its patches, in one safetensors file, replaced at once."""
+"""Geometry as arrays by name, as files hold it: Gaussians, planes, and a mesh with its patches."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warprrf import tensor_files
 from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.planes import Plane
@@ -36,16 +34,6 @@ PLANE_ARRAYS = {
 }
 """What the arrays of planes must be: K planes, C cells of all of them."""
 Arrays = dict[str, np.ndarray]
-
-
-def write(path: Path, arrays: Arrays, header: Mapping[str, Any] | None = None) -> None:
-    """Write ``arrays`` by name, and ``header`` (plain values), to ``path``."""
-    tensor_files.write(path, arrays, header or {}, None)
-
-
-def read(path: Path) -> tuple[Arrays, dict[str, Any]]:
-    """Arrays and header that :func:`write` wrote; errors as for :func:`warprrf.tensor_files.read`."""
-    return tensor_files.read(path, None)
 
 
 def of_gaussians(gaussians: Gaussians) -> Arrays:

@@ -247,8 +247,7 @@ class Mesh:
     @cached_property
     def distinct_faces(self) -> np.ndarray:
         """Faces of which no earlier one has the same three corners, however wound, shape ``(K,)``."""
-        corner = np.sort(self.welded_faces, axis=1)
-        return np.sort(np.unique(corner, axis=0, return_index=True)[1])
+        return np.unique(self.first_at_place)
 
     @cached_property
     def center(self) -> np.ndarray:
@@ -389,23 +388,6 @@ class Mesh:
             ends.append(a[:, :2] + share[:, None] * (b - a)[:, :2])
         points = np.stack(ends, axis=1)  # exactly two of the three edges cross
         return points[~np.isnan(points[:, :, 0])].reshape(-1, 2, 2)
-
-    def winding_number(self, points: ArrayLike) -> np.ndarray:
-        """Solid angle that the faces subtend at each of ``points`` (N, 3), over 4 pi, shape ``(N,)``.
-
-        Of a closed mesh it is whole: how many of its parts, wound outward, a point lies in. Source: van Oosterom and
-        Strackee, "The solid angle of a plane triangle", IEEE Trans. Biomed. Eng. 30 (1983).
-        """
-        p = check_array("points", points, (None, 3))
-        number = np.zeros(len(p))
-        for k, point in enumerate(p):
-            a, b, c = np.moveaxis(self.triangles - point, 1, 0)
-            la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
-            volume = np.einsum("ni,ni->n", a, np.cross(b, c))
-            cosines = [np.einsum("ni,ni->n", x, y) for x, y in ((a, b), (b, c), (c, a))]
-            below = la * lb * lc + cosines[0] * lc + cosines[1] * la + cosines[2] * lb
-            number[k] = np.arctan2(volume, below).sum() / (2.0 * np.pi)
-        return number
 
     def _local(self, points: np.ndarray, device: wp.Device) -> wp.array:
         return wp.array((points - self.center).astype(np.float32), dtype=wp.vec3, device=device)

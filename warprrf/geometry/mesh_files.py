@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import LARGEST_M, check_array, check_count
-from warprrf.files import write_bytes
 from warprrf.geometry import o3d
 from warprrf.geometry.gltf_files import read_gltf
 from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent, to_linear, to_srgb
-from warprrf.geometry.obj_files import obj_bytes, read_obj
+from warprrf.geometry.obj_files import read_obj
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
 
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
@@ -271,25 +270,21 @@ def is_mesh_file(path: str | os.PathLike[str]) -> bool:
 def write_mesh(
     path: str | os.PathLike[str], vertices: ArrayLike, faces: ArrayLike, *, uv: ArrayLike | None = None
 ) -> None:
-    """Write a mesh as PLY or OBJ (the suffix of ``path`` says which), whole or not at all.
+    """Write a mesh as a PLY file, whole or not at all.
 
     Args:
         vertices: positions [m], shape ``(V, 3)``.
         faces: vertex indices, shape ``(F, 3)``.
-        uv: texture coordinates, shape ``(V, 2)``, for PLY.
+        uv: texture coordinates, shape ``(V, 2)``.
 
     Raises:
-        ValueError: for another suffix, or arrays of another shape.
+        ValueError: for another suffix than ``.ply``, or arrays of another shape.
     """
-    path = Path(path)
+    if Path(path).suffix != ".ply":
+        raise ValueError(f"path: got {path}, expected a name that ends in .ply")
     vertices = check_array("vertices", vertices, (None, 3))
     triangles = check_array("faces", faces, (None, 3), dtype=np.int32)
-    coordinates = None if uv is None else check_array("uv", uv, (len(vertices), 2))
-    if path.suffix == ".ply":
-        columns = dict(zip("xyz", vertices.T, strict=True))
-        columns |= {} if coordinates is None else dict(zip("st", coordinates.T, strict=True))
-        write_ply(path, columns, triangles)
-    elif path.suffix == ".obj":
-        write_bytes(path, obj_bytes(vertices, triangles))
-    else:
-        raise ValueError(f"path: got {path}, expected a name that ends in .ply or .obj")
+    columns = dict(zip("xyz", vertices.T, strict=True))
+    if uv is not None:
+        columns |= dict(zip("st", check_array("uv", uv, (len(vertices), 2)).T, strict=True))
+    write_ply(path, columns, triangles)

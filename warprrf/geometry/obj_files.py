@@ -5,7 +5,6 @@ What a line states is held against what the format gives it: a damaged line is a
 
 from __future__ import annotations
 
-import hashlib
 import warnings
 from array import array
 from collections.abc import Iterator
@@ -24,7 +23,6 @@ from warprrf.geometry.mesh_content import (
     to_srgb,
 )
 
-_CHECKSUM = b"# warprrf sha256 "  # the comment that begins an OBJ file of ours: a letter there may be a face
 _STATEMENTS = {
     "v": (3, 8), "vt": (1, 3), "vn": (3, 3), "vp": (1, 3), "f": (3, 4096), "l": (2, 4096), "p": (1, 4096), "o": (0, 99),
     "g": (0, 99), "s": (1, 1), "usemtl": (1, 99), "mtllib": (1, 99),
@@ -112,14 +110,6 @@ def read_obj(folder: Folder) -> MeshContent:
     )  # fmt: skip
 
 
-def obj_bytes(vertices: np.ndarray, faces: np.ndarray) -> bytes:
-    """An OBJ file that begins with its checksum."""
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
-    data = "\n".join([*lines, ""]).encode()
-    return _CHECKSUM + hashlib.sha256(data).hexdigest().encode() + b"\n" + data
-
-
 def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
     """Number and words of each line that says something."""
     for number, line in enumerate(text.replace("\\\n", " ").splitlines(), 1):
@@ -130,11 +120,6 @@ def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
 
 def _lines(folder: Folder) -> _Lines:
     data = folder.path.read_bytes()
-    first, _, content = data.partition(b"\n")
-    if first.startswith(_CHECKSUM) and first != _CHECKSUM + hashlib.sha256(content).hexdigest().encode():
-        raise ValueError(
-            f"path: {folder.path} is damaged: its sha256 does not fit; take that line out if the file was edited"
-        )
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError as error:

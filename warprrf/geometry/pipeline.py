@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from warprrf import tensor_files
 from warprrf.checks import checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
@@ -309,8 +310,8 @@ def _kept(
     path = steps.folder / f"{name}.safetensors"
 
     def write(attempt: Attempt) -> dict[str, Any]:
-        files.write(path, make(attempt))
+        tensor_files.write(path, make(attempt), {}, None)
         return {}
 
     steps.run(name, write, version=VERSIONS[name], inputs=inputs, outputs=[path.name])
-    return files.read(path)[0]
+    return tensor_files.read(path, None)[0]

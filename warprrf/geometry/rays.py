@@ -21,9 +21,9 @@ from warprrf.kernels.rays.mesh import (
     AGAIN,
     BAD,
     GRAZING,
-    ROUNDING,
     cast_rays,
     pack_rays,
+    pack_segments,
     place_hits,
 )
 
@@ -207,25 +207,24 @@ class RaySearch:
         Raises:
             ValueError: if a point is not finite, or on an unknown back end, or Embree on a GPU.
         """
-        with np.errstate(over="ignore", invalid="ignore"):
-            way = b - a
-            length = np.linalg.norm(way, axis=1)
+        count = max(len(a), len(b)) if min(len(a), len(b)) else 0
+        rays, length = np.empty((count, 6), dtype=np.float32), np.empty(count)
+        cpu = _device.resolve("cpu")
+        inputs = [
+            *self._frame, clearance, _LONGEST, _given(a, wp.vec3d, cpu), _given(b, wp.vec3d, cpu),
+            _given(rays.reshape(-1, 3), wp.vec3, cpu), _given(length, wp.float64, cpu),
+        ]  # fmt: skip
+        _device.launch(pack_segments, count, inputs, device=cpu)
         if not np.isfinite(length).all():
             _refuse(("a", a), ("b", b))
-        free = np.ones(len(way), dtype=bool)
-        which = np.flatnonzero(length > 2.0 * clearance)
-        chosen = choose_backend(backend, device, len(way))
+        free, which = np.ones(count, dtype=bool), np.flatnonzero(length > 2.0 * clearance)
+        chosen = choose_backend(backend, device, count)
         if chosen == "embree" and len(which):
             # Most segments are free, and to find out that nothing is met at all takes half as long as what is met.
-            start = rows(a, which)
-            rays = self._pack(start, way[which], clearance, np.empty(0), device)
-            margin = 2.0 * ROUNDING * (self._radius + float(np.abs(start - self._center).sum(axis=1).max()))
-            rays[:, 3:] *= np.minimum(length[which] - 2.0 * clearance + margin, _LONGEST)[:, None]
-            which = which[self._embree.blocked(rays)]
-        inner = length[which] - clearance
-        t, _ = self.nearest(
-            rows(a, which), way[which], reach=inner, clearance=clearance, device=device, backend=chosen
-        )
+            which = np.flatnonzero(self._embree.blocked(rays))
+        inner, start = length[which] - clearance, rows(a, which)
+        way = (rows(b, which) - start)[: len(which)]
+        t, _ = self.nearest(start, way, reach=inner, clearance=clearance, device=device, backend=chosen)
         free[which] = t >= inner
         return free
 

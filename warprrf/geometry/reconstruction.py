@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from warprrf import tensor_files
 from warprrf.checks import check_number, check_type, checked
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.fusion import fuse_gaussians
-from warprrf.geometry.photos.report import Subject, write_report
+from warprrf.geometry.photos.report import write_report
 from warprrf.geometry.photos.sfm import read_colmap
 from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
@@ -147,7 +148,7 @@ class Reconstruction:
             arrays |= files.of_patches(self.patches)
         elif self._mesh is not None:
             arrays |= files.of_mesh(self._mesh)
-        files.write(Path(folder) / FILE, arrays, header)
+        tensor_files.write(Path(folder) / FILE, arrays, header, None)
 
     def report(
         self,
@@ -172,23 +173,7 @@ class Reconstruction:
             OSError: if ``path`` cannot be written.
             ImportError: if Pillow is not installed.
         """
-        write_report(
-            path,
-            Subject(
-                self._gaussians,
-                self._mesh,
-                self.cameras,
-                photos=self.photos,
-                held_out=self.held_out,
-                unposed={name: self.causes.get(name, "") for name in self.unposed},
-                lenses=self.lenses,
-                guessed=self.guessed,
-                metric=self.metric,
-                scale_rms_m=self.scale_rms_m,
-            ),
-            progress=progress,
-            device=device,
-        )
+        write_report(path, self, self._gaussians, self._mesh, progress=progress, device=device)
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> Reconstruction:
@@ -202,7 +187,7 @@ class Reconstruction:
             raise ValueError(
                 f"folder: {folder} holds no {FILE}; expected a folder that Reconstruction.save wrote"
             )
-        arrays, header = files.read(path)
+        arrays, header = tensor_files.read(path, None)
         if header.get("format") != FORMAT:
             raise ValueError(
                 f"folder: {path} has format {header.get('format')}, this version reads {FORMAT}; make it again from "

@@ -262,12 +262,13 @@ class Scene:
         if is_open_air(self.mesh, device=device):
             free[free] = over_ground(self.mesh, points[free], device=device)
             return free
-        for direction in ((0.021, 0.013, 1.0), (0.017, -0.011, -1.0), (1.0, 0.37, 0.113)):
-            unit = np.asarray(direction) / np.linalg.norm(direction)
+        directions = np.array([(0.021, 0.013, 1.0), (0.017, -0.011, -1.0), (1.0, 0.37, 0.113)])
+        for unit in directions / np.linalg.norm(directions, axis=1, keepdims=True):
             hit = self.mesh.cast(points[free], np.tile(unit, (int(free.sum()), 1)), device=device)
             free[free] = np.where(hit.face >= 0, self.mesh.face_normals[hit.face] @ unit < 0, False)
         if self.mesh.is_closed and free.any():
-            free[free] = self.mesh.winding_number(points[free]) < 0.5
+            winding, _ = self.mesh.look_around(points[free], directions, device=device)
+            free[free] = np.median(winding, axis=1) < 1
         return free
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -141,19 +140,11 @@ def errors(predicted: Spectrum, truth: Spectrum) -> dict[str, float]:
     }
 
 
-def segments(paths: Paths) -> np.ndarray:
-    """Legs of the paths of one receiver from transmitter to receiver, shape ``(L, D + 1, 2, 3)`` [m]; NaN past the last."""
-    count, depth = paths.vertices.shape[:2]
-    if paths.transmitter is None or paths.receiver is None:
-        raise ValueError("paths: got paths that do not say where they start and end, expected both")
-    ends = np.broadcast_to(paths.receiver, (count, 3))
-    points = np.empty((count, depth + 2, 3))
-    points[:, 0] = paths.transmitter
-    points[:, 1:-1] = np.where(np.isnan(paths.vertices), ends[:, None], paths.vertices)
-    points[:, -1] = ends
-    legs = np.stack([points[:, :-1], points[:, 1:]], axis=2)
-    legs[(legs[:, :, 0] == legs[:, :, 1]).all(axis=-1)] = np.nan
-    return legs
+def legs(paths: Paths, index: int) -> np.ndarray:
+    """Legs of one path from transmitter to receiver [m], shape ``(D + 1, 2, 3)``."""
+    met = paths.vertices[index]
+    points = np.array([paths.transmitter, *met[np.isfinite(met[:, 0])], paths.receiver], dtype=np.float64)
+    return np.stack([points[:-1], points[1:]], axis=1)
 
 
 def strongest(found: Sequence[Paths], count: int) -> list[tuple[Paths, int]]:
@@ -174,16 +165,16 @@ def described(paths: Paths, index: int) -> tuple[str, str, str, str, str]:
     )  # fmt: skip
 
 
-def nearest_path(legs: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
-    """Which of the paths with ``legs`` (L, D, 2, 3) a ray passes nearest to as seen from its ``origin``, and the angle
-    between the two [rad]; NaN legs are none."""
-    unit = direction / np.linalg.norm(direction)
-    points = legs[:, :, :1] + np.linspace(0.0, 1.0, 200)[:, None] * (legs[:, :, 1:] - legs[:, :, :1])
-    toward = points - origin
-    along = toward @ unit
-    angle = np.arctan2(np.linalg.norm(toward - along[..., None] * unit, axis=-1), along)
-    each = np.where(np.isnan(angle), np.inf, angle).min(axis=(1, 2), initial=np.inf)
-    return int(each.argmin()), float(each.min())
+def nearest_path(each: Sequence[np.ndarray], origin: np.ndarray, direction: np.ndarray) -> tuple[int, float]:
+    """Which of the paths with :func:`legs` ``each`` a ray passes nearest to as seen from its ``origin``, and the angle
+    between the two [rad]."""
+    unit, angles = direction / np.linalg.norm(direction), [np.inf]
+    for start, end in ((own[:, :1], own[:, 1:]) for own in each):
+        toward = start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start) - origin
+        along = toward @ unit
+        angles.append(np.arctan2(np.linalg.norm(toward - along[..., None] * unit, axis=-1), along).min())
+    nearest = int(np.argmin(angles))
+    return nearest - 1, float(angles[nearest])
 
 
 def reading_errors(field: RadioField, readings: Readings, progress: Progress | None = None) -> np.ndarray:
@@ -196,9 +187,8 @@ def reading_errors(field: RadioField, readings: Readings, progress: Progress | N
     """
     if not readings.azimuth_known:
         raise ValueError("readings: their azimuths count from an unknown zero, expected azimuth_known=True")
-    ends = np.column_stack([readings.transmitters, readings.receivers])
+    power, ends = np.empty(len(readings)), np.column_stack([readings.transmitters, readings.receivers])
     links, own = np.unique(ends, axis=0, return_inverse=True)
-    power = np.empty(len(readings))
     for k, link in enumerate(links):
         rows, paths = np.flatnonzero(own.reshape(-1) == k), field.paths(link[3:], link[:3])
         arrival = directions_from_angles(paths.theta_r, paths.phi_r)
@@ -229,16 +219,11 @@ def delay_profile(
     return (first + np.arange(taps) / bandwidth_hz) * 1e9, 10.0 * np.log10(np.maximum(total, 1e-300))
 
 
-def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> dict[str, Any]:
-    """The receiver's best beam of a DFT codebook, without pilots.
-
-    Args:
-        paths: that arrive.
-        size: rows and columns of the array.
-        azimuth_rad: that the array faces.
+def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> tuple[float, np.ndarray, np.ndarray]:
+    """The best beam of the DFT codebook of an array of ``size`` squared that faces ``azimuth_rad``, without pilots.
 
     Returns:
-        ``gain_db`` over one isotropic antenna, and the beam's power gain ``lobe`` (K, M) along ``directions`` (K, M, 3).
+        What it gains over one isotropic antenna [dB], and its power gain (K, M) along directions (K, M, 3).
     """
     codebook = dft_codebook(PlanarArray(size, size, orientation=(azimuth_rad, 0.0, 0.0)))
     arrival = np.concatenate([directions_from_angles(p.theta_r, p.phi_r) for p in paths])
@@ -248,8 +233,5 @@ def best_beam(paths: Sequence[Paths], size: int, azimuth_rad: float) -> dict[str
     zenith, azimuth = np.meshgrid(np.linspace(0, np.pi, 61), np.linspace(-np.pi, np.pi, 121), indexing="ij")
     directions = directions_from_angles(zenith, azimuth)
     lobe = np.abs(codebook.amplitude(directions.reshape(-1, 3))[best]) ** 2
-    return {
-        "gain_db": 10.0 * float(np.log10(max(received[best] / max(power.sum(), 1e-300), 1e-300))),
-        "directions": directions,
-        "lobe": lobe.reshape(zenith.shape),
-    }
+    gain_db = 10.0 * float(np.log10(max(received[best] / max(power.sum(), 1e-300), 1e-300)))
+    return gain_db, lobe.reshape(zenith.shape), directions

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -25,63 +24,46 @@ ERROR_DB = 10.0
 
 
 class Channel:
-    """Spectrum and figures of the last answer, and the settings that a new one takes.
-
-    Args:
-        page: that it is on.
-        subject: that is asked.
-        changed: called when a setting changes.
+    """Spectrum and figures of the last answer, and the settings that a new one takes: ``changed`` is called with each.
 
     Attributes:
-        images: titles, dB images, ranges and colour maps of the panoramas shown.
+        images: the panoramas shown.
+        spectra, table: them and the strongest paths in HTML.
+        range_db, carrier: sliders.
     """
 
     def __init__(self, page: Page, subject: Subject, changed: Callable[[], None]) -> None:
-        gui, self._subject = page.gui, subject
-        self.images: list[tuple[str, np.ndarray, float, float, str]] = []
-        self._spectra = gui.add_html(pictures.STYLE)
+        gui, field, self._subject = page.gui, subject.field, subject
+        self.images: list[pictures.Image] = []
+        self.spectra = gui.add_html("")
         self._profile = gui.add_uplot(
             (np.arange(2.0), np.zeros(2)),
             ({"label": "delay [ns]"}, {"label": "path gain [dB]", "stroke": "#1e6edc", "width": 1}),
             scales={"x": {"time": False, "auto": True}, "y": {"auto": True}}, aspect=2.2,
             axes=({"label": "delay [ns]", "labelSize": 20, "size": 30}, {"label": "path gain [dB]", "labelSize": 20}),
         )  # fmt: skip
-        self._table = gui.add_html("")
-        field = subject.field
+        self.table = gui.add_html("")
         most = field.terms.mirror_order if isinstance(field, BistaticField) else 3
-        carrier = subject.carrier_hz / 1e9
-        low, high = CARRIERS_GHZ if field is not None else (1.0, CARRIERS_GHZ[1])
+        carrier, step = subject.carrier_hz / 1e9, answers.CARRIER_STEP_HZ / 1e9
+        low, high = min(carrier, 1.0 if field is None else CARRIERS_GHZ[0]), max(carrier, CARRIERS_GHZ[1])
         with gui.add_folder("What is asked", expand_by_default=False):
             self.range_db = gui.add_slider("dynamic range [dB]", min=10, max=100, step=1, initial_value=60)
             self._mirrors = gui.add_slider(
-                "mirrors on a path",
-                min=0,
-                max=max(most, 1),
-                step=1,
-                initial_value=MIRRORS if field is None else most,
+                "mirrors on a path", min=0, max=max(most, 1), step=1, initial_value=most if field else MIRRORS
             )
-            self._carrier = gui.add_slider(
-                "carrier [GHz]", min=min(low, carrier), max=max(high, carrier), step=answers.CARRIER_STEP_HZ / 1e9,
-                initial_value=carrier,
-            )  # fmt: skip
-            self._carrier.disabled = isinstance(field, RadioField) and not isinstance(field, BistaticField)
-            self._uncertainty = gui.add_checkbox(
-                "expected error", False, visible=getattr(field, "errors", None) is not None
+            self.carrier = gui.add_slider(
+                "carrier [GHz]", min=low, max=high, step=step, initial_value=carrier
             )
-        for handle in (self.range_db, self._mirrors, self._carrier, self._uncertainty):
+            self.carrier.disabled = isinstance(field, RadioField) and not isinstance(field, BistaticField)
+            self._told = gui.add_checkbox("expected error", False, visible=hasattr(field, "gain_std_db"))
+            self._told.disabled = getattr(field, "errors", None) is None
+        for handle in (self.range_db, self._mirrors, self.carrier, self._told):
             handle.on_update(lambda _: changed())
 
     @property
     def asked(self) -> Asked:
         """What the settings ask for."""
-        return Asked(
-            float(self._carrier.value) * 1e9, int(self._mirrors.value), bool(self._uncertainty.value)
-        )
-
-    @property
-    def html(self) -> str:
-        """What is shown, but for the delays."""
-        return f"{self._spectra.content}{self._table.content}"
+        return Asked(float(self.carrier.value) * 1e9, int(self._mirrors.value), bool(self._told.value))
 
     def show(self, found: Answer) -> None:
         """Show an answer."""
@@ -94,37 +76,32 @@ class Channel:
                 marks.append((zenith, azimuth, "{}: {}, {}, from {}, sent to {}".format(*row)))
         self.images, note = self._panoramas(found)
         scales = [image[2:] for image in self.images]
-        figures = [
-            pictures.panorama(*image, marks=() if k else marks, scale=image[2:] not in scales[k + 1 :])
+        drawn = [
+            pictures.panorama(image, () if k else marks, scale=scales[k] not in scales[k + 1 :])
             for k, image in enumerate(self.images)
         ]
-        self._spectra.content = f'{pictures.STYLE}<div class="wr">{"".join(figures)}{note}</div>'
-        self._table.content = _table(rows[:LISTED])
+        self.spectra.content = pictures.figure("", "".join(drawn) + note)
+        self.table.content = pictures.figure("strongest paths", _table(rows[:LISTED]))
         delay, power = answers.delay_profile(found.paths, BANDWIDTH_HZ)
         self._profile.data = (delay, np.maximum(power, power.max() - float(self.range_db.value)))
 
-    def _panoramas(self, found: Answer) -> tuple[list[tuple[str, np.ndarray, float, float, str]], str]:
+    def _panoramas(self, found: Answer) -> tuple[list[pictures.Image], str]:
         """Images of the spectrum and what is known to compare with, and a note on how wrong it is."""
-        spectrum, truth, note = found.spectrum, None, ""
+        spectrum, ds, field = found.spectrum, self._subject.spectra, self._subject.field
         if spectrum is None:
             return [], ""
-        ds, field = self._subject.spectra, self._subject.field
-        index = answers.measured_here(ds, found.receiver)
+        index, truth, note = answers.measured_here(ds, found.receiver), None, ""
         if ds is not None and index is not None:
-            if abs(ds.frequency_hz - found.frequency_hz) < 0.5 * answers.CARRIER_STEP_HZ:
-                truth = ds[index]
-            else:
-                note = f"What was measured here is of {ds.frequency_hz / 1e9:g} GHz."
-        images = [s.path_gain_db for s in (spectrum, truth) if s is not None]
-        top = max(float(image.max()) for image in images)
+            same = abs(ds.frequency_hz - found.frequency_hz) < 0.5 * answers.CARRIER_STEP_HZ
+            truth = ds[index] if same else None
+            note = "" if same else f"What was measured here is of {ds.frequency_hz / 1e9:g} GHz."
+        known = [s.path_gain_db for s in (spectrum, truth) if s is not None]
+        top = max(float(image.max()) for image in known)
         low = top - float(self.range_db.value)
-        shown = [
-            (title, image, low, top, "viridis")
-            for title, image in zip(("spectrum", "truth"), images, strict=False)
-        ]
+        images = [(n, i, low, top, "viridis") for n, i in zip(("spectrum", "truth"), known, strict=False)]
         if truth is not None and ds is not None and field is not None:
-            difference = np.maximum(images[0], low) - np.maximum(images[1], low)
-            shown.append(("spectrum - truth", difference, -ERROR_DB, ERROR_DB, "RdBu_r"))
+            difference = np.maximum(known[0], low) - np.maximum(known[1], low)
+            images.append(("spectrum less truth", difference, -ERROR_DB, ERROR_DB, "RdBu_r"))
             wrong = answers.errors(spectrum, truth)
             note = (
                 f"PSNR {wrong['psnr_db']:.1f} dB, strongest direction off by {wrong['direction_deg']:.1f}°, total by "
@@ -132,13 +109,13 @@ class Channel:
                 + (" (fitted to this place)" if field.was_fitted_on(ds)[index] else "")
             )
         if spectrum.std_db is not None:
-            shown.append(("expected error (standard deviation)", spectrum.std_db, 0.0, ERROR_DB, "magma"))
-        return shown, note
+            images.append(("expected error (standard deviation)", spectrum.std_db, 0.0, ERROR_DB, "magma"))
+        return images, note
 
 
-def _table(rows: list[Any]) -> str:
-    """HTML of the strongest paths."""
-    head = "".join(f"<th>{name}</th>" for name in ("path", "gain", "delay", "arrives from", "sent to"))
+def _table(rows: Sequence[tuple[str, ...]]) -> str:
+    """HTML of paths."""
+    head = "".join(f"<th>{name}</th>" for name in ("kind", "gain", "delay", "arrives from", "sent to"))
     body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    note = "Directions are zenith, azimuth. Point at a ring in the spectrum, or click on a path in the room."
-    return f'<div class="wr"><table><tr>{head}</tr>{body}</table>{note}</div>'
+    note = "Directions: zenith, azimuth. Point at a ring in the spectrum, or click on a path in the room."
+    return f"<table><tr>{head}</tr>{body}</table>{note}"

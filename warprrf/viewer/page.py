@@ -35,6 +35,8 @@ class Page:
 
     def __init__(self, host: str, port: int, bounds: np.ndarray) -> None:
         check_type("host", host, str)
+        if not host:  # which sockets take for every address of the machine
+            raise ValueError("host: got '', expected an address of this machine; 0.0.0.0 means all of them")
         check_count("port", port, 1, 65535)
         try:
             with socket.create_server((host, 0)):
@@ -64,10 +66,6 @@ class Page:
         """Write ``message`` (Markdown) at the top of the page."""
         self.message = self._status.content = message
 
-    def visible(self, name: str) -> bool:
-        """Whether what is called ``name`` is shown."""
-        return name not in self.hidden
-
     def show(self, name: str, visible: bool) -> bool:
         """Show or hide what is drawn under ``name``; False if nothing is drawn there yet."""
         (self.hidden.discard if visible else self.hidden.add)(name)
@@ -75,12 +73,6 @@ class Page:
         if handle is not None:
             handle.visible = visible
         return handle is not None
-
-    def remove(self, name: str) -> None:
-        """Take what is drawn under ``name`` off the page."""
-        handle = self.scene.get_handle_by_name(f"/{name}")
-        if handle is not None:
-            handle.remove()
 
     def in_background(self, work: Callable[[Progress], None]) -> None:
         """Run ``work(progress)`` in a thread of its own, with a bar; one at a time."""
@@ -112,10 +104,10 @@ class Page:
         self._background = threading.Thread(target=run, name="warprrf-view-slow", daemon=True)
         self._background.start()
 
-    def wait(self, timeout_s: float | None = None) -> None:
+    def wait(self) -> None:
         """Wait for work in the background."""
         if self._background is not None:
-            self._background.join(timeout_s)
+            self._background.join()
 
     def close(self) -> None:
         """Give up what is computed, and take the page down."""

@@ -5,28 +5,25 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from warprrf import device as _device
 from warprrf.geometry.splats.gaussians import Gaussians
 
+Image = tuple[str, np.ndarray, float, float, str]
+"""Title, values (H, W) [dB], lowest and highest that are told apart, colour map."""
 GREY = (200, 200, 205)
 STYLE = """<style>
-.wr{font:12px/1.4 sans-serif;padding:0 10px 8px;color:#333}
-.wr .title{font-weight:600;margin-top:4px}
-.wr .image{position:relative}
-.wr img{width:100%;display:block;aspect-ratio:2;image-rendering:pixelated}
-.wr .ends{display:flex;justify-content:space-between;color:#777;font-size:11px}
-.wr .bar{height:8px}
+.wr{font:12px/1.4 sans-serif;padding:0 10px 8px;color:#333} .wr .title{font-weight:600;margin-top:4px}
+.wr img{width:100%;display:block;aspect-ratio:2;image-rendering:pixelated} .wr .image{position:relative}
+.wr .ends{display:flex;justify-content:space-between;color:#777;font-size:11px} .wr .bar{height:8px}
 .wr .mark{position:absolute;width:14px;height:14px;margin:-7px;border-radius:7px;border:1.5px solid #ffffffa0}
-.wr .mark:hover{border-color:#fff;background:#ffffff60}
+.wr .mark:hover{border-color:#fff;background:#ffffff60} .wr .mark:hover+.tip{display:block}
 .wr .tip{display:none;position:absolute;left:0;right:0;top:100%;z-index:9;background:#222;color:#fff;padding:4px 8px}
-.wr .mark:hover+.tip{display:block}
-.wr table{width:100%;border-collapse:collapse}
+.wr table{width:100%;border-collapse:collapse} .wr th{color:#777}
 .wr td,.wr th{text-align:right;padding:1px 4px;font-weight:400}
-.wr th{color:#777}
 .wr i{display:inline-block;width:10px;height:10px;margin-right:4px}
 </style>"""
 
@@ -49,78 +46,71 @@ def png(image: np.ndarray) -> bytes:
     return data.getvalue()
 
 
+def figure(title: str, content: str) -> str:
+    """HTML of ``content`` in the page's style, below a title."""
+    return f'{STYLE}<div class="wr"><div class="title">{html.escape(title)}</div>{content}</div>'
+
+
+def _spread(texts: Iterable[str]) -> str:
+    return '<div class="ends">' + "".join(f"<span>{text}</span>" for text in texts) + "</div>"
+
+
 def colour_bar(low: float, high: float, unit: str, name: str = "viridis") -> str:
     """HTML of the colours from ``low`` to ``high``."""
     steps = ",".join("rgb({},{},{})".format(*c) for c in coloured(np.linspace(0, 1, 9), 0, 1, name))
-    ends = "".join(f"<span>{value:.4g} {unit}</span>" for value in (low, 0.5 * (low + high), high))
-    return f'<div class="bar" style="background:linear-gradient(90deg,{steps})"></div><div class="ends">{ends}</div>'
+    ends = _spread(f"{value:.4g} {unit}" for value in (low, 0.5 * (low + high), high))
+    return f'<div class="bar" style="background:linear-gradient(90deg,{steps})"></div>{ends}'
 
 
-def legend(names: Sequence[str], colours: np.ndarray) -> str:
-    """HTML of names with their colours (K, 3)."""
-    return " &emsp; ".join(
-        '<i style="background:rgb({},{},{})"></i>'.format(*c) + html.escape(n)
-        for n, c in zip(names, colours, strict=True)
-    )
+def legend(names: Sequence[str]) -> str:
+    """HTML of names with their :func:`named_colours`."""
+    colours = named_colours(np.arange(len(names)))
+    square = '<i style="background:rgb({},{},{})"></i>{} &emsp;'
+    return "".join(square.format(*c, html.escape(n)) for n, c in zip(names, colours, strict=True))
 
 
-def panorama(
-    title: str,
-    image_db: np.ndarray,
-    low: float,
-    high: float,
-    name: str = "viridis",
-    *,
-    marks: Sequence[tuple[float, float, str]] = (),
-    scale: bool = True,
-) -> str:
-    """HTML of an image (H, W) [dB] over azimuth and zenith, with its colours.
+def panorama(image: Image, marks: Sequence[tuple[float, float, str]] = (), *, scale: bool = True) -> str:
+    """HTML of an image over azimuth and zenith.
 
     Args:
-        title: above it.
-        image_db: what is shown from ``low`` to ``high`` in the colour map ``name``.
+        image: its title, values (H, W) [dB], their range, and a colour map.
         marks: zenith and azimuth [rad] of small rings, each with the text that appears while the mouse is over it.
         scale: whether azimuths and colours are told below it.
     """
-    data = base64.b64encode(png(coloured(image_db, low, high, name))).decode()
+    title, values, *colours = image
+    data = base64.b64encode(png(coloured(values, *colours))).decode()
     rings = "".join(
         f'<div class="mark" style="left:{50.0 + azimuth * 50.0 / np.pi:.2f}%;top:{zenith * 100.0 / np.pi:.2f}%"></div>'
         f'<div class="tip">{html.escape(text)}</div>'
         for zenith, azimuth, text in marks
     )
-    ends = "".join(f"<span>{a}°</span>" for a in ("azimuth -180", "-90", "0", "90", "180"))
-    below = f'<div class="ends">{ends}</div>{colour_bar(low, high, "dB", name)}' if scale else ""
+    low, high, name = colours
+    ends = _spread(("azimuth -180°", "-90°", "0°", "90°", "180°"))
+    below = ends + colour_bar(low, high, "dB", name) if scale else ""
     return (
-        f'<div class="title">{html.escape(title)}</div><div class="image">'
-        f'<img src="data:image/png;base64,{data}">{rings}</div>{below}'
+        f'<div class="title">{html.escape(title)}</div>'
+        f'<div class="image"><img src="data:image/png;base64,{data}">{rings}</div>{below}'
     )
 
 
-def sheet(
-    caption: str, images: Sequence[tuple[str, np.ndarray, float, float, str]], view: np.ndarray | None
-) -> bytes:
-    """A PNG file of images as :func:`panorama` takes them, below each other, beside what the browser shows (H, W, 3)."""
+def sheet(caption: str, images: Sequence[Image], view: np.ndarray | None = None) -> bytes:
+    """A PNG file of images as :func:`panorama` takes them, below what the browser shows (H, W, 3)."""
     figures = _device.require("matplotlib.figure", extra="view")
-    rows = max(len(images), 1)
-    figure = figures.Figure(
-        figsize=(14.0 if view is not None else 6.0, 0.5 + 3.0 * rows), layout="constrained"
+    drawing = figures.Figure(
+        figsize=(9.0, 3.5 * len(images) + (6.8 if view is not None else 0.5)), layout="constrained"
     )
-    figure.suptitle(caption, fontsize=10)
-    grid = figure.add_gridspec(
-        rows, 2 if view is not None else 1, width_ratios=(9, 5) if view is not None else None
-    )
+    drawing.suptitle(caption, fontsize=10)
+    heights = [3.5] * len(images) if view is None else [6.5] + [3.5] * len(images)
+    axes = list(drawing.subplots(len(heights), height_ratios=heights, squeeze=False).flat) if heights else []
     if view is not None:
-        ax = figure.add_subplot(grid[:, 0])
-        ax.imshow(view)
-        ax.axis("off")
-    for row, (title, image_db, low, high, name) in enumerate(images):
-        ax = figure.add_subplot(
-            grid[row, -1], xlabel="azimuth [degrees]", ylabel="zenith [degrees]", title=title
-        )
-        drawn = ax.imshow(image_db, extent=(-180, 180, 180, 0), vmin=low, vmax=high, cmap=name, aspect="auto")
-        figure.colorbar(drawn, ax=ax, label="dB")
+        axes[0].imshow(view)
+        axes.pop(0).axis("off")
+    for ax, (title, values, low, high, name) in zip(axes, images, strict=True):
+        shown = ax.imshow(values, extent=(-180, 180, 180, 0), vmin=low, vmax=high, cmap=name, aspect="auto")
+        drawing.colorbar(shown, ax=ax, label="dB")
+        ax.set(title=title, xlabel="azimuth [degrees]", ylabel="zenith [degrees]")
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110)
+    drawing.savefig(data, format="png", dpi=110)
     return data.getvalue()
 
 
@@ -128,7 +118,9 @@ def named_colours(index: np.ndarray) -> np.ndarray:
     """A colour (..., 3) uint8 for each index (...), neighbours in index far apart in hue."""
     import colorsys
 
-    hues = [colorsys.hsv_to_rgb((0.61803399 * k) % 1.0, 0.5, 0.9) for k in range(int(index.max()) + 1)]
+    hues = [
+        colorsys.hsv_to_rgb((0.61803399 * k) % 1.0, 0.5, 0.9) for k in range(int(index.max(initial=-1)) + 1)
+    ]
     return np.round(np.array(hues) * 255).astype(np.uint8)[index]
 
 

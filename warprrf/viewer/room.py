@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from scipy.spatial import cKDTree
 
 from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.splats.camera import Camera
-from warprrf.geometry.splats.gaussians import quaternions_of
+from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import mirror_share
 from warprrf.viewer import pictures
@@ -17,6 +16,7 @@ from warprrf.viewer.page import Page
 from warprrf.viewer.subject import Subject
 
 THUMBNAIL = 96  # width of a photo at its camera, pixels
+NEAREST, NEAR_M = 16, 0.15  # Gaussians that colour a face
 MOST_NAMES = 16  # in a legend
 LEARNED = {
     "reflection": (-40.0, 0.0, "dB", "viridis"),
@@ -30,7 +30,7 @@ LEARNED = {
 def colourings(subject: Subject) -> list[str]:
     """Ways in which the faces of ``subject`` can be coloured, the most natural first."""
     found = []
-    if subject.mesh is not None and subject.mesh.face_colours is not None:
+    if subject.mesh is not None and (subject.mesh.face_colours is not None or subject.gaussians is not None):
         found.append("photo colours")
     if subject.scene is not None and subject.scene.mesh is subject.mesh:
         found.append("scene materials")
@@ -48,52 +48,50 @@ def learned(field: BistaticField, kind: str, progress: Progress | None = None) -
             standard deviation of the gain of what a surface scatters, by what the measurements saw of it [dB].
         progress: of the last, which takes seconds.
     """
-    surface, p = field.surface, field.parameters
-    groups = np.arange(surface.groups)
+    surface, p, groups = field.surface, field.parameters, np.arange(field.surface.groups)
     if kind == "uncertainty":
-        return field.gain_std_db(progress=progress)[surface.element]
-    if kind == "reflection":
-        value = 10.0 * np.log10(np.maximum(mirror_share(p, groups, np.ones(len(groups))), 1e-12))
-    elif kind == "scattering":
-        value = 10.0 * np.log10(np.maximum(p.scattered_share, 1e-12))
-    else:
-        value = 1e3 * field.wavelength_m / (4.0 * np.pi) * np.sqrt(np.maximum(-p.log_smooth, 0.0))
-    return np.asarray(value[surface.group])
+        return field.gain_std_db(progress)[surface.element]
+    if kind == "roughness":
+        height_m = field.wavelength_m / (4.0 * np.pi) * np.sqrt(np.maximum(-p.log_smooth, 0.0))
+        return np.asarray(1e3 * height_m[surface.group])
+    share = mirror_share(p, groups, np.ones(len(groups))) if kind == "reflection" else p.scattered_share
+    return np.asarray(10.0 * np.log10(np.maximum(share, 1e-12))[surface.group])
 
 
 def face_colours(
     subject: Subject, kind: str, progress: Progress | None = None
 ) -> tuple[Mesh, np.ndarray, str]:
-    """The mesh that is drawn, colours (F, 3) uint8 of its faces by one of :func:`colourings`, and a legend in HTML."""
-    mesh, field = subject.mesh, subject.field
+    """A mesh with colours (F, 3) uint8 of its faces by one of :func:`colourings`, and what they mean in HTML."""
+    mesh, field, names = subject.mesh, subject.field, []
     if mesh is None:
         raise ValueError("subject: got no mesh, expected one")
-    if kind == "photo colours" and mesh.face_colours is not None:
-        seen = np.isfinite(mesh.face_colours).all(axis=1)
-        known = np.round(np.nan_to_num(mesh.face_colours) * 255.0)
-        return mesh, np.where(seen[:, None], known, pictures.GREY).astype(np.uint8), ""
     if kind == "scene materials" and subject.scene is not None:
-        return mesh, *_named(subject.scene.face_material, [m.name for m in subject.scene.materials])
-    if kind == "plain" or not isinstance(field, BistaticField):
+        index, names = subject.scene.face_material, [m.name for m in subject.scene.materials]
+    elif kind == "learned materials" and isinstance(field, BistaticField):
+        mesh, index = field.surface.mesh, field.material[field.surface.group]
+        names = [field.surface.group_names[g] for g in np.unique(field.material, return_index=True)[1]]
+    elif kind in LEARNED and isinstance(field, BistaticField):  # whose mesh has more, smaller faces
+        low, high, unit, name = LEARNED[kind]
+        shades = pictures.coloured(learned(field, kind, progress), low, high, name)
+        return field.surface.mesh, shades, pictures.colour_bar(low, high, unit, name)
+    elif kind == "photo colours":
+        seen = mesh.face_colours if subject.gaussians is None else _of_splats(mesh, subject.gaussians)
+        known = np.round(np.asarray(seen) * 255.0)
+        return mesh, np.where(np.isfinite(known), known, pictures.GREY).astype(np.uint8), ""
+    else:
         return mesh, np.tile(np.array([pictures.GREY], dtype=np.uint8), (len(mesh.faces), 1)), ""
-    surface = field.surface  # its mesh has more, smaller faces
-    if kind == "learned materials":
-        first = np.unique(field.material, return_index=True)[1]
-        return surface.mesh, *_named(field.material[surface.group], [surface.group_names[g] for g in first])
-    low, high, unit, name = LEARNED[kind]
-    colours = pictures.coloured(learned(field, kind, progress), low, high, name)
-    return surface.mesh, colours, pictures.colour_bar(low, high, unit, name)
+    return mesh, pictures.named_colours(index), pictures.legend(names if len(names) <= MOST_NAMES else [])
 
 
-def _named(index: np.ndarray, names: Any) -> tuple[np.ndarray, str]:
-    shown = names if len(names) <= MOST_NAMES else ()
-    return pictures.named_colours(index), pictures.legend(
-        shown, pictures.named_colours(np.arange(len(names)))[: len(shown)]
-    )
+def _of_splats(mesh: Mesh, gaussians: Gaussians) -> np.ndarray:
+    """Median colour (F, 3) of the Gaussians nearest to each face, NaN where there are none near."""
+    arrays = pictures.splats(gaussians)
+    distance, nearest = cKDTree(arrays["centers"]).query(mesh.triangles.mean(axis=1), NEAREST)
+    return np.where(distance[:, :1] < NEAR_M, np.median(arrays["rgbs"][nearest], axis=1), np.nan)
 
 
 class Room:
-    """Mesh, splats and cameras, and what of all that is drawn is shown."""
+    """Mesh, splats and cameras, and which of all that is drawn is shown; ``legend`` is what the mesh's colours mean."""
 
     def __init__(self, page: Page, subject: Subject) -> None:
         self._page, self._subject = page, subject
@@ -105,7 +103,7 @@ class Room:
             initial_value=float(high - 0.02 * (high - low)),
         )  # fmt: skip
         self._colouring = page.gui.add_dropdown("colour the mesh by", tuple(colourings(subject)))
-        self._legend = page.gui.add_html("")
+        self.legend = page.gui.add_html("")
         self._cut.on_update(lambda _: self._draw())
         self._colouring.on_update(lambda _: self.recolour())
         held = {
@@ -114,16 +112,11 @@ class Room:
         }  # fmt: skip
         for name, thing in held.items():
             if thing is not None:
-                box = page.gui.add_checkbox(name, page.visible(name))
+                box = page.gui.add_checkbox(name, name not in page.hidden)
                 box.on_update(lambda event, name=name: self._show(name, event.target.value))
         self._faces: tuple[Mesh, np.ndarray] | None = None
         self._draw_cameras()
         self.recolour()
-
-    @property
-    def html(self) -> str:
-        """What the colours of the mesh mean."""
-        return str(self._legend.content)
 
     def recolour(self) -> None:
         """Colour the mesh as is chosen now; in the background where that takes seconds."""
@@ -136,7 +129,7 @@ class Room:
         if self._subject.mesh is not None:
             mesh, colours, meaning = face_colours(self._subject, self._colouring.value, progress)
             self._faces = mesh, colours
-            self._legend.content = f'{pictures.STYLE}<div class="wr">{meaning}</div>'
+            self.legend.content = pictures.figure("", meaning)
         self._draw()
 
     def _show(self, name: str, visible: bool) -> None:
@@ -147,7 +140,7 @@ class Room:
         """Mesh and splats up to the cut; what is hidden is not sent, for browsers sort splats even so."""
         cut, scene = float(self._cut.value), self._page.scene
         with self._page.server.atomic():
-            if self._faces is not None and self._page.visible("mesh"):
+            if self._faces is not None and "mesh" not in self._page.hidden:
                 import trimesh
 
                 mesh, colours = self._faces
@@ -158,7 +151,7 @@ class Room:
                     vertex_colors=np.repeat(colours[kept], 3, axis=0),
                 )  # fmt: skip
                 scene.add_mesh_trimesh("/mesh", shown)
-            if self._subject.gaussians is not None and self._page.visible("splats"):
+            if self._subject.gaussians is not None and "splats" not in self._page.hidden:
                 arrays = pictures.splats(self._subject.gaussians)
                 low = arrays["centers"][:, 2] <= cut
                 scene.add_gaussian_splats("/splats", **{name: array[low] for name, array in arrays.items()})
@@ -168,7 +161,7 @@ class Room:
         scene, subject = self._page.scene, self._subject
         if not subject.cameras:
             return
-        scene.add_frame("/cameras", show_axes=False, visible=self._page.visible("cameras"))
+        scene.add_frame("/cameras", show_axes=False, visible="cameras" not in self._page.hidden)
         for name, camera in subject.cameras.items():
             to_world = np.linalg.inv(camera.world_to_camera)
             scene.add_camera_frustum(

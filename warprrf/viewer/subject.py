@@ -94,6 +94,8 @@ class Subject:
         if self.gaussians is not None:
             return np.asarray(np.percentile(self.gaussians.means, [1, 99], axis=0), dtype=np.float64)
         places = np.concatenate([d.receivers for d in (self.spectra, self.readings) if d is not None])
+        if not len(places):
+            raise ValueError("things: got spectra of no receiver, and nothing else that says where to look")
         return np.stack([places.min(axis=0) - 1.0, places.max(axis=0) + 1.0])
 
     @property

@@ -22,6 +22,7 @@ READING_DB = 10.0
 WORST = 5
 CANDIDATE_M = 1.0  # between places that could be measured next
 CLEAR_M = 0.3  # of them to a transmitter
+HEIGHT_M = 1.5  # of a map where nothing was measured, at first
 _OCTAHEDRON = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 _OCTAHEDRON_FACES = np.array(
     [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
@@ -32,15 +33,13 @@ class Survey:
     """Map, errors and suggestions, each computed in the background when its button is pressed.
 
     Args:
-        page: that it is on.
-        subject: whose places were measured.
         asked: gives the field as the settings ask for it.
         transmitters: gives where they stand.
         go_to: puts the receiver at a place (3,).
 
     Attributes:
         map, suggest, errors, reading_errors: what the buttons do, as far as the subject allows.
-        listed: buttons of the places that the last of them named.
+        legend, listed: what was computed last in HTML, and buttons of the places that it named.
     """
 
     def __init__(
@@ -53,14 +52,16 @@ class Survey:
     ) -> None:
         self._page, self._subject, self._asked = page, subject, asked
         self._transmitters, self._go_to = transmitters, go_to
+        gui, self.legend = page.gui, page.gui.add_html("")
         self.listed: list[Any] = []
-        gui = page.gui
+        self._meanings: dict[str, str] = {}
         if len(subject.places):
             self._mark("measured", subject.places, MEASURED)
         if subject.field is None:
             gui.add_markdown("A map needs a field.")
             return
-        self._height = gui.add_number("height [m]", float(self._usual_height()), step=0.1)
+        height = np.median(subject.places[:, 2]) if len(subject.places) else subject.bounds[0, 2] + HEIGHT_M
+        self._height = gui.add_number("height [m]", round(float(height), 2), step=0.1)
         self._cell = gui.add_number("cell [m]", 0.5, min=0.05, step=0.05)
         self._quantity = gui.add_dropdown("quantity", tuple(QUANTITIES.values()))
         self.map = self._add("compute the map", self._map)
@@ -71,12 +72,7 @@ class Survey:
             self.errors = self._add("errors at measured places", self._spectrum_errors)
         if subject.readings is not None:
             self.reading_errors = self._add("errors of readings", self._reading_errors)
-        self._legend = gui.add_html("")
-
-    @property
-    def html(self) -> str:
-        """What the colours of the last thing computed mean."""
-        return "" if self._subject.field is None else str(self._legend.content)
+        self._folder = gui.add_folder("Places", visible=False)
 
     def _add(self, label: str, work: Callable[[RadioField, Progress], None]) -> Callable[[], None]:
         """A button for ``work``; returns what it does."""
@@ -87,21 +83,13 @@ class Survey:
         self._page.gui.add_button(label).on_click(lambda _: run())
         return run
 
-    def _usual_height(self) -> float:
-        low, high = self._subject.bounds[:, 2]
-        known = float(np.median(self._subject.places[:, 2])) if len(self._subject.places) else low + 1.5
-        return round(min(known, 0.5 * (low + high)), 2)
-
-    def _explain(self, title: str, bar: str) -> None:
-        self._legend.content = f'{pictures.STYLE}<div class="wr"><div class="title">{title}</div>{bar}</div>'
-
     def _mark(self, name: str, places: np.ndarray, colours: Any, size_m: float = 0.1) -> None:
         """A small octahedron at each of ``places`` (K, 3) in ``colours`` (K, 3) or (3,); a click puts the receiver there."""
         shades = np.broadcast_to(np.asarray(colours, dtype=np.uint8), places.shape)
         turns = np.broadcast_to(np.array([1.0, 0.0, 0.0, 0.0], dtype=np.float32), (len(places), 4))
         handle = self._page.scene.add_batched_meshes_simple(
             f"/{name}", size_m * _OCTAHEDRON, _OCTAHEDRON_FACES, turns, places.astype(np.float32),
-            batched_colors=shades, visible=self._page.visible(name),
+            batched_colors=shades, visible=name not in self._page.hidden,
         )  # fmt: skip
 
         @handle.on_click
@@ -109,11 +97,21 @@ class Survey:
             if event.instance_index is not None:
                 self._go_to(places[event.instance_index])
 
+    def _explain(self, title: str, bar: str, about: str = "places") -> None:
+        self._meanings[about] = pictures.figure(title, bar)
+        self.legend.content = "".join(self._meanings.values())
+
     def _list(self, places: np.ndarray, labels: list[str]) -> None:
-        """A button for each of ``places``, in place of the last ones."""
+        """A button for each of ``places`` (K, 3), in place of the last ones."""
         for button in self.listed:
             button.remove()
-        self.listed = [self._page.gui.add_button(label, color="gray") for label in labels]
+        names = [
+            f"{label} at {', '.join(f'{x:.2f}' for x in at)} m"
+            for label, at in zip(labels, places, strict=True)
+        ]
+        with self._folder:
+            self.listed = [self._page.gui.add_button(name, color="gray") for name in names]
+        self._folder.visible = True
         for button, place in zip(self.listed, places, strict=True):
             button.on_click(lambda _, place=place: self._go_to(place))
 
@@ -127,12 +125,16 @@ class Survey:
         picture = pictures.coloured(value, low, high)[::-1]
         seen = np.where(np.isnan(value), 0, 255).astype(np.uint8)[::-1]
         width, height = found.cell_m * value.shape[1], found.cell_m * value.shape[0]
-        floor = float(self._subject.bounds[0, 2]) + 0.03
+        free = found.positions[found.free]
+        floor = 0.03 + float(
+            np.nanmedian(field.mesh.cast(free, np.tile([0.0, 0.0, -1.0], (len(free), 1))).point[:, 2])
+        )
         self._page.scene.add_image(
             "/map", np.dstack([picture, seen]), width, height,
             position=(float(found.x.mean()), float(found.y.mean()), floor), wxyz=(0.0, 1.0, 0.0, 0.0),
         )  # fmt: skip
-        self._explain(f"{self._quantity.value} at {found.height_m:g} m", pictures.colour_bar(low, high, ""))
+        title = f"{self._quantity.value} at {found.height_m:g} m"
+        self._explain(title, pictures.colour_bar(low, high, ""), "map")
 
     def candidates(self, field: RadioField) -> np.ndarray:
         """Places (C, 3) in the air, at the height that is set."""
@@ -153,8 +155,8 @@ class Survey:
         self._mark("suggested", chosen, SUGGESTED, 0.2)
         for k, place in enumerate(chosen):
             self._page.scene.add_label(f"/suggested/{k}", f"measure {k + 1}", position=place)
-        self._explain("To measure next, best first", "")
-        self._list(chosen, [f"{k + 1}: {_at(place)}" for k, place in enumerate(chosen)])
+        self._explain("to measure next, best first", "")
+        self._list(chosen, [str(k + 1) for k in range(count)])
 
     def _spectrum_errors(self, field: RadioField, progress: Progress) -> None:
         truth = self._subject.spectra
@@ -162,45 +164,38 @@ class Survey:
             return
         found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
+        worst = np.argsort(psnr)[:WORST]
+        labels = [f"{psnr[k]:.1f} dB{' (fitted)' if fitted[k] else ''}" for k in worst]
         self._mark("measured", truth.receivers, pictures.coloured(psnr, *PSNR_DB, "RdYlGn"))
         self._explain(
             f"PSNR at {len(psnr)} measured places, mean {found['psnr_db']:.1f} dB; worst first",
             pictures.colour_bar(*PSNR_DB, "dB", "RdYlGn"),
         )
-        worst = np.argsort(psnr)[:WORST]
-        self._list(
-            truth.receivers[worst],
-            [
-                f"{psnr[k]:.1f} dB at {_at(truth.receivers[k])}{' (fitted)' if fitted[k] else ''}"
-                for k in worst
-            ],
-        )
+        self._list(truth.receivers[worst], labels)
 
     def _reading_errors(self, field: RadioField, progress: Progress) -> None:
         readings = self._subject.readings
         if readings is None:
             return
         error = answers.reading_errors(field, readings, progress)
-        known = np.isfinite(error)
         places, own = np.unique(readings.receivers, axis=0, return_inverse=True)
-        own, count = own.reshape(-1)[known], len(places)
-        square = np.bincount(own, error[known] ** 2, count) / np.maximum(np.bincount(own, minlength=count), 1)
-        rms = np.where(np.bincount(own, minlength=count) > 0, np.sqrt(square), np.nan)
+        each = [error[own.reshape(-1) == k] for k in range(len(places))]
+        rms = np.array([_rms(e) for e in each])
+        worst = np.argsort(-np.abs(np.nan_to_num(error)))[:WORST]
+        labels = [f"{error[k]:+.1f} dB" for k in worst]
+        if readings.arrival is not None:
+            turned = np.degrees(readings.arrival[worst])
+            labels = [
+                f"{label} from {z:.0f}°, {a:.0f}°" for label, (z, a) in zip(labels, turned, strict=True)
+            ]
         self._mark("measured", places, pictures.coloured(rms, 0.0, READING_DB, "RdYlGn_r"))
         self._explain(
-            f"Error of {known.sum()} readings, rms at each place; {np.sqrt(np.mean(error[known] ** 2)):.1f} dB in all; "
-            "worst first",
+            f"Error of {np.isfinite(error).sum()} readings, rms {_rms(error):.1f} dB, by place; worst first",
             pictures.colour_bar(0.0, READING_DB, "dB", "RdYlGn_r"),
         )
-        worst = np.argsort(-np.abs(np.nan_to_num(error)))[:WORST]
-        turned = readings.arrival
-        labels = [
-            f"{error[k]:+.1f} dB at {_at(readings.receivers[k])}"
-            + ("" if turned is None else " toward {:.0f}°, {:.0f}°".format(*np.degrees(turned[k])))
-            for k in worst
-        ]
         self._list(readings.receivers[worst], labels)
 
 
-def _at(place: np.ndarray) -> str:
-    return ", ".join(f"{x:.2f}" for x in place) + " m"
+def _rms(error: np.ndarray) -> float:
+    known = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

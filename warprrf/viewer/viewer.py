@@ -256,10 +256,12 @@ class Viewer:
     def _html(self) -> bytes:
         """The scene as it stands, with spectrum and figures in a corner."""
         said = html.escape(self.message.replace("**", ""))
+        shown = (
+            self._channel.spectra, self._channel.table, self._rays.legend, self._room.legend, self._survey.legend
+        )  # fmt: skip
         corner = (
             '<div style="position:fixed;right:1em;top:1em;bottom:1em;width:26em;overflow:auto;padding:0.5em 0;'
-            f'background:#ffffffe0;z-index:9"><p class="wr">{said}</p>{self._channel.html}{self._rays.html}'
-            f"{self._room.html}{self._survey.html}</div>"
+            f'background:#ffffffe0;z-index:9"><p class="wr">{said}</p>{"".join(part.content for part in shown)}</div>'
         )
         page: str = self._page.server.get_scene_serializer().as_html()
         return page.replace("</body>", corner + "</body>").encode()

@@ -101,6 +101,17 @@ def plane_mesh(planes: Sequence[Plane]) -> Mesh | None:
     return Mesh(vertices, np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])) if len(vertices) else None
 
 
+def in_frame(camera: Camera, points: np.ndarray, nearest_m: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Which points ``(N, 3)`` have a pixel and lie deeper than ``nearest_m``, shape ``(N,)`` bool; and the row and column
+    of each, shape ``(N, 2)`` int, 0 for the others."""
+    uv, depth = camera.project(points)
+    with np.errstate(invalid="ignore"):
+        inside = (
+            (depth > nearest_m) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+        )
+    return inside, np.where(inside[:, None], uv[:, ::-1], 0).astype(int)
+
+
 def visible_from(
     surface: Mesh | None,
     points: np.ndarray,
@@ -117,9 +128,7 @@ def visible_from(
     normals = np.broadcast_to(normal, points.shape)
     seen = np.zeros((len(points), len(cameras)), dtype=bool)
     for c, camera in enumerate(cameras):
-        uv, depth = camera.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (depth > 0.05) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+        inside, _ = in_frame(camera, points, 0.05)
         seen[:, c] = inside & (((camera.position - points) * normals).sum(axis=1) > 0)
     if surface is not None and seen.any():
         positions = np.array([camera.position for camera in cameras])

@@ -18,15 +18,11 @@ from scipy import ndimage
 from warprrf.geometry.splats.camera import Camera
 
 BLUR_PX = 1.5  # photos are smoothed by so much before they are differentiated
-EDGE, EDGE_DEG = (
-    0.009,
-    6.0,
-)  # an edge changes some colour by this part of white a pixel; its direction is good to so much
+EDGE = 0.009  # an edge changes some colour by this part of white per pixel,
+EDGE_DEG = 6.0  # and its direction in the photo is good to this
 SEGMENT_PX, GAP_PX = 24.0, 6.0  # shortest segment, and longest gap in one
-SIDE_PX, ALIKE = (
-    4.0,
-    0.08,
-)  # colours so far beside an edge are one surface's when they differ by no more than this
+SIDE_PX = 4.0  # colours are taken so far beside an edge,
+ALIKE = 0.08  # and are one surface's when they differ by no more than this
 MEETING_DEG = 3.0  # two bearings that differ by less meet nowhere for sure
 LINE_VIEWS = 3  # fewest photos that show an edge
 LEAST_SLOPE = 0.15  # a ray closer to the direction than this (sine) fixes no bearing

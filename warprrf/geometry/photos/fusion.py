@@ -19,6 +19,7 @@ from warprrf.geometry import o3d as o3d_package
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
+from warprrf.geometry.photos.photo_files import spread
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.snapping import MIN_PATCH_M2, find_patches, flattened, largest_first, simplified
 from warprrf.geometry.photos.stereo import mended
@@ -30,9 +31,7 @@ from warprrf.geometry.splats.render import render
 
 VIEWS = 120  # most depth maps that are fused, spread over all cameras
 ALPHA = 0.6  # a depth counts where at least so much light is blocked,
-DEPTH_SPREAD = (
-    0.05  # and where the blended depth and that of the dominant Gaussian differ by no more than this part
-)
+DEPTH_SPREAD = 0.05  # and where blended depth and dominant Gaussian differ by no more than this part
 VOXEL_PIXELS = 4.0  # widest voxel, in pixels of the depth maps at their median range
 EDGE_TOLERANCE = 8.0
 """A pixel is left out where inverse depth bends by more than this part of itself, per focal length in pixels: on a plane
@@ -59,7 +58,7 @@ def fuse_gaussians(
     """
     config = config or ReconstructionConfig()
     report = progress or (lambda stage, done, total: None)
-    chosen = _spread_out(len(cameras), VIEWS)
+    chosen = spread(range(len(cameras)), VIEWS)
     views, depths = depth_maps(
         gaussians, [cameras[k] for k in chosen], config=config.surface, progress=report, device=device
     )
@@ -115,11 +114,6 @@ def depth_maps(
         views.append(view)
     progress("depth", len(cameras), len(cameras))
     return views, depths
-
-
-def _spread_out(count: int, most: int) -> list[int]:
-    """At most so many of ``count`` numbers, evenly spread."""
-    return [int(k) for k in np.linspace(0, count - 1, min(count, most)).round()]
 
 
 def _with_voxels(

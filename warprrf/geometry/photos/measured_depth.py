@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warprrf.geometry.photos.photo_files import read_photo
+from warprrf.geometry.photos.cells import in_frame
+from warprrf.geometry.photos.photo_files import read_photo, spread
 from warprrf.geometry.photos.poses import DepthFile, read_depth
 from warprrf.geometry.photos.sparse import SparseModel
 from warprrf.geometry.photos.undistort import stored_pixels
@@ -17,10 +18,8 @@ from warprrf.geometry.splats.camera import Camera
 CELL_M = 0.03  # one point for each cube of this side
 MOST_PIXELS = 400_000  # of all maps that points are made of
 VIEWS = 120  # most maps that are used, spread over all
-NEAR_M, NEAR_SHARE = (
-    0.02,
-    0.02,
-)  # a map shows a point that it measures this near to, or within this part of its range
+NEAR_M = 0.02  # a map shows a point that it measures this near to,
+NEAR_SHARE = 0.02  # or within this part of its range
 AGREE = 0.5  # least share of the points in a map's sight that it shows, over those that it looks through
 
 
@@ -34,10 +33,8 @@ def range_maps(sparse: SparseModel, files: Mapping[str, DepthFile]) -> dict[str,
     Raises:
         ValueError: if a file does not read, or has another shape than its photo.
     """
-    names = [name for name in sparse.cameras if name in files]
-    chosen = np.linspace(0, len(names) - 1, min(len(names), VIEWS)).round().astype(int)
     found = {}
-    for name in (names[k] for k in chosen):
+    for name in spread((name for name in sparse.cameras if name in files), VIEWS):
         depth, camera, lens = read_depth(files[name]), sparse.cameras[name], sparse.lenses[name]
         height, width = depth.shape
         if abs(width / height / (lens.width / lens.height) - 1) > 0.02:
@@ -128,9 +125,6 @@ def _cloud(
 
 def _compared(points: np.ndarray, view: Camera, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Range of each point from a camera, and that measured at its pixel, 0 where it is out of sight or unknown."""
-    uv, depth = view.project(points)
-    inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [view.width, view.height]).all(axis=1)
-    there = np.zeros(len(points))
-    columns, rows = uv[inside].astype(int).T
-    there[inside] = measured[rows, columns]
+    inside, place = in_frame(view, points)
+    there = np.where(inside, measured[place[:, 0], place[:, 1]], 0.0)
     return np.linalg.norm(points - view.position, axis=1), there

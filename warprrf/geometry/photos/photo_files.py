@@ -7,11 +7,13 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from warprrf.device import require
+
+T = TypeVar("T")
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 MASK_SUFFIX = ".mask.png"
@@ -238,6 +240,12 @@ def read_mask(photo: str | os.PathLike[str]) -> np.ndarray | None:
     """
     path = mask_beside(Path(photo))
     return None if path is None else np.asarray(open_photo(path, "L")) < 128
+
+
+def spread(items: Iterable[T], most: int) -> list[T]:
+    """At most so many of ``items``, evenly spread."""
+    every = list(items)
+    return [every[k] for k in np.linspace(0, len(every) - 1, min(len(every), most)).round().astype(int)]
 
 
 def some(items: Sequence[str], limit: int = 5) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from warprrf.geometry.photos.cells import BEHIND_M as SEEN_BEHIND_M
-from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL
+from warprrf.geometry.photos.cells import CONTESTED_M, PARALLEL, in_frame
 from warprrf.geometry.photos.edges import (
     EDGE_DEG,
     FARTHEST_M,
@@ -36,9 +36,7 @@ from warprrf.geometry.splats.camera import Camera
 SURE_VIEWS, LINE_M = 4, 0.4  # photos and length from which on an edge counts
 FLAT, PLAIN_PX = 0.006, 7  # a pixel is plain where none in a square of this side changes by more than this
 SHOWN_SHARE = 0.15  # where so much of an edge shows in a photo, all of it parts regions
-LEAST_SHARE = (
-    0.12  # photos with fewer plain pixels than this share, in a dozen of them, show no plain surface
-)
+LEAST_SHARE = 0.12  # a dozen photos with fewer plain pixels than this share show no plain surface
 REGION_PX, VOTES_PX = 150, 25.0  # fewest pixels of a plain region, and of its border on a plane
 SAME_M = 0.04  # an edge this close to a plane lies on it
 RIVAL = 0.8  # of the planes with at least this share of the most votes, the nearest has the region
@@ -285,10 +283,8 @@ def _shown(lines: Sequence[Line], camera: Camera, edgels: Edgels) -> tuple[np.nd
     of_line, barrier = np.full(len(edgels.position), -1), np.zeros((height, width), dtype=bool)
     for number, line in enumerate(lines):
         along = np.linspace(line.low, line.high, int((line.high - line.low) / 0.01) + 2)
-        pixels, depth = camera.project(line.points(along))
-        with np.errstate(invalid="ignore"):
-            inside = (depth > 0.1) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-        x, y = pixels[inside].astype(int).T
+        inside, pixels = in_frame(camera, line.points(along), 0.1)
+        y, x = pixels[inside].T
         first = np.flatnonzero(np.concatenate([x[:1] == x[:1], (np.diff(x) != 0) | (np.diff(y) != 0)]))
         x, y = x[first], y[first]
         if len(x) < SEGMENT_PX / 2:
@@ -385,11 +381,9 @@ def _agreed(
     for camera, view in zip(cameras, seen, strict=True):
         if side * (camera.position[axis] - height) < 0.1:
             continue
-        pixels, depth = camera.project(cells)
-        with np.errstate(invalid="ignore"):
-            inside = (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-        own = np.flatnonzero(inside & (depth > 0.1))
-        x, y = (pixels[own] / STRIDE).astype(int).T
+        inside, pixels = in_frame(camera, cells, 0.1)
+        own = np.flatnonzero(inside)
+        y, x = pixels[own].T // STRIDE
         y, x = np.minimum(y, view.plane.shape[0] - 1), np.minimum(x, view.plane.shape[1] - 1)
         here = view.plane[y, x] == number
         away = np.linalg.norm(cells[own] - camera.position, axis=1)

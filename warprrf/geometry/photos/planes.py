@@ -19,15 +19,11 @@ from warprrf.cache import cached_property
 from warprrf.checks import check_array
 from warprrf.geometry.photos.config import PlaneConfig
 
-HYPOTHESES, SCORED_POINTS = (
-    192,
-    6000,
-)  # points tried as centres of planes in a round, and that each is scored on
+HYPOTHESES = 192  # points tried as centres of planes in each round
+SCORED_POINTS = 6000  # that a hypothesis is scored on
 REFINED = 12  # hypotheses of a round that are refined before the best is chosen
-ECHO_M, ECHO_CELL_M = (
-    0.1,
-    0.3,
-)  # a plane this close behind a better one is its noise where both share cells of this size
+ECHO_M = 0.1  # a parallel plane this close is the noise of a better one,
+ECHO_CELL_M = 0.3  # where both have points in the same cells of this size
 REFITS = 8  # of a hypothesis, from its neighbourhood outwards
 AROUND = np.ones((3, 3), dtype=bool)  # a cell and its eight neighbours
 

@@ -43,9 +43,7 @@ CHECKPOINT = "warprrf refinement 2"
 
 DENSIFY_UNTIL = 0.65  # of the iterations Gaussians are split and cloned
 FINE_FROM = 0.8  # until this share of the iterations photos with many pixels are made still smaller
-FULL_PIXELS = (
-    400_000  # fewer iterations take photos as they are if these have more, so that they take as long
-)
+FULL_PIXELS = 400_000  # of larger photos fewer iterations see all, so that they take as long
 SSIM_SHARE = 0.2  # weight of 1 - SSIM; L1 has the rest
 FINAL_MEAN_RATE = 4e-5  # metres a step at the end; exponential from that at the start
 SCALE_RATE, QUATERNION_RATE, OPACITY_RATE, COLOR_RATE = 5e-3, 2e-3, 3e-2, 5e-3

@@ -7,16 +7,16 @@ import html
 import io
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from warprrf.device import DeviceLike, Progress, require
 from warprrf.files import write_text
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.photo_files import read_photo
+from warprrf.geometry.photos.photo_files import read_photo, spread
 from warprrf.geometry.photos.sight import CLASSES, colours_of, from_outside, how_seen, painted
 from warprrf.geometry.photos.undistort import Lens
 from warprrf.geometry.splats.camera import Camera
@@ -42,40 +42,25 @@ th, td { padding: .3rem .8rem .3rem 0; border-bottom: 1px solid #ddd; text-align
 """
 
 
-@dataclass(frozen=True)
-class Subject:
-    """What a report is about: the parts of a reconstruction.
+class Subject(Protocol):
+    """What a report is about: a :class:`~warprrf.geometry.reconstruction.Reconstruction`, whose attributes these are."""
 
-    Attributes:
-        gaussians, mesh, cameras: as in :class:`~warprrf.geometry.reconstruction.Reconstruction`.
-        photos: image files of the cameras, by name, as the Gaussians were fitted to them.
-        held_out: names of photos that they were not fitted to.
-        unposed: photos without a pose, and why.
-        lenses: that took the photos, by name.
-        guessed: what nobody measured and the photos do not show.
-        metric, scale_rms_m: whether lengths are metres, and how well surveyed positions fit.
-    """
-
-    gaussians: Gaussians | None
-    mesh: Mesh | None
-    cameras: Mapping[str, Camera]
-    photos: Mapping[str, Path] = field(default_factory=dict)
-    held_out: Sequence[str] = ()
-    unposed: Mapping[str, str] = field(default_factory=dict)
-    lenses: Mapping[str, Lens] = field(default_factory=dict)
-    guessed: Sequence[str] = ()
-    metric: bool = True
-    scale_rms_m: float = float("nan")
-
-    @property
-    def unit(self) -> str:
-        """Of lengths."""
-        return "m" if self.metric else "assumed m"
+    cameras: dict[str, Camera]
+    photos: dict[str, Path]
+    held_out: tuple[str, ...]
+    unposed: tuple[str, ...]
+    causes: dict[str, str]
+    lenses: dict[str, Lens]
+    guessed: tuple[str, ...]
+    metric: bool
+    scale_rms_m: float
 
 
 def write_report(
     path: str | os.PathLike[str],
     subject: Subject,
+    gaussians: Gaussians | None,
+    mesh: Mesh | None,
     *,
     progress: Progress | None = None,
     device: DeviceLike = None,
@@ -88,13 +73,13 @@ def write_report(
     """
     report = progress or (lambda stage, done, total: None)
     report("report", 0, 3)
-    parts = [_head(subject), _warnings(subject)]
+    parts = [_head(subject, gaussians, mesh), _warnings(subject)]
     if subject.cameras:
-        parts.append(_from_above(subject))
-        parts.append(_beside(subject, device))
+        parts.append(_from_above(subject, mesh))
+        parts.append(_beside(subject, gaussians, device))
     report("report", 1, 3)
-    if subject.mesh is not None:
-        parts.append(_surface(subject.mesh, subject, device))
+    if mesh is not None:
+        parts.append(_surface(mesh, gaussians, subject, device))
     report("report", 2, 3)
     parts += [_lenses(subject), _unposed(subject)]
     body = "\n".join(part for part in parts if part)
@@ -119,20 +104,20 @@ def colours_matched(picture: np.ndarray, photo: np.ndarray) -> np.ndarray:
     return np.asarray((given @ change).reshape(picture.shape))
 
 
-def _head(subject: Subject) -> str:
+def _head(subject: Subject, gaussians: Gaussians | None, mesh: Mesh | None) -> str:
     total = len(subject.cameras) + len(subject.unposed)
     rows = [
         ("photos", f"{len(subject.cameras)} of {total} posed, {len(subject.held_out)} held out of the fit")
     ]
-    if subject.gaussians is not None:
-        rows.append(("Gaussians", f"{len(subject.gaussians)}"))
-    if subject.mesh is not None:
-        low, high = subject.mesh.bounds
+    if gaussians is not None:
+        rows.append(("Gaussians", f"{len(gaussians)}"))
+    if mesh is not None:
+        low, high = mesh.bounds
         size = " x ".join(f"{length:.2f}" for length in high - low)
         rows.append(
             (
                 "mesh",
-                f"{len(subject.mesh.faces)} triangles, {subject.mesh.areas.sum():.1f} m², within {size} m",
+                f"{len(mesh.faces)} triangles, {mesh.areas.sum():.1f} m², within {size} m",
             )
         )
     if not np.isnan(subject.scale_rms_m):
@@ -150,9 +135,9 @@ def _warnings(subject: Subject) -> str:
     return f"<h2>What is guessed</h2><ul>{items}</ul>"
 
 
-def _from_above(subject: Subject) -> str:
+def _from_above(subject: Subject, mesh: Mesh | None) -> str:
     """Cameras with the directions that they look in, over a section of the mesh at their median height, as SVG."""
-    cameras, mesh = subject.cameras, subject.mesh
+    cameras = subject.cameras
     places = np.array([c.position for c in cameras.values()])
     walls = np.zeros((0, 2, 2))
     if mesh is not None:
@@ -194,16 +179,17 @@ def _from_above(subject: Subject) -> str:
             f'<path d="{line(at, at + ahead - half, at + ahead + half)}Z" fill="{colour}" opacity=".28"/>'
             f'<circle cx="{x}" cy="{y}" r="3" fill="{colour}"><title>{title}</title></circle>'
         )
+    unit = "m" if subject.metric else "assumed m"
     keys = _key(FITTED, "photos that were fitted") + _key(HELD, "held out.")
     return (
-        f"<h2>Cameras from above</h2><figure>{''.join(parts)}</svg><figcaption>{keys} x and y in {subject.unit}. Lines: "
+        f"<h2>Cameras from above</h2><figure>{''.join(parts)}</svg><figcaption>{keys} x and y in {unit}. Lines: "
         "where the mesh is at the cameras' median height.</figcaption></figure>"
     )
 
 
-def _beside(subject: Subject, device: DeviceLike) -> str:
+def _beside(subject: Subject, gaussians: Gaussians | None, device: DeviceLike) -> str:
     """Photos beside what the Gaussians show, those held out where there are some."""
-    if subject.gaussians is None:
+    if gaussians is None:
         return ""
     held = [name for name in subject.held_out if name in subject.cameras]
     names = held or list(subject.cameras)
@@ -214,12 +200,10 @@ def _beside(subject: Subject, device: DeviceLike) -> str:
     if not there:
         return f'<h2>{title}</h2><p class="note">Their files are not there any more.</p>'
     rows, scores = [], []
-    for name in (
-        there[k] for k in np.linspace(0, len(there) - 1, min(len(there), SHOWN)).round().astype(int)
-    ):
+    for name in spread(there, SHOWN):
         photo = read_photo(subject.photos[name])
         camera = subject.cameras[name].resized(photo.shape[1], photo.shape[0])
-        picture = render(subject.gaussians, camera, device=device).features
+        picture = render(gaussians, camera, device=device).features
         plain, matched = psnr_db(picture, photo), psnr_db(colours_matched(picture, photo), photo)
         scores.append((plain, matched))
         caption = f"{html.escape(name)}: {plain:.1f} dB, {matched:.1f} dB with colours matched"
@@ -231,11 +215,11 @@ def _beside(subject: Subject, device: DeviceLike) -> str:
     return f'<h2>{title} beside renderings</h2><p class="note">{text}</p>{"".join(rows)}'
 
 
-def _surface(mesh: Mesh, subject: Subject, device: DeviceLike) -> str:
+def _surface(mesh: Mesh, gaussians: Gaussians | None, subject: Subject, device: DeviceLike) -> str:
     """The mesh from four sides, in its colours and by how often it was seen."""
     views = [(from_outside(mesh, np.pi * turn, device=device), name) for turn, name in SIDES]
     grey = np.zeros((1, 3)), np.full((1, 3), 0.8)
-    own = grey if subject.gaussians is None else (subject.gaussians.means, colours_of(subject.gaussians))
+    own = grey if gaussians is None else (gaussians.means, colours_of(gaussians))
     said = (
         "Backs of surfaces are left out: walls and ceiling between the eye and the room are looked through."
     )
@@ -296,7 +280,7 @@ def _taken_with(subject: Subject) -> str:
 def _unposed(subject: Subject) -> str:
     if not subject.unposed:
         return ""
-    rows = [(name, cause or "cause not known") for name, cause in subject.unposed.items()]
+    rows = [(name, subject.causes.get(name, "cause not known")) for name in subject.unposed]
     return f"<h2>Photos without a pose</h2>{_table(rows)}"
 
 

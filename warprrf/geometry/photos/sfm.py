@@ -63,10 +63,8 @@ MAX_EXHAUSTIVE_PAIRS = 2000
 COARSE_FEATURES = 300  # the largest features of a photo take part in the coarse comparison
 COARSE_NEIGHBOURS = 16  # pairs kept for a photo; on the lobby 24 takes half as long again for the same errors
 PEAK_THRESHOLD = 0.004  # COLMAP's 0.0067 finds too little on bare walls
-FEWEST_FEATURES, FEWEST_MATCHES = (
-    8,
-    15,
-)  # of a photo that can be matched, and of a pair that COLMAP counts as matched
+FEWEST_FEATURES = 8  # of a photo that can be matched
+FEWEST_MATCHES = 15  # of a pair that COLMAP counts as matched
 EXTRACT_BATCH = 12
 MATCH_BATCH = 400
 

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
+from warprrf.geometry.photos.cells import in_frame
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 
@@ -63,11 +64,9 @@ def how_seen(mesh: Mesh, cameras: Sequence[Camera], *, device: DeviceLike = None
     for camera in cameras:
         towards = camera.position - points
         distance = np.linalg.norm(towards, axis=1)
-        uv, depth = camera.project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
+        inside, _ = in_frame(camera, points)
         facing = np.einsum("si,si->s", towards, normals) > GRAZING * distance
-        some = np.flatnonzero(inside & facing & (depth > 0) & (distance < FARTHEST_M))
+        some = np.flatnonzero(inside & facing & (distance < FARTHEST_M))
         photos[some] += mesh.visible(camera.position, points[some], clearance=1e-3, device=device)
     return Seen(points, photos)
 

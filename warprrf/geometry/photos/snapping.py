@@ -18,9 +18,7 @@ from warprrf.geometry.photos.config import PlaneConfig, SurfaceConfig
 from warprrf.geometry.photos.planes import Plane, detect_planes, drawn_by_place
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise
 
-PATCH_ANGLE_DEG = (
-    35.0  # the smoothed normal of a face of a patch differs from the plane's by no more than this
-)
+PATCH_ANGLE_DEG = 35.0  # most between the smoothed normal of a face and that of its patch
 MIN_PATCH_M2 = 0.15  # smallest planar patch
 SIMPLIFY_M = 0.25  # flat parts are made of faces of about this size in the end
 LONGEST_MOVE_M = 0.15  # of a vertex to its plane

@@ -16,6 +16,7 @@ import warp as wp
 from scipy import ndimage
 
 from warprrf.device import DeviceLike, Progress, launch, require, resolve
+from warprrf.geometry.photos.cells import in_frame
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels.patch_match import UNKNOWN, match
@@ -26,10 +27,8 @@ GOOD_ANGLE_DEG = 9.0  # between two lines of sight: less tells depths badly, mor
 DOWNSCALE = 2  # photos are compared at the depth maps' size divided by this
 SOURCES = 3  # photos that one is compared with
 TURNS = 2  # how often planes are handed on between pixels
-SETTLED, PROVED = (
-    0.2,
-    0.6,
-)  # a depth of less cost (1 - correlation) stays as it is; one of more proves nothing
+SETTLED = 0.2  # a depth of less cost (one minus a correlation) stays as it is
+PROVED = 0.6  # depths of more cost prove nothing
 GAIN = 0.05  # by which a new depth has to cost less than the old one
 CHECKED, AGREED = 8, 2  # maps of other photos that a depth is checked against, and how many must agree on it
 TOLERANCE = 0.02  # up to this part of the range two depths agree
@@ -240,7 +239,7 @@ def _companions(
     angle = np.degrees(np.arccos(np.clip(np.einsum("cpi,pi->cp", line, line[view]), -1, 1)))
     good = np.exp(-0.5 * (np.log(np.maximum(angle, 0.1) / GOOD_ANGLE_DEG) / 0.7) ** 2)
     good *= np.minimum(distance / distance[view], distance[view] / np.maximum(distance, 1e-9))
-    inside = np.array([_inside(c, points)[0] for c in cameras])
+    inside = np.array([in_frame(c, points)[0] for c in cameras])
     worth = np.where(inside.mean(axis=1) > 0.3, (good * inside).mean(axis=1), 0.0) * weight
     worth[view] = 0.0
     chosen: list[int] = []
@@ -253,14 +252,6 @@ def _companions(
     return np.array(chosen, dtype=np.int64)
 
 
-def _inside(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which points a camera has in its image, and their rows and columns there, shape ``(N, 2)``."""
-    uv, z = camera.project(points)
-    uv = np.nan_to_num(uv, nan=-1.0)
-    inside = (z > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    return inside, np.where(inside[:, None], uv[:, ::-1], 0).astype(int)
-
-
 def _votes(
     depth: np.ndarray, camera: Camera, others: Sequence[tuple[Camera, np.ndarray]], tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -269,7 +260,7 @@ def _votes(
     known = depth > 0
     points = camera.position + depth[known][:, None] * camera.directions()[known]
     for other, ranges in others:
-        inside, place = _inside(other, points)
+        inside, place = in_frame(other, points)
         seen = np.where(inside, ranges[place[:, 0], place[:, 1]], 0.0)
         distance = np.linalg.norm(points - other.position, axis=1)
         agreed[known] += (seen > 0) & (np.abs(seen - distance) < tolerance * distance)

@@ -212,9 +212,7 @@ def lenses_in_use(lenses: Mapping[str, Lens]) -> dict[Lens, tuple[str, ...]]:
     return {lens: tuple(names) for lens, names in found.items()}
 
 
-FREE_MODEL = (
-    "SIMPLE_RADIAL"  # of the mapping, where the model is free: one coefficient, which a few photos fix
-)
+FREE_MODEL = "SIMPLE_RADIAL"  # of the mapping where it is free: one coefficient, which a few photos fix
 CANDIDATES = (("SIMPLE_PINHOLE", False), ("SIMPLE_RADIAL", False), ("RADIAL", True), ("OPENCV", True))
 """Models tried, the simplest first, and whether the principal point is estimated with them."""
 

@@ -17,6 +17,7 @@ from scipy import ndimage
 from warprrf.device import require
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos.config import PlaneConfig
+from warprrf.geometry.photos.photo_files import spread
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.points import clean_points, detect_room_planes, estimate_normals
 from warprrf.geometry.photos.sparse import SparseModel, transformed
@@ -24,18 +25,14 @@ from warprrf.geometry.splats.camera import Camera
 
 PHOTOS = 40  # looked at for edges, spread over all
 EDGE_PIXELS = 480  # about the longer side of a photo while its edges are looked for
-STRAIGHT, CONTRAST = (
-    0.9,
-    0.01,
-)  # least coherence of gradients round a pixel of an edge, and least slope [white/pixel]
+STRAIGHT = 0.9  # least coherence of gradients round a pixel of an edge
+CONTRAST = 0.01  # least slope there [white/pixel]
 NEAR_DEG = 25.0  # the vertical is this near to the photos' own up
 WINDOWS_DEG = (12, 8, 5, 3, 2, 1.5, 1, 0.7, 0.5, 0.5, 0.5)  # standard deviations of the window, in turn
 PROVEN = 1.3  # density of edges within 1 degree of the vertical over that from 4 to 10 degrees; of clutter: 1
 PLANE_DEG = (4.0, 2.0, 1.0, 0.7, 0.7)  # of the window for planes, in turn
-FLOOR_M, FLOOR_SHARE = (
-    0.05,
-    0.1,
-)  # thickness of a level surface; least points of a floor, over those of the largest level
+FLOOR_M = 0.05  # thickness of a level surface
+FLOOR_SHARE = 0.1  # least points of a floor, over those of the largest level
 BELOW_SHARE = 0.01  # of all points may lie beneath a floor
 
 
@@ -99,10 +96,8 @@ def vertical_of_edges(
         cameras: by photo.
         photo: reads a photo by its name, ``(H, W, 3)`` in [0, 1].
     """
-    names = list(cameras)
     held = held_up(list(cameras.values()))
-    chosen = np.linspace(0, len(names) - 1, min(len(names), PHOTOS)).round().astype(int)
-    normals = np.concatenate([_edge_planes(photo(names[k]), cameras[names[k]]) for k in chosen])
+    normals = np.concatenate([_edge_planes(photo(name), cameras[name]) for name in spread(cameras, PHOTOS)])
     normals = normals[np.abs(normals @ held) < np.sin(np.radians(NEAR_DEG))]
     if len(normals) < 100:
         return held, False

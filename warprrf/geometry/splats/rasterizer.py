@@ -27,9 +27,7 @@ from warprrf.kernels.raster import project as projection
 from warprrf.kernels.raster import sh as harmonics
 from warprrf.kernels.raster.view import PINHOLE, SPHERICAL, View
 
-PARTS = (
-    8  # partial sums of gradients on a CPU, one writer each: the result does not depend on the thread count
-)
+PARTS = 8  # partial sums of gradients on a CPU, one writer each: the thread count changes nothing
 MOST_WEIGHTS = 1 << 16  # of a pixel that can be asked for
 GRAIN = 32  # a tile is work enough for few of them to be worth a thread
 PIXEL_TILE = 16  # pixels: side of a tile where each pixel has a thread of its own

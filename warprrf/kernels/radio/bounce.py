@@ -44,13 +44,15 @@ def light_surface(
     cos_out: wp.array(dtype=wp.float32),
     cos_mirror: wp.array(dtype=wp.float32),
     grazing: wp.array(dtype=wp.float32),
+    point: wp.array(dtype=wp.vec3d),
 ):
     """How a transmitter at ``source`` illuminates what each ray hits, shadows apart.
 
     Ray k starts at origin k / per_origin; ``directions`` holds one for each ray, or one set for every origin. Writes
     ``strength`` = Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] less what air of ``loss`` [neper/m] absorbs from the source
     over the hit to the ray's origin, the cosines of incidence and of scattering, that of the angle between the scattered
-    and the mirror direction, and the mean of 1 / cos(theta_s) over +-``half_width`` (what lies below the horizon left out).
+    and the mirror direction, the mean of 1 / cos(theta_s) over +-``half_width`` (what lies below the horizon left out), and
+    where the ray hits [m].
     ``nearest`` [m] bounds d1 from below: an element at the source spans directions.
     """
     k = offset + wp.tid()
@@ -58,7 +60,8 @@ def light_surface(
     f = face[k]
     if f >= 0:
         d = directions[k % directions.shape[0]]
-        way = source - (origins[k / per_origin] + range_m[k] * d)
+        met = origins[k / per_origin] + range_m[k] * d
+        way = source - met
         d1 = wp.float32(wp.length(way))
         toward = narrow(way) / wp.max(d1, 1.0e-9)
         look = -narrow(d)
@@ -70,6 +73,7 @@ def light_surface(
         cos_s = wp.max(cos_s, 0.0)  # a smoothed normal may turn away from who sees the face
         cos_i = wp.dot(n, toward)
         if cos_i > 0.0 and d1 > 0.0:
+            point[k] = met
             reach = wp.max(d1, nearest)
             air = wp.exp(-loss * (d1 + wp.float32(range_m[k])))
             strength[k] = (

@@ -165,6 +165,34 @@ def pack_rays(
 
 
 @wp.kernel(enable_backward=False)
+def pack_segments(
+    offset: int,
+    center: wp.vec3d,
+    radius: wp.float64,
+    clearance: wp.float64,
+    longest: wp.float64,
+    a: wp.array(dtype=wp.vec3d),
+    b: wp.array(dtype=wp.vec3d),
+    rays: wp.array(dtype=wp.vec3),
+    length: wp.array(dtype=wp.float64),
+):
+    """Each segment between ``a`` and ``b``, less ``clearance`` at both ends and longer by what float32 may err, as a pair
+    (point, way) in float32; what is no longer than both clearances holds NaN. And the whole ``length`` [m]."""
+    i = offset + wp.tid()
+    start = a[wp.min(i, a.shape[0] - 1)]
+    way = b[wp.min(i, b.shape[0] - 1)] - start
+    size = wp.length(way)
+    margin = _ROUNDING * rounding_scale(start - center, radius)
+    inner = size - wp.float64(2.0) * clearance
+    scale = wp.float64(wp.nan)
+    if inner > wp.float64(0.0):
+        scale = wp.min(inner + wp.float64(2.0) * margin, longest) / size
+    rays[2 * i] = narrow(start - center + (clearance - margin) / size * way)
+    rays[2 * i + 1] = narrow(scale * way)
+    length[i] = size
+
+
+@wp.kernel(enable_backward=False)
 def place_hits(
     offset: int,
     center: wp.vec3d,

@@ -9,7 +9,7 @@ approximation of a partly covered zone), so that power falls with its square.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 
 import numpy as np
@@ -62,6 +62,11 @@ class MirrorPaths:
     def subset(self, chosen: np.ndarray) -> MirrorPaths:
         """The rows ``chosen``."""
         return MirrorPaths(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
+
+    def of(self, receivers: np.ndarray) -> MirrorPaths:
+        """The rows of ``receivers`` (N,), ascending, which are counted anew."""
+        own = self.subset(np.isin(self.receiver, receivers))
+        return replace(own, receiver=np.searchsorted(receivers, own.receiver))
 
     def gain(self, wavelength_m: float) -> np.ndarray:
         """Complex gain ``(L,)`` of perfect reflectors without a sign change: Friis along the unfolded length."""

@@ -70,6 +70,7 @@ class Readings:
         name: by which a report tells these readings from others.
         azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
             from line of sight and mirrors. Give readings whose zeros differ as several data sets.
+        position_std_m: standard deviation of each coordinate of the receivers [m]; above 0 a fit finds where they stood.
 
     Raises:
         TypeError, ValueError: naming the argument.
@@ -98,6 +99,7 @@ class Readings:
     air: Air | None = None
     name: str = "readings"
     azimuth_known: bool = True
+    position_std_m: float = 0.0
 
     def __post_init__(self) -> None:
         power = check_array("power", self.power, (None,), finite=False)
@@ -131,7 +133,7 @@ class Readings:
                     f"{pattern}: it goes with {turned}, got one of the two; expected both or neither"
                 )
             if value is not None:
-                fields[turned] = check_array(turned, value, (count, 2))
+                fields[turned] = check_turned(turned, value, count)
                 check_gains(pattern, gain)
         if (self.delay_s is None) != (self.bandwidth_hz is None):
             raise ValueError(
@@ -144,6 +146,12 @@ class Readings:
         if not self.azimuth_known and self.arrival is None:
             raise ValueError(
                 "azimuth_known: got False without arrival; expected the azimuths whose zero is to be found"
+            )
+        check_number("position_std_m", self.position_std_m, 0.0, 1.0)
+        if self.position_std_m > 0 and self.total:
+            raise ValueError(
+                "position_std_m: got readings of power alone, which say nothing of where they were taken; expected "
+                "directions or delays"
             )
         if self.samples is not None:
             check_count("samples", self.samples)
@@ -316,6 +324,21 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     angle = np.linspace(0.0, np.pi, 20_001)
     mean = 0.5 * np.trapezoid(shape(angle) * np.sin(angle), angle)
     return lambda off: shape(np.asarray(off)) / mean
+
+
+def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    """Zeniths and azimuths (count, 2) [rad] that antennas are turned to.
+
+    Raises:
+        ValueError: for another shape, or zeniths that are none.
+    """
+    angles = check_array(name, value, (count, 2))
+    wrong = angles[np.abs(angles[:, 0] - np.pi / 2) > np.pi / 2 + 1e-6, 0]
+    if len(wrong):
+        raise ValueError(
+            f"{name}: got a zenith of {wrong[0]:g}, expected 0 to pi (elevations from -90 to 90 degrees)"
+        )
+    return angles
 
 
 def check_gains(name: str, pattern: Pattern) -> None:

@@ -11,6 +11,7 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.fit import Target
+from warprrf.rf.fields.bistatic.training import Selection
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights
@@ -126,6 +127,27 @@ def test_a_rotator_whose_zero_is_unknown_is_turned_to_the_room(scene: RadioScene
     assert zero["away"] == pytest.approx(137.0, abs=1.0)
     with pytest.raises(ValueError, match="azimuth_known: got False without arrival"):
         replace(turned, arrival=None, receive_pattern=None, azimuth_known=False)
+
+
+def test_receivers_that_stood_elsewhere_are_found(scene: RadioScene, turned: Readings) -> None:
+    rng = np.random.default_rng(2)
+    away = 0.08 * rng.normal(size=(6, 3)).clip(-1.5, 1.5)
+    count = len(turned) // 6
+    said = replace(turned, receivers=turned.receivers + np.repeat(away, count, axis=0))
+    field = RadioField.fit(scene, replace(said, position_std_m=0.08, name="away"), quick=True)
+    found = field.report["position_offset_m"]["away"]
+    np.testing.assert_allclose([place for place, _ in found], RECEIVERS[:6] + away)
+    left = away + [offset for _, offset in found]
+    sight = RECEIVERS[:6] - TX
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+
+    def across(error: np.ndarray) -> float:  # powers say little of how far away a receiver is
+        return float(np.sqrt(((error - (error * sight).sum(axis=1, keepdims=True) * sight) ** 2).mean()))
+
+    assert across(left) < 0.5 * across(away)
+    np.testing.assert_allclose(field.fitted_on, RECEIVERS[:6] + away)
+    with pytest.raises(ValueError, match="position_std_m: got readings of power alone"):
+        replace(turned, arrival=None, receive_pattern=None, position_std_m=0.05)
 
 
 def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -> None:
@@ -280,3 +302,20 @@ def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
     for missing in (None, np.nan):
         read = Readings.from_table(table.assign(chain=["horn", missing]), frequency_hz=F, floor=1e-12)
         assert read.chain.tolist() == ["horn", ""]
+
+
+def test_the_only_place_of_a_chain_is_not_held_out(scene: RadioScene, turned: Readings) -> None:
+    """Its gain would be known from nothing: a horn at one place beside spectra at seven, whichever place it is."""
+    spectra = exact_spectra(scene, RECEIVERS[1:8], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    alone = turned.subset(np.flatnonzero((turned.receivers == RECEIVERS[0]).all(axis=1)))
+    for data in ([spectra, alone], [alone, spectra]):
+        for seed in range(2):
+            field = RadioField.fit(scene, data, quick=True, seed=seed)
+            assert field.report["held_out"] == 2
+            assert field.report["chains"]["horn"]["gain_db"] == pytest.approx(CHAIN_DB, abs=1.0)
+    # readings that come after more spectra than terms are chosen by
+    few = Selection(most_to_choose=4)
+    field = RadioField.fit(
+        scene, [spectra, turned.subset(np.arange(72))], quick=True, indirect=None, selection=few
+    )
+    assert field.report["chains"]["horn"]["gain_db"] == pytest.approx(CHAIN_DB, abs=1.0)

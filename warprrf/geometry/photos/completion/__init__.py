@@ -31,10 +31,8 @@ from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.geometry.splats.camera import Camera
 
 LEAST_SEEN = 0.7  # of the surface must be seen; else the photos cover too little for the rest to be inferred
-KEEP_M, KEEP_M2 = (
-    0.12,
-    0.3,
-)  # pieces of the old mesh this far from every known plane, and this large, are kept
+KEEP_M = 0.12  # pieces of the old mesh this far from every known plane are kept,
+KEEP_M2 = 0.3  # if they are this large
 
 
 def complete(

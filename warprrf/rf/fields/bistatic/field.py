@@ -30,7 +30,7 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.itu import assumed_permittivity
-from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
@@ -52,7 +52,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.beam import BeamOperator, beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import check_gains
+from warprrf.rf.spectra.readings import check_gains, check_turned
 from warprrf.rf.spectra.spectrum import Spectrum, default_floor, directions_from_angles, to_db
 
 
@@ -277,7 +277,7 @@ class BistaticField(RadioField):
 
             field_140 = field_300.at_frequency(140e9)
         """
-        ratio = check_frequency(frequency_hz) / self.frequency_hz
+        ratio = check_number("frequency_hz", frequency_hz, *CARRIERS_HZ) / self.frequency_hz
         fall = 20.0 * float(np.log10(ratio))
         return replace(
             self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
@@ -350,12 +350,14 @@ class BistaticField(RadioField):
         transport = self.transport(transmitter)
         sent, found = self.sent_radiance(transport), np.empty((len(receivers), *self.shape), np.float32)
         batch = max(1, RAYS_AT_A_TIME // len(transport.grid.directions))
+        paths = transport.paths(
+            receivers, self.terms.mirror_order
+        )  # chains of mirrors are searched once for all
         for first in range(0, len(receivers), batch):
-            view = transport.view(receivers[first : first + batch], self.terms)
+            some = np.arange(first, min(first + batch, len(receivers)))
+            view = transport.view(receivers[some], self.terms, paths=paths.of(some))
             powers = path_powers(view, self.materials, sent)
-            found[first : first + batch] = images(
-                view, powers, powers.single + powers.further.by_ray(), self._beam
-            )
+            found[some] = images(view, powers, powers.single + powers.further.by_ray(), self._beam)
         return found
 
     def array_spectrum(
@@ -439,7 +441,7 @@ class BistaticField(RadioField):
             )
         if arrival is not None and receive_pattern is not None:
             check_gains("receive_pattern", receive_pattern)
-            angles = check_array("arrival", arrival, (len(places), 2))
+            angles = check_turned("arrival", arrival, len(places))
             pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
         sensitivity, unknowns = self._sensitivity(source)
         measured = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on

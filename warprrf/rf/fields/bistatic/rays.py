@@ -155,16 +155,16 @@ class RayGrid:
         """How a transmitter at ``source`` (3,) [m] illuminates what was hit; shadows included."""
         count = len(hits.face)
         found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
-        position = wp.vec3d(*source)
+        point = wp.empty(count, dtype=wp.vec3d, device=self.device)
         inputs = [
-            self.surface.on_device(self.device), position, *hits.inputs, hits.solid_angle, float(self.half_width),
-            NEAREST_M, self.loss_per_m, *found.inputs,
+            self.surface.on_device(self.device), wp.vec3d(*source), *hits.inputs, hits.solid_angle,
+            float(self.half_width), NEAREST_M, self.loss_per_m, *found.inputs, point,
         ]  # fmt: skip
         _device.launch(bounce.light_surface, count, inputs, device=self.device)
         strength = found.strength.numpy()
         ray = np.flatnonzero(strength > 0)
         free = self.surface.mesh.visible(
-            np.asarray(source, float), hits.points(ray), clearance=self.surface.skin_m, device=self.device,
+            np.asarray(source, float), point.numpy()[ray], clearance=self.surface.skin_m, device=self.device,
             backend=self._backend(len(ray)),
         )  # fmt: skip
         strength[ray[~free]] = 0.0

@@ -16,7 +16,6 @@ from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
-from warprrf.rf.fields.bistatic.azimuth import with_azimuths
 from warprrf.rf.fields.bistatic.fit import (
     NEPER,
     OWN_GAIN,
@@ -31,6 +30,7 @@ from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import Frame, Place, as_list, observe, places_of
+from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
 from warprrf.rf.fields.bistatic.render import path_powers, sent_radiance
 from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
@@ -405,8 +405,25 @@ def train(
     # The fit's matrices are small: threads of BLAS would spend more time waiting for each other than they save.
     with threadpool_limits(1, user_api="blas"):
         data, zeros = with_azimuths(data, seen.places, seen.views)
-        found = _Training(seen, data, o, progress).run()
-    return replace(found, report=found.report | {"azimuth_zero_deg": zeros})
+        training = _Training(seen, data, o, progress)
+        found = training.run()
+        offsets = training.offsets(found.materials)
+        if offsets:
+            data = [
+                moved(one, offsets[k]) if isinstance(one, Readings) and k in offsets else one
+                for k, one in enumerate(data)
+            ]
+            seen = trace(
+                geometry, data, mirror_order=o.mirror_order, sub_pixels=o.sub_pixels, client=client, device=device,
+                progress=progress,
+            )  # fmt: skip
+            found = _Training(seen, data, o, progress).run()
+    names = training.names
+    told = {
+        names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
+        for k, own in offsets.items()
+    }
+    return replace(found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": told})
 
 
 def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
@@ -439,7 +456,7 @@ class _Training:
         options: FitOptions,
         progress: Progress | None,
     ) -> None:
-        self.seen, self.options, self.choose = seen, options, options.selection
+        self.seen, self.data, self.options, self.choose = seen, data, options, options.selection
         self.started = time.perf_counter()
         self.surface, self.count, self.views = seen.surface, len(seen.places), list(seen.views)
         self.frequency_hz = Frame.of(data).frequency_hz
@@ -451,9 +468,13 @@ class _Training:
         self.transmitter = seen.places[0].transmitter if len(sources) == 1 else np.full(3, np.nan)
         rng = np.random.default_rng(options.seed)
         self.held = np.zeros(0, int)
+        chain = np.array([o.chain for o in self.observed])
+        # One place of each chain is never held out: without any its gain would not be known.
+        self.kept_always = [int(np.argmax(chain == k)) for k in range(len(self.chains))]
         if self.count >= self.choose.least_receivers:
             held = min(int(self.count * self.choose.held_out), self.choose.most_held_out)
-            self.held = np.sort(rng.permutation(self.count)[:held])
+            order = rng.permutation(self.count)
+            self.held = np.sort(order[~np.isin(order, self.kept_always)][:held])
         self.kept = np.setdiff1d(np.arange(self.count), self.held)
         self.progress: Progress = progress or _silent
         self.behind, self.steps = 0, self._planned() if len(self.held) else 1
@@ -536,6 +557,26 @@ class _Training:
             found.append(rows)
         return found
 
+    def offsets(self, materials: Materials) -> dict[int, list[tuple[Place, np.ndarray]]]:
+        """By data set of unknown positions its places, and how far each receiver is from where it is said to be [m]."""
+        lit = self._lit(materials)
+        found: dict[int, list[tuple[Place, np.ndarray]]] = {}
+        for k, observed in enumerate(self.observed):
+            one, place = self.data[observed.place.data], observed.place
+            if not isinstance(one, Readings) or one.position_std_m == 0:
+                continue
+            (here, sent), view = lit(k), self._view(k, materials.terms)
+            powers = path_powers(view, here, sent)
+            total = np.maximum(read(view, observed.measured, powers), 0.0) / observed.floor
+            direct = powers.mirror / observed.floor
+            gain = gain_of(observed.chain, here.parameters, observed.target, total)
+            other = np.maximum(total - direct @ observed.measured.of_paths(view), 0.0)
+            offset = position_offset(
+                one, place, view, observed.target, gain * other, gain * direct, self.options.groups
+            )
+            found.setdefault(place.data, []).append((place, offset))
+        return found
+
     def _leave_out(self, wrong: Sequence[np.ndarray]) -> None:
         """Readings that count no longer."""
         for k, rows in enumerate(wrong):
@@ -579,8 +620,10 @@ class _Training:
     # ------------------------------------------------------------------------------------------ choosing
 
     def _few(self, times: int) -> np.ndarray:
-        """Receivers that fits which only decide about a term learn from."""
-        return self.kept[: times * self.choose.most_to_choose]
+        """Receivers that fits which only decide about a term learn from, those of every chain among them."""
+        others = np.setdiff1d(self.kept, self.kept_always)
+        more = max(times * self.choose.most_to_choose - len(self.kept_always), 0)
+        return np.union1d(self.kept_always, others[:more]).astype(int)
 
     def _note(self, term: str, kept: bool, error: float) -> None:
         self.log.append({"term": term, "kept": bool(kept), "held_out_rmse_db": float(np.sqrt(error))})
@@ -761,7 +804,8 @@ class _Training:
         """Receivers that are held out in turn to learn errors."""
         folds = [self.held]
         if self.count <= self.choose.few_receivers:
-            folds += np.array_split(self.kept, max(len(self.kept) // max(len(self.held), 2), 2))
+            others = np.setdiff1d(self.kept, self.kept_always)
+            folds += np.array_split(others, max(len(others) // max(len(self.held), 2), 2))
         return folds
 
     # ------------------------------------------------------------------------------------------ fitting

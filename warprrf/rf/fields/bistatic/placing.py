@@ -1,7 +1,10 @@
-"""The zero of azimuths that a rotator counts from, where nobody knows it.
+"""How a receiver stood, where that is not known: the zero of a rotator's azimuths, and positions to some centimetres.
 
 Line of sight and mirrors hold no unknown but their strength, which matters little: turned about the vertical, the zero is
 where readings and what those paths would give are most alike. It is found before anything else is fitted.
+
+A position is found after a first fit: moved by an offset, a receiver sees the same images of the transmitter elsewhere,
+and what is scattered hardly changes.
 """
 
 from __future__ import annotations
@@ -10,7 +13,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import least_squares
 
+from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic.fit import GroupFit, Target
 from warprrf.rf.fields.bistatic.materials import Parameters, mirror_power
 from warprrf.rf.fields.bistatic.measured import direct_paths
 from warprrf.rf.fields.bistatic.observations import Place
@@ -20,6 +26,7 @@ from warprrf.rf.spectra.readings import Readings, path_weights
 
 STRONGEST = 20  # paths that count
 STEPS = 360
+MOST_OFFSET = 2.0  # standard deviations, along each axis
 
 
 def with_azimuths(
@@ -71,3 +78,52 @@ def _strongest(view: ReceiverView) -> tuple[np.ndarray, ...]:
     power = mirror_power(view.friis, view.path_groups, view.paths.cosine, view.paths.turn, prior)[0]
     kept = np.argsort(-power)[:STRONGEST]
     return power[kept], *(values[kept] for values in direct_paths(view))
+
+
+def moved(one: Readings, offsets: Sequence[tuple[Place, np.ndarray]]) -> Readings:
+    """``one`` with the receivers of its places moved by offsets (3,) [m], and known there."""
+    receivers = one.receivers.copy()
+    for place, offset in offsets:
+        receivers[place.rows] += offset
+    return replace(one, receivers=receivers, position_std_m=0.0)
+
+
+def position_offset(
+    one: Readings, place: Place, view: ReceiverView, target: Target, other: np.ndarray, power: np.ndarray, fit: GroupFit
+) -> np.ndarray:  # fmt: skip
+    """Offset of a receiver from where it is said to be [m], shape ``(3,)``: the one that readings and prior like best.
+
+    Args:
+        one: table that holds its readings.
+        place: receiver, and which rows are its readings.
+        view: what is seen where it is said to be.
+        target: what was read.
+        other: prediction without line of sight and mirrors, shape ``(N,)``.
+        power: of those paths, shape ``(L,)``; both in the units of ``target``, gain of the chain included.
+        fit: how errors count.
+    """
+    s, paths, std = view.transport.surface, view.paths, one.position_std_m
+    image = place.receiver + paths.arrival * paths.length_m[:, None]
+    turn = np.tile(-np.eye(3), (len(paths), 1, 1))  # from arrival to departure
+    for patch in paths.patch.T:  # from the transmitter on
+        normal = np.where((patch >= 0)[:, None], s.plane_normal[np.maximum(patch, 0)], 0.0)
+        turn = turn - 2.0 * (turn @ normal[:, :, None]) * normal[:, None, :]
+    known = np.ones(len(target.db)) if target.trust is None else target.trust > 0
+
+    def error(offset: np.ndarray) -> np.ndarray:
+        out = image - place.receiver - offset
+        length = np.linalg.norm(out, axis=1)
+        arrival = out / length[:, None]
+        departure = (turn @ arrival[:, :, None])[..., 0]
+        weight = path_weights(one, place.rows, arrival, departure, length / SPEED_OF_LIGHT)
+        missed = known * target.error(other + weight @ power) / fit.noise_db
+        return np.concatenate([missed, offset / std])
+
+    scale = fit.huber_db / fit.noise_db
+    found = least_squares(
+        error, np.zeros(3), bounds=(-MOST_OFFSET * std, MOST_OFFSET * std), loss="huber", f_scale=scale,
+        x_scale=std, diff_step=1e-3,
+    ).x  # fmt: skip
+    # A step and a half of it must be free, or the receiver would end in a wall.
+    free = s.mesh.visible(place.receiver[None], (place.receiver + 1.5 * found)[None])[0]
+    return np.asarray(found) if free and np.abs(found).max() > 0 else np.zeros(3)
