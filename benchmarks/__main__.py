@@ -45,6 +45,10 @@ NAMES = {
         "benchmarks.suggest",
         "receivers that the field suggests beside random ones, from none to ten",
     ),
+    "batches": (
+        "benchmarks.batches",
+        "thousands of receivers at once: time, memory, and workers of a cluster",
+    ),
     "view": ("benchmarks.viewer", "the viewer: from a drag to its answer, and whether anything grows"),
     "outside": (
         "benchmarks.outside",

@@ -50,6 +50,18 @@ TARGETS: dict[str, tuple[Target, ...]] = {
     "arrays": (
         Target("rows.carrier_ghz=2.4&method=field.gained_db", "2.4 GHz, over the nearest", 3.0, True, "dB"),
     ),
+    "batches": (
+        Target("rows.figure=spectra, exact truth.over", "spectra over one by one, exact truth", 0.5),
+        Target("rows.figure=spectra, sionna truth.over", "spectra over one by one, Sionna RT's truth", 0.5),
+        Target("rows.figure=spectra, exact truth, two workers.faster", "two workers over one", 1.7, True),
+        Target("rows.receivers=10000.peak_gb", "memory of 10 000 responses", 4.0, unit="GB"),
+        Target(
+            "rows.figure=single spectra, one ray a pixel.growth_mb",
+            "memory after 2000 queries",
+            10.0,
+            unit="MB",
+        ),
+    ),
     "report": (  # the lobby's
         Target("photo_psnr_db", "held-out photo PSNR of stage 1", 25.0, True, "dB"),
         Target("camera_rms_m", "camera positions, rms error", 0.02, unit="m"),

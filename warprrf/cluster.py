@@ -7,6 +7,7 @@ there to each worker once. A worker that dies loses nothing: dask gives its part
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,11 +16,13 @@ from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from warprrf.cache import Cache
 from warprrf.device import one_thread, require
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
+_works = Cache(2)  # on a worker
 _LEAST = 8  # parts under way at once, also while a cluster has no worker yet
 
 
@@ -46,16 +49,20 @@ def each(
         return
     distributed, dask = require("distributed", extra="cluster"), require("dask", extra="cluster")
     code = require("distributed.protocol.pickle", extra="cluster")
+    data = code.dumps(work)
+    known = hashlib.sha256(data).hexdigest()
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
-        # The scheduler keeps the bytes: if every worker that holds the object dies, another makes it again.
-        shared = client.submit(code.loads, code.dumps(work), pure=False)
+        # The scheduler keeps the bytes too: if every worker that holds them dies, another gets them again.
+        shared = client.submit(bytes, data, pure=False)
     waiting, running = iter(enumerate(parts)), dict[Any, int]()
     ready = distributed.as_completed(loop=client.loop)
     try:
         while True:
             room = max(_LEAST, 2 * sum(client.nthreads().values())) - len(running)
             for k, part in islice(waiting, max(room, 0)):
-                future = client.submit(_run, shared, part, pure=False, priority=-k)  # first come, first done
+                future = client.submit(
+                    _run, known, shared, part, pure=False, priority=-k
+                )  # first come, first done
                 running[future] = k
                 ready.add(future)
             if not running:
@@ -66,10 +73,11 @@ def each(
         client.cancel([*running, shared])
 
 
-def _run(work: Callable[[Part], Result], part: Part) -> Result:
-    """A part, on a worker."""
+def _run(known: str, data: bytes, part: Any) -> Any:
+    """A part, on a worker, which keeps the last pieces of work with what they have traced."""
+    code = require("distributed.protocol.pickle", extra="cluster")
     with one_thread(), threadpool_limits(1, user_api="blas"):
-        return work(part)
+        return _works.get(known, lambda: code.loads(data))(part)
 
 
 @contextmanager

@@ -130,6 +130,63 @@ def test_errors_at_measured_places_are_listed_worst_first(viewer):
     np.testing.assert_allclose(listed, np.sort(wanted)[: len(listed)], atol=0.06)
 
 
+def test_errors_of_readings_are_listed_worst_first_with_where_the_horn_was_turned():
+    field, wrong = make.bistatic(), np.array([1.0, -6.0, 2.0])
+    places = RECEIVER + np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    turned = np.radians([[90.0, 0.0], [80.0, 120.0], [90.0, 170.0]])
+    power = np.array([field.paths(place).power.sum() for place in places]) / 10 ** (wrong / 10)
+    readings = wr.Readings(
+        field.transmitter,
+        places,
+        power,
+        field.frequency_hz,
+        1e-20,
+        arrival=turned,
+        receive_pattern=np.ones(7),
+    )
+    viewer = wr.view(field, readings, port=8140)
+    try:
+        viewer._survey.reading_errors()
+        viewer._page.wait()
+        listed = [button.label for button in viewer._survey.listed]
+        assert [label.split(" dB")[0] for label in listed] == ["-6.0", "+2.0", "+1.0"]
+        assert "from 80°, 120° at " + ", ".join(f"{x:.2f}" for x in places[1]) in listed[0]
+        assert "rms 3.7 dB" in viewer._survey.legend.content  # (1 + 36 + 4) / 3 is 3.7 squared
+    finally:
+        viewer.close()
+
+
+def test_the_mesh_is_coloured_by_what_is_chosen_and_the_scale_says_so(viewer):
+    room = viewer._room
+    room.colouring.value = "reflection"
+    assert "-40 dB" in room.legend.content
+    room.colouring.value = "uncertainty"
+    viewer._page.wait()
+    assert "2.5 dB" in room.legend.content
+    room.colouring.value = "plain"
+
+
+def test_spectra_are_not_compared_with_what_was_measured_at_another_carrier(viewer):
+    viewer.receiver = viewer.subject.spectra.receivers[0]
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images] == ["spectrum", "truth", "spectrum less truth"]
+    viewer._channel.carrier.value = 140.0
+    viewer.wait()
+    assert [image[0] for image in viewer._channel.images] == ["spectrum"]
+    viewer._survey.errors()
+    viewer._page.wait()
+    assert f"expected that of what was measured, {make.CARRIER_HZ / 1e9:g} GHz" in viewer.message
+    viewer._channel.carrier.value = make.CARRIER_HZ / 1e9
+
+
+def test_what_cannot_be_computed_is_said_on_the_page(viewer):
+    viewer._survey.height.value = 1000.0
+    viewer._survey.map()
+    viewer._page.wait()
+    assert "height: got 1000.0 m" in viewer.message
+    viewer._survey.height.value = 1.5
+
+
 def test_places_to_measure_next_are_those_that_the_field_suggests(viewer):
     survey, field = viewer._survey, viewer.subject.field
     survey.suggest()

@@ -91,7 +91,8 @@ def _of_splats(mesh: Mesh, gaussians: Gaussians) -> np.ndarray:
 
 
 class Room:
-    """Mesh, splats and cameras, and which of all that is drawn is shown; ``legend`` is what the mesh's colours mean."""
+    """Mesh, splats and cameras, and which of all that is drawn is shown; ``colouring`` chooses
+    the mesh's colours, ``legend`` says what they mean."""
 
     def __init__(self, page: Page, subject: Subject) -> None:
         self._page, self._subject = page, subject
@@ -99,16 +100,16 @@ class Room:
         if subject.mesh is not None:
             page.hidden.add("splats")
         self._cut = page.gui.add_slider(
-            "show up to [m]", min=float(low), max=float(high) + 0.01, step=0.01,
-            initial_value=float(high - 0.02 * (high - low)),
+            "show up to [m]", min=round(float(low), 2), max=round(float(high), 2) + 0.01, step=0.01,
+            initial_value=round(float(high - 0.02 * (high - low)), 2),
         )  # fmt: skip
-        self._colouring = page.gui.add_dropdown("colour the mesh by", tuple(colourings(subject)))
+        self.colouring = page.gui.add_dropdown("colour the mesh by", tuple(colourings(subject)))
         self.legend = page.gui.add_html("")
         self._cut.on_update(lambda _: self._draw())
-        self._colouring.on_update(lambda _: self.recolour())
+        self.colouring.on_update(lambda _: self.recolour())
         held = {
             "mesh": subject.mesh, "splats": subject.gaussians, "cameras": subject.cameras or None,
-            "measured": subject.places if len(subject.places) else None, "paths": page,
+            "measured": subject.places if len(subject.places) else None, "paths": page, "map": subject.field,
         }  # fmt: skip
         for name, thing in held.items():
             if thing is not None:
@@ -120,14 +121,14 @@ class Room:
 
     def recolour(self) -> None:
         """Colour the mesh as is chosen now; in the background where that takes seconds."""
-        if self._colouring.value == "uncertainty":
+        if self.colouring.value == "uncertainty":
             self._page.in_background(self._recolour)
         else:
             self._recolour()
 
     def _recolour(self, progress: Progress | None = None) -> None:
         if self._subject.mesh is not None:
-            mesh, colours, meaning = face_colours(self._subject, self._colouring.value, progress)
+            mesh, colours, meaning = face_colours(self._subject, self.colouring.value, progress)
             self._faces = mesh, colours
             self.legend.content = pictures.figure("", meaning)
         self._draw()

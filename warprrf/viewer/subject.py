@@ -131,6 +131,7 @@ _KINDS: dict[str, type] = {
     "gaussians": Gaussians, "mesh": Mesh, "scene": Scene, "field": RadioField, "spectra": SpectrumDataset,
     "readings": Readings,
 }  # fmt: skip
+_FILES = {".safetensors": RadioField, ".nc": SpectrumDataset, ".xml": Scene}
 
 
 def _opened(path: Path) -> list[Any]:
@@ -139,17 +140,12 @@ def _opened(path: Path) -> list[Any]:
         return _folder(path)
     if not path.is_file():
         raise ValueError(f"things: {path}: no such file or folder")
-    if path.suffix == ".safetensors":
-        return [RadioField.load(path)]
-    if path.suffix == ".nc":
-        return [SpectrumDataset.load(path)]
-    if path.suffix == ".xml":
-        return [Scene.load(path)]
     if path.suffix == ".ply" and "opacity" in ply_columns(path):
         return [Gaussians.load_ply(path)]
-    if is_mesh_file(path):
-        return [Mesh.load(path)]
-    raise ValueError(f"things: {path}: got a file of another kind, expected {KINDS}")
+    kind: Any = _FILES.get(path.suffix, Mesh if is_mesh_file(path) else None)
+    if kind is None:
+        raise ValueError(f"things: {path}: got a file of another kind, expected {KINDS}")
+    return [kind.load(path)]
 
 
 def _folder(path: Path) -> list[Any]:

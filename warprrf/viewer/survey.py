@@ -11,7 +11,9 @@ from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.maps.radio_map import QUANTITIES, in_the_air
+from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
+from warprrf.rf.spectra.readings import Readings
 from warprrf.viewer import answers, pictures
 from warprrf.viewer.page import Page
 from warprrf.viewer.subject import Subject
@@ -39,6 +41,7 @@ class Survey:
 
     Attributes:
         map, suggest, errors, reading_errors: what the buttons do, as far as the subject allows.
+        height: of map and suggestions [m].
         legend, listed: what was computed last in HTML, and buttons of the places that it named.
     """
 
@@ -61,7 +64,7 @@ class Survey:
             gui.add_markdown("A map needs a field.")
             return
         height = np.median(subject.places[:, 2]) if len(subject.places) else subject.bounds[0, 2] + HEIGHT_M
-        self._height = gui.add_number("height [m]", round(float(height), 2), step=0.1)
+        self.height = gui.add_number("height [m]", round(float(height), 2), step=0.1)
         self._cell = gui.add_number("cell [m]", 0.5, min=0.05, step=0.05)
         self._quantity = gui.add_dropdown("quantity", tuple(QUANTITIES.values()))
         self.map = self._add("compute the map", self._map)
@@ -117,7 +120,7 @@ class Survey:
 
     def _map(self, field: RadioField, progress: Progress) -> None:
         found = field.radio_map(
-            float(self._height.value), float(self._cell.value), self._transmitters()[0], progress=progress
+            float(self.height.value), float(self._cell.value), self._transmitters()[0], progress=progress
         )
         quantity = next(name for name, text in QUANTITIES.items() if text == self._quantity.value)
         value = found.shown(quantity)
@@ -132,6 +135,7 @@ class Survey:
         self._page.scene.add_image(
             "/map", np.dstack([picture, seen]), width, height,
             position=(float(found.x.mean()), float(found.y.mean()), floor), wxyz=(0.0, 1.0, 0.0, 0.0),
+            visible="map" not in self._page.hidden,
         )  # fmt: skip
         title = f"{self._quantity.value} at {found.height_m:g} m"
         self._explain(title, pictures.colour_bar(low, high, ""), "map")
@@ -142,14 +146,14 @@ class Survey:
         if not isinstance(mesh, Mesh):
             raise ValueError("field: got one without a mesh, expected one that knows walls from air")
         axes = [np.arange(a + 0.5 * CANDIDATE_M, b, CANDIDATE_M) for a, b in mesh.bounds[:, :2].T]
-        places = np.stack(np.meshgrid(*axes, [float(self._height.value)]), axis=-1).reshape(-1, 3)
+        places = np.stack(np.meshgrid(*axes, [float(self.height.value)]), axis=-1).reshape(-1, 3)
         places = places[in_the_air(mesh, places, field.transmitter, device=field.device)]
         return np.asarray(places[np.linalg.norm(places - field.transmitter, axis=1) > CLEAR_M])
 
     def _suggest(self, field: RadioField, progress: Progress) -> None:
         places = self.candidates(field)
         if not len(places):
-            raise ValueError(f"height: no place at {self._height.value:g} m is in the air")
+            raise ValueError(f"height: no place at {self.height.value:g} m is in the air")
         count = min(int(self._count.value), len(places))
         chosen = places[field.suggest(places, count, progress=progress)]
         self._mark("suggested", chosen, SUGGESTED, 0.2)
@@ -162,6 +166,7 @@ class Survey:
         truth = self._subject.spectra
         if truth is None:
             return
+        _check_carrier(field, truth)
         found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
         worst = np.argsort(psnr)[:WORST]
@@ -177,6 +182,7 @@ class Survey:
         readings = self._subject.readings
         if readings is None:
             return
+        _check_carrier(field, readings)
         error = answers.reading_errors(field, readings, progress)
         places, own = np.unique(readings.receivers, axis=0, return_inverse=True)
         each = [error[own.reshape(-1) == k] for k in range(len(places))]
@@ -194,6 +200,12 @@ class Survey:
             pictures.colour_bar(0.0, READING_DB, "dB", "RdYlGn_r"),
         )
         self._list(readings.receivers[worst], labels)
+
+
+def _check_carrier(field: RadioField, measured: SpectrumDataset | Readings) -> None:
+    if abs(field.frequency_hz - measured.frequency_hz) > 0.5 * answers.CARRIER_STEP_HZ:
+        asked, known = (f"{one.frequency_hz / 1e9:g} GHz" for one in (field, measured))
+        raise ValueError(f"carrier: got {asked}, expected that of what was measured, {known}")
 
 
 def _rms(error: np.ndarray) -> float:

@@ -261,7 +261,7 @@ class Viewer:
         )  # fmt: skip
         corner = (
             '<div style="position:fixed;right:1em;top:1em;bottom:1em;width:26em;overflow:auto;padding:0.5em 0;'
-            f'background:#ffffffe0;z-index:9"><p class="wr">{said}</p>{"".join(part.content for part in shown)}</div>'
+            f'background:#fff;z-index:9"><p class="wr">{said}</p>{"".join(part.content for part in shown)}</div>'
         )
         page: str = self._page.server.get_scene_serializer().as_html()
         return page.replace("</body>", corner + "</body>").encode()
