@@ -15,7 +15,7 @@ import numpy as np
 
 import warprrf as wr
 from benchmarks.data import DATA
-from benchmarks.evaluation.runs import peak_memory
+from benchmarks.evaluation.runs import connected, peak_memory
 from benchmarks.lobby.spectra import FILES
 from benchmarks.machine import machine
 from benchmarks.report import Report, Row, columns_table
@@ -240,7 +240,7 @@ class _Workers:
             ("two workers", 2, False),
             ("two, one killed", 2, True),
         ):
-            with _cluster(count) as client:
+            with connected(None, count, 1) as client:
                 self.field.spectra(self.places[: 4 * AT_ONCE], client=client)  # the library is loaded
                 before = sum(client.run(time.process_time).values())
                 start = time.perf_counter()
@@ -283,19 +283,6 @@ class _Killer:
             self._killed = True
             os.kill(self._process, signal.SIGKILL)
         self._tell(stage, done, total)
-
-
-@contextmanager
-def _cluster(workers: int) -> Iterator[Any]:
-    distributed = require("distributed", extra="cluster")
-    with (
-        distributed.LocalCluster(
-            n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address=None, silence_logs="CRITICAL",
-            env={"WARPRRF_THREADS": "1", "OMP_NUM_THREADS": "1"},
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):  # fmt: skip
-        yield client
 
 
 BENCHMARKS = {"batches": Benchmark("batches", Options, run, HELP)}

@@ -14,8 +14,9 @@ import warp as wp
 from golden import make
 
 import warprrf as wr
+from benchmarks.evaluation.runs import connected
 from warprrf import device
-from warprrf.cluster import connected, each
+from warprrf.cluster import each
 from warprrf.device import threads
 from warprrf.rf.fields import batches
 from warprrf.rf.fields.bistatic.training import trace

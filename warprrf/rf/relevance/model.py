@@ -239,6 +239,7 @@ class FullModel:
         )
         self.beam = beam_operator(field.shape, field.beam_sigma_rad, field.device)
         self._parts: dict[tuple[Any, ...], np.ndarray] = {}
+        progress("relevance", 0, len(receivers) + 1)
         self.seconds: dict[str, float] = {}
         field.render(
             replace(field, terms=replace(field.terms, **ONE_BOUNCE)).view(receivers[0])
@@ -251,7 +252,7 @@ class FullModel:
             self.views.append(field.view(receiver))
             self._mirror_power.append(field.render(self.views[-1]).powers.mirror)
             seconds.append(time.perf_counter() - start)
-            progress("relevance", r, len(receivers) + 1)
+            progress("relevance", r + 1, len(receivers) + 1)
         self.spectrum_s = float(np.median(seconds))
         self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
         self._time(setup_s)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
+from told import check_told
 
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -73,12 +74,7 @@ def psnr(field: RadioField, ds: SpectrumDataset, transmitter: np.ndarray | None 
 def test_every_long_stage_of_a_fit_tells_how_far_it_is(scene: RadioScene, data: SpectrumDataset) -> None:
     told: list[tuple[str, int, int]] = []
     RadioField.fit(scene, data.subset(np.arange(4)), sub_pixels=1, progress=lambda *words: told.append(words))
-    stages = list(dict.fromkeys(stage for stage, _, _ in told))
-    assert stages == ["patches", "mirrors", "transport", "fit"]
-    for name in stages:
-        done = [d for stage, d, _ in told if stage == name]
-        total = {t for stage, _, t in told if stage == name}
-        assert done == sorted(done) and total == {done[-1]}
+    check_told(told, ["patches", "mirrors", "transport", "fit"])
     assert len([d for stage, d, _ in told if stage == "fit"]) > 4 + 6  # receivers, and fits that choose terms
 
 

@@ -153,14 +153,7 @@ class RayGrid:
 
     def light(self, hits: Hits, source: np.ndarray) -> Illumination:
         """How a transmitter at ``source`` (3,) [m] illuminates what was hit; shadows included."""
-        count = len(hits.face)
-        found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
-        point = wp.empty(count, dtype=wp.vec3d, device=self.device)
-        inputs = [
-            self.surface.on_device(self.device), wp.vec3d(*source), *hits.inputs, hits.solid_angle,
-            float(self.half_width), NEAREST_M, self.loss_per_m, *found.inputs, point,
-        ]  # fmt: skip
-        _device.launch(bounce.light_surface, count, inputs, device=self.device)
+        found, point = self.light_through(hits, source)
         strength = found.strength.numpy()
         ray = np.flatnonzero(strength > 0)
         free = self.surface.mesh.visible(
@@ -170,3 +163,20 @@ class RayGrid:
         strength[ray[~free]] = 0.0
         found.strength.assign(strength)
         return found
+
+    def light_through(
+        self, hits: Hits, sources: np.ndarray, ray: np.ndarray | None = None
+    ) -> tuple[Illumination, wp.array]:
+        """How transmitters at ``sources`` (3,) or (K, 3) [m] would illuminate what rays of index ``ray`` (K,), by default
+        all, hit if nothing threw a shadow; and where those hit [m], known where there is light."""
+        count = len(hits.face) if ray is None else len(ray)
+        found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
+        point = wp.empty(count, dtype=wp.vec3d, device=self.device)
+        chosen = np.zeros(0) if ray is None else ray
+        inputs = [
+            self.surface.on_device(self.device), wp.array(chosen, dtype=wp.int32, device=self.device),
+            wp.array(np.reshape(sources, (-1, 3)), dtype=wp.vec3d, device=self.device), *hits.inputs,
+            hits.solid_angle, float(self.half_width), NEAREST_M, self.loss_per_m, *found.inputs, point,
+        ]  # fmt: skip
+        _device.launch(bounce.light_surface, count, inputs, device=self.device)
+        return found, point
