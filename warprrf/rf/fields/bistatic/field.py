@@ -23,16 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import (
-    Expected,
-    check_array,
-    check_arrays,
-    check_count,
-    check_number,
-    checked,
-    index_to,
-    lengths,
-)
+from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked, index_to
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
@@ -79,13 +70,12 @@ class BistaticField(RadioField):
         terms: what it models.
         parameters: of the groups; those of one material are alike.
         material: of each group, shape ``(G,)``.
-        residual: ln gain of each surface cell over its group, for single bounces and for light that it sends on, by
-            transmitter, shape ``(1 + S, X)``; see :mod:`warprrf.rf.fields.bistatic.residuals`.
+        residual: ln gain of each surface cell over its group, for single bounces and for light that it sends on, shape
+            ``(2, X)``; see :mod:`warprrf.rf.fields.bistatic.residuals`.
         errors: how wrong it is; None if it was fitted to fewer receivers than that takes.
         air: absorption of every path: that of the data set it was fitted to; None for none.
         fitted_on: receivers that it was fitted to [m], shape ``(R, 3)``; None where it is not known.
         fitted_under: transmitter of each of those [m], shape ``(R, 3)``; None for its own.
-        residual_under: transmitters of the residual [m], shape ``(S, 3)``; None for its own alone.
         report: how the fit went.
         device: where it computes.
     """
@@ -105,7 +95,6 @@ class BistaticField(RadioField):
     air: Air | None = None
     fitted_on: np.ndarray | None = field(default=None, repr=False)
     fitted_under: np.ndarray | None = field(default=None, repr=False)
-    residual_under: np.ndarray | None = field(default=None, repr=False)
     report: dict[str, Any] = field(default_factory=dict, repr=False)
     device: DeviceLike = field(default=None, repr=False)
     _sent: Cache = field(init=False, repr=False, default_factory=lambda: Cache(4))
@@ -114,8 +103,7 @@ class BistaticField(RadioField):
         super().__post_init__()
         sizes = {"G": self.surface.groups, "L": len(self.terms.lobes), "X": self.surface.cells}
         check_arrays(vars(self.parameters), PARAMETER_ARRAYS, **sizes)
-        sources = self.materials.sources
-        check_arrays(vars(self) | {"residual_under": sources}, _ARRAYS, R=1 + len(sources), **sizes)
+        check_arrays(vars(self), _ARRAYS, **sizes)
         materials = int(self.material.max()) + 1
         if len(np.unique(self.material)) != materials:
             raise ValueError(
@@ -151,8 +139,7 @@ class BistaticField(RadioField):
     @property
     def materials(self) -> Materials:
         """All that a spectrum depends on besides the geometry."""
-        under = self.transmitter[None] if self.residual_under is None else self.residual_under
-        return Materials(self.terms, self.parameters, self.residual, under)
+        return Materials(self.terms, self.parameters, self.residual, self.transmitter)
 
     @classmethod
     def fit(  # type: ignore[override]
@@ -202,7 +189,6 @@ class BistaticField(RadioField):
             cls.prior(found.surface, frame, terms=found.materials.terms, device=device),
             parameters=found.materials.parameters, residual=found.materials.residual, material=found.material,
             errors=found.errors, report=found.report, fitted_on=ends[:, 3:], fitted_under=ends[:, :3],
-            residual_under=found.materials.sources,
         )  # fmt: skip
         if any(isinstance(one, SpectrumDataset) for one in data):
             return fitted
@@ -514,8 +500,5 @@ class BistaticField(RadioField):
         return files.put_together(tensors, header)
 
 
-_ARRAYS = {
-    "material": index_to("G", "G"), "residual": Expected("R X", -MOST_NEPERS, MOST_NEPERS),
-    "residual_under": lengths("S 3"),
-}  # fmt: skip
-"""What the arrays of a field's own must be: G groups, X cells, R gains of each, under S transmitters."""
+_ARRAYS = {"material": index_to("G", "G"), "residual": Expected("2 X", -MOST_NEPERS, MOST_NEPERS)}
+"""What the arrays of a field's own must be: G groups, X cells."""

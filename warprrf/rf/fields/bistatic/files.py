@@ -31,8 +31,6 @@ def taken_apart(parts: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str,
     tensors |= {"mesh/vertices": s.mesh.vertices, "mesh/faces": s.mesh.faces}
     tensors |= {f"parameters/{name}": getattr(p, name) for name in _PARAMETERS}
     tensors |= {name: parts[name] for name in ("residual", "material")}
-    if parts["residual_under"] is not None:
-        tensors["residual_under"] = parts["residual_under"]
     if parts["errors"] is not None:
         tensors |= {f"errors/{name}": np.asarray(value) for name, value in vars(parts["errors"]).items()}
     header = {
@@ -75,6 +73,5 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
         "material": tensors["material"],
         "residual": tensors["residual"],
         "fitted_under": tensors.get("fitted_under"),
-        "residual_under": tensors.get("residual_under"),
         "errors": ErrorModel(**errors) if errors else None,
     }

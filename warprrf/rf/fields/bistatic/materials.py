@@ -115,16 +115,16 @@ class Materials:
     Attributes:
         terms: kinds of paths.
         parameters: of the groups.
-        residual: ln gain of each surface cell over its group, shape ``(1 + S, X)``: for single bounces, and for light
-            that the cell sends on after others, by transmitter; see :mod:`warprrf.rf.fields.bistatic.residuals`.
-        sources: transmitters under which the latter were learned [m], shape ``(S, 3)``. Light of another falls
+        residual: ln gain of each surface cell over its group, shape ``(2, X)``: for single bounces, and for light that
+            the cell sends on after others; see :mod:`warprrf.rf.fields.bistatic.residuals`.
+        transmitter: under which the gains of light sent on were learned [m], shape ``(3,)``. Light of another falls
             elsewhere: of that nothing was learned, so its gains are 1.
     """
 
     terms: Terms
     parameters: Parameters
     residual: np.ndarray
-    sources: np.ndarray
+    transmitter: np.ndarray
 
     def cell_gain(self, cell: np.ndarray) -> np.ndarray | float:
         """Gain of cells (K,) for single bounces."""
@@ -132,15 +132,9 @@ class Materials:
 
     def sent_gain(self, cell: np.ndarray, transmitter: np.ndarray) -> np.ndarray | float:
         """Gain of cells (K,) for light of ``transmitter`` (3,) that they send on after others."""
-        source = self.source(transmitter)
-        if not self.terms.residual or source is None:
+        if not self.terms.residual or not np.array_equal(transmitter, self.transmitter):
             return 1.0
-        return np.asarray(np.exp(self.residual[1 + source]))[cell]
-
-    def source(self, transmitter: np.ndarray) -> int | None:
-        """Index of ``transmitter`` (3,) among :attr:`sources`; None where it is none of them."""
-        same = np.flatnonzero((self.sources == transmitter).all(axis=1))
-        return int(same[0]) if len(same) else None
+        return np.asarray(np.exp(self.residual[1]))[cell]
 
 
 class Layout:

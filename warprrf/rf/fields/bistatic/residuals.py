@@ -3,7 +3,7 @@
 Photos tell materials apart only so far, and a mesh misses what it misses: that is the gain of single bounces. Light
 that surfaces send on to each other has a gain of its own, because it is known less well: elements are half a metre
 wide, and of further bounces some are left out. (Sionna RT's rays scatter at the same points whatever the receiver, so
-its dark corners have a texture that can be learned.) It falls elsewhere under each transmitter, and so has gains for each.
+its dark corners have a texture that can be learned.)
 
 Both are fitted by Gauss-Newton with conjugate gradients: the Jacobian is the measurement after a sparse matrix.
 """
@@ -61,7 +61,6 @@ class Shares:
     Attributes:
         single: single bounces, sparse, shape ``(B, X)``.
         further: light that is sent on, likewise.
-        source: index of the transmitter that sent it.
         rest: readings of everything else, shape ``(N,)``.
         measured: how readings come from bins.
         target: what was read.
@@ -69,7 +68,6 @@ class Shares:
 
     single: csr_matrix
     further: csr_matrix
-    source: int
     rest: np.ndarray
     measured: Measurement
     target: Target
@@ -103,21 +101,18 @@ def shares_of(
     powers, (bins, count) = path_powers(view, bare, sent), measured.bins(view)
     on = powers.further.sent
     own = gather_shares(bins, count, view.hits.face.numpy(), powers.single / unit, surface)
-    further = gather_shares(bins[on.ray], count, on.face, on.power / unit, surface)
+    # Gains of light sent on are learned under one transmitter alone.
+    learned = on.power / unit * np.array_equal(view.transport.transmitter, materials.transmitter)
+    further = gather_shares(bins[on.ray], count, on.face, learned, surface)
     known = np.asarray((own + further).sum(axis=1)).reshape(-1, 1)
     rest = np.maximum(read(view, measured, powers) / unit - measured.of_bins(known)[:, 0], 0.0)
-    source = materials.source(view.transport.transmitter)
-    if source is None:
-        raise ValueError(
-            "materials: got none of light that this view's transmitter sends, expected it among sources"
-        )
-    return Shares(own, further, source, rest, measured, target)
+    return Shares(own, further, rest, measured, target)
 
 
 def fit_residual(
     shares: Sequence[Shares], surface: Surface, options: ResidualFit | None = None
 ) -> np.ndarray:
-    """ln of each cell's gains over its group's, shape ``(1 + S, X)`` of S transmitters; zero where nothing is seen of it.
+    """ln of each cell's gains over its group's, shape ``(2, X)``; zero where nothing is seen of it.
 
     A cell's gain is the product of its element's and its own, each log-normal about 1: few spectra move elements, many
     move cells.
@@ -128,12 +123,7 @@ def fit_residual(
         options: priors and steps.
     """
     o = options or ResidualFit()
-    sources = 1 + max(s.source for s in shares)
-    none = csr_matrix(shares[0].further.shape, dtype=np.float32)
-    power = vstack(
-        [hstack([s.single, *(s.further if k == s.source else none for k in range(sources))]) for s in shares],
-        format="csr",
-    )
+    power = vstack([hstack([s.single, s.further]) for s in shares], format="csr")
     rest = np.concatenate([s.rest for s in shares])
     target = Target.joined([s.target for s in shares])
     # Receivers that are measured alike go through the measurement together.
@@ -160,11 +150,7 @@ def fit_residual(
     cell = np.arange(surface.cells)
     member = csr_matrix((np.ones(len(cell)), (cell, surface.cell_element)))
     gains = block_diag(
-        [
-            hstack([element * member, own * identity(len(cell))])
-            for element, own in (o.deviations[0], *[o.deviations[1]] * sources)
-        ],
-        format="csr",
+        [hstack([element * member, own * identity(len(cell))]) for element, own in o.deviations], format="csr"
     )
     unknown = np.zeros(gains.shape[1])
     for _ in range(o.rounds):
@@ -183,4 +169,4 @@ def fit_residual(
         system = LinearOperator((len(unknown),) * 2, matvec=curvature, dtype=np.float64)
         step = cg(system, -gradient, rtol=0.0, atol=1e-6, maxiter=o.conjugate_steps)[0]
         unknown += np.clip(step, -o.longest, o.longest)
-    return np.clip(gains @ unknown, -o.largest, o.largest).reshape(1 + sources, -1)
+    return np.clip(gains @ unknown, -o.largest, o.largest).reshape(2, -1)

@@ -463,8 +463,9 @@ class _Training:
         self.area = np.bincount(self.surface.group, self.surface.mesh.areas, minlength=self.surface.groups)
         self.material = self.surface.material
         self.observed, self.chains = observe(data, seen.places, self.views, options.groups.noise_db)
-        under = np.stack([place.transmitter for place in seen.places])
-        self.sources = under[np.sort(np.unique(under, axis=0, return_index=True)[1])]
+        sources = {place.transmitter.tobytes() for place in seen.places}
+        # Light that surfaces send on falls elsewhere under each transmitter: of several, no gains of it are learned.
+        self.transmitter = seen.places[0].transmitter if len(sources) == 1 else np.full(3, np.nan)
         rng = np.random.default_rng(options.seed)
         self.held = np.zeros(0, int)
         chain = np.array([o.chain for o in self.observed])
@@ -865,7 +866,7 @@ class _Training:
         return self.views[receiver]
 
     def _residual(self, materials: Materials, chosen: np.ndarray) -> np.ndarray:
-        """Gains of surface cells over ``materials``, shape ``(1 + S, X)`` of S transmitters."""
+        """Gains of surface cells over ``materials``, shape ``(2, X)``."""
         lit = self._lit(materials)
         shares = []
         for r in chosen:
@@ -879,9 +880,9 @@ class _Training:
             )
         found = fit_residual(shares, self.surface, self.options.residuals)
         self._stepped()
-        return np.concatenate([found, np.zeros_like(materials.residual[len(found) :])])
+        return found
 
     def _materials(self, terms: Terms, fit: Fitted) -> Materials:
         """What ``fit`` found, by groups, without a residual."""
-        none = np.zeros((1 + len(self.sources), self.surface.cells))
-        return Materials(terms, fit.parameters.take(self.material), none, self.sources)
+        none = np.zeros((2, self.surface.cells))
+        return Materials(terms, fit.parameters.take(self.material), none, self.transmitter)
