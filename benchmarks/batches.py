@@ -217,7 +217,7 @@ class _Responses:
                 self.places, BAND_HZ, diffuse="random_phase", method="dense", max_paths=self.max_paths,
                 store=attempt.folder / "responses.nc", progress=tell, **ARRAYS,
             )  # fmt: skip
-        done = len(self.places) - told[0] + AT_ONCE if told else 0  # by this attempt
+        done = len(self.places) - told[0]  # by this attempt
         return {
             "figure": f"cfr, 8 x 8 by 4 x 4, 64 frequencies, {self.max_paths} paths, one ray a pixel",
             "receivers": len(self.places), "core_ms": 1e3 * clock.core / max(done, 1), "gigabytes": found.nbytes / 1e9,

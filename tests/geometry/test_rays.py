@@ -332,14 +332,14 @@ def test_a_forked_child_answers_as_its_parent(where):
 
 def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypatch):
     cpu, choose = resolve("cpu"), raysearch.choose_backend
-    monkeypatch.setattr(raysearch.o3d, "installed", lambda: True)
+    monkeypatch.setattr(raysearch, "open3d_installed", lambda: True)
     monkeypatch.delitem(sys.modules, "open3d", raising=False)
     assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD) == "embree"
     assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD - 1) == "warp"
     monkeypatch.setitem(sys.modules, "open3d", raysearch)
     assert choose("auto", cpu, raysearch.EMBREE_RAYS) == "embree"
     assert choose("auto", cpu, raysearch.EMBREE_RAYS - 1) == "warp"
-    monkeypatch.setattr(raysearch.o3d, "installed", lambda: False)
+    monkeypatch.setattr(raysearch, "open3d_installed", lambda: False)
     assert choose("auto", cpu, 10**7) == "warp"
 
 
