@@ -419,5 +419,6 @@ def test_rays_that_leave_their_surface_slowly_meet_the_next_one(monkeypatch):
     hit = Mesh(*box(low, high)).cast(origin, d, backend="embree", device="cpu")
     t = box_exit(origin, d, low, high)
     foot = t * d[:, 2] < 1e-5  # there float32 may give either face
-    assert foot.mean() < 0.1 and len(casts) > 100
+    assert foot.mean() < 0.1
+    assert casts[-1] > 100  # so many glide on after the last round
     np.testing.assert_allclose(hit.t[~foot], t[~foot], rtol=1e-9)

@@ -42,6 +42,8 @@ EMBREE_RAYS_TO_LOAD = 200_000
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4
+# How often Embree casts rays again that met a surface at their start.
+_ROUNDS = 8
 # Rays that are worth another thread of Embree's: starting and stopping it takes as long as a thousand rays do.
 _RAYS_A_THREAD = 4_096
 # Longer segments overflow where Embree squares them in float32 [m].
@@ -180,13 +182,14 @@ class RaySearch:
     def _nearest_embree(
         self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`nearest`. Rays that met a surface at their start are cast again from behind it, until none is."""
+        """As :meth:`nearest`. Rays that met a surface at their start are cast again from behind it; the few that glide
+        along it go on in the kernel, where a step costs less."""
         scene, planes = self._embree, _given(self._planes, wp.vec4d, cpu)
         count = max(len(o), len(d))
         t, face = np.empty(count), np.full(count, AGAIN, dtype=np.int32)
         which: slice | np.ndarray = slice(None)
         start = np.empty(0)
-        while True:
+        for _ in range(_ROUNDS):
             origin, toward = rows(o, which), rows(d, which)
             near, met = scene.cast(self._pack(origin, toward, clearance, start, cpu))
             distance, found = np.empty(len(met)), np.empty(len(met), dtype=np.int32)
@@ -201,6 +204,10 @@ class RaySearch:
             if len(which) == 0:
                 return t, face
             start = t[which]
+        t[which], face[which] = self.nearest(
+            rows(o, which), rows(d, which), clearance=clearance, device=cpu, backend="warp"
+        )
+        return t, face
 
     def free(
         self, a: np.ndarray, b: np.ndarray, *, clearance: float, device: wp.Device, backend: str
