@@ -17,7 +17,7 @@ from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.photos import sparse
 from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
 from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
-from warprrf.geometry.photos.initial_gaussians import initial_gaussians
+from warprrf.geometry.photos.initialise import initial_gaussians
 from warprrf.geometry.photos.planes import Plane, plane_axes
 from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.planar_patches import planar_patches

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from warprrf.device import DeviceLike
 from warprrf.geometry.photos.config import RefineConfig
-from warprrf.geometry.photos.initial_gaussians import SPREAD, discs
+from warprrf.geometry.photos.initialise import SPREAD, discs
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
