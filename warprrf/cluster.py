@@ -37,6 +37,7 @@ def each(
 
     Raises:
         Exception: what ``work`` raises; parts under way are given up.
+        TypeError: for a client that is none.
         ImportError: without dask.distributed, where it is needed.
     """
     if client is None:
@@ -47,6 +48,8 @@ def each(
         return
     distributed, dask = require("distributed", extra="cluster"), require("dask", extra="cluster")
     code = require("distributed.protocol.pickle", extra="cluster")
+    if not isinstance(client, distributed.Client):
+        raise TypeError(f"client: got {type(client).__name__}, expected a dask.distributed.Client")
     data = code.dumps(work)
     known = hashlib.sha256(data).hexdigest()
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):

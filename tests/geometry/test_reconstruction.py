@@ -22,7 +22,7 @@ from warprrf.geometry.photos.planes import Plane, plane_axes
 from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.geometry.reconstruction import Reconstruction
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")
 pycolmap = pytest.importorskip("pycolmap")

@@ -19,8 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.brief import one_line
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import check_array, check_number, check_positive, checked, one_line
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 

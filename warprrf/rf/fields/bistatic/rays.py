@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.device import DeviceLike
-from warprrf.geometry import o3d
 from warprrf.geometry import rays as mesh_rays
 from warprrf.kernels.radio import bounce
 from warprrf.rf.fields.bistatic.surface import Surface
@@ -148,7 +147,9 @@ class RayGrid:
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""
-        by_embree = not self.device.is_cuda and o3d.installed() and count >= mesh_rays.EMBREE_RAYS
+        by_embree = (
+            not self.device.is_cuda and mesh_rays.open3d_installed() and count >= mesh_rays.EMBREE_RAYS
+        )
         return "embree" if by_embree else "warp"
 
     def light(self, hits: Hits, source: np.ndarray) -> Illumination:
