@@ -158,7 +158,7 @@ class _Spectra:
         for first in range(0, len(self.places), AT_ONCE):
             some = self.places[first : first + AT_ONCE]
             with together.over(len(some)):
-                found.append(field.spectra(some))
+                found.append(field.spectra(some).path_gain)
             for image, place in zip(found[-1], some[:ALONE], strict=False):
                 with alone.over(1):
                     single = field.spectrum(place).path_gain
@@ -248,7 +248,7 @@ class _Workers:
                     self.places,
                     client=client,
                     progress=_Killer(client, attempt.progress) if kill else attempt.progress,
-                )
+                ).path_gain
                 wall = time.perf_counter() - start
                 core = sum(client.run(time.process_time).values()) - before
             one = one or wall

@@ -128,7 +128,7 @@ def run(options: Options, job: Job) -> Report:
     rows: list[dict[str, Any]] = []
 
     def add(name: str, sets: Iterable[Sequence[int]]) -> None:
-        each = []
+        each: list[dict[str, Any]] = []
         for chosen in sets:
             job.progress(name, len(each), options.draws)
             each.append(fits.scored(chosen))
