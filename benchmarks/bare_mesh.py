@@ -12,6 +12,7 @@ import warprrf as wr
 from benchmarks.data import DATA, Truth
 from benchmarks.lobby.spectra import FILES, SHAPE
 from benchmarks.machine import machine
+from benchmarks.newrf_rays import load_newrf
 from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import require
@@ -56,7 +57,7 @@ class Options:
     Attributes:
         scene: true scene (XML).
         truths: spectra (NetCDF), each in a file.
-        room: folder of NeWRF's conference room (see :func:`warprrf.load_newrf`), whose parts get materials.
+        room: folder of NeWRF's conference room (see :mod:`benchmarks.newrf_rays`), whose parts get materials.
         counts: training receivers.
         every: each how-manieth test receiver counts.
         edge_m: longest edge of a scan's faces.
@@ -109,7 +110,7 @@ def named_by_part(mesh: wr.Mesh) -> wr.Scene:
 
 def furnished(folder: str, options: Options, job: Job) -> tuple[wr.Scene, Truth]:
     """NeWRF's conference room in ``folder``, its materials drawn by part, and exact spectra at some of its receivers."""
-    rays = wr.load_newrf(folder)
+    rays = load_newrf(folder)
     scene, count = named_by_part(rays.mesh), max(options.counts) + TESTED
     low, high = scene.mesh.bounds
     ds = wr.simulate(

@@ -15,7 +15,7 @@ import numpy as np
 
 import warprrf as wr
 from benchmarks.data import DATA
-from benchmarks.evaluation.runs import peak_memory
+from benchmarks.evaluation.runs import connected, peak_memory
 from benchmarks.lobby.spectra import FILES
 from benchmarks.machine import machine
 from benchmarks.report import Report, Row, columns_table
@@ -158,7 +158,7 @@ class _Spectra:
         for first in range(0, len(self.places), AT_ONCE):
             some = self.places[first : first + AT_ONCE]
             with together.over(len(some)):
-                found.append(field.spectra(some))
+                found.append(field.spectra(some).path_gain)
             for image, place in zip(found[-1], some[:ALONE], strict=False):
                 with alone.over(1):
                     single = field.spectrum(place).path_gain
@@ -217,7 +217,7 @@ class _Responses:
                 self.places, BAND_HZ, diffuse="random_phase", method="dense", max_paths=self.max_paths,
                 store=attempt.folder / "responses.nc", progress=tell, **ARRAYS,
             )  # fmt: skip
-        done = len(self.places) - told[0] + AT_ONCE if told else 0  # by this attempt
+        done = len(self.places) - told[0]  # by this attempt
         return {
             "figure": f"cfr, 8 x 8 by 4 x 4, 64 frequencies, {self.max_paths} paths, one ray a pixel",
             "receivers": len(self.places), "core_ms": 1e3 * clock.core / max(done, 1), "gigabytes": found.nbytes / 1e9,
@@ -240,7 +240,7 @@ class _Workers:
             ("two workers", 2, False),
             ("two, one killed", 2, True),
         ):
-            with _cluster(count) as client:
+            with connected(None, count, 1) as client:
                 self.field.spectra(self.places[: 4 * AT_ONCE], client=client)  # the library is loaded
                 before = sum(client.run(time.process_time).values())
                 start = time.perf_counter()
@@ -248,7 +248,7 @@ class _Workers:
                     self.places,
                     client=client,
                     progress=_Killer(client, attempt.progress) if kill else attempt.progress,
-                )
+                ).path_gain
                 wall = time.perf_counter() - start
                 core = sum(client.run(time.process_time).values()) - before
             one = one or wall
@@ -283,19 +283,6 @@ class _Killer:
             self._killed = True
             os.kill(self._process, signal.SIGKILL)
         self._tell(stage, done, total)
-
-
-@contextmanager
-def _cluster(workers: int) -> Iterator[Any]:
-    distributed = require("distributed", extra="cluster")
-    with (
-        distributed.LocalCluster(
-            n_workers=workers, threads_per_worker=1, memory_limit=0, dashboard_address=None, silence_logs="CRITICAL",
-            env={"WARPRRF_THREADS": "1", "OMP_NUM_THREADS": "1"},
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):  # fmt: skip
-        yield client
 
 
 BENCHMARKS = {"batches": Benchmark("batches", Options, run, HELP)}

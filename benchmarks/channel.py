@@ -30,7 +30,7 @@ from warprrf.rf.interop.sionna_engine import load_sionna_scene
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import MirrorTracer, trace_paths
 from warprrf.rf.scene import Scene
-from warprrf.rf.sionna_package import sionna_rt
+from warprrf.rf.scene_sionna import sionna_rt
 
 FREQUENCY_HZ = 300e9
 TRANSMITTER = (13.6, 11.2, 2.5)

@@ -118,14 +118,14 @@ LINKS = {
 
 def scene_path(name: str) -> str:
     """File of one of Sionna RT's scenes."""
-    from warprrf.rf.sionna_package import sionna_rt
+    from warprrf.rf.scene_sionna import sionna_rt
 
     return str(getattr(sionna_rt().scene, name))
 
 
 def solve(scene: Any, transmitter: np.ndarray, receivers: np.ndarray, order: int) -> tuple[Paths, float]:
     """Paths of PathSolver in a ``sionna.rt.Scene``, diffraction, refraction and scattering off, and its seconds."""
-    from warprrf.rf.sionna_package import sionna_rt
+    from warprrf.rf.scene_sionna import sionna_rt
 
     rt = sionna_rt()
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
@@ -243,7 +243,7 @@ def match(ours: list[Paths], theirs: Paths) -> dict[str, Any]:
 
 def compare(links: Links, order: int = 2) -> dict[str, Any]:
     """One scene: counts, errors and times of both."""
-    from warprrf.rf.sionna_package import sionna_rt
+    from warprrf.rf.scene_sionna import sionna_rt
 
     rt = sionna_rt()
     path = scene_path(links.scene)

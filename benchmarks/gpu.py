@@ -31,7 +31,7 @@ from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import resolve
 from warprrf.files import write_json
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.geometry.splats.rasterizer import RADIO, Rasterizer
 from warprrf.geometry.splats.render import blend_weights
 from warprrf.rf.fields.base import RadioField

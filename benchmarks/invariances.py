@@ -19,7 +19,7 @@ import warprrf as wr
 from benchmarks.data import DATA
 from benchmarks.report import Report, cell, table
 from benchmarks.runner import Benchmark, Job, option
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -360,8 +360,11 @@ def _transmitters(lobby: Lobby) -> Iterator[dict[str, Any]]:
     for name, one in sets.items():
         row = f"{count} spectra of transmitter {name}, asked under D"
         yield lobby.row(row, lambda one=one: _scored_fit(lobby, one, test))  # type: ignore[misc]
-    some = [one.subset(range(k * SHARE, (k + 1) * SHARE)) for k, one in enumerate(sets.values())]
-    yield lobby.row(f"{SHARE} of each of A, B, C, asked under D", lambda: _scored_fit(lobby, some, test))
+    for turn in range(len(sets)):  # which places stand under which transmitter
+        order = [*sets.values()][turn:] + [*sets.values()][:turn]
+        some = [one.subset(range(k * SHARE, (k + 1) * SHARE)) for k, one in enumerate(order)]
+        row = f"{SHARE} of each of A, B, C, asked under D, turn {turn + 1}"
+        yield lobby.row(row, lambda some=some: _scored_fit(lobby, some, test))  # type: ignore[misc]
 
 
 def _carriers(lobby: Lobby) -> Iterator[dict[str, Any]]:
@@ -386,6 +389,11 @@ def _carriers(lobby: Lobby) -> Iterator[dict[str, Any]]:
         for at in own:
             name = f"10 spectra at {of / 1e9:g} GHz, asked at {at / 1e9:g} GHz"
             yield lobby.row(name, lambda at=at, of=of: asked(at, of))  # type: ignore[misc]
+    halves = [train.subset(range(5 * k, 5 * k + 5)) for k, (train, _) in enumerate(own.values())]
+    together = cache(lambda: lobby.fit(halves))
+    for at in own:
+        name = f"5 spectra at each of both carriers, asked at {at / 1e9:g} GHz"
+        yield lobby.row(name, lambda at=at: lobby.scored(together().at_frequency(at), own[at][1]))  # type: ignore[misc]
 
 
 BENCHMARKS = {"measurements": Benchmark("measurements", Options, run, HELP)}

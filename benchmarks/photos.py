@@ -14,9 +14,9 @@ from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.geometry import pipeline as stage_1
 from warprrf.geometry.photos.photo_files import find_photos, read_photo
-from warprrf.geometry.splats.blending import Blending
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.steps import Attempt, Steps
 
 HELP = """\

@@ -9,7 +9,7 @@ import numpy as np
 from warprrf.checks import check_array
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.interop.sionna_engine import load_sionna_scene
-from warprrf.rf.sionna_package import select_variant, sionna_rt
+from warprrf.rf.scene_sionna import select_variant, sionna_rt
 
 
 class SionnaMap:

@@ -32,12 +32,12 @@ FIT_VERSION, CHOICE_VERSION = 1, 1
 """Counted up by hand when fits, or suggestions, come out differently."""
 POOL = 60  # candidates: training receivers
 SUB_PIXELS = 1  # square root of the rays per pixel; 3, the fit's default, takes twice the time
-FIGURES = ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db")
+FIGURES = ("psnr_db", "direction_within_3deg_blocked", "beam_gain_loss_db", "total_rms_db")
 COLUMNS = (
     ("readings", "spectra of", "{}"), ("draws", "draws", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
     ("psnr_std_db", "spread [dB]", "{:.2f}"), ("psnr_least_db", "least [dB]", "{:.2f}"),
     ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
-    ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"),
+    ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"), ("total_rms_db", "total power, rms [dB]", "{:.2f}"),
 )  # fmt: skip
 
 
@@ -128,7 +128,7 @@ def run(options: Options, job: Job) -> Report:
     rows: list[dict[str, Any]] = []
 
     def add(name: str, sets: Iterable[Sequence[int]]) -> None:
-        each = []
+        each: list[dict[str, Any]] = []
         for chosen in sets:
             job.progress(name, len(each), options.draws)
             each.append(fits.scored(chosen))

@@ -164,7 +164,7 @@ def _save(still: bytes, frames: list[bytes], folder: Path) -> None:
     from PIL import Image
 
     folder.mkdir(parents=True, exist_ok=True)
-    Image.open(io.BytesIO(still)).convert("RGB").quantize(256).save(folder / "viewer.png", optimize=True)
+    Image.open(io.BytesIO(still)).convert("RGB").save(folder / "viewer.png", optimize=True)
     pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
     small = [p.resize((p.width // 2, p.height // 2), Image.Resampling.LANCZOS) for p in pictures]
     small[0].save(

@@ -157,7 +157,7 @@ def test_a_process_may_start_with_all_verbs_at_once(field_file, tmp_path):
     """Warp itself, kernels and tables of the process are then first used by several threads."""
     run(
         """
-    from warprrf.geometry.splats.discs import discs_on_mesh
+    from warprrf.geometry.splats.gaussians import discs_on_mesh
     path, folder = sys.argv[1:]
     scene, (mesh, _) = make.room(), make.room_mesh()
     camera = wr.Camera.spherical(36, 18, position=RX[0])
@@ -300,7 +300,7 @@ def test_used_objects_go_to_spawned_processes(field_file, tmp_path):
         return mesh.distance(POINTS), mesh.cast(RX[0], POINTS, backend="warp").t
 
     if __name__ == "__main__":
-        from warprrf.geometry.splats.discs import discs_on_mesh
+        from warprrf.geometry.splats.gaussians import discs_on_mesh
         mesh, _ = make.room_mesh()
         rec = wr.Reconstruction(discs_on_mesh(mesh, 400), mesh)
         harmonic = wr.RadioField.fit(rec, make.spectra().subset([0, 1, 2]), model="rf3dgs+", iterations=2)

@@ -9,12 +9,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from places import ROOT
+from told import check_told
 
 import warprrf as wr
 from warprrf import cli
@@ -83,17 +85,6 @@ def events(text: str) -> list[dict[str, Any]]:
     return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
 
 
-def check_told(rows: list[tuple[str, int, int]], stages: list[str]) -> None:
-    """Stages come in order, each once; ``done`` never falls, and ends at ``total``."""
-    assert list(dict.fromkeys(stage for stage, _, _ in rows)) == stages
-    for stage in stages:
-        places = [k for k, row in enumerate(rows) if row[0] == stage]
-        counts = [rows[k][1:] for k in places]
-        assert places == list(range(places[0], places[-1] + 1)), stage
-        assert [done for done, _ in counts] == sorted(done for done, _ in counts), stage
-        assert len({total for _, total in counts}) == 1 and counts[-1][0] == counts[-1][1], stage
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scene, a hundred receivers and what is made of them by the tests below, in order."""
@@ -142,6 +133,37 @@ def test_json_holds_progress_and_one_result(
     assert all(one["seconds_left"] == 0 for one in told if one["done"] == one["total"])
     assert result.pop("files") == files and all((room / file).exists() for file in files)
     assert figures.items() <= result.items() and (figures or result)
+
+
+def test_every_long_function_tells_how_far_it_is(room: Path) -> None:
+    """As does a reconstruction (tests/geometry/test_reconstruction.py)."""
+    scene, data = wr.Scene.load(room / "room.xml"), wr.SpectrumDataset.load(room / "x.nc")
+    few, others = data.subset(range(12)), data.subset(range(90, 100))
+    places = others.receivers[:5]
+    field = wr.RadioField.load(room / "f.safetensors")
+    ends = {"transmitter": data.transmitter, "frequency_hz": 300e9, "receivers": places}
+    store = {"store": room / "stored.nc"}
+    fit = ["patches", "mirrors", "transport", "fit"]
+    asked: list[tuple[list[str], Callable[[Callable[[str, int, int], None]], object]]] = [
+        (fit, lambda tell: wr.RadioField.fit(scene, few, progress=tell)),
+        (["transport", "fit"], lambda tell: wr.RadioField.fit(scene, few, "rf3dgs+", iterations=9, progress=tell)),
+        (["transport", "fit"], lambda tell: wr.RadioField.fit(scene, few, "rf3dgs", iterations=9, progress=tell)),
+        (["spectra"], lambda tell: field.spectra(places, progress=tell)),
+        (["spectra"], lambda tell: field.spectra(places, **store, progress=tell)),
+        (["spectra"], lambda tell: field.spectra(places, **store, progress=tell)),  # all is there
+        (["paths"], lambda tell: field.paths(places, progress=tell)),
+        (["cfr"], lambda tell: field.cfr(places, [300e9], diffuse="power", progress=tell)),
+        (["links"], lambda tell: field.links(places, progress=tell)),
+        (["suggest"], lambda tell: field.suggest(places, 2, progress=tell)),
+        (["evaluate"], lambda tell: wr.evaluate(others, field.spectrum, progress=tell)),
+        (["patches", "mirrors"], lambda tell: wr.trace_paths(scene, **ends, mirror_order=2, progress=tell)),
+        (["simulate"], lambda tell: wr.simulate(scene, **ends, shape=(8, 16), progress=tell)),
+        (["relevance"], lambda tell: wr.relevance(scene, **ends, progress=tell)),
+    ]  # fmt: skip
+    for stages, call in asked:
+        told: list[tuple[str, int, int]] = []
+        call(lambda *news, told=told: told.append(news))
+        check_told(told, stages)
 
 
 BAD = {

@@ -79,7 +79,7 @@ from warprrf.rf import channel as channel
 # Fresnel coefficients, materials, absorption by the air
 from warprrf.rf import em as em
 
-# Sionna RT, DeepMIMO, NeWRF, digital twins
+# Sionna RT, DeepMIMO, digital twins
 from warprrf.rf import interop as interop
 
 # the rasteriser, blending weights, rays through Gaussians
@@ -93,7 +93,7 @@ from warprrf.rf.spectra import lookups as lookups
 
 # == kept ==
 from warprrf.geometry.splats.gaussian_rays import GaussianRays as GaussianRays
-from warprrf.geometry.splats.blending import Blending as Blending
+from warprrf.geometry.splats.rasterizer import Blending as Blending
 from warprrf.geometry.splats.rasterizer import Rasterizer as Rasterizer
 from warprrf.geometry.splats.render import BlendWeights as BlendWeights
 from warprrf.geometry.splats.render import blend_weights as blend_weights
@@ -113,7 +113,6 @@ from warprrf.rf.channel.precoding import precoders as precoders
 from warprrf.rf.channel.precoding import transmit_covariance as transmit_covariance
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m as gas_attenuation_db_per_m
 from warprrf.rf.interop.deepmimo import write_deepmimo as write_deepmimo
-from warprrf.rf.interop.newrf import load_newrf as load_newrf
 from warprrf.rf.interop.sionna_engine import load_sionna_scene as load_sionna_scene
 from warprrf.rf.interop.twin import write_twin as write_twin
 

@@ -8,7 +8,7 @@ import numbers
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
 
@@ -388,3 +388,15 @@ def _as_object(kind: type, value: object) -> object:
     own = kind.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
     fits = isinstance(value, kind) or (own and not isinstance(value, wp.array))
     return value if fits and not isinstance(value, bytes) else _OTHER
+
+
+def one_line(self: Any) -> str:
+    """The ``__repr__`` of a dataclass of arrays: their shapes, other values as they are, None left out."""
+    parts = []
+    for field in fields(self):
+        value = getattr(self, field.name)
+        if hasattr(value, "shape") and np.prod(value.shape) > 3:
+            parts.append(f"{field.name} {tuple(value.shape)}")
+        elif value is not None and len(text := repr(value)) <= 60:
+            parts.append(f"{field.name}={text}")
+    return f"{type(self).__name__}({', '.join(parts)})"

@@ -8,9 +8,7 @@ there to each worker once. A worker that dies loses nothing: dask gives its part
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -39,6 +37,7 @@ def each(
 
     Raises:
         Exception: what ``work`` raises; parts under way are given up.
+        TypeError: for a client that is none.
         ImportError: without dask.distributed, where it is needed.
     """
     if client is None:
@@ -49,6 +48,8 @@ def each(
         return
     distributed, dask = require("distributed", extra="cluster"), require("dask", extra="cluster")
     code = require("distributed.protocol.pickle", extra="cluster")
+    if not isinstance(client, distributed.Client):
+        raise TypeError(f"client: got {type(client).__name__}, expected a dask.distributed.Client")
     data = code.dumps(work)
     known = hashlib.sha256(data).hexdigest()
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
@@ -78,33 +79,3 @@ def _run(known: str, data: bytes, part: Any) -> Any:
     code = require("distributed.protocol.pickle", extra="cluster")
     with one_thread(), threadpool_limits(1, user_api="blas"):
         return _works.get(known, lambda: code.loads(data))(part)
-
-
-@contextmanager
-def connected(scheduler: str | None, workers: int) -> Iterator[Any]:
-    """A client of the scheduler at an address, or of a local cluster of processes that share the cores; None for none.
-
-    Raises:
-        ImportError: without dask.distributed, where it is needed.
-    """
-    if scheduler is None and workers == 0:
-        yield None
-        return
-    distributed = require("distributed", extra="cluster")
-    if scheduler is not None:
-        with distributed.Client(scheduler, set_as_default=False) as client:
-            yield client
-        return
-    share = str(max(1, (os.cpu_count() or 1) // workers))
-    with (
-        distributed.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            memory_limit=0,  # a part may need what the machine has: no worker is stopped for it
-            dashboard_address=None,
-            env={"WARPRRF_THREADS": share, "OMP_NUM_THREADS": share},
-            silence_logs="ERROR",
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client

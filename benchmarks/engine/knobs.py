@@ -24,8 +24,8 @@ from benchmarks.engine.scenes import best_seconds, gain, gaussians, positions, r
 from benchmarks.report import Row
 from warprrf.device import resolve
 from warprrf.geometry.splats.camera import Camera
-from warprrf.geometry.splats.discs import discs_on_mesh
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
 from warprrf.geometry.splats.render import blend_weights
 from warprrf.rf.em.waves import SPEED_OF_LIGHT

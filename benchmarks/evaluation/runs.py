@@ -8,6 +8,7 @@ their checkpoint.
 
 from __future__ import annotations
 
+import os
 import platform
 import resource
 import shutil
@@ -27,8 +28,8 @@ from benchmarks.evaluation.protocol import Run, Setting, shown_receivers, truth_
 from benchmarks.machine import processor_name
 from benchmarks.methods import AFTER, METHODS, Fitted, Task, score
 from benchmarks.report import Row
-from warprrf.cluster import connected, each
-from warprrf.device import Progress, resolve, threads
+from warprrf.cluster import each
+from warprrf.device import Progress, require, resolve, threads
 from warprrf.files import write_arrays
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
@@ -290,3 +291,34 @@ def _named(
 def _keep(folder: Path, run: Run, row: Row, arrays: dict[str, np.ndarray], _: Attempt) -> Row:
     write_arrays(folder / pictures_of(run), arrays)
     return row
+
+
+@contextmanager
+def connected(scheduler: str | None, workers: int, share: int | None = None) -> Iterator[Any]:
+    """A client of the scheduler at an address, or of a local cluster of processes with ``share`` threads each, equal parts
+    of the cores by default; None for no workers.
+
+    Raises:
+        ImportError: without dask.distributed, where it is needed.
+    """
+    if scheduler is None and workers == 0:
+        yield None
+        return
+    distributed = require("distributed", extra="cluster")
+    if scheduler is not None:
+        with distributed.Client(scheduler, set_as_default=False) as client:
+            yield client
+        return
+    threads_each = str(share or max(1, (os.cpu_count() or 1) // workers))
+    with (
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,  # a part may need what the machine has: no worker is stopped for it
+            dashboard_address=None,
+            env={"WARPRRF_THREADS": threads_each, "OMP_NUM_THREADS": threads_each},
+            silence_logs="CRITICAL",
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client

@@ -423,7 +423,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "interop.SionnaPaths.cir": _on(lambda p: p.paths.to_sionna()),
     "interop.SionnaPaths.taps": _on(lambda p: p.paths.to_sionna(), bandwidth=1e9, l_min=-2, l_max=20),
     "interop.Twin": lambda p: {"xml": Path("scene.xml"), "frequency_hz": CARRIER, "groups": (), "left_out": ()},
-    "interop.load_newrf": lambda p: {"folder": p.folder / "newrf"},
     "interop.load_sionna_scene": lambda p: {"scene": "missing.xml", "frequency_hz": CARRIER},
     "interop.select_llvm": lambda p: {},
     "interop.write_deepmimo": lambda p: {"paths": p.paths, "folder": "deepmimo", "scene": p.scene},

@@ -17,7 +17,7 @@ from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.photos.photo_files import check_photos, find_photos, read_photo
 from warprrf.geometry.photos.poses import DepthFile, read_depth, read_poses
 from warprrf.geometry.photos.sfm import read_colmap
-from warprrf.rf.spectra.exr import export_exr, import_exr
+from warprrf.rf.spectra.dataset_files import export_exr, import_exr
 from warprrf.steps import Steps
 
 SEES = np.array([4.0, 3.0, 1.0])
@@ -199,9 +199,5 @@ FORMATS: dict[str, Format] = {
         )
         for name in ("cameras", "images", "points3D")
     },
-    "NeWRF rays": Format(
-        _copy("newrf/newrf_conference.npz"), lambda p: wr.interop.load_newrf(p.parent), "zip"
-    ),
-    "NeWRF room": Format(_copy("newrf/conferenceroom.stl"), lambda p: wr.interop.load_newrf(p.parent)),
 }
 """By name."""

@@ -12,7 +12,7 @@ import numpy as np
 import warprrf as wr
 from warprrf.device import require
 from warprrf.geometry.mesh_files import write_mesh
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 ROOT = Path(__file__).parents[2]
 CARRIER = 300e9
@@ -107,25 +107,18 @@ class Place:
             Image.fromarray(pixels).save(photos / f"{k}.{suffix}")
 
     def _make_foreign(self) -> None:
-        """What other software writes: NeWRF's rays, a COLMAP model, meshes."""
+        """What other software writes: a COLMAP model, meshes."""
         import pycolmap
         import trimesh
 
-        rng = np.random.default_rng(0)
-        newrf, model, meshes = (self.folder / name for name in ("newrf", "colmap", "meshes"))
-        for folder in (newrf, model, meshes):
+        model, meshes = (self.folder / name for name in ("colmap", "meshes"))
+        for folder in (model, meshes):
             folder.mkdir(exist_ok=True)
-        np.savez_compressed(
-            newrf / "newrf_conference.npz", transmitter=TRANSMITTER, receivers=self.receivers, frequency_hz=2.4e9,
-            last_point=rng.uniform(0.5, 3.0, (10, 4, 3)), gain=rng.normal(size=(10, 4)) * (1e-3 + 1e-3j),
-            rays=np.full(10, 3), csi=rng.normal(size=10) * (1e-3 + 1e-3j), line_of_sight=np.ones(10, bool),
-        )  # fmt: skip
         write_mesh(meshes / "mesh.ply", self.mesh.vertices, self.mesh.faces)
         for suffix in ("obj", "stl", "glb"):
             trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False).export(
                 meshes / f"mesh.{suffix}"
             )
-        (newrf / "conferenceroom.stl").write_bytes((meshes / "mesh.stl").read_bytes())
         options = pycolmap.SyntheticDatasetOptions(
             num_points3D=20, num_frames_per_rig=3, camera_model_id=pycolmap.CameraModelId.PINHOLE,
             camera_width=64, camera_height=48, camera_params=[60.0, 60.0, 32.0, 24.0], num_points2D_without_point3D=0,

@@ -19,7 +19,7 @@ import numpy as np
 from warprrf.device import Progress, require
 from warprrf.files import write_atomically
 from warprrf.geometry.splats.camera import Camera
-from warprrf.rf.sionna_package import select_llvm
+from warprrf.rf.scene_sionna import select_llvm
 
 VARIANT = "llvm_ad_rgb"
 SIONNA_VARIANT = (

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.photos import psnr, recoloured, score
-from warprrf.geometry.splats.blending import Blending
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import render
 
 

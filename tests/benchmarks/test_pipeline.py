@@ -16,7 +16,7 @@ import warprrf as wr
 from benchmarks.lobby import pipeline, plain, seeds
 from benchmarks.runner import Job, execute
 from warprrf.files import write_json
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 SIZES = pipeline.Sizes(steps=20, train=6, test=4)
 MODELS = ("bistatic", "rf3dgs+", "rf3dgs")

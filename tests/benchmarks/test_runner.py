@@ -95,6 +95,13 @@ def test_bad_input_is_one_line_and_status_two(nothing: None, tmp_path: Path, cap
     )
 
 
+def test_with_json_a_benchmark_prints_its_figures(nothing: None, tmp_path: Path, capsys: Any) -> None:
+    assert command.main(["nothing", "--out", str(tmp_path), "--json"]) == 0
+    (said,) = map(json.loads, capsys.readouterr().out.splitlines())
+    assert said["figures"]["value"] is None and said["figures"]["count"] == 3
+    assert said["files"] == [str(tmp_path / "nothing.md"), str(tmp_path / "nothing.json")]
+
+
 def test_figures_are_found_by_their_path() -> None:
     figures = {
         "rows": [{"n": 1, "x": 2.0}, {"n": 2, "x": 3.0, "ok": True}],

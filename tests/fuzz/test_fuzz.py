@@ -48,6 +48,7 @@ FOUND = [
     ("Paths.taps", ("center_hz", "huge")),
     ("Paths.select", ("chosen", "2^63")),
     ("RadioField.at_frequency", ("frequency_hz", "tiny")),
+    ("RadioField.cfr", ("client", "true")),
     ("RadioField.fit", ("relevance", "text")),
     ("RadioField.links", ("shape", "with inf")),
     ("RadioField.load", ("path", "no text")),

@@ -332,14 +332,14 @@ def test_a_forked_child_answers_as_its_parent(where):
 
 def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypatch):
     cpu, choose = resolve("cpu"), raysearch.choose_backend
-    monkeypatch.setattr(raysearch.o3d, "installed", lambda: True)
+    monkeypatch.setattr(raysearch, "open3d_installed", lambda: True)
     monkeypatch.delitem(sys.modules, "open3d", raising=False)
     assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD) == "embree"
     assert choose("auto", cpu, raysearch.EMBREE_RAYS_TO_LOAD - 1) == "warp"
     monkeypatch.setitem(sys.modules, "open3d", raysearch)
     assert choose("auto", cpu, raysearch.EMBREE_RAYS) == "embree"
     assert choose("auto", cpu, raysearch.EMBREE_RAYS - 1) == "warp"
-    monkeypatch.setattr(raysearch.o3d, "installed", lambda: False)
+    monkeypatch.setattr(raysearch, "open3d_installed", lambda: False)
     assert choose("auto", cpu, 10**7) == "warp"
 
 
@@ -419,5 +419,6 @@ def test_rays_that_leave_their_surface_slowly_meet_the_next_one(monkeypatch):
     hit = Mesh(*box(low, high)).cast(origin, d, backend="embree", device="cpu")
     t = box_exit(origin, d, low, high)
     foot = t * d[:, 2] < 1e-5  # there float32 may give either face
-    assert foot.mean() < 0.1 and len(casts) > 100
+    assert foot.mean() < 0.1
+    assert casts[-1] > 100  # so many glide on after the last round
     np.testing.assert_allclose(hit.t[~foot], t[~foot], rtol=1e-9)

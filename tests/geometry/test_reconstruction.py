@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from places import LOBBY
+from told import check_told
 from views import look
 
 import warprrf as wr
@@ -16,12 +17,12 @@ from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.photos import sparse
 from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
 from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
-from warprrf.geometry.photos.initial_gaussians import initial_gaussians
+from warprrf.geometry.photos.initialise import initial_gaussians
 from warprrf.geometry.photos.planes import Plane, plane_axes
 from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.planar_patches import planar_patches
 from warprrf.geometry.reconstruction import Reconstruction
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")
 pycolmap = pytest.importorskip("pycolmap")
@@ -138,10 +139,13 @@ def test_without_a_survey_the_size_is_plausible_and_said_to_be_assumed():
 def whole(tmp_path_factory):
     workspace = tmp_path_factory.mktemp("whole")
     photos = [LOBBY / "photos" / n for n in VIEWS]
-    known = surveyed()
+    known, told = surveyed(), []
     rec = reconstruct(
-        photos, workspace=workspace, known_positions=known, held_out=VIEWS[4:5], config=SMALL, device="cpu"
-    )
+        photos, workspace=workspace, known_positions=known, held_out=VIEWS[4:5], config=SMALL, device="cpu",
+        progress=lambda *news: told.append(news),
+    )  # fmt: skip
+    posed = ["features", "matching", "mapping", "undistorting"]
+    check_told(told, [*posed, "planes", "refine", "depth", "stereo", "surface"])
     return workspace, photos, known, rec
 
 

@@ -5,8 +5,8 @@ import pytest
 from rays_by_definition import brute_hits, one
 
 import warprrf as wr
-from warprrf.geometry.splats.blending import RADIO
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
+from warprrf.geometry.splats.rasterizer import RADIO
 
 
 def test_peak_outside_the_segment_does_not_count():

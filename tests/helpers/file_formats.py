@@ -19,13 +19,13 @@ from twin_fields import BLOCKED, SEES, SIGMA, F, known_field, room
 import warprrf as wr
 from warprrf.geometry.mesh_files import read_mesh, write_mesh
 from warprrf.geometry.planar_patches import planar_patches
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.fields.bistatic.uncertainty import LEVEL_DB, STEEPNESS_DB, ErrorModel
 from warprrf.rf.fields.harmonic.field import HarmonicField
 from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.interop.twin import write_twin
 from warprrf.rf.maps.radio_map import RadioMap
-from warprrf.rf.spectra.exr import export_exr, import_exr
+from warprrf.rf.spectra.dataset_files import export_exr, import_exr
 from warprrf.rf.spectra.spectrum import Spectrum
 
 Maker = Callable[[Path], Path]

@@ -3,14 +3,14 @@
 import pytest
 from radio_scenes import box_mesh, joined
 
-from warprrf.rf import sionna_package
+from warprrf.rf import scene_sionna
 from warprrf.rf.em.materials import Material
 from warprrf.rf.scene import Scene
 
 
 def sionna_or_skip():
     try:
-        sionna_package.select_llvm()
+        scene_sionna.select_llvm()
     except ImportError as error:
         pytest.skip(str(error))
     pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)

@@ -12,7 +12,7 @@ from radio_scenes import box_mesh
 
 import warprrf as wr
 from warprrf.geometry.mesh_files import write_mesh
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.simulate import sample_receivers
 
 TRANSMITTER = (0.8, 0.9, 2.2)

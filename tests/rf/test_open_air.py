@@ -11,8 +11,7 @@ import warprrf as wr
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material
 from warprrf.rf.fields.bistatic.surface import ELEMENT_M, ELEMENTS, Surface
-from warprrf.rf.open_air import ground_height, is_open_air, under_a_roof
-from warprrf.rf.positions import check_positions
+from warprrf.rf.positions import check_positions, ground_height, is_open_air, under_a_roof
 from warprrf.rf.scene import Scene
 
 F = 3.5e9

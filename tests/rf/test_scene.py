@@ -43,7 +43,7 @@ def test_each_face_has_the_material_of_its_object(lobby: Scene) -> None:
 
 
 def test_sionna_opens_the_scene_with_the_same_objects_and_materials(lobby: Scene) -> None:
-    from warprrf.rf.sionna_package import select_llvm
+    from warprrf.rf.scene_sionna import select_llvm
 
     select_llvm()
     rt = pytest.importorskip("sionna.rt", reason="sionna-rt is not installed")

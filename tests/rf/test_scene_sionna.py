@@ -11,7 +11,7 @@ from warprrf.rf.scene import Scene
 @pytest.fixture(scope="module")
 def rt():
     sionna_or_skip()
-    from warprrf.rf.sionna_package import sionna_rt
+    from warprrf.rf.scene_sionna import sionna_rt
 
     return sionna_rt()
 

@@ -122,7 +122,7 @@ TRANSFORMS = [
 
 def test_surfaces_stand_where_mitsuba_puts_them(tmp_path: Path) -> None:
     sionna_or_skip()
-    from warprrf.rf.sionna_package import select_variant
+    from warprrf.rf.scene_sionna import select_variant
 
     mitsuba = select_variant()
     write_mesh(tmp_path / "box.ply", *box_mesh([0, 0, 0], [1, 2, 3]))

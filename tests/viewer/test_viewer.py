@@ -187,6 +187,16 @@ def test_what_cannot_be_computed_is_said_on_the_page(viewer):
     viewer._survey.height.value = 1.5
 
 
+def test_the_map_lies_on_the_floor_with_its_scale(viewer):
+    viewer._survey.map()
+    viewer._page.wait()
+    handle = viewer._page.scene.get_handle_by_name("/map")
+    assert handle.position[2] == pytest.approx(0.03, abs=1e-4), viewer.message
+    low, high = viewer.subject.mesh.bounds
+    np.testing.assert_allclose(handle.position[:2], 0.5 * (low + high)[:2], atol=0.5)
+    assert "total path gain [dB] at " in viewer._survey.legend.content
+
+
 def test_places_to_measure_next_are_those_that_the_field_suggests(viewer):
     survey, field = viewer._survey, viewer.subject.field
     survey.suggest()

@@ -694,6 +694,22 @@ def _measurements() -> str:
     return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
 
 
+@entry("suggest")
+def _suggest() -> str:
+    found = measured("suggest")
+    if found is None:
+        return missing("python -m benchmarks suggest")
+    lines = [
+        [
+            r["readings"], str(r["draws"]), f"{r['psnr_db']:.2f}", f"{r['psnr_std_db']:.2f}",
+            f"{r['direction_within_3deg_blocked']:.0%}", f"{r['beam_gain_loss_db']:.2f}", f"{r['total_rms_db']:.2f}",
+        ]
+        for r in found["rows"]
+    ]  # fmt: skip
+    wanted = "blocked: within 3 degrees", "beam loss [dB]", "total power, rms [dB]"
+    return markdown(("spectra of", "draws", "PSNR [dB]", "spread", *wanted), lines)
+
+
 @entry("arrays")
 def _arrays() -> str:
     found = measured("arrays")

@@ -21,9 +21,8 @@ from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.brief import one_line
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import LARGEST_M, check_array, check_number, checked
+from warprrf.checks import LARGEST_M, check_array, check_number, checked, one_line
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.checks import LARGEST_M, check_array, check_count
-from warprrf.geometry import o3d
 from warprrf.geometry.gltf_files import read_gltf
 from warprrf.geometry.mesh_content import LARGEST_BYTES, Folder, MeshContent, to_linear, to_srgb
 from warprrf.geometry.obj_files import read_obj
 from warprrf.geometry.ply_files import Element, Lists, read_ply, write_ply
+from warprrf.geometry.rays import open3d
 
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 """Units of length [m]."""
@@ -148,10 +148,10 @@ def _simplified(
 
     Source: Garland and Heckbert, "Surface simplification using quadric error metrics", SIGGRAPH 1997, in Open3D.
     """
-    open3d = o3d.load()
+    o3d = open3d()
     middle = vertices.mean(axis=0)
-    mesh = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(vertices - middle), open3d.utility.Vector3iVector(faces)
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(vertices - middle), o3d.utility.Vector3iVector(faces)
     )
     fewer = mesh.simplify_quadric_decimation(target)
     points, triangles = np.asarray(fewer.vertices), np.asarray(fewer.triangles, dtype=np.int32)
@@ -159,10 +159,10 @@ def _simplified(
         raise ValueError(
             f"simplify: got {target}, but nothing is left of {len(faces)} triangles; ask for more"
         )
-    rays = open3d.t.geometry.RaycastingScene()
+    rays = o3d.t.geometry.RaycastingScene()
     rays.add_triangles((vertices - middle).astype(np.float32), faces.astype(np.uint32))
     centre = points[triangles].mean(axis=1).astype(np.float32)
-    parent = rays.compute_closest_points(open3d.core.Tensor(centre))["primitive_ids"].numpy()
+    parent = rays.compute_closest_points(o3d.core.Tensor(centre))["primitive_ids"].numpy()
     return points + middle, triangles, parent.astype(np.int64)
 
 

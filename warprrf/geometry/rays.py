@@ -7,7 +7,11 @@ float64 from the plane of that face (:mod:`warprrf.kernels.rays.mesh`), so the t
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -16,7 +20,6 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import check_array
-from warprrf.geometry import o3d
 from warprrf.kernels.rays.mesh import (
     AGAIN,
     BAD,
@@ -39,6 +42,8 @@ EMBREE_RAYS_TO_LOAD = 200_000
 # A ray aimed exactly at a vertex of a closed mesh can slip through; turned by this much it meets a face [rad].
 _JITTER = 1e-5
 _RECASTS = 4
+# How often Embree casts rays again that met a surface at their start.
+_ROUNDS = 8
 # Rays that are worth another thread of Embree's: starting and stopping it takes as long as a thousand rays do.
 _RAYS_A_THREAD = 4_096
 # Longer segments overflow where Embree squares them in float32 [m].
@@ -177,13 +182,14 @@ class RaySearch:
     def _nearest_embree(
         self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`nearest`. Rays that met a surface at their start are cast again from behind it, until none is."""
+        """As :meth:`nearest`. Rays that met a surface at their start are cast again from behind it; the few that glide
+        along it go on in the kernel, where a step costs less."""
         scene, planes = self._embree, _given(self._planes, wp.vec4d, cpu)
         count = max(len(o), len(d))
         t, face = np.empty(count), np.full(count, AGAIN, dtype=np.int32)
         which: slice | np.ndarray = slice(None)
         start = np.empty(0)
-        while True:
+        for _ in range(_ROUNDS):
             origin, toward = rows(o, which), rows(d, which)
             near, met = scene.cast(self._pack(origin, toward, clearance, start, cpu))
             distance, found = np.empty(len(met)), np.empty(len(met), dtype=np.int32)
@@ -198,6 +204,10 @@ class RaySearch:
             if len(which) == 0:
                 return t, face
             start = t[which]
+        t[which], face[which] = self.nearest(
+            rows(o, which), rows(d, which), clearance=clearance, device=cpu, backend="warp"
+        )
+        return t, face
 
     def free(
         self, a: np.ndarray, b: np.ndarray, *, clearance: float, device: wp.Device, backend: str
@@ -269,7 +279,7 @@ class EmbreeScene:
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, kept: np.ndarray) -> None:
-        self._o3d = o3d.load()
+        self._o3d = open3d()
         self._kept = None if len(kept) == len(faces) else kept.astype(np.int32)
         self._scene = self._o3d.t.geometry.RaycastingScene(nthreads=_device.threads())
         tensor = self._o3d.core.Tensor.from_numpy
@@ -295,6 +305,21 @@ class EmbreeScene:
         return min(_device.threads(), 1 + len(rays) // _RAYS_A_THREAD)
 
 
+def open3d() -> ModuleType:
+    """Open3D, which stage 1 and Embree's rays use: the one place that imports it, when first called.
+
+    Raises:
+        ImportError: naming the extra that brings it, if it is not installed.
+    """
+    return _device.require("open3d", extra="photos")
+
+
+@cache
+def open3d_installed() -> bool:
+    """Whether it can be imported here; it is not imported to find out."""
+    return importlib.util.find_spec("open3d") is not None
+
+
 def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     """``"warp"`` or ``"embree"`` for ``count`` rays on ``device``.
 
@@ -307,8 +332,8 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
         raise ValueError(f'backend: got "embree" on {device}, expected "warp" there, or device="cpu"')
     if backend != "auto":
         return backend
-    least = EMBREE_RAYS if o3d.loaded() else EMBREE_RAYS_TO_LOAD
-    return "embree" if count >= least and not device.is_cuda and o3d.installed() else "warp"
+    least = EMBREE_RAYS if "open3d" in sys.modules else EMBREE_RAYS_TO_LOAD
+    return "embree" if count >= least and not device.is_cuda and open3d_installed() else "warp"
 
 
 def rows(array: np.ndarray, which: slice | np.ndarray) -> np.ndarray:

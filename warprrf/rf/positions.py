@@ -6,11 +6,15 @@ other is in the same air. Else rays in many directions are counted: of a closed 
 open one a place is taken for solid only if nearly all rays from it cross one surface more or fewer than those from the
 air, and most of them meet a surface from behind where those from the air meet one from the front (or the other way
 round): places behind a partition or under a table top do not, nor do those in rooms whose mesh has holes.
-Under the open sky buildings are told apart besides (:mod:`warprrf.rf.open_air`): they often have no floors.
+
+A city's mesh is no closed room: rays leave it, buildings often have no floors, and the ground is one sheet. So under the
+sky places are judged by rays upward besides. In a building low, slanting and steep ones all cross an odd number of
+surfaces, or out of the same number of solids; in a court, under a bridge or below a canopy some of them do not.
 """
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from functools import lru_cache
 
@@ -21,7 +25,6 @@ from warprrf.checks import check_array
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.open_air import is_open_air, sees_sky, under_a_roof, warn_of_unmodelled
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
 WALL_CLEARANCE_M = 1e-4
@@ -37,9 +40,14 @@ LARGEST_M = 20e3
 HIGHEST_M = 1e3
 MOST_WAVELENGTHS = 5e6
 SMALLEST_M = 0.05
+LEAST_HZ = 100e9
+"""Below it walls let much through, and waves bend round edges, indoors too."""
 
 _DIRECTIONS = 24
 _AGREED = 0.75  # share of rays that must say the same
+_BANDS = 3  # of rays upward: low, slanting, steep
+_SKY = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
+_PLACES = 5  # along each side of a scene, at which the sky is looked for
 _BEHIND = -0.3  # mean of the sides (1 front, -1 back) from which rays meet surfaces: 65 % from behind
 _AT_ONCE = 20_000  # places whose rays are cast in one launch
 
@@ -141,11 +149,11 @@ def in_another_solid(
     blocked = np.flatnonzero(~mesh.visible(points, known, device=device))
     if len(blocked) == 0:
         return found
-    of_known, side_of_known = mesh.look_around(known[None], _fan(), device=device)
+    of_known, side_of_known = mesh.look_around(known[None], lattice(_DIRECTIONS), device=device)
     front_of_known = _mean_side(side_of_known)[0]
     for first in range(0, len(blocked), _AT_ONCE):
         some = blocked[first : first + _AT_ONCE]
-        winding, side = mesh.look_around(points[some], _fan(), device=device)
+        winding, side = mesh.look_around(points[some], lattice(_DIRECTIONS), device=device)
         differs = winding - of_known
         parted = (differs % 2).mean(axis=1) >= _AGREED
         if mesh.is_closed:  # solids may overlap: their winding numbers add up
@@ -182,6 +190,88 @@ def question_unit(mesh: Mesh, wavelength_m: float) -> None:
         f"metres: Mesh({metres} * vertices, faces)",
         UserWarning,
         stacklevel=3,
+    )
+
+
+def under_a_roof(mesh: Mesh, points: np.ndarray, *, device: DeviceLike = None) -> np.ndarray:
+    """Whether each of ``points`` (N, 3) [m] of a scene under the sky is in a building or in the ground, shape ``(N,)``,
+    bool; in doubt it is not."""
+    found = np.zeros(len(points), dtype=bool)
+    for first in range(0, len(points), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        winding, _ = mesh.look_around(points[some], _upward(), device=device)
+        middle = np.median(winding, axis=1, keepdims=True)
+        for votes in (winding % 2 == 1, (winding == middle) & (middle != 0)):
+            share = votes.reshape(len(votes), _BANDS, -1).mean(axis=2)
+            found[some] |= (share >= _AGREED).all(axis=1)
+    return found
+
+
+def over_ground(mesh: Mesh, points: np.ndarray, *, device: DeviceLike = None) -> np.ndarray:
+    """Whether each of ``points`` (N, 3) [m] of a scene under the sky is in its air: over something, and neither in a
+    building nor in the ground, shape ``(N,)``, bool."""
+    below = mesh.cast(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), device=device)
+    return (below.face >= 0) & ~under_a_roof(mesh, points, device=device)
+
+
+def ground_height(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, device: DeviceLike = None) -> np.ndarray:
+    """Height z of the lowest surface at ``x``, ``y`` [m], of their shape; NaN where there is none."""
+    low = mesh.bounds[0, 2] - 1.0
+    start = np.column_stack([np.ravel(x), np.ravel(y), np.full(np.size(x), low)])
+    up = mesh.cast(start, np.tile([0.0, 0.0, 1.0], (len(start), 1)), device=device).t
+    return np.where(np.isfinite(up), low + up, np.nan).reshape(np.shape(x))
+
+
+def sees_sky(mesh: Mesh, *points: np.ndarray, device: DeviceLike = None) -> bool:
+    """Whether there is sky over any of the first ``points``, each (3,) or (N, 3) [m]."""
+    places = np.concatenate([np.reshape(p, (-1, 3)) for p in points])[:_DIRECTIONS]
+    return bool(_sky_over(mesh, places, device).any())
+
+
+def is_open_air(mesh: Mesh, *, device: DeviceLike = None) -> bool:
+    """Whether most of a scene is ground under the sky: a street or a city, not a room or a corridor, torn as its mesh
+    may be."""
+    if mesh.is_closed:
+        return False
+    low, high = mesh.bounds
+    share = (np.arange(_PLACES) + 0.5) / _PLACES
+    x, y = (a.ravel() for a in np.meshgrid(*(low[:2, None] + share * (high - low)[:2, None])))
+    places = np.column_stack([x, y, np.full(len(x), 0.5 * (low[2] + high[2]))])
+    ground = np.isfinite(ground_height(mesh, x, y, device=device))
+    return bool((ground & _sky_over(mesh, places, device)).mean() > 0.5)
+
+
+def warn_of_unmodelled(
+    mesh: Mesh | None,
+    transmitter: np.ndarray,
+    receivers: np.ndarray,
+    *,
+    frequency_hz: float,
+    transmission: bool = False,
+    device: DeviceLike = None,
+) -> None:
+    """Warn, where the user's code calls, of what is left out and matters: below 100 GHz, and outdoors.
+
+    Args:
+        mesh: The scene's; None if there is none.
+        transmitter, receivers: Positions [m], shapes ``(3,)``, and ``(3,)`` or ``(R, 3)``.
+        frequency_hz: Carrier frequency [Hz].
+        transmission: Whether transmission through walls is modelled.
+        device: Where rays are cast.
+    """
+    reasons = [f"below {LEAST_HZ / 1e9:g} GHz"] if frequency_hz < LEAST_HZ else []
+    if mesh is not None and (
+        sees_sky(mesh, transmitter, receivers, device=device) or is_open_air(mesh, device=device)
+    ):
+        reasons.append("outdoors (under the sky)")
+    if not reasons:
+        return
+    what = "diffraction is" if transmission else "diffraction and transmission through walls are"
+    warnings.warn(
+        f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
+        "of sight may get more power than is found here; warprrf.relevance estimates how much",
+        UserWarning,
+        stacklevel=_users_level(),
     )
 
 
@@ -224,7 +314,7 @@ def _is_room(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> bool:
         return False
     if mesh.is_closed:
         return True
-    side = mesh.look_around(points, _fan(), device=device)[1]
+    side = mesh.look_around(points, lattice(_DIRECTIONS), device=device)[1]
     return bool(((side != 0).mean(axis=1) >= 0.95).all())
 
 
@@ -234,7 +324,21 @@ def _is_within(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
         return False
     if is_open_air(mesh, device=device):
         return bool(under_a_roof(mesh, point[None], device=device)[0])
-    return bool(_mean_side(mesh.look_around(point[None], _fan(), device=device)[1])[0] < 0)
+    return bool(_mean_side(mesh.look_around(point[None], lattice(_DIRECTIONS), device=device)[1])[0] < 0)
+
+
+def _users_level() -> int:
+    """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def _sky_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
+    """Whether a third of the rays upward from ``points`` (N, 3) meets nothing, shape ``(N,)``, bool."""
+    side = mesh.look_around(points, _upward(), device=device)[1]
+    return np.asarray((side == 0).mean(axis=1) >= _SKY)
 
 
 def _mean_side(side: np.ndarray) -> np.ndarray:
@@ -243,11 +347,20 @@ def _mean_side(side: np.ndarray) -> np.ndarray:
     return mean
 
 
+@lru_cache(maxsize=4)
+def lattice(count: int) -> np.ndarray:
+    """Directions ``(count, 3)`` spread over the sphere: a Fibonacci lattice, of which none runs along a wall."""
+    k = np.arange(count) + 0.5
+    return _turned(1.0 - 2.0 * k / count, k)
+
+
 @lru_cache(maxsize=1)
-def _fan() -> np.ndarray:
-    """Directions spread over the sphere: a Fibonacci lattice, of which none runs along a wall."""
+def _upward() -> np.ndarray:
+    """Directions likewise spread over the upper half of the sphere, from low to steep."""
     k = np.arange(_DIRECTIONS) + 0.5
-    zenith, azimuth = np.arccos(1.0 - 2.0 * k / _DIRECTIONS), np.pi * (1.0 + np.sqrt(5.0)) * k
-    return np.column_stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
-    )
+    return _turned(k / _DIRECTIONS, k)
+
+
+def _turned(height: np.ndarray, k: np.ndarray) -> np.ndarray:
+    azimuth, across = np.pi * (1.0 + np.sqrt(5.0)) * k, np.sqrt(1.0 - height**2)
+    return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), height])

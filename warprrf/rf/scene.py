@@ -19,7 +19,7 @@ from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
 from warprrf.rf.em.materials import Material, load_materials
-from warprrf.rf.open_air import is_open_air, over_ground
+from warprrf.rf.positions import is_open_air, over_ground
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
 from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml

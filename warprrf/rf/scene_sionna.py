@@ -3,27 +3,48 @@
 Sionna RT holds one radio material an object, in single precision, for one frequency. Materials of ITU-R P.2040 and
 constant ones are read for all frequencies; one with a law of its own in Python for the frequency that the scene has.
 Radio devices are read as positions; antennas and orientations stay with Sionna.
+
+Here too is how Sionna RT and Mitsuba are imported, on an LLVM and a variant that they can use. Dr.Jit takes any LLVM on a
+CPU: 15 and 16 abort the process, 14 is too old, so the choice isn't left to it.
 """
 
 from __future__ import annotations
 
+import glob
+import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from warprrf.checks import checked
+from warprrf.device import require
 from warprrf.rf.em.itu import itu_material
 from warprrf.rf.em.materials import Band, Material
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
-from warprrf.rf.sionna_package import select_variant, sionna_rt
 
 SIONNA_FREQUENCY_HZ = 3.5e9  # that a scene of Sionna RT has before it is set
 
 NARROWEST_SIONNA_LOBE = 127
 """Largest exponent of a lobe that Sionna RT can normalise: it divides by 2^alpha_r in single precision."""
+
+MIN_LLVM = 17
+"""Oldest LLVM whose code generator has what Dr.Jit 1.5 asks for ("Cannot select ... fminimum" before)."""
+
+_FOLDERS = (
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/usr/lib/llvm-*/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+)
 
 Positions = dict[str, np.ndarray]
 
@@ -199,3 +220,56 @@ def _follow_frequency(radio: Any, material: Material) -> None:
         return material.relative_permittivity(hertz), material.conductivity(hertz)
 
     radio.frequency_update_callback = law
+
+
+def installed_llvm() -> dict[int, Path]:
+    """The LLVM shared libraries found, by major version."""
+    found: dict[int, Path] = {}
+    for folder in _FOLDERS:
+        for name in sorted(glob.glob(f"{folder}/libLLVM*")):
+            version = re.search(r"libLLVM[-.](?:so\.)?(\d+)[\d.]*(?:\.so|\.dylib)?(?:[\d.]*)$", name)
+            if version:
+                found.setdefault(int(version.group(1)), Path(name).resolve())
+    return found
+
+
+@checked
+def select_llvm() -> Path | None:
+    """Point Dr.Jit at the newest LLVM of at least 17 before it is first imported; returns it.
+
+    A ``DRJIT_LIBLLVM_PATH`` that is already set stays. None where no version is installed that Dr.Jit could take by
+    mistake either (it may run on a GPU).
+
+    Raises:
+        ImportError: if only versions are installed that would abort the process.
+    """
+    chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if chosen:
+        return Path(chosen)
+    found = installed_llvm()
+    usable = [version for version in found if version >= MIN_LLVM]
+    if usable:
+        os.environ["DRJIT_LIBLLVM_PATH"] = str(found[max(usable)])
+        return found[max(usable)]
+    if found:
+        versions = ", ".join(str(v) for v in sorted(found))
+        raise ImportError(
+            f"Dr.Jit needs LLVM {MIN_LLVM} or newer, but only {versions} is installed and would abort the process: "
+            "apt-get install libllvm19 (Debian, Ubuntu), or set DRJIT_LIBLLVM_PATH"
+        )
+    return None
+
+
+def sionna_rt() -> Any:
+    """Sionna RT, on a variant of Mitsuba and an LLVM that it can use."""
+    select_llvm()
+    select_variant()
+    return require("sionna.rt", extra="sionna")
+
+
+def select_variant() -> Any:
+    """Mitsuba, on a variant for radio: it may be on another, for photos, and Sionna needs the one of its import."""
+    mitsuba = require("mitsuba", extra="sionna")
+    if mitsuba.variant() is None or not mitsuba.variant().endswith("mono_polarized"):
+        mitsuba.set_variant("cuda_ad_mono_polarized", "llvm_ad_mono_polarized")
+    return mitsuba

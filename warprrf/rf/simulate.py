@@ -22,8 +22,13 @@ from warprrf.rf.em.fresnel import surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import REVISION, SUB_PIXELS, ExactEngine, ReceivedPaths
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
-from warprrf.rf.open_air import ground_height, warn_of_unmodelled
-from warprrf.rf.positions import check_positions, check_receivers, question_unit
+from warprrf.rf.positions import (
+    check_positions,
+    check_receivers,
+    ground_height,
+    question_unit,
+    warn_of_unmodelled,
+)
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape

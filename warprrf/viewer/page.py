@@ -12,7 +12,7 @@ import numpy as np
 
 from warprrf import device as _device
 from warprrf.checks import check_count, check_type
-from warprrf.device import Progress
+from warprrf.device import Progress, TimeLeft
 
 
 class _GivenUp(Exception):  # noqa: N818
@@ -79,12 +79,15 @@ class Page:
         if self._background is not None and self._background.is_alive():
             self.say("The bar shows what is still computed; try again when it is gone.")
             return
-        bar = self.gui.add_progress_bar(0.0, order=0.0)
+        bar, note = self.gui.add_progress_bar(0.0, order=0.0), self.gui.add_markdown("", order=0.0)
+        left = TimeLeft()
 
-        def progress(_stage: str, done: int, total: int) -> None:
+        def progress(stage: str, done: int, total: int) -> None:
             if self._closed:
                 raise _GivenUp
+            seconds = left(stage, done, total)
             bar.value = 100.0 * done / max(total, 1)
+            note.content = stage if seconds is None else f"{stage}: {seconds:.0f} s left"
 
         def run() -> None:
             try:
@@ -96,6 +99,7 @@ class Page:
             finally:
                 if not self._closed:
                     bar.remove()
+                    note.remove()
 
         self._background = threading.Thread(target=run, name="warprrf-view-slow", daemon=True)
         self._background.start()

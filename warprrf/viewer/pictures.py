@@ -77,14 +77,13 @@ def panorama(image: Image, marks: Sequence[tuple[float, float, str]] = (), *, sc
         marks: zenith and azimuth [rad] of small rings, each with the text that appears while the mouse is over it.
         scale: whether azimuths and colours are told below it.
     """
-    title, values, *colours = image
-    data = base64.b64encode(png(coloured(values, *colours))).decode()
+    title, values, low, high, name = image
+    data = base64.b64encode(png(coloured(values, low, high, name))).decode()
     rings = "".join(
         f'<div class="mark" style="left:{50.0 + azimuth * 50.0 / np.pi:.2f}%;top:{zenith * 100.0 / np.pi:.2f}%"></div>'
         f'<div class="tip">{html.escape(text)}</div>'
         for zenith, azimuth, text in marks
     )
-    low, high, name = colours
     ends = _spread(("azimuth -180°", "-90°", "0°", "90°", "180°"))
     below = ends + colour_bar(low, high, "dB", name) if scale else ""
     return (

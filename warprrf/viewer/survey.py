@@ -128,10 +128,12 @@ class Survey:
         picture = pictures.coloured(value, low, high)[::-1]
         seen = np.where(np.isnan(value), 0, 255).astype(np.uint8)[::-1]
         width, height = found.cell_m * value.shape[1], found.cell_m * value.shape[0]
-        free = found.positions[found.free]
-        floor = 0.03 + float(
-            np.nanmedian(field.mesh.cast(free, np.tile([0.0, 0.0, -1.0], (len(free), 1))).point[:, 2])
-        )
+        free, down = found.positions[found.free], np.array([0.0, 0.0, -1.0])
+        floor = 0.0
+        if self._subject.mesh is not None:  # a little above what is drawn
+            floor = 0.03 + float(
+                np.nanmedian(self._subject.mesh.cast(free, np.tile(down, (len(free), 1))).point[:, 2])
+            )
         self._page.scene.add_image(
             "/map", np.dstack([picture, seen]), width, height,
             position=(float(found.x.mean()), float(found.y.mean()), floor), wxyz=(0.0, 1.0, 0.0, 0.0),

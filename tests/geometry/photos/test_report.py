@@ -13,7 +13,7 @@ from views import look
 import warprrf as wr
 from warprrf.geometry.photos.report import colours_matched, psnr_db
 from warprrf.geometry.photos.sight import CLASSES, from_outside, how_seen
-from warprrf.geometry.splats.discs import discs_on_mesh
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 image = pytest.importorskip("PIL.Image")
 

@@ -11,7 +11,7 @@ def test_the_table_is_sionnas_row_by_row():
     from sionna_room import sionna_or_skip
 
     sionna_or_skip()
-    from warprrf.rf.sionna_package import sionna_rt
+    from warprrf.rf.scene_sionna import sionna_rt
 
     sionna_rt()
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES as THEIRS

@@ -8,11 +8,10 @@ import pytest
 from places import ROOT
 from radio_scenes import box_mesh, joined
 
-import warprrf as wr
 from benchmarks import newrf as bench
+from benchmarks.newrf_rays import load_newrf
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
-from warprrf.rf.interop.newrf import load_newrf
 from warprrf.rf.paths.reflections import fit_reflections, mesh_parts
 from warprrf.rf.paths.trace import MirrorTracer
 
@@ -46,7 +45,7 @@ def folder():
 
 @pytest.fixture(scope="module")
 def rays(folder):
-    return wr.load_newrf(folder)
+    return load_newrf(folder)
 
 
 def test_all_receivers_rays_once_reflected_and_in_sight_agree(rays):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sionna_room import sionna_or_skip, write_scene
 
-from warprrf.rf import sionna_package
+from warprrf.rf import scene_sionna
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.interop.sionna_engine import Sampling
@@ -157,12 +157,12 @@ def test_reciprocal_materials_are_refused(scene):
 def test_an_llvm_that_aborts_is_never_chosen(monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(
-        sionna_package, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
+        scene_sionna, "installed_llvm", lambda: {14: Path("a"), 15: Path("b"), 19: Path("c"), 17: Path("d")}
     )
-    assert sionna_package.select_llvm() == Path("c")
+    assert scene_sionna.select_llvm() == Path("c")
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH")
-    monkeypatch.setattr(sionna_package, "installed_llvm", lambda: {15: Path("b")})
+    monkeypatch.setattr(scene_sionna, "installed_llvm", lambda: {15: Path("b")})
     with pytest.raises(ImportError, match="15.*libllvm19"):
-        sionna_package.select_llvm()
+        scene_sionna.select_llvm()
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/mine.so")
-    assert sionna_package.select_llvm() == Path("/mine.so")
+    assert scene_sionna.select_llvm() == Path("/mine.so")

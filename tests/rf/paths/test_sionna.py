@@ -5,7 +5,7 @@ import pytest
 from path_makers import CARRIER, random_paths
 from places import LOBBY
 
-from warprrf.rf import sionna_package
+from warprrf.rf import scene_sionna
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.interop.sionna_engine import load_sionna_scene
 from warprrf.rf.paths.path_set import Paths
@@ -19,11 +19,11 @@ RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
 @pytest.fixture(scope="module")
 def rt():
     try:
-        sionna_package.select_llvm()
+        scene_sionna.select_llvm()
     except ImportError as error:
         pytest.skip(str(error))
     pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
-    from warprrf.rf.sionna_package import sionna_rt
+    from warprrf.rf.scene_sionna import sionna_rt
 
     return sionna_rt()
 

@@ -254,26 +254,3 @@ def test_bad_input_is_named(furnished: RadioScene, change: dict[str, object], er
     options = {"geometry": furnished, "receivers": RECEIVERS[:1], **OPTIONS, **change}
     with pytest.raises(error, match=name):
         relevance(options.pop("geometry"), **options)
-
-
-def test_gaussians_behind_others_are_counted_and_change_nothing(furnished: RadioScene) -> None:
-    from types import SimpleNamespace
-
-    from warprrf.geometry.splats.gaussians import Gaussians
-
-    # Opaque discs on the near side of a wall at x = 4.6, the same again 0.3 m behind it, and one beside the receiver.
-    y, z = np.meshgrid(np.arange(0.1, 4, 0.1), np.arange(0.1, 3, 0.1))
-    front = np.stack([np.full(y.size, 4.6), y.ravel(), z.ravel()], axis=1)
-    means = np.concatenate([front, front + [0.3, 0, 0], [[2.0, 3.0, 1.0]]])
-    count = len(means)
-    gaussians = Gaussians(
-        means, np.tile([1.0, 0, 0, 0], (count, 1)), np.tile([0.005, 0.1, 0.1], (count, 1)), np.full(count, 0.999),
-        np.zeros((count, 1, 3)),
-    )  # fmt: skip
-    geometry = SimpleNamespace(mesh=furnished.mesh, gaussians=gaussians)
-    row = relevance(geometry, receivers=[[1.4, 1.5, 1.5]], **OPTIONS)["gaussians"]
-    assert row.kept is False
-    assert row.image_db < 0.1
-    unseen, total = (int(word) for word in row.reason.split(";")[0].split(" of "))
-    assert total == count
-    assert 0.9 * len(front) < unseen < 1.5 * len(front)  # those behind, and some of the front between pixels

@@ -10,8 +10,12 @@ import pytest
 from damage import survey
 
 from warprrf.rf.spectra.dataset import SpectrumDataset, assign_roles
-from warprrf.rf.spectra.dataset_files import COMPACT_AOD_STEP_RAD, COMPACT_DELAY_STEP_S
-from warprrf.rf.spectra.exr import export_exr, import_exr
+from warprrf.rf.spectra.dataset_files import (
+    COMPACT_AOD_STEP_RAD,
+    COMPACT_DELAY_STEP_S,
+    export_exr,
+    import_exr,
+)
 from warprrf.rf.spectra.spectrum import Spectrum
 
 
@@ -257,7 +261,7 @@ FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
 import warprrf as wr
-from warprrf.rf.spectra.exr import export_exr
+from warprrf.rf.spectra.dataset_files import export_exr
 ds = wr.SpectrumDataset.load(sys.argv[1])
 ds[0].plot
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

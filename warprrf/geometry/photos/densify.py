@@ -18,11 +18,11 @@ from scipy import ndimage
 
 from warprrf.device import DeviceLike
 from warprrf.geometry.photos.config import RefineConfig
-from warprrf.geometry.photos.initial_gaussians import SPREAD, discs
+from warprrf.geometry.photos.initialise import SPREAD, discs
 from warprrf.geometry.photos.targets import PosedPhotos
-from warprrf.geometry.splats.blending import Blending
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians, rotations_of
+from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import render
 
 Arrays = dict[str, np.ndarray]

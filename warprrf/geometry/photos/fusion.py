@@ -15,7 +15,6 @@ import numpy as np
 
 from warprrf.checks import check_array
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry import o3d as o3d_package
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
 from warprrf.geometry.photos.config import ReconstructionConfig, SurfaceConfig
@@ -25,6 +24,7 @@ from warprrf.geometry.photos.snapping import MIN_PATCH_M2, find_patches, flatten
 from warprrf.geometry.photos.stereo import mended
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.planar_patches import PlanarPatches
+from warprrf.geometry.rays import open3d
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.render import render
@@ -141,7 +141,7 @@ def fuse_depth(
             than its camera, or no surface comes out.
     """
     config = config or SurfaceConfig()
-    o3d = o3d_package.load()
+    o3d = open3d()
     if len(depths) != len(cameras) or not len(depths):
         raise ValueError(f"depths: got {len(depths)} maps for {len(cameras)} cameras, expected one for each")
     core = o3d.core

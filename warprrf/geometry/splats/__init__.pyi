@@ -6,7 +6,7 @@ from warprrf.geometry.splats.camera import Camera as Camera
 from warprrf.geometry.splats.gaussians import Gaussians as Gaussians
 
 # transmittance rule, thresholds and cutoff of blending
-from warprrf.geometry.splats.blending import Blending as Blending
+from warprrf.geometry.splats.rasterizer import Blending as Blending
 
 # renders one camera again and again, with gradients
 from warprrf.geometry.splats.rasterizer import Rasterizer as Rasterizer

@@ -21,11 +21,10 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, checked
-from warprrf.device import DeviceLike, launch, resolve
+from warprrf.device import DeviceLike, active_tape, gradient, launch, record, resolve
 from warprrf.geometry.rays import check_rows
-from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.tape import active_tape, gradient, record
+from warprrf.geometry.splats.rasterizer import RADIO, Blending
 from warprrf.kernels.rays import gaussians as kernels
 
 CPU_PIECES = 4  # gradient sums on a CPU, one writer each: the result does not depend on the thread count

@@ -8,13 +8,11 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from warprrf.brief import one_line
-from warprrf.checks import check_array, check_count, checked
+from warprrf.checks import check_array, check_count, checked, one_line
 from warprrf.device import DeviceLike, resolve
-from warprrf.geometry.splats.blending import RADIO, Blending
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussians import Gaussians
-from warprrf.geometry.splats.rasterizer import Rasterizer
+from warprrf.geometry.splats.rasterizer import RADIO, Blending, Rasterizer
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,9 @@ from typing import Any, TypeVar, cast
 import warp as wp
 
 from warprrf.device import resolve
-from warprrf.geometry.splats.blending import Blending
 from warprrf.geometry.splats.camera import Camera, check_camera
 from warprrf.geometry.splats.gaussian_rays import GaussianRays
-from warprrf.geometry.splats.rasterizer import Rasterizer
+from warprrf.geometry.splats.rasterizer import Blending, Rasterizer
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 try:

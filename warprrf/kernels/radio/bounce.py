@@ -29,7 +29,8 @@ def narrow(v: wp.vec3d):
 def light_surface(
     offset: int,
     surface: Surface,
-    source: wp.vec3d,
+    ray: wp.array(dtype=wp.int32),
+    source: wp.array(dtype=wp.vec3d),
     origins: wp.array(dtype=wp.vec3d),
     per_origin: int,
     directions: wp.array(dtype=wp.vec3d),
@@ -46,22 +47,25 @@ def light_surface(
     grazing: wp.array(dtype=wp.float32),
     point: wp.array(dtype=wp.vec3d),
 ):
-    """How a transmitter at ``source`` illuminates what each ray hits, shadows apart.
+    """How transmitters at ``source``, one for all or one for each row, illuminate what rays hit, shadows apart.
 
-    Ray k starts at origin k / per_origin; ``directions`` holds one for each ray, or one set for every origin. Writes
-    ``strength`` = Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] less what air of ``loss`` [neper/m] absorbs from the source
-    over the hit to the ray's origin, the cosines of incidence and of scattering, that of the angle between the scattered
-    and the mirror direction, the mean of 1 / cos(theta_s) over +-``half_width`` (what lies below the horizon left out), and
-    where the ray hits [m].
-    ``nearest`` [m] bounds d1 from below: an element at the source spans directions.
+    Row k is of ray ``ray[k]``, or of ray k if that is empty. Ray r starts at origin r / per_origin; ``directions`` holds
+    one for each ray, or one set for every origin. Writes ``strength`` = Omega cos(theta_i) / (4 pi d1)^2 [sr/m^2] less
+    what air of ``loss`` [neper/m] absorbs from the source over the hit to the ray's origin, the cosines of incidence and of
+    scattering, that of the angle between the scattered and the mirror direction, the mean of 1 / cos(theta_s) over
+    +-``half_width`` (what lies below the horizon left out), and where the ray hits [m]. ``nearest`` [m] bounds d1 from
+    below: an element at the source spans directions.
     """
     k = offset + wp.tid()
     strength[k] = 0.0
-    f = face[k]
+    r = k
+    if ray.shape[0] > 0:
+        r = ray[k]
+    f = face[r]
     if f >= 0:
-        d = directions[k % directions.shape[0]]
-        met = origins[k / per_origin] + range_m[k] * d
-        way = source - met
+        d = directions[r % directions.shape[0]]
+        met = origins[r / per_origin] + range_m[r] * d
+        way = source[wp.min(k, source.shape[0] - 1)] - met
         d1 = wp.float32(wp.length(way))
         toward = narrow(way) / wp.max(d1, 1.0e-9)
         look = -narrow(d)
@@ -75,9 +79,9 @@ def light_surface(
         if cos_i > 0.0 and d1 > 0.0:
             point[k] = met
             reach = wp.max(d1, nearest)
-            air = wp.exp(-loss * (d1 + wp.float32(range_m[k])))
+            air = wp.exp(-loss * (d1 + wp.float32(range_m[r])))
             strength[k] = (
-                air * solid_angle[k % solid_angle.shape[0]] * cos_i / (157.91367041742973 * reach * reach)
+                air * solid_angle[r % solid_angle.shape[0]] * cos_i / (157.91367041742973 * reach * reach)
             )
             cos_in[k] = wp.min(cos_i, 1.0)
             cos_out[k] = wp.min(cos_s, 1.0)

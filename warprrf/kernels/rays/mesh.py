@@ -24,7 +24,8 @@ GRAZING = 1e-7
 _ROUNDING = wp.constant(wp.float64(ROUNDING))
 _GRAZING = wp.constant(wp.float64(GRAZING))
 _FAR = wp.constant(wp.float64(1e30))
-_STEPS = 8
+_STEPS = 1 << 20
+"""Most times that a ray which glides along its own surface meets it, a step of float32's rounding further each time."""
 
 
 @wp.func

@@ -36,9 +36,18 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_count, check_positive, check_seed
 from warprrf.rf.channel.arrays import ISOTROPIC, SLANTS_RAD, PlanarArray
-from warprrf.rf.channel.lengths import PairLengths, plane_lengths, scattered_lengths, spherical_lengths
 from warprrf.rf.channel.path_arrays import PathArrays
-from warprrf.rf.channel.sums import LEAST_FREQUENCIES, Sum, dense_sum, gridded_sum, squint_sum
+from warprrf.rf.channel.sums import (
+    LEAST_FREQUENCIES,
+    PairLengths,
+    Sum,
+    dense_sum,
+    gridded_sum,
+    plane_lengths,
+    scattered_lengths,
+    spherical_lengths,
+    squint_sum,
+)
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 

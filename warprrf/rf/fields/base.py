@@ -41,7 +41,7 @@ from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and
 from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectrum, check_shape
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_shape
 from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
@@ -188,7 +188,7 @@ class RadioField(ABC):
         store: str | os.PathLike[str] | None = None,
         client: Any = None,
         progress: Progress | None = None,
-    ) -> np.ndarray:
+    ) -> Spectra:
         """Path gain of the spectra at many receivers: what :meth:`spectrum` says of each, without delays and departures.
 
         Args:
@@ -200,20 +200,21 @@ class RadioField(ABC):
             progress: called as ``progress("spectra", done, total)``.
 
         Returns:
-            Path gain [linear], shape ``(R, H, W)``, float32; that of a store stays on the disk.
+            Path gain ``(R, H, W)`` and where it holds; path gain of a store stays on the disk.
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``store`` of something else.
 
         Example::
 
-            gain = field.spectra(receivers, store="spectra.nc", client=distributed.Client("lab:8786"))
+            many = field.spectra(receivers, store="spectra.nc", client=distributed.Client("lab:8786"))
+            many.path_gain[17]
         """
         batch = self._batch("spectra", receivers, transmitters)
         variables = {"path_gain": Variable(("receiver", "zenith", "azimuth"), "1")}
         delivery = Delivery(store, client, progress)
         found = batch.gather(partial(_spectra, self), variables, {}, self._known_by(batch), delivery)
-        return found["path_gain"]
+        return Spectra(batch.receivers, batch.transmitters, self.frequency_hz, found["path_gain"])
 
     def paths(
         self,
@@ -243,6 +244,8 @@ class RadioField(ABC):
         if max_paths is not None:
             check_count("max_paths", max_paths)
         batch = self._batch("paths", receivers, transmitters)
+        if np.ndim(receivers) == 1 and store is None and client is None:  # in a hurry
+            return self._trace_paths(batch.receivers[0], batch.transmitters[0], max_paths)
         work, delivery = partial(_paths, self, max_paths), Delivery(store, client, progress)
         if store is None:
             found: dict[int, Paths] = {}

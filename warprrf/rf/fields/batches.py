@@ -61,13 +61,13 @@ class Batch:
         """Rows and answers of the parts of which some are ``missing`` (R,), all by default, as they are ready."""
         parts = [own for own in self.parts() if missing is None or missing[own].any()]
         count = len(self.receivers)
-        done = count - sum(map(len, parts))
+        done, tell = count - sum(map(len, parts)), delivery.progress or (lambda *_: None)
+        tell(self.stage, done, count)
         jobs = [(self.receivers[own], self.transmitters[own[0]]) for own in parts]
         for k, found in each(work, jobs, delivery.client):
             yield parts[k], found
             done += len(parts[k])
-            if delivery.progress is not None:
-                delivery.progress(self.stage, done, count)
+            tell(self.stage, done, count)
 
     def gather(
         self,

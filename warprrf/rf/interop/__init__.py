@@ -1,4 +1,4 @@
-"""Other people's software and files: Sionna RT, DeepMIMO, NeWRF, digital twins for ray tracers."""
+"""Other people's software and files: Sionna RT, DeepMIMO, digital twins for ray tracers."""
 
 from warprrf.lazy import attach
 

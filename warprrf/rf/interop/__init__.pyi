@@ -12,14 +12,11 @@ from warprrf.rf.interop.twin import Twin as Twin
 from warprrf.rf.paths.sionna import SionnaPaths as SionnaPaths
 
 # choose an LLVM that Dr.Jit can use
-from warprrf.rf.sionna_package import select_llvm as select_llvm
+from warprrf.rf.scene_sionna import select_llvm as select_llvm
 
 # == files ==
 # paths as a DeepMIMO scenario
 from warprrf.rf.interop.deepmimo import write_deepmimo as write_deepmimo
-
-# NeWRF's published rays
-from warprrf.rf.interop.newrf import load_newrf as load_newrf
 
 # complex reflection coefficients of surfaces from a few measured channels
 from warprrf.rf.paths.reflections import fit_reflections as fit_reflections

@@ -22,7 +22,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.exact import ReceivedPaths
 from warprrf.rf.paths.sionna import DIFFUSE, repeated
 from warprrf.rf.scene import Scene
-from warprrf.rf.sionna_package import select_variant, sionna_rt
+from warprrf.rf.scene_sionna import select_variant, sionna_rt
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape, directions_from_angles, spread_paths
 
 # Dr.Jit keeps freed memory and compiled kernels; emptied every so many receivers.

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.brief import one_line
-from warprrf.checks import check_positive, checked
+from warprrf.checks import check_positive, checked, one_line
 from warprrf.cluster import each
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread

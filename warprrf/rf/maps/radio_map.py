@@ -25,8 +25,16 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions, Links
-from warprrf.rf.open_air import ground_height, is_open_air, sees_sky, under_a_roof
-from warprrf.rf.positions import NEAR_FIELD, WALL_CLEARANCE_M, check_positions
+from warprrf.rf.positions import (
+    NEAR_FIELD,
+    WALL_CLEARANCE_M,
+    check_positions,
+    ground_height,
+    is_open_air,
+    lattice,
+    sees_sky,
+    under_a_roof,
+)
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
 ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
@@ -379,17 +387,8 @@ def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any
 
 
 def _in_room(mesh: Mesh, points: np.ndarray, known: np.ndarray, device: Any) -> np.ndarray:
-    k = np.arange(_SIDE_RAYS) + 0.5  # a Fibonacci lattice: no direction along a wall
-    zenith, azimuth = np.arccos(1.0 - 2.0 * k / _SIDE_RAYS), np.pi * (1.0 + np.sqrt(5.0)) * k
-    rays = np.column_stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
-    )
     places = np.concatenate([np.reshape(known, (1, 3)), points])
-    directions = np.tile(rays, (len(places), 1))
-    hit = mesh.cast(np.repeat(places, _SIDE_RAYS, axis=0), directions, device=device)
-    meets = hit.face >= 0
-    slope = (mesh.face_normals[np.maximum(hit.face, 0)] * directions).sum(axis=1)
-    outer = np.where(meets, -np.sign(slope), 0.0).reshape(len(places), -1).mean(axis=1)
+    outer = mesh.look_around(places, lattice(_SIDE_RAYS), device=device)[1].mean(axis=1)
     return np.asarray(outer[1:] * np.sign(outer[0]) > _OUTER_SHARE)
 
 

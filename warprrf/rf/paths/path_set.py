@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import netcdf_files
-from warprrf.brief import one_line
-from warprrf.checks import Expected, check_arrays, check_positive, checked, lengths
+from warprrf.checks import Expected, check_arrays, check_positive, checked, lengths, one_line
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.dispersion import Dispersion, dispersion

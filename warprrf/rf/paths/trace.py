@@ -16,12 +16,11 @@ from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.absorption import Gas
 from warprrf.rf.em.fresnel import SurfaceTable, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.open_air import warn_of_unmodelled
 from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
-from warprrf.rf.positions import check_positions, check_receivers, question_unit
+from warprrf.rf.positions import check_positions, check_receivers, question_unit, warn_of_unmodelled
 
 
 @checked

@@ -7,10 +7,8 @@ parts are computed for each combination that is asked for.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -216,8 +214,6 @@ class FullModel:
     Attributes:
         effects: names of all parts, in the order of the table.
         blocked: whether each receiver has no line of sight, shape ``(R,)``.
-        seconds: what an effect takes by itself [s] per spectrum, for those that take a time of their own.
-        spectrum_s: what a spectrum with every term takes [s].
 
     Raises:
         ValueError: if most receivers get no power at all.
@@ -239,22 +235,14 @@ class FullModel:
         )
         self.beam = beam_operator(field.shape, field.beam_sigma_rad, field.device)
         self._parts: dict[tuple[Any, ...], np.ndarray] = {}
-        self.seconds: dict[str, float] = {}
-        field.render(
-            replace(field, terms=replace(field.terms, **ONE_BOUNCE)).view(receivers[0])
-        )  # compile first
-        setup_s = clock(lambda: field.sent_radiance(field.transport())) / len(receivers)
+        progress("relevance", 0, len(receivers) + 1)
         self.views: list[ReceiverView] = []
-        self._mirror_power, seconds = [], []
+        self._mirror_power = []
         for r, receiver in enumerate(receivers):
-            start = time.perf_counter()
             self.views.append(field.view(receiver))
             self._mirror_power.append(field.render(self.views[-1]).powers.mirror)
-            seconds.append(time.perf_counter() - start)
-            progress("relevance", r, len(receivers) + 1)
-        self.spectrum_s = float(np.median(seconds))
+            progress("relevance", r + 1, len(receivers) + 1)
         self.blocked = np.array([not (v.paths.order == 0).any() for v in self.views])
-        self._time(setup_s)
         self.side = {"diffraction": self._diffracted(), "transmission": self._transmitted()}
         self.effects = self._names()
         self.all = frozenset(self.effects)
@@ -412,54 +400,25 @@ class FullModel:
         """The field with every term on but for what elements that no receiver sees scatter."""
         return without_elements(self.field, self.unseen)
 
-    # -------------------------------------------------------------------------------------- estimates and times
+    # -------------------------------------------------------------------------------------- estimates
 
     def _diffracted(self) -> SidePaths:
-        start = time.perf_counter()
         which = np.flatnonzero(self.blocked)
         f = self.field
         found = diffracted(
             self.walls.mesh, f.transmitter, self.receivers[which], f.wavelength_m,
             lift_m=max(LIFT_M, f.surface.skin_m), device=f.device,
         )  # fmt: skip
-        self.seconds["diffraction"] = (time.perf_counter() - start) / len(self.receivers)
         return replace(found, receiver=which[found.receiver])
 
     def _transmitted(self) -> SidePaths:
-        start = time.perf_counter()
         which = np.flatnonzero(self.blocked)
         f, w = self.field, self.walls
         found = transmitted(
             w.mesh, f.transmitter, self.receivers[which], f.wavelength_m, w.permittivity, w.thickness_m,
             skin_m=f.surface.skin_m, device=f.device,
         )  # fmt: skip
-        self.seconds["transmission"] = (time.perf_counter() - start) / len(self.receivers)
         return replace(found, receiver=which[found.receiver])
-
-    def _time(self, setup_s: float) -> None:
-        """Seconds per spectrum of the terms, each by itself; ``setup_s`` is a receiver's share of lighting elements."""
-        f, transport, view = self.field, self.field.transport(), self.views[0]
-        orders = [
-            clock(partial(transport.paths, self.receivers, order)) / len(self.receivers)
-            for order in (0, 1, 2)
-        ]
-        differences = np.maximum(np.diff(orders, prepend=0.0), 0.0)
-        self.seconds |= dict(zip(MIRRORS, map(float, differences), strict=True))
-        single = replace(f, terms=replace(f.terms, **ONE_BOUNCE))
-
-        def bounce() -> None:
-            transport.grid.light(transport.grid.hit(view.receivers), transport.transmitter)
-            single.render(view)
-
-        self.seconds["diffuse_1"] = clock(bounce)
-        for name, share, terms in (
-            ("mirror_scatter", setup_s, {"mirror_scatter": True}),
-            ("scatter_mirror", 0.0, {"scatter_mirror": True}),
-            ("diffuse_2", setup_s, {"diffuse_order": 3}),
-        ):
-            alone = replace(f, terms=replace(f.terms, **{**ONE_BOUNCE, **terms}))
-            bare = replace(view, mirror_illumination=None, mirror_shown=None)
-            self.seconds[name] = share + clock(partial(_further_image, alone, bare))
 
 
 def _further_image(field: BistaticField, view: ReceiverView) -> np.ndarray:
@@ -469,10 +428,3 @@ def _further_image(field: BistaticField, view: ReceiverView) -> np.ndarray:
     own = transport.complete(replace(view, transport=transport), field.terms)
     found = further_bounces(own, field.materials, field.sent_radiance(transport))
     return found.by_ray().reshape(*field.shape, -1).sum(axis=-1)
-
-
-def clock(work: Callable[[], Any]) -> float:
-    """Seconds that ``work`` takes."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start

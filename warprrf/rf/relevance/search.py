@@ -13,9 +13,8 @@ The order does not depend on the tolerance, so a larger one never keeps more.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,14 +23,12 @@ from warprrf.checks import check_array, check_positive, checked
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
-from warprrf.geometry.splats.gaussians import Gaussians, gaussians_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.positions import check_positions, check_receivers, question_unit
-from warprrf.rf.relevance.choice import Effect, decisive, effect_row, gaussians_row, leave_out, open_row, rms
-from warprrf.rf.relevance.model import FullModel, full_field, with_lobes
+from warprrf.rf.relevance.model import FURTHER, FullModel, full_field, with_lobes
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, check_shape
 
 SAME_BAND = 0.05  # relative difference of carriers up to which a choice holds
@@ -50,17 +47,51 @@ TITLES = {
     "diffraction": "diffraction (knife edge, ITU-R P.526)",
     "transmission": "transmission through walls (ITU-R P.2040)",
     "unseen": "surface elements that no receiver sees",
-    "gaussians": "Gaussians that no receiver sees",
 }
 OUTSIDE = ("diffraction", "transmission")
 """Effects that a bistatic field has no term for."""
 ESTIMATED = ("gas", *OUTSIDE)
 """Effects that are estimated beside the model."""
+ALIKE_DB = 0.01  # losses that round to the same hundredth of a dB are alike: then cost decides
+NEEDS = {"mirror_1": ("mirror_2",), "diffuse_1": (*FURTHER, "residual")}
+"""What goes with an effect, because it rests on it."""
+COSTLY = (
+    "scatter_mirror", "diffuse_2", "mirror_scatter", "mirror_2", "diffuse_1", "mirror_1", "diffraction", "transmission",
+    "line_of_sight",
+)  # fmt: skip
+"""From the costliest down, as measured on the lobby: fixed, so that a choice does not hang on the clock."""
 MATERIALS = {
     "scene": "materials of the scene",
     "fit": "fitted parameters",
     "assumed": "no materials known: half scattered, half mirrored, permittivity 4 assumed",
 }
+
+
+@checked
+@dataclass(frozen=True)
+class Effect:
+    """One row of the table.
+
+    Attributes:
+        name: key of the effect.
+        image_db, total_db: changes of the dB image and of the total path gain without it [dB], rms over receivers.
+        image_blocked_db, total_blocked_db: those of the receivers without line of sight; None if there are none.
+        kept: whether the smallest model has it; None if only a fit can tell.
+        reason: why, in a few words.
+    """
+
+    name: str
+    image_db: float | None
+    total_db: float | None
+    image_blocked_db: float | None
+    total_blocked_db: float | None
+    kept: bool | None
+    reason: str
+
+    @property
+    def worth_db(self) -> float | None:
+        """The larger of both changes."""
+        return None if self.image_db is None or self.total_db is None else max(self.image_db, self.total_db)
 
 
 @checked
@@ -77,8 +108,6 @@ class Relevance:
         effects: rows of the table.
         terms: the smallest bistatic model.
         image_db, total_db: its changes against the full model [dB], rms over receivers, all effects left out at once.
-        full_s, reduced_s: time of a spectrum by the full and by the smallest model [s].
-        unseen: surface elements that no receiver sees, shape ``(E,)``, bool; not written to files.
     """
 
     materials: str
@@ -91,9 +120,6 @@ class Relevance:
     terms: Terms
     image_db: float
     total_db: float
-    full_s: float
-    reduced_s: float
-    unseen: np.ndarray | None = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Effect:
         """The effect ``name``; KeyError if there is none."""
@@ -153,28 +179,27 @@ class Relevance:
             f"{self.frequency_hz / 1e9:g} GHz, tolerance {self.tolerance_db:g} dB, {self.receivers} receivers, "
             f"{self.blocked} of them blocked; {MATERIALS[self.materials]}.",
             "",
-            "| effect | image [dB] | total [dB] | blocked: image [dB] | total [dB] | time [ms] | in the model | why |",
-            "|---|---|---|---|---|---|---|---|",
+            "| effect | image [dB] | total [dB] | blocked: image [dB] | total [dB] | in the model | why |",
+            "|---|---|---|---|---|---|---|",
         ]
         for e in self.effects:
             chosen = "left to the fit" if e.kept is None else "yes" if e.kept else "no"
             if e.name in self.missing:
                 chosen = "needed, no term for it"
             numbers = [cell(v) for v in (e.image_db, e.total_db, e.image_blocked_db, e.total_blocked_db)]
-            time_ms = "" if e.seconds is None else f"{1e3 * e.seconds:.1f}"
-            lines.append(f"| {title(e.name)} | {' | '.join(numbers)} | {time_ms} | {chosen} | {e.reason} |")
+            lines.append(f"| {title(e.name)} | {' | '.join(numbers)} | {chosen} | {e.reason} |")
         lines += [
             "",
             f"All that is left out, together: {self.image_db:.3f} dB of the image, {self.total_db:.3f} dB of the "
-            f"total. A spectrum takes {1e3 * self.reduced_s:.0f} ms instead of {1e3 * self.full_s:.0f} ms.",
+            "total.",
         ]
         if self.missing:
             lines.append(f"Needed, but no term of the bistatic model: {', '.join(map(title, self.missing))}.")
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """All but ``unseen``, in terms of JSON."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "unseen"}
+        """All of it, in terms of JSON."""
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
         values["effects"] = [{**asdict(e), "worth_db": e.worth_db} for e in self.effects]
         return {**values, "terms": asdict(self.terms), "missing": list(self.missing)}
 
@@ -317,14 +342,7 @@ def relevances(
     check_positions(full.mesh, full.transmitter, places, full.wavelength_m, known=known, device=device)
     tick: Progress = progress or (lambda stage, done, total: None)
     model = FullModel(full, walls, places, floor=asked.floor, gas_db_per_m=asked.gas_db_per_m, progress=tick)
-    gaussians = gaussians_of(geometry)
-    found = []
-    for tolerance in tolerances_db:
-        one = _choose(model, source, float(tolerance))
-        if isinstance(gaussians, Gaussians):
-            row = gaussians_row(gaussians, places, full.shape, tolerance, device)
-            one = replace(one, effects=(*one.effects, row))
-        found.append(one)
+    found = [_choose(model, source, float(tolerance)) for tolerance in tolerances_db]
     tick("relevance", len(places) + 1, len(places) + 1)
     return found
 
@@ -338,9 +356,10 @@ def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
         kept = model.all - frozenset(order)
         chosen = Relevance(
             source, full.frequency_hz, tolerance_db, model.floor, len(places), int(model.blocked.sum()), (),
-            _terms(full.terms, kept), 0.0, 0.0, model.spectrum_s, 0.0, model.unseen,
+            _terms(full.terms, kept), 0.0, 0.0,
         )  # fmt: skip
-        image, seconds = _spectra(chosen.reduce(full if "unseen" in kept else model.seen_only), places)
+        reduced = chosen.reduce(full if "unseen" in kept else model.seen_only)
+        image = np.stack([reduced.render(reduced.view(receiver)).image for receiver in places])
         image += model.image(kept) - model.image(kept - set(ESTIMATED))
         loss = model.difference(np.maximum(image, 0.0))
         if decisive(loss) <= tolerance_db or not order:
@@ -352,9 +371,7 @@ def _choose(model: FullModel, source: str, tolerance_db: float) -> Relevance:
     for name in ("residual", "indirect"):
         if name not in model.all:
             effects.append(open_row(name, "only a fit tells"))
-    return replace(
-        chosen, effects=tuple(effects), image_db=rms(loss[0]), total_db=rms(loss[1]), reduced_s=seconds
-    )
+    return replace(chosen, effects=tuple(effects), image_db=rms(loss[0]), total_db=rms(loss[1]))
 
 
 def _terms(full: Terms, kept: frozenset[str]) -> Terms:
@@ -374,12 +391,129 @@ def _terms(full: Terms, kept: frozenset[str]) -> Terms:
     )
 
 
-def _spectra(field: BistaticField, receivers: np.ndarray) -> tuple[np.ndarray, float]:
-    """Spectra (R, H, W), and the median time of one [s], set-up apart."""
-    field.render(field.view(receivers[0]))  # tables and, where needed, the light on elements
-    images, seconds = [], []
-    for receiver in receivers:
-        start = time.perf_counter()
-        images.append(field.render(field.view(receiver)).image)
-        seconds.append(time.perf_counter() - start)
-    return np.stack(images), float(np.median(seconds))
+def rms(change: np.ndarray) -> float:
+    """Root mean square over receivers [dB]."""
+    return float(np.sqrt(np.mean(change**2)))
+
+
+def decisive(loss: tuple[np.ndarray, np.ndarray]) -> float:
+    """What decides [dB]: the larger of both changes, rms over receivers, the mean square raised by its standard error.
+
+    A handful of receivers stands for all of a room: one place that an effect matters at tells of others like it.
+    """
+    return max(float(np.sqrt(np.mean(x**2) + np.std(x**2) / np.sqrt(len(x)))) for x in loss)
+
+
+def leave_out(model: FullModel, candidates: frozenset[str], tolerance_db: float) -> list[str]:
+    """Effects to leave out, in order; every beginning of the list is a model within the tolerance, too."""
+    kept = model.all
+    order: list[str] = []
+    while True:
+        trials = []
+        for name in sorted(candidates & kept):
+            if not _needed(name, kept):
+                loss = decisive(model.loss(kept - {name}))
+                trials.append((round(loss / ALIKE_DB), _rank(name), name, loss))
+        if not trials or min(trials)[-1] > tolerance_db:
+            return order
+        name = min(trials)[2]
+        kept = kept - {name}
+        order.append(name)
+
+
+def _rank(name: str) -> int:
+    return COSTLY.index(name) if name in COSTLY else len(COSTLY)
+
+
+def _needed(name: str, kept: frozenset[str]) -> bool:
+    """Whether other effects in ``kept`` rest on ``name``."""
+    if name.startswith("lobe_"):
+        return sum(k.startswith("lobe_") for k in kept) == 1
+    return any(k in kept for k in NEEDS.get(name, ()))
+
+
+def effect_row(model: FullModel, name: str, kept: frozenset[str]) -> Effect:
+    """The row of one effect in a model with the effects ``kept``."""
+    lost = frozenset({name, *NEEDS.get(name, ())})
+    lobe = name.startswith("lobe_")
+    if lobe and len(model.field.terms.lobes) == 1:
+        lost = frozenset(
+            {"diffuse_1", *NEEDS["diffuse_1"]}
+        )  # without its only lobe a surface scatters nothing
+    loss = model.loss(model.all - lost)
+    image, total = (rms(x) for x in loss)
+    dark = [rms(x[model.blocked]) if model.blocked.any() else None for x in loss]
+    stays = name in kept and not (lobe and "diffuse_1" not in kept)
+    return Effect(name, image, total, dark[0], dark[1], stays, _reason(model, name, lost))
+
+
+def open_row(name: str, reason: str) -> Effect:
+    """The row of an effect that only a fit can tell about."""
+    return Effect(name, None, None, None, None, None, reason)
+
+
+def _reason(model: FullModel, name: str, lost: frozenset[str]) -> str:
+    if name == "gas":
+        return _gas(model)
+    if name == "unseen":
+        return _elements(model)
+    if name in model.side:
+        return _beside(model, name)
+    if name.startswith("lobe_"):
+        return _lobe(model, int(name.removeprefix("lobe_")))
+    share = f"{_percent(model.power(lost))} of the received power"
+    if name == "line_of_sight":
+        return f"{int((~model.blocked).sum())} of {len(model.blocked)} receivers see the transmitter; {share}"
+    return share
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share >= 1e-4 or share == 0 else f"{100 * share:.0e} %"
+
+
+def _gas(model: FullModel) -> str:
+    longest = max(
+        [float(np.max(x, initial=0.0)) for x in model.bounce_length_m]
+        + [float(np.max(v.paths.length_m, initial=0.0)) for v in model.views]
+    )
+    rate = model.gas_db_per_m
+    return f"{1e3 * rate:.2g} dB/km, longest path {longest:.1f} m: at most {rate * longest:.2g} dB"
+
+
+def _beside(model: FullModel, name: str) -> str:
+    found, blocked = model.side[name], model.blocked
+    if not blocked.any():
+        return "no receiver is blocked"
+    power = np.bincount(found.receiver, found.power, minlength=len(blocked))[blocked]
+    rest = model.image(model.all - set(model.side)).sum(axis=(1, 2))[blocked]
+    reached = power > 0
+    assumed = (
+        "; walls of 12.5 mm and permittivity 4 assumed"
+        if name == "transmission" and model.walls.assumed
+        else ""
+    )
+    if not reached.any():
+        over = "over one edge (ways over two are not sought) " if name == "diffraction" else ""
+        return f"no such path {over}to any blocked receiver{assumed}"
+    dark = int((rest[reached] == 0).sum())
+    if dark:
+        return f"nothing else reaches {dark} of {len(rest)} blocked receivers{assumed}"
+    nearest = float(np.min(10.0 * np.log10(rest[reached] / power[reached])))
+    where = f"{nearest:.0f} dB below" if nearest >= 0 else f"{-nearest:.0f} dB above"
+    return f"at its strongest {where} the rest of a blocked receiver's power{assumed}"
+
+
+def _lobe(model: FullModel, n: int) -> str:
+    others = [k for k in model.field.terms.lobes if k != n]
+    if not others:
+        return "the only lobe"
+    surface, weight = model.field.surface, model.field.parameters.weight
+    area = np.bincount(surface.element_group, surface.element_area, minlength=surface.groups)
+    share = area @ weight[:, model.field.terms.lobes.index(n)] / max(float(area @ weight.sum(axis=1)), 1e-300)
+    return f"{_percent(float(share))} of the lobes' weight; its neighbours stand in for it"
+
+
+def _elements(model: FullModel) -> str:
+    unseen, area = model.unseen, model.field.surface.element_area
+    share = _percent(float(area[unseen].sum() / area.sum()))
+    return f"{int(unseen.sum())} of {len(unseen)}, {share} of the area; they matter to further bounces alone"

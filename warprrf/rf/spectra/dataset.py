@@ -15,7 +15,7 @@ from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_number, check_positive, check_seed, checked
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT, check_frequency
-from warprrf.rf.spectra import dataset_files, exr
+from warprrf.rf.spectra import dataset_files
 from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
@@ -405,7 +405,7 @@ class SpectrumDataset:
         if not -len(self) <= index < len(self):
             raise ValueError(f"index: got {index}, expected a receiver from 0 to {len(self) - 1}")
         spectrum = self[index]
-        exr.export_exr(
+        dataset_files.export_exr(
             path, replace(spectrum, attributes={**spectrum.attributes, "polarisation": self.polarisation})
         )
 

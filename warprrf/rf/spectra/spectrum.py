@@ -19,8 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.brief import one_line
-from warprrf.checks import check_array, check_number, check_positive, checked
+from warprrf.checks import check_array, check_number, check_positive, checked, one_line
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -402,6 +401,27 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
 
 
 @checked
+@dataclass(frozen=True)
+class Spectra:
+    """Path gain by direction at many receivers; :meth:`RadioField.spectra` gives them.
+
+    Attributes:
+        receivers, transmitters: positions [m], shape ``(R, 3)``.
+        frequency_hz: carrier [Hz].
+        path_gain: [linear], shape ``(R, H, W)``, float32; an array that stays on the disk where they were stored.
+    """
+
+    receivers: np.ndarray
+    transmitters: np.ndarray
+    frequency_hz: float
+    path_gain: np.ndarray
+
+    __repr__ = one_line
+
+    def __len__(self) -> int:
+        return len(self.receivers)
+
+
 @dataclass(frozen=True)
 class Spectrum:
     """The spatial spectrum of one receiver.

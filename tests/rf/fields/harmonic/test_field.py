@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.splats.discs import discs_on_mesh
-from warprrf.geometry.splats.gaussians import Gaussians
+from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh
 from warprrf.rf.fields.harmonic.field import HarmonicField
 from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.fields.harmonic.paths import BEAM_REACH

@@ -84,65 +84,25 @@ class MirrorLight:
         share = mirror_share(p, self.surface.patch_group[self._patch], self._cosine)
         return np.bincount(self._side, share * self._irradiance, minlength=sides)
 
-    def view(self, grid: RayGrid, receivers: np.ndarray, hits: Hits) -> MirrorIllumination:
-        """Mirrored light that the rays of ``grid`` from ``receivers``, (3,) or (O, 3), see where they hit faces."""
-        s = self.surface
+    def view(self, grid: RayGrid, hits: Hits) -> MirrorIllumination:
+        """Mirrored light that the rays of ``grid`` see at what they hit."""
         # About two rays of a pixel look for mirrored light; the stride takes all of their places in turn.
-        every = grid.sub_pixels**2 // 2 + 1
-        size = len(grid.directions)
+        every, size = grid.sub_pixels**2 // 2 + 1, len(grid.directions)
         rays = np.add.outer(np.arange(0, len(hits.face), size), np.arange(0, size, every)).ravel()
         face = hits.face.numpy()[rays]
         rays, face = rays[face >= 0], face[face >= 0]
         count = self._first[face + 1] - self._first[face]
-        row = np.repeat(np.arange(len(rays)), count)
-        within = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-        pair = self._first[face[row]] + within
-        own = rays % len(grid.directions)
-        direction = grid.directions[own]
-        start = np.asarray(receivers, float).reshape(-1, 3)[rays // len(grid.directions)]
-        points = start + hits.range_m.numpy()[rays, None] * direction
-        if len(row) == 0:
-            none = np.zeros(0, int)
-            return _packed(grid, none, none, np.zeros(0), none, *[np.zeros(0)] * 5)
-        patch = self._mirror[pair]
-        normal = s.normal[face]
-        turned = (s.mesh.face_normals[face] * direction).sum(axis=1) > 0
-        normal = np.where(turned[:, None], -normal, normal)[row]
-        to_receiver = -direction[row]
-        way = self._image[patch] - points[row]
-        length = np.linalg.norm(way, axis=1)
-        toward = way / np.maximum(length, 1e-9)[:, None]
-        cos_in = (normal * toward).sum(axis=1)
-        k = np.flatnonzero(cos_in > 0)
-        cos_s = np.maximum((normal[k] * to_receiver[k]).sum(axis=1), 0.0)
-        high = cos_s + grid.half_width
-        low = np.maximum(cos_s - grid.half_width, 0.01 * grid.half_width)
-        strength = every * grid.solid_angle[own[row[k]]] * cos_in[k]
-        strength /= (4.0 * np.pi * np.maximum(length[k], NEAREST_M)) ** 2
-        strength *= grid.transmittance(length[k] + hits.range_m.numpy()[rays[row[k]]])
-        return _packed(
-            grid,
-            rays[row[k]],
-            patch[k],
-            np.abs((toward[k] * s.plane_normal[patch[k]]).sum(axis=1)),
-            face[row[k]],
-            strength,
-            np.minimum(cos_in[k], 1.0),
-            np.minimum(cos_s, 1.0),
-            np.clip(2.0 * cos_in[k] * cos_s - (toward[k] * to_receiver[k]).sum(axis=1), -1.0, 1.0),
-            np.log(high / low) / (high - low),
-        )
-
-
-def _packed(
-    grid: RayGrid,
-    ray: np.ndarray,
-    patch: np.ndarray,
-    cosine: np.ndarray,
-    face: np.ndarray,
-    *light: np.ndarray,
-) -> MirrorIllumination:
-    return MirrorIllumination(
-        ray, patch, cosine, wp.array(face, dtype=wp.int32, device=grid.device),
-        Illumination(*(wp.array(value, dtype=wp.float32, device=grid.device) for value in light)),
-    )  # fmt: skip
+        within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        ray, patch = np.repeat(rays, count), self._mirror[np.repeat(self._first[face], count) + within]
+        light, point = grid.light_through(hits, self._image[patch], ray)
+        k = np.flatnonzero(light.strength.numpy() > 0)
+        ray, patch = ray[k], patch[k]
+        way = self._image[patch] - point.numpy()[k]
+        cosine = np.abs(np.einsum("ni,ni->n", way, self.surface.plane_normal[patch]))
+        lit = [array.numpy()[k] for array in light.inputs]
+        lit[0] *= every
+        return MirrorIllumination(
+            ray, patch, cosine / np.maximum(np.sqrt(np.einsum("ni,ni->n", way, way)), 1e-9),
+            wp.array(hits.face.numpy()[ray], dtype=wp.int32, device=grid.device),
+            Illumination(*(wp.array(value, dtype=wp.float32, device=grid.device) for value in lit)),
+        )  # fmt: skip

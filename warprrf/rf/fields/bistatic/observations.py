@@ -20,8 +20,7 @@ from warprrf.rf.fields.bistatic.response import predict, respond
 from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.fields.data import Data, Measured
-from warprrf.rf.open_air import warn_of_unmodelled
-from warprrf.rf.positions import check_dataset, check_positions, question_unit
+from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings, path_weights

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from warprrf import device as _device
 from warprrf.device import DeviceLike
-from warprrf.geometry import o3d
 from warprrf.geometry import rays as mesh_rays
 from warprrf.kernels.radio import bounce
 from warprrf.rf.fields.bistatic.surface import Surface
@@ -148,19 +147,14 @@ class RayGrid:
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""
-        by_embree = not self.device.is_cuda and o3d.installed() and count >= mesh_rays.EMBREE_RAYS
+        by_embree = (
+            not self.device.is_cuda and mesh_rays.open3d_installed() and count >= mesh_rays.EMBREE_RAYS
+        )
         return "embree" if by_embree else "warp"
 
     def light(self, hits: Hits, source: np.ndarray) -> Illumination:
         """How a transmitter at ``source`` (3,) [m] illuminates what was hit; shadows included."""
-        count = len(hits.face)
-        found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
-        point = wp.empty(count, dtype=wp.vec3d, device=self.device)
-        inputs = [
-            self.surface.on_device(self.device), wp.vec3d(*source), *hits.inputs, hits.solid_angle,
-            float(self.half_width), NEAREST_M, self.loss_per_m, *found.inputs, point,
-        ]  # fmt: skip
-        _device.launch(bounce.light_surface, count, inputs, device=self.device)
+        found, point = self.light_through(hits, source)
         strength = found.strength.numpy()
         ray = np.flatnonzero(strength > 0)
         free = self.surface.mesh.visible(
@@ -170,3 +164,20 @@ class RayGrid:
         strength[ray[~free]] = 0.0
         found.strength.assign(strength)
         return found
+
+    def light_through(
+        self, hits: Hits, sources: np.ndarray, ray: np.ndarray | None = None
+    ) -> tuple[Illumination, wp.array]:
+        """How transmitters at ``sources`` (3,) or (K, 3) [m] would illuminate what rays of index ``ray`` (K,), by default
+        all, hit if nothing threw a shadow; and where those hit [m], known where there is light."""
+        count = len(hits.face) if ray is None else len(ray)
+        found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
+        point = wp.empty(count, dtype=wp.vec3d, device=self.device)
+        chosen = np.zeros(0) if ray is None else ray
+        inputs = [
+            self.surface.on_device(self.device), wp.array(chosen, dtype=wp.int32, device=self.device),
+            wp.array(np.reshape(sources, (-1, 3)), dtype=wp.vec3d, device=self.device), *hits.inputs,
+            hits.solid_angle, float(self.half_width), NEAREST_M, self.loss_per_m, *found.inputs, point,
+        ]  # fmt: skip
+        _device.launch(bounce.light_surface, count, inputs, device=self.device)
+        return found, point

@@ -121,7 +121,7 @@ class Selection:
     much_better: float = 0.5
     even_better: float = 0.9
     clearly_worse: float = 1.05
-    not_much_worse: float = 1.5
+    not_much_worse: float = 1.25
     few_materials: int = 30
     regrouped: int = 3
     rounds: int = 2

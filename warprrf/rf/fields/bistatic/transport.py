@@ -232,7 +232,7 @@ class Transport:
         if not terms.diffuse:
             return view
         if terms.mirror_scatter and view.mirror_illumination is None:
-            found = self.mirror_light.view(self.grid, view.receivers, view.hits)
+            found = self.mirror_light.view(self.grid, view.hits)
             view = replace(view, mirror_illumination=found)
         if terms.scatter_mirror and view.mirror_shown is None:
             view = replace(view, mirror_shown=self._mirror_shown(view.receivers))

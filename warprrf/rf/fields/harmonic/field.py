@@ -37,8 +37,7 @@ from warprrf.checks import (
 )
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
-from warprrf.geometry.splats.discs import discs_on_mesh
-from warprrf.geometry.splats.gaussians import Gaussians, gaussians_of
+from warprrf.geometry.splats.gaussians import Gaussians, discs_on_mesh, gaussians_of
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
