@@ -20,6 +20,7 @@ CHOICES = {
     "rule": (0, 1),
     "width": (1, 4),
     "lanes": (1,),  # of a GPU
+    "channels": (1, 3),
 }  # what builders of kernels are asked for
 FOR_A_CPU_ALONE = "warprrf.kernels.raster.blocks"  # a GPU blends by `reference`
 MODULES = sorted(

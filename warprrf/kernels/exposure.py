@@ -1,11 +1,11 @@
 """What a photo shows of a rendered image: its own gain for every colour, masked pixels left out, highlights clipped.
 
-Photos are planes (:mod:`.photo_ssim`), images are flat.
+Photos are planes (:mod:`.ssim`), images are flat.
 """
 
 import warp as wp
 
-from warprrf.kernels.photo_ssim import MARGIN
+from warprrf.kernels.ssim import MARGIN
 
 CLIPPED = 1.0 - 0.5 / 255.0  # a photo's value from here on may stand for any brighter one
 

@@ -1,17 +1,23 @@
-"""The loss of photos, (1 - s) L1 + s (1 - SSIM), and its derivative with respect to the rendered image, in Warp.
+"""The loss of images, (1 - s) L1 + s (1 - SSIM), and its derivative with respect to the rendered image, in Warp.
 
-Images are planes as :mod:`warprrf.kernels.photo_ssim` wants them: :meth:`PhotoLoss.plane` makes one.
+Images are planes as :mod:`warprrf.kernels.ssim` wants them: :meth:`PhotoLoss.plane` makes one. A ``shape`` is
+``(H, W)``, or ``(R, H, W)`` for several images in one plane. A panorama goes on beyond its left and right end: its
+rows are longer by :data:`WRAPPED` columns on either side, which repeat those of the other end.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from warprrf.device import DeviceLike, launch, resolve
-from warprrf.kernels import photo_ssim as kernels
+from warprrf.kernels import ssim as kernels
+
+WRAPPED = 2 * kernels.RADIUS  # the window reaches half as far, and slopes are filtered once more
+SIZES = 2  # of images whose working planes are kept: batches have two
 
 
 @dataclass(frozen=True)
@@ -34,33 +40,43 @@ class PhotoLoss:
         device: Warp device.
         ssim_share: weight ``s`` of 1 - SSIM.
         real: scalar type of the images.
+        panorama: images of one number a pixel that wrap around, not photos.
         lanes: numbers that a thread works on; default: one on a GPU, a vector register's worth on a CPU.
     """
 
     def __init__(
-        self, device: DeviceLike, ssim_share: float, real: type = wp.float32, lanes: int | None = None
+        self,
+        device: DeviceLike,
+        ssim_share: float,
+        *,
+        real: type = wp.float32,
+        panorama: bool = False,
+        lanes: int | None = None,
     ) -> None:
         self.device, self.ssim_share, self.real = resolve(device), ssim_share, real
         self.lanes = lanes or (1 if self.device.is_cuda else kernels.LANES)
-        self.kernels = kernels.build(real, self.lanes)
-        self.rooms: dict[tuple[int, int], _Room] = {}
+        self.channels, self.wrapped = (1, WRAPPED) if panorama else (3, 0)
+        self.kernels = kernels.build(real, self.lanes, self.channels)
+        self.rooms: dict[tuple[int, ...], _Room] = {}
 
-    def plane(self, values: np.ndarray | None, shape: tuple[int, int]) -> wp.array:
-        """An image ``(H, W, 3)`` of ``shape`` ``(H, W)`` as a plane, zero if None."""
-        height, width = shape
-        rows = np.zeros((height, kernels.stride_of(width)), dtype=wp.dtype_to_numpy(self.real))
+    def plane(self, values: np.ndarray | None, shape: tuple[int, ...]) -> wp.array:
+        """An image ``(*shape, 3)``, or panorama ``shape``, as a plane, zero if None."""
+        count = self._numbers(shape)
+        rows = np.zeros((math.prod(shape[:-1]), kernels.stride_of(count)), wp.dtype_to_numpy(self.real))
         if values is not None:
-            rows[:, kernels.MARGIN : kernels.MARGIN + 3 * width] = values.reshape(height, -1)
+            image = values.reshape(len(rows), -1)
+            image = np.pad(image, ((0, 0), (self.wrapped, self.wrapped)), mode="wrap")
+            rows[:, kernels.MARGIN : kernels.MARGIN + count] = image
         return wp.array(rows.reshape(-1), dtype=self.real, device=self.device)
 
-    def values(self, plane: wp.array, shape: tuple[int, int]) -> np.ndarray:
-        """The image ``(H, W, 3)`` of a plane."""
-        height, width = shape
-        rows = plane.numpy().reshape(height, -1)
-        return rows[:, kernels.MARGIN : kernels.MARGIN + 3 * width].reshape(height, width, 3)
+    def values(self, plane: wp.array, shape: tuple[int, ...]) -> np.ndarray:
+        """The image ``(*shape, 3)``, or panorama ``(*shape, 1)``, of a plane."""
+        rows = plane.numpy().reshape(math.prod(shape[:-1]), -1)
+        first = kernels.MARGIN + self.wrapped
+        return rows[:, first : first + self.channels * shape[-1]].reshape(*shape, self.channels)
 
-    def moments(self, photo: wp.array, shape: tuple[int, int]) -> tuple[wp.array, wp.array]:
-        """Window averages of a photo and its square, of ``shape`` ``(H, W)``."""
+    def moments(self, photo: wp.array, shape: tuple[int, ...]) -> tuple[wp.array, wp.array]:
+        """Window averages of a photo and its square, of ``shape``."""
         columns = self._room(shape).averages
         self._launch(self.kernels.moments, shape, [photo, photo, *columns], height=True)
         mean, square = self.plane(None, shape), self.plane(None, shape)
@@ -68,16 +84,16 @@ class PhotoLoss:
         self._launch(self.kernels.filter_rows, shape, [columns[1], square])
         return mean, square
 
-    def canvas(self, shape: tuple[int, int]) -> wp.array:
-        """The plane that a rendered image of ``shape`` ``(H, W)`` has to be written to before the loss is asked for."""
+    def canvas(self, shape: tuple[int, ...]) -> wp.array:
+        """The plane that a rendered image of ``shape`` has to be written to before the loss is asked for."""
         return self._room(shape).canvas
 
     def __call__(
-        self, photo: wp.array, moments: tuple[wp.array, wp.array], shape: tuple[int, int]
+        self, photo: wp.array, moments: tuple[wp.array, wp.array], shape: tuple[int, ...]
     ) -> tuple[wp.array, wp.array]:
         """SSIM of every number of the image on the canvas, and the derivative of the loss with respect to it, planes
         that the next call overwrites."""
-        room, count = self._room(shape), 3 * shape[0] * shape[1]
+        room, count = self._room(shape), self.channels * math.prod(shape)
         self._launch(self.kernels.moments, shape, [room.canvas, photo, *room.averages], height=True)
         inputs = [room.inside, *moments, *room.averages, room.score, *room.slopes]
         self._launch(self.kernels.slopes, shape, inputs)
@@ -88,19 +104,26 @@ class PhotoLoss:
         self._launch(self.kernels.adjoint, shape, inputs)
         return room.score, room.gradient
 
+    def _numbers(self, shape: tuple[int, ...]) -> int:
+        """Numbers in a row of a plane."""
+        return self.channels * shape[-1] + 2 * self.wrapped
+
     def _launch(
-        self, kernel: wp.Kernel, shape: tuple[int, int], inputs: list[object], *, height: bool = False
+        self, kernel: wp.Kernel, shape: tuple[int, ...], inputs: list[object], *, height: bool = False
     ) -> None:
         """Launch a kernel over the blocks of planes."""
-        blocks = kernels.blocks_of(shape[1], self.lanes)
-        layout = [*shape[: int(height)], kernels.stride_of(shape[1]), blocks]
-        launch(kernel, shape[0] * blocks, [*layout, *inputs], device=self.device)
+        count = self._numbers(shape)
+        blocks = kernels.blocks_of(count, self.lanes)
+        layout = [*shape[-2:-1][: int(height)], kernels.stride_of(count), blocks]
+        launch(kernel, math.prod(shape[:-1]) * blocks, [*layout, *inputs], device=self.device)
 
-    def _room(self, shape: tuple[int, int]) -> _Room:
-        """Planes to work in; those of the size asked for last are kept."""
+    def _room(self, shape: tuple[int, ...]) -> _Room:
+        """Planes to work in; those of the sizes asked for last are kept."""
         if shape not in self.rooms:
-            self.rooms.clear()
-            inside = self.plane(np.ones((1, shape[1], 3)), (1, shape[1]))
+            if len(self.rooms) == SIZES:
+                del self.rooms[next(iter(self.rooms))]
+            row = 1, shape[-1]
+            inside = self.plane(np.ones((*row, self.channels)), row)
             one, two, three, *others = (self.plane(None, shape) for _ in range(12))
             groups = ((others[k], others[k + 1], others[k + 2]) for k in (0, 3, 6))
             self.rooms[shape] = _Room(inside, one, two, three, *groups)

@@ -18,7 +18,7 @@ from warprrf.device import launch
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.splats.camera import Camera
 from warprrf.kernels import exposure as kernels
-from warprrf.kernels.photo_ssim import stride_of
+from warprrf.kernels.ssim import stride_of
 
 MOST_KEPT = 60_000_000  # numbers of photos kept on the device: with their moments 720 MB
 
@@ -158,7 +158,7 @@ class Exposures:
     def _inputs(self, image: wp.array, target: Target) -> list[object]:
         """What the kernels take first."""
         width = image.shape[1]
-        layout = [width, stride_of(width)]
+        layout = [width, stride_of(3 * width)]
         return [*layout, image.flatten(), target.pixels, target.kept, self.gain(target.view)]
 
     def fit(self, image: wp.array, target: Target, visits: int) -> None:

@@ -11,7 +11,8 @@ the same bits as one thread: rows own their contributions and gradients, pixels 
     adjoint, row:  dL/da_g = sum_e (dL/dP_p F_p) w_e u_g A'(b_p . a_g) b_p
 
 ``b_p`` are the 16 real harmonics of the pixel's ray direction, shared by all its Gaussians and by all receivers.
-SSIM is that of :mod:`warprrf.kernels.ssim`, zero beyond the poles, periodic in azimuth.
+Images are planes of :mod:`warprrf.kernels.ssim`, which is zero beyond the poles; a row repeats ``wrapped`` columns of
+its other end on either side, as it is periodic in azimuth.
 """
 
 from types import SimpleNamespace
@@ -21,8 +22,8 @@ import numpy as np
 import warp as wp
 
 from warprrf.cache import once
-from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.raster import sh as _sh
+from warprrf.kernels.ssim import MARGIN
 
 EXPONENTIAL, CLAMPED, SIGNED = 0, 1, 2  # what a gain is of its harmonics' sum
 COEFFICIENTS = 16
@@ -55,7 +56,6 @@ def _basis(real: type) -> wp.Kernel:
 
 def _forward(real: type) -> dict[str, Any]:
     """From coefficients to contributions, sums and images."""
-    vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(COEFFICIENTS, real)
     limit = wp.constant(real(EXPONENT_LIMIT))
     per_neper = wp.constant(real(PER_NEPER))
@@ -106,22 +106,25 @@ def _forward(real: type) -> dict[str, Any]:
     @wp.kernel(module="unique", enable_backward=False)
     def to_image(
         offset: int,
+        width: int,
+        stride: int,
+        wrapped: int,
         factor: wp.array(dtype=real),
         extra: wp.array(dtype=real),
         floor: real,
         low: real,
         high: real,
-        target: wp.array(dtype=real),
         total: wp.array(dtype=real),
         image: wp.array(dtype=real),
-        moments: wp.array(dtype=vec3),
     ):
-        """The dB image in units of the range, and the products (u, u^2, u t) that SSIM averages."""
-        p = offset + wp.tid()
+        """The dB image in units of the range, one number of a plane's rows."""
+        i = offset + wp.tid()
+        row = i / (width + 2 * wrapped)
+        place = i % (width + 2 * wrapped)
+        p = row * width + (place + (width - 1) * wrapped) % width
         power = wp.max(factor[p] * total[p] + extra[p], real(0.0))
         u = (per_neper * wp.log(power + floor) - low) / (high - low)
-        image[p] = u
-        moments[p] = vec3(u, u * u, u * target[p])
+        image[row * stride + wp.static(MARGIN) + place] = u
 
     @wp.kernel(module="unique", enable_backward=False)
     def predict(
@@ -151,33 +154,32 @@ def _forward(real: type) -> dict[str, Any]:
 
 def _adjoints(real: type) -> dict[str, Any]:
     """From the loss back to coefficients."""
-    vec3 = wp.types.vector(3, real)
     vec16 = wp.types.vector(COEFFICIENTS, real)
     per_neper = wp.constant(real(PER_NEPER))
-    slope_of = _ssim.build(real).slope
 
     @wp.kernel(module="unique", enable_backward=False)
     def loss_adjoint(
         offset: int,
+        width: int,
+        stride: int,
+        wrapped: int,
         factor: wp.array(dtype=real),
         extra: wp.array(dtype=real),
         floor: real,
         low: real,
         high: real,
-        absolute_share: real,
-        ssim_share: real,
-        target: wp.array(dtype=real),
         total: wp.array(dtype=real),
         image: wp.array(dtype=real),
-        slopes: wp.array(dtype=vec3),
+        target: wp.array(dtype=real),
+        slopes: wp.array(dtype=real),
         absolute: wp.array(dtype=real),
         pixel_adjoint: wp.array(dtype=real),
     ):
-        """``|u - t|`` and ``dL/d(sum of contributions)``; the shares already hold the division by the pixel count."""
+        """``|u - t|`` and ``dL/d(sum of contributions)`` from the planes of u, t and dL/du."""
         p = offset + wp.tid()
-        u = image[p]
-        absolute[p] = wp.abs(u - target[p])
-        slope = slope_of(u, target[p], slopes[p], absolute_share, ssim_share)
+        e = (p / width) * stride + wp.static(MARGIN) + wrapped + p % width
+        absolute[p] = wp.abs(image[e] - target[e])
+        slope = slopes[e]
         power = factor[p] * total[p] + extra[p]
         if power < real(0.0):
             slope = real(0.0)

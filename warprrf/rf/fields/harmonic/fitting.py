@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from warprrf import tensor_files
+from warprrf.geometry.photos.photo_loss import WRAPPED, PhotoLoss
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.opacity import RATE as OPACITY_RATE
@@ -134,7 +135,8 @@ class _BatchTarget:
     """One batch's part of a :class:`Target` on the device, flattened.
 
     Attributes:
-        moments: window averages of (t, t^2, t^2), which SSIM needs.
+        image: of a gain a plane of the loss.
+        moments: what the loss keeps of a gain's image.
         count: pixels that the loss is averaged over.
     """
 
@@ -142,7 +144,7 @@ class _BatchTarget:
     factor: wp.array
     extra: wp.array
     mask: wp.array | None
-    moments: wp.array
+    moments: tuple[wp.array, wp.array] | None
     count: float
 
 
@@ -152,6 +154,7 @@ class Layer:
     def __init__(self, problem: Problem, target: Target, opacity: OpacityTraining | None = None) -> None:
         self.problem, self.target, self.kind, self.opacity = problem, target, KINDS[target.kind], opacity
         p, k = problem, problem.kernels
+        self.loss = PhotoLoss(p.device, SSIM_SHARE, real=p.real, panorama=True)
         shape = (len(p.transport.receivers), p.pixels)
         ones, zeros = np.ones(shape, p.precision), np.zeros(shape, p.precision)
         arrays = [
@@ -164,42 +167,39 @@ class Layer:
         self.data: list[_BatchTarget] = []
         for batch in p.batches:
             image, factor, extra, mask = (p.upload(a[batch.receivers].ravel()) for a in arrays)
-            moments = wp.zeros(len(image), dtype=k.vec3, device=p.device)
-            if target.mask is None:
-                t = image.numpy()
-                wp.copy(moments, p.upload(np.stack([t, t * t, t * t], axis=-1), k.vec3))
-                moments = self._smoothed(moments, wp.zeros_like(moments), wp.zeros_like(moments), len(t))
             count = max(float(mask.numpy().sum(dtype=np.float64)), 1.0)
-            shown = None if target.mask is None else mask
+            shown, moments = mask, None
+            if target.mask is None:
+                size = self._size(image)
+                image = self.loss.plane(image.numpy(), size)
+                shown, moments = None, self.loss.moments(image, size)
             self.data.append(_BatchTarget(image, factor, extra, shown, moments, count))
         pairs, pixels = (
             max(sizes)
-            for sizes in ([len(b.pair_pixel) for b in p.batches], [len(d.image) for d in self.data])
+            for sizes in ([len(b.pair_pixel) for b in p.batches], [len(d.factor) for d in self.data])
         )
         self.contribution = wp.zeros(pairs, dtype=p.real, device=p.device)
-        self.scalars = [wp.zeros(pixels, dtype=p.real, device=p.device) for _ in range(5)]
-        self.vectors = [wp.zeros(pixels, dtype=k.vec3, device=p.device) for _ in range(3)]
+        self.scalars = [wp.zeros(pixels, dtype=p.real, device=p.device) for _ in range(3)]
         self.gradient = wp.zeros(len(p.seen), dtype=k.vec16, device=p.device)
         self.opacity_gradient = np.zeros(len(p.seen))
 
-    def _smoothed(self, source: wp.array, between: wp.array, out: wp.array, count: int) -> wp.array:
-        p, (height, width) = self.problem, self.problem.transport.shape
-        p.launch(p.ssim.filter_rows, count, width, source, between)
-        p.launch(p.ssim.filter_columns, count, height, width, between, out)
-        return out
+    def _size(self, pixels: wp.array) -> tuple[int, ...]:
+        """Receivers, rows and columns of the images that ``pixels`` are."""
+        return len(pixels) // self.problem.pixels, *self.problem.transport.shape
 
     def step(self, index: int, coefficients: wp.array) -> float:
         """Loss of batch ``index``; leaves its gradient in ``self.gradient`` (zero for Gaussians it does not see)."""
         p, k, batch, data = self.problem, self.problem.kernels, self.problem.batches[index], self.data[index]
-        size = len(data.image)
-        total, _, absolute, score, adjoint = self.scalars
+        size = len(data.factor)
+        total, absolute, adjoint = self.scalars
         weight = batch.pair_weight if self.opacity is None else self.opacity.weights(index)
         gaussians = [batch.row_gaussian, batch.row_start]
         seen = [batch.pair_direction, weight, self.unit, p.basis]
         p.launch(k.contributions, batch.rows, self.kind, *gaussians, *seen, coefficients, self.contribution)
         p.launch(k.pixel_sums, size, batch.pixel_start, batch.pair_of_pixel, self.contribution, total)
-        if data.mask is None:
-            self._image_adjoint(data)
+        similarity = 1.0
+        if data.moments is not None:
+            similarity = self._image_adjoint(data, data.moments)
         else:
             share = p.real(1.0 / data.count)
             p.launch(k.absolute_adjoint, size, share, data.mask, data.image, total, absolute, adjoint)
@@ -212,24 +212,23 @@ class Layer:
         error = float(np.sum(absolute.numpy()[:size], dtype=np.float64)) / data.count
         if data.mask is not None:
             return error
-        similarity = float(np.mean(score.numpy()[:size], dtype=np.float64))
         return (1 - SSIM_SHARE) * error + SSIM_SHARE * (1 - similarity)
 
-    def _image_adjoint(self, data: _BatchTarget) -> None:
-        """Error, similarity and adjoint of the dB image of the sums that lie in ``self.scalars``."""
-        p, k, target, size = self.problem, self.problem.kernels, self.target, len(data.image)
-        total, image, absolute, score, adjoint = self.scalars
-        moments, between, slopes = self.vectors
+    def _image_adjoint(self, data: _BatchTarget, moments: tuple[wp.array, wp.array]) -> float:
+        """Similarity of the dB image of the sums that lie in ``self.scalars``; leaves errors and adjoint there."""
+        p, k, target, shape = self.problem, self.problem.kernels, self.target, self._size(data.factor)
+        total, absolute, adjoint = self.scalars
+        canvas, rows, width = self.loss.canvas(shape), shape[0] * shape[1], shape[2]
+        place = width, len(canvas) // rows, WRAPPED
         scale = (p.real(target.floor), p.real(target.low), p.real(target.high))
-        p.launch(k.to_image, size, data.factor, data.extra, *scale, data.image, total, image, moments)
-        self._smoothed(moments, between, slopes, size)
-        p.launch(p.ssim.slopes, size, data.moments, slopes, score, moments)
-        self._smoothed(moments, between, slopes, size)
-        shares = p.real((1 - SSIM_SHARE) / size), p.real(SSIM_SHARE / size)
+        count = rows * (width + 2 * WRAPPED)
+        p.launch(k.to_image, count, *place, data.factor, data.extra, *scale, total, canvas)
+        score, slopes = self.loss(data.image, moments, shape)
         p.launch(
-            k.loss_adjoint, size, data.factor, data.extra, *scale, *shares, data.image, total, image, slopes, absolute,
-            adjoint,
+            k.loss_adjoint, rows * width, *place, data.factor, data.extra, *scale, total, canvas, data.image, slopes,
+            absolute, adjoint,
         )  # fmt: skip
+        return float(np.mean(self.loss.values(score, shape), dtype=np.float64))
 
 
 def fit_layer(

@@ -14,7 +14,6 @@ from numpy.typing import DTypeLike
 
 from warprrf import device as _device
 from warprrf.device import DeviceLike
-from warprrf.kernels import ssim as _ssim
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.rf.fields.harmonic.transport import Transport
 from warprrf.rf.spectra.spectrum import pixel_directions
@@ -61,7 +60,6 @@ class Problem:
         self.precision = np.dtype(precision)
         self.real = wp.float64 if self.precision == np.float64 else wp.float32
         self.kernels = _kernels.build(self.real)
-        self.ssim = _ssim.build(self.real)
         self.seen = transport.seen
         self.pixels = transport.shape[0] * transport.shape[1]
         count = len(transport.receivers)
