@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.newrf_rays import NewrfRays, load_newrf
+from benchmarks.reflections import fit_reflections
 from benchmarks.report import Report, cell, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress
 from warprrf.rf.paths.mirror_paths import MirrorPaths
-from warprrf.rf.paths.reflections import fit_reflections
 from warprrf.rf.paths.trace import MirrorTracer
 
 PUBLISHED = {

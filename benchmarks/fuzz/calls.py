@@ -213,9 +213,6 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "sample_receivers": lambda p: {"scene": p.scene, "n": 3, "seed": 0},
     "trace_paths": lambda p: {**TRACE, "mesh_or_scene": p.scene, "receivers": p.receivers[:3], "device": "cpu"},
-    "interop.fit_reflections": lambda p: {
-        **TRACE, "mesh": p.mesh, "receivers": p.receivers[:4], "csi": np.full(4, 1e-6 + 1e-6j), "order": 1,
-    },
     "relevance": lambda p: {**TRACE, "geometry": p.field, "receivers": p.receivers[:2], "device": "cpu"},
     "evaluate": lambda p: {"test": p.test, "predict": wr.lookups.nearest(p.train)},
     # nouns

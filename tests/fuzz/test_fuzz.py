@@ -74,7 +74,6 @@ FOUND = [
     ("em.slab_transmission", ("thickness_m", "zero"), ("cos_incidence", "zero")),
     ("evaluate", ("beam_width_rad", "tiny")),
     ("evaluate", ("predict", "class")),
-    ("interop.fit_reflections", ("csi", "as list")),
     ("metrics.beam_gain_loss_db", ("width_rad", "tiny")),
     ("metrics.beam_response", ("width_rad", "tiny")),
     ("metrics.psnr", ("truth", "empty"), ("prediction", "no list")),

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import warprrf as wr
+from benchmarks.reflections import fit_reflections
 
 HERE = Path(__file__).parent
 LOBBY = HERE.parent.parent / "data" / "lobby"
@@ -472,7 +473,7 @@ def reflections() -> Values:
         room(), transmitter=TRANSMITTER, receivers=receivers, frequency_hz=3e9, mirror_order=1
     )
     csi = np.where(paths.valid, paths.gain, 0).sum(axis=1)
-    fitted = wr.interop.fit_reflections(mesh, TRANSMITTER, receivers, csi, 3e9, order=1)
+    fitted = fit_reflections(mesh, TRANSMITTER, receivers, csi, 3e9, order=1)
     return {
         "csi": (csi, Check(rtol=1e-6)),
         "predicted": (fitted.predict(receivers), Check(rtol=1e-4, atol=1e-7)),

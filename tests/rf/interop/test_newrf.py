@@ -10,9 +10,9 @@ from radio_scenes import box_mesh, joined
 
 from benchmarks import newrf as bench
 from benchmarks.newrf_rays import load_newrf
+from benchmarks.reflections import fit_reflections, mesh_parts
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import read_mesh
-from warprrf.rf.paths.reflections import fit_reflections, mesh_parts
 from warprrf.rf.paths.trace import MirrorTracer
 
 LOW, HIGH = np.array([-3.0, -2, 0]), np.array([4.0, 3, 2.5])

@@ -17,6 +17,3 @@ from warprrf.rf.scene_sionna import select_llvm as select_llvm
 # == files ==
 # paths as a DeepMIMO scenario
 from warprrf.rf.interop.deepmimo import write_deepmimo as write_deepmimo
-
-# complex reflection coefficients of surfaces from a few measured channels
-from warprrf.rf.paths.reflections import fit_reflections as fit_reflections
