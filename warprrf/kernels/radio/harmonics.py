@@ -1,4 +1,4 @@
-"""Fitting spherical harmonics to spectra on cached blending weights: forward, loss, hand-written adjoint, Adam.
+"""Fitting spherical harmonics to spectra on cached blending weights: forward, loss, hand-written adjoint.
 
 A pair is one Gaussian seen in one pixel of one receiver, with its blending weight ``w``. Pairs are stored Gaussian by
 Gaussian; a row is one Gaussian's stretch of them. Every sum has one owner, so that a launch split over threads gives
@@ -36,7 +36,7 @@ def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}
     forward, adjoint = _forward(real), _adjoints(real)
-    return SimpleNamespace(**types, **forward, **adjoint, evaluate_basis=_basis(real), adam=_adam(real))
+    return SimpleNamespace(**types, **forward, **adjoint, evaluate_basis=_basis(real))
 
 
 def _basis(real: type) -> wp.Kernel:
@@ -237,41 +237,3 @@ def _adjoints(real: type) -> dict[str, Any]:
         "absolute_adjoint": absolute_adjoint,
         "coefficient_adjoint": coefficient_adjoint,
     }
-
-
-def _adam(real: type) -> Any:
-    """The step of the coefficients."""
-    vec16 = wp.types.vector(COEFFICIENTS, real)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def adam(
-        offset: int,
-        rate: vec16,
-        ridge: vec16,
-        first_decay: real,
-        second_decay: real,
-        first_correction: real,
-        second_correction: real,
-        epsilon: real,
-        initial: wp.array(dtype=real),
-        gradient: wp.array(dtype=vec16),
-        first: wp.array(dtype=vec16),
-        second: wp.array(dtype=vec16),
-        coefficients: wp.array(dtype=vec16),
-    ):
-        """One step of Adam (Kingma and Ba 2015) on a Gaussian, with a pull ``ridge`` towards the initial constant."""
-        i = offset + wp.tid()
-        a = coefficients[i]
-        away = a
-        away[0] -= initial[i]
-        g = gradient[i] + wp.cw_mul(ridge, away)
-        m = first_decay * first[i] + (real(1.0) - first_decay) * g
-        v = second_decay * second[i] + (real(1.0) - second_decay) * wp.cw_mul(g, g)
-        first[i] = m
-        second[i] = v
-        for k in range(COEFFICIENTS):
-            a[k] -= rate[k] * first_correction * m[k] / (wp.sqrt(second_correction * v[k]) + epsilon)
-        coefficients[i] = a
-        gradient[i] = vec16(real(0.0))
-
-    return adam
