@@ -16,7 +16,7 @@ from benchmarks.newrf_rays import load_newrf
 from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import require
-from warprrf.geometry.mesh_topology import components, edge_pairs
+from warprrf.geometry.mesh import components, edge_pairs
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.spectra import metrics
 from warprrf.rf.spectra.dataset import assign_roles

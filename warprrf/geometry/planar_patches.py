@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
-from warprrf.geometry.mesh import Mesh, vectors_across
-from warprrf.geometry.mesh_topology import components, edge_pairs
+from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 
 FLAT_M = 1e-5
 """Corners may lie this far from their patch's plane [m], and six standard deviations of vertices' errors more."""

@@ -17,8 +17,7 @@ import numpy as np
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
-from warprrf.rf.em.itu import itu_material, itu_name
-from warprrf.rf.em.materials import Material, load_materials
+from warprrf.rf.em.materials import Material, itu_material, itu_name, load_materials
 
 Materials = Mapping[str, Material] | str | os.PathLike[str]
 """Materials by the name of what they replace, or a table's file."""

@@ -23,8 +23,7 @@ import numpy as np
 
 from warprrf.checks import checked
 from warprrf.device import require
-from warprrf.rf.em.itu import itu_material
-from warprrf.rf.em.materials import Band, Material
+from warprrf.rf.em.materials import Band, Material, itu_material
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 

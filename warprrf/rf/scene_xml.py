@@ -22,8 +22,7 @@ from scipy.spatial.transform import Rotation
 from warprrf.checks import LARGEST_M
 from warprrf.geometry.mesh_content import Folder
 from warprrf.geometry.mesh_files import read_mesh
-from warprrf.rf.em.itu import DEFAULT_THICKNESS_M, ITU_BANDS, itu_material, itu_name
-from warprrf.rf.em.materials import Material
+from warprrf.rf.em.materials import DEFAULT_THICKNESS_M, ITU_BANDS, Material, itu_material, itu_name
 from warprrf.rf.scene_parts import MaterialChoice, ScenePart
 
 MOST_BYTES = 200_000_000  # of an XML file; that of 4735 objects has a million

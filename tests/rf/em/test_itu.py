@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from warprrf.rf.em.itu import ITU_BANDS, itu_material, itu_name
-from warprrf.rf.em.materials import WIDEST_HZ, Band, Material, load_materials, table_entry
+from warprrf.rf.em.materials import (
+    ITU_BANDS,
+    WIDEST_HZ,
+    Band,
+    Material,
+    itu_material,
+    itu_name,
+    load_materials,
+    table_entry,
+)
 
 
 def test_the_table_is_sionnas_row_by_row():

@@ -12,8 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_topology import connected_pieces, edge_pairs, face_neighbours, smoothed_normals
+from warprrf.geometry.mesh import Mesh, connected_pieces, edge_pairs, face_neighbours, smoothed_normals
 from warprrf.geometry.photos.config import PlaneConfig, SurfaceConfig
 from warprrf.geometry.photos.planes import Plane, detect_planes, drawn_by_place
 from warprrf.geometry.planar_patches import PlanarPatches, vertex_noise

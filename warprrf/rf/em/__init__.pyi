@@ -3,7 +3,7 @@
 from warprrf.rf.em.materials import Material as Material
 
 # a material of ITU-R P.2040 by its name
-from warprrf.rf.em.itu import itu_material as itu_material
+from warprrf.rf.em.materials import itu_material as itu_material
 
 # permittivity by frequency, one row of a material
 from warprrf.rf.em.materials import Band as Band

@@ -218,8 +218,8 @@ class RadioField(ABC):
 
     def paths(
         self,
-        receivers: ArrayLike,
-        transmitters: ArrayLike | None = None,
+        rx: ArrayLike,
+        transmitter: ArrayLike | None = None,
         max_paths: int | None = None,
         *,
         store: str | os.PathLike[str] | None = None,
@@ -232,8 +232,8 @@ class RadioField(ABC):
         paths in proportion.
 
         Args:
-            receivers: one position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded [m].
-            transmitters: as for :meth:`spectra`.
+            rx: one position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded [m].
+            transmitter: position ``(3,)``, or one for each receiver ``(R, 3)`` [m]; the fitted one by default.
             max_paths: keep the strongest only (the sum is then what they carry).
             store: as for :meth:`spectra`, with room for ``max_paths``; :meth:`Paths.load` reads it.
             client, progress: as for :meth:`spectra`.
@@ -243,15 +243,15 @@ class RadioField(ABC):
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
-        batch = self._batch("paths", receivers, transmitters)
-        if np.ndim(receivers) == 1 and store is None and client is None:  # in a hurry
+        batch = self._batch("paths", rx, transmitter, names=("rx", "transmitter"))
+        if np.ndim(rx) == 1 and store is None and client is None:  # in a hurry
             return self._trace_paths(batch.receivers[0], batch.transmitters[0], max_paths)
         work, delivery = partial(_paths, self, max_paths), Delivery(store, client, progress)
         if store is None:
             found: dict[int, Paths] = {}
             for rows, several in batch.each(work, delivery):
                 found |= zip(rows.tolist(), several, strict=True)
-            return found[0] if np.ndim(receivers) == 1 else Paths.stack([found[k] for k in sorted(found)])
+            return found[0] if np.ndim(rx) == 1 else Paths.stack([found[k] for k in sorted(found)])
         if max_paths is None:
             raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
         source = batch.transmitters if len(batch.groups()) > 1 else batch.transmitters[0]
@@ -302,18 +302,23 @@ class RadioField(ABC):
         return batch.gather(work, variables, {"frequency": f}, key, delivery)["cfr"]
 
     def _batch(
-        self, stage: str, receivers: ArrayLike, transmitters: ArrayLike | None, row_bytes: int = 0
+        self,
+        stage: str,
+        receivers: ArrayLike,
+        transmitters: ArrayLike | None,
+        row_bytes: int = 0,
+        names: tuple[str, str] = ("receivers", "transmitters"),
     ) -> Batch:
         """What is asked of many receivers, once the field holds there."""
-        places = np.atleast_2d(check_receivers("receivers", receivers))
-        sources = check_array("transmitters", self.transmitter if transmitters is None else transmitters)
+        places = np.atleast_2d(check_receivers(names[0], receivers))
+        sources = check_array(names[1], self.transmitter if transmitters is None else transmitters)
         if sources.shape not in ((3,), places.shape):
             raise ValueError(
-                f"transmitters: got shape {sources.shape}, expected (3,) or one for each receiver, {places.shape}"
+                f"{names[1]}: got shape {sources.shape}, expected (3,) or one for each receiver, {places.shape}"
             )
         batch = Batch(stage, places, np.broadcast_to(sources, places.shape), row_bytes)
         for source, own in batch.groups():
-            self.check_positions(places[own], source, name="receivers")
+            self.check_positions(places[own], source, name=names[0])
         return batch
 
     def _known_by(self, batch: Batch, *options: Any) -> dict[str, str]:

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 
 from warprrf.checks import check_array, check_positive, checked
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
-from warprrf.geometry.mesh_topology import components
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.paths.mirror_paths import MirrorPaths

@@ -5,7 +5,7 @@ import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
 import warprrf as wr
-from warprrf.rf.em.itu import assumed_permittivity
+from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.fields.bistatic.suggest import Unknowns
 from warprrf.rf.fields.bistatic.training import trace
 

@@ -15,8 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_topology import connected_pieces
+from warprrf.geometry.mesh import Mesh, connected_pieces
 from warprrf.geometry.photos.completion.boxes import divide, least_surface, surface_of
 from warprrf.geometry.photos.completion.evidence import closed_sides, seen_share, vote_proven, votes
 from warprrf.geometry.photos.completion.room_planes import (

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_topology import connected_pieces
+from warprrf.geometry.mesh import Mesh, connected_pieces
 from warprrf.geometry.photos.completion.boxes import Grid
 from warprrf.geometry.photos.completion.room_planes import FaceLevels, Level
 from warprrf.geometry.photos.planes import Plane

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_topology import smoothed_normals
+from warprrf.geometry.mesh import Mesh, smoothed_normals
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.planar_patches import PlanarPatches
 

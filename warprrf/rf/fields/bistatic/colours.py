@@ -9,8 +9,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_topology import connected_pieces
+from warprrf.geometry.mesh import Mesh, connected_pieces
 from warprrf.geometry.splats.gaussians import Gaussians
 
 Y00 = 0.28209479177387814  # harmonic of degree 0

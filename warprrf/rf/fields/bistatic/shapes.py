@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.mesh_topology import components, edge_pairs
+from warprrf.geometry.mesh import Mesh, components, edge_pairs
 
 SHAPES = 6  # numbers that tell shapes apart
 

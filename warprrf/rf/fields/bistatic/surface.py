@@ -19,8 +19,7 @@ from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
 from warprrf.checks import LARGEST_M, Expected, check_arrays, check_number, index_to, lengths
 from warprrf.device import DeviceLike
-from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh
-from warprrf.geometry.mesh_topology import components, smoothed_normals
+from warprrf.geometry.mesh import GeometryLike, Mesh, as_mesh, components, smoothed_normals
 from warprrf.geometry.photos.snapping import is_scan, scanned_patches
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.gaussians import gaussians_of
