@@ -6,7 +6,7 @@ the same bits as one thread: rows own their contributions and gradients, pixels 
 
     row:    c_e = w_e u_g A(b_p . a_g)           A = exp, max(0, .), or the identity (delay and angle channels), u: unit
     pixel:  P_p = F_p sum_e c_e + X_p            F: solid angle and spreading loss, X: explicit line of sight
-            u_p = (10 log10(P_p + N0) - lo) / (hi - lo)
+            u_p = (10 log10(P_p + 1) - lo) / (hi - lo)          in units of N0
     loss:   0.8 mean |u - t| + 0.2 (1 - mean SSIM(u, t))
     adjoint, row:  dL/da_g = sum_e (dL/dP_p F_p) w_e u_g A'(b_p . a_g) b_p
 
@@ -111,7 +111,6 @@ def _forward(real: type) -> dict[str, Any]:
         wrapped: int,
         factor: wp.array(dtype=real),
         extra: wp.array(dtype=real),
-        floor: real,
         low: real,
         high: real,
         total: wp.array(dtype=real),
@@ -123,7 +122,7 @@ def _forward(real: type) -> dict[str, Any]:
         place = i % (width + 2 * wrapped)
         p = row * width + (place + (width - 1) * wrapped) % width
         power = wp.max(factor[p] * total[p] + extra[p], real(0.0))
-        u = (per_neper * wp.log(power + floor) - low) / (high - low)
+        u = (per_neper * wp.log(power + real(1.0)) - low) / (high - low)
         image[row * stride + wp.static(MARGIN) + place] = u
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -165,7 +164,6 @@ def _adjoints(real: type) -> dict[str, Any]:
         wrapped: int,
         factor: wp.array(dtype=real),
         extra: wp.array(dtype=real),
-        floor: real,
         low: real,
         high: real,
         total: wp.array(dtype=real),
@@ -183,7 +181,9 @@ def _adjoints(real: type) -> dict[str, Any]:
         power = factor[p] * total[p] + extra[p]
         if power < real(0.0):
             slope = real(0.0)
-        pixel_adjoint[p] = slope * per_neper / ((wp.max(power, real(0.0)) + floor) * (high - low)) * factor[p]
+        pixel_adjoint[p] = (
+            slope * per_neper / ((wp.max(power, real(0.0)) + real(1.0)) * (high - low)) * factor[p]
+        )
 
     @wp.kernel(module="unique", enable_backward=False)
     def absolute_adjoint(

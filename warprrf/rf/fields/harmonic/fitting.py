@@ -51,7 +51,7 @@ class Target:
             a channel.
         extra: power added to a pixel [linear], shape ``(R, H, W)``; None for zero.
         mask: one where a channel's pixel counts, shape ``(R, H, W)``; None for a gain.
-        floor, low, high: N0 [linear, in the units of ``factor``] and the range of the dB image [dB].
+        low, high: range of the dB image [dB over N0]; ``factor`` and ``extra`` are in units of N0.
     """
 
     image: np.ndarray
@@ -61,7 +61,6 @@ class Target:
     factor: np.ndarray | None = None
     extra: np.ndarray | None = None
     mask: np.ndarray | None = None
-    floor: float = 1.0
     low: float = 0.0
     high: float = 1.0
 
@@ -220,7 +219,7 @@ class Layer:
         total, absolute, adjoint = self.scalars
         canvas, rows, width = self.loss.canvas(shape), shape[0] * shape[1], shape[2]
         place = width, len(canvas) // rows, WRAPPED
-        scale = (p.real(target.floor), p.real(target.low), p.real(target.high))
+        scale = p.real(target.low), p.real(target.high)
         count = rows * (width + 2 * WRAPPED)
         p.launch(k.to_image, count, *place, data.factor, data.extra, *scale, total, canvas)
         score, slopes = self.loss(data.image, moments, shape)
@@ -365,7 +364,6 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
             # in units of the floor, so that float32 works near one
             factor=factor * (gain_unit / floor),
             extra=extra / floor,
-            floor=1.0,
             low=low - 10 * np.log10(floor),
             high=high - 10 * np.log10(floor),
         )
