@@ -12,7 +12,6 @@ from views import look
 
 import warprrf as wr
 from warprrf import tensor_files
-from warprrf.geometry import geometry_files as files
 from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.photos import sparse
 from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
@@ -21,7 +20,7 @@ from warprrf.geometry.photos.initialise import initial_gaussians
 from warprrf.geometry.photos.planes import Plane, plane_axes
 from warprrf.geometry.pipeline import reconstruct
 from warprrf.geometry.planar_patches import planar_patches
-from warprrf.geometry.reconstruction import Reconstruction
+from warprrf.geometry.reconstruction import Reconstruction, of_patches, to_patches
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 pytest.importorskip("open3d")
@@ -331,9 +330,9 @@ def test_patches_of_older_files_are_read():
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [3, 3, 3], [3, 3, 4]], float)
     mesh = wr.Mesh(corners, np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [0, 4, 5]]))
     patches = planar_patches(mesh)
-    arrays = files.of_patches(patches)
+    arrays = of_patches(patches)
     del arrays["patch_first"]
-    found = files.to_patches(arrays | {"patch_once": patches.once & (patches.face_patch >= 0)})
+    found = to_patches(arrays | {"patch_once": patches.once & (patches.face_patch >= 0)})
     np.testing.assert_array_equal(found.first, [0, 1, 0, 3])
     np.testing.assert_array_equal(found.face_patch, patches.face_patch)
 

@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike
 from warprrf import tensor_files
 from warprrf.checks import checked
 from warprrf.device import DeviceLike, Progress
-from warprrf.geometry import geometry_files as files
 from warprrf.geometry.mesh_files import UP
 from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.cells import surface_shares
@@ -44,7 +43,16 @@ from warprrf.geometry.photos.sparse import SparseModel, align_to_known, assume_s
 from warprrf.geometry.photos.targets import PosedPhotos
 from warprrf.geometry.photos.upright import turned, upright
 from warprrf.geometry.planar_patches import PlanarPatches
-from warprrf.geometry.reconstruction import Reconstruction
+from warprrf.geometry.reconstruction import (
+    Arrays,
+    Reconstruction,
+    of_gaussians,
+    of_patches,
+    of_planes,
+    to_gaussians,
+    to_patches,
+    to_planes,
+)
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.steps import Attempt, Steps
 
@@ -233,7 +241,7 @@ def _steps(
         images = [read_photo(photo) for photo in fitted.values()]
         return PosedPhotos(images, list(cameras.values()), [read_mask(photo) for photo in fitted.values()])
 
-    def initial(attempt: Attempt) -> files.Arrays:
+    def initial(attempt: Attempt) -> Arrays:
         planes, gaussians = initialise(
             sparse,
             cameras,
@@ -243,11 +251,11 @@ def _steps(
             progress=attempt.progress,
             device=device,
         )
-        return files.of_planes(planes) | files.of_gaussians(gaussians)
+        return of_planes(planes) | of_gaussians(gaussians)
 
-    def refined(attempt: Attempt) -> files.Arrays:
+    def refined(attempt: Attempt) -> Arrays:
         gaussians = refine(
-            files.to_gaussians(first),
+            to_gaussians(first),
             photos(),
             config=config.refine,
             planes=planes,
@@ -255,9 +263,9 @@ def _steps(
             checkpoint=attempt.folder / "checkpoint.safetensors",
             device=device,
         )
-        return files.of_gaussians(gaussians)
+        return of_gaussians(gaussians)
 
-    def surface(attempt: Attempt) -> files.Arrays:
+    def surface(attempt: Attempt) -> Arrays:
         everywhere = list(sparse.cameras.values())
         if measured:
             maps = range_maps(sparse, measured).values()
@@ -269,7 +277,7 @@ def _steps(
                 progress=attempt.progress, device=device,
             )  # fmt: skip
         shares = np.array(surface_shares(patches.mesh, planes, everywhere))
-        return files.of_patches(patches) | {"shares": shares}
+        return of_patches(patches) | {"shares": shares}
 
     settings = [
         config.planes,
@@ -279,13 +287,13 @@ def _steps(
         seed,
     ]
     first = _kept(steps, "initial", initial, [sparse, list(fitted), masks, *settings])
-    planes = files.to_planes(first)
-    gaussians = files.to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
+    planes = to_planes(first)
+    gaussians = to_gaussians(_kept(steps, "refined", refined, [steps.key("initial"), config.refine]))
     inputs: list[Any] = [steps.key("refined"), config.stereo, config.surface, config.completion]
     if measured:
         inputs.append({name: [file.path, file.unit_m] for name, file in measured.items()})
     kept = _kept(steps, "surface", surface, inputs)
-    return gaussians, files.to_patches(kept), _said_of_surface(*kept["shares"])
+    return gaussians, to_patches(kept), _said_of_surface(*kept["shares"])
 
 
 def _said_of_surface(unseen: float, plain: float) -> tuple[str, ...]:
@@ -303,9 +311,7 @@ def _said_of_surface(unseen: float, plain: float) -> tuple[str, ...]:
     return (said,)
 
 
-def _kept(
-    steps: Steps, name: str, make: Callable[[Attempt], files.Arrays], inputs: Sequence[Any]
-) -> files.Arrays:
+def _kept(steps: Steps, name: str, make: Callable[[Attempt], Arrays], inputs: Sequence[Any]) -> Arrays:
     """Arrays of a step, from its file if it was made from the same inputs."""
     path = steps.folder / f"{name}.safetensors"
 

@@ -1,6 +1,10 @@
-"""Adam on flat float32 arrays, and the bounded parameters of Gaussians: logarithms of scales, logits of opacities."""
+"""Adam on flat arrays, and the bounded parameters of Gaussians: logarithms of scales, logits of opacities."""
 
 import warp as wp
+
+from warprrf.cache import once
+
+FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-15  # as Gaussian splatting publishes them
 
 
 @wp.kernel(enable_backward=False)
@@ -53,29 +57,51 @@ def accumulate(
     hits[i] = hits[i] + 1.0
 
 
-@wp.kernel(enable_backward=False)
-def adam(
-    offset: int,
-    width: int,
-    rates: wp.array(dtype=float),
-    first_correction: float,
-    second_correction: float,
-    gradient: wp.array(dtype=float),
-    first: wp.array(dtype=float),
-    second: wp.array(dtype=float),
-    values: wp.array(dtype=float),
-):
-    """One step (Kingma and Ba 2015; 0.9, 0.999, 1e-15) on rows of ``width`` numbers; clears the gradient."""
-    row = offset + wp.tid()
-    for k in range(width):
-        e = row * width + k
-        g = gradient[e]
-        m = 0.9 * first[e] + 0.1 * g
-        v = 0.999 * second[e] + 0.001 * g * g
-        first[e] = m
-        second[e] = v
-        values[e] = values[e] - rates[k] * first_correction * m / (wp.sqrt(second_correction * v) + 1.0e-15)
-        gradient[e] = 0.0
+@once
+def build_adam(real: type) -> wp.Kernel:
+    """The kernel of one step, for ``wp.float32`` or ``wp.float64``."""
+    d1, d2, epsilon = (wp.constant(real(value)) for value in (FIRST_DECAY, SECOND_DECAY, EPSILON))
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def adam(
+        offset: int,
+        width: int,
+        rates: wp.array(dtype=real),
+        first_correction: real,
+        second_correction: real,
+        ridge: wp.array(dtype=real),
+        initial: wp.array(dtype=real),
+        gradient: wp.array(dtype=real),
+        first: wp.array(dtype=real),
+        second: wp.array(dtype=real),
+        values: wp.array(dtype=real),
+    ):
+        """One step (Kingma and Ba 2015) on rows of ``width`` numbers; clears the gradient. ``ridge`` pulls a row's first
+        number to ``initial`` and the others to zero; empty for none."""
+        row = offset + wp.tid()
+        for k in range(width):
+            e = row * width + k
+            g = gradient[e]
+            if ridge.shape[0] > 0:
+                away = values[e]
+                if k == 0:
+                    away -= initial[row]
+                g += ridge[k] * away
+            m = d1 * first[e] + (real(1.0) - d1) * g
+            v = d2 * second[e] + (real(1.0) - d2) * g * g
+            first[e] = m
+            second[e] = v
+            values[e] = values[e] - rates[k] * first_correction * m / (
+                wp.sqrt(second_correction * v) + epsilon
+            )
+            gradient[e] = real(0.0)
+
+    return adam
+
+
+def corrections(step: int) -> tuple[float, float]:
+    """What Adam multiplies its moments by after ``step`` steps."""
+    return 1 / (1 - FIRST_DECAY**step), 1 / (1 - SECOND_DECAY**step)
 
 
 @wp.kernel(enable_backward=False)

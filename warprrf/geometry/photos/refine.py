@@ -54,8 +54,6 @@ PLANE_STRENGTH = 0.1  # share of the deviation from its plane removed after ever
 PARTS = 1000  # of the work: what progress counts, as iterations become slower when photos are compared larger
 OVERHEAD = 30_000  # pixels that would take as long as what every iteration does besides
 
-FIRST_DECAY, SECOND_DECAY = 0.9, 0.999  # of Adam's moments
-
 
 def refine(
     gaussians: Gaussians,
@@ -232,12 +230,12 @@ class _Refinement:
             "means": [mean_rate] * 3, "quaternions": [QUATERNION_RATE] * 4, "log_scales": [SCALE_RATE] * 3,
             "logits": [OPACITY_RATE], "sh": [COLOR_RATE] * 3 + higher,
         }  # fmt: skip
-        corrections = [1 / (1 - FIRST_DECAY**t), 1 / (1 - SECOND_DECAY**t)]
+        adam = optimize.build_adam(wp.float32)
         for name, width in self.widths.items():
             rate = wp.array(rates[name], dtype=float, device=self.device)
             moments = [self.state[f"first.{name}"], self.state[f"second.{name}"]]
-            inputs = [width, rate, *corrections, self.gradients[name], *moments, self.state[name]]
-            launch(optimize.adam, self.count, inputs, device=self.device)
+            inputs = [width, rate, *optimize.corrections(t), None, None, self.gradients[name], *moments]
+            launch(adam, self.count, [*inputs, self.state[name]], device=self.device)
         strength = PLANE_STRENGTH if t < c.iterations else 1.0  # in the end exactly flat
         plane = [self.state["plane_of"], self.plane_table, strength, c.thickness_m]
         shape = [self.means, self.quaternions, self.log_scales]

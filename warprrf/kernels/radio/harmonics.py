@@ -1,4 +1,4 @@
-"""Fitting spherical harmonics to spectra on cached blending weights: forward, loss, hand-written adjoint, Adam.
+"""Fitting spherical harmonics to spectra on cached blending weights: forward, loss, hand-written adjoint.
 
 A pair is one Gaussian seen in one pixel of one receiver, with its blending weight ``w``. Pairs are stored Gaussian by
 Gaussian; a row is one Gaussian's stretch of them. Every sum has one owner, so that a launch split over threads gives
@@ -6,7 +6,7 @@ the same bits as one thread: rows own their contributions and gradients, pixels 
 
     row:    c_e = w_e u_g A(b_p . a_g)           A = exp, max(0, .), or the identity (delay and angle channels), u: unit
     pixel:  P_p = F_p sum_e c_e + X_p            F: solid angle and spreading loss, X: explicit line of sight
-            u_p = (10 log10(P_p + N0) - lo) / (hi - lo)
+            u_p = (10 log10(P_p + 1) - lo) / (hi - lo)          in units of N0
     loss:   0.8 mean |u - t| + 0.2 (1 - mean SSIM(u, t))
     adjoint, row:  dL/da_g = sum_e (dL/dP_p F_p) w_e u_g A'(b_p . a_g) b_p
 
@@ -36,7 +36,7 @@ def build(real: type) -> SimpleNamespace:
     """The kernels for one scalar type, ``wp.float32`` or ``wp.float64``; compiled when first launched."""
     types = {"vec3": wp.types.vector(3, real), "vec16": wp.types.vector(COEFFICIENTS, real)}
     forward, adjoint = _forward(real), _adjoints(real)
-    return SimpleNamespace(**types, **forward, **adjoint, evaluate_basis=_basis(real), adam=_adam(real))
+    return SimpleNamespace(**types, **forward, **adjoint, evaluate_basis=_basis(real))
 
 
 def _basis(real: type) -> wp.Kernel:
@@ -111,7 +111,6 @@ def _forward(real: type) -> dict[str, Any]:
         wrapped: int,
         factor: wp.array(dtype=real),
         extra: wp.array(dtype=real),
-        floor: real,
         low: real,
         high: real,
         total: wp.array(dtype=real),
@@ -123,7 +122,7 @@ def _forward(real: type) -> dict[str, Any]:
         place = i % (width + 2 * wrapped)
         p = row * width + (place + (width - 1) * wrapped) % width
         power = wp.max(factor[p] * total[p] + extra[p], real(0.0))
-        u = (per_neper * wp.log(power + floor) - low) / (high - low)
+        u = (per_neper * wp.log(power + real(1.0)) - low) / (high - low)
         image[row * stride + wp.static(MARGIN) + place] = u
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -165,7 +164,6 @@ def _adjoints(real: type) -> dict[str, Any]:
         wrapped: int,
         factor: wp.array(dtype=real),
         extra: wp.array(dtype=real),
-        floor: real,
         low: real,
         high: real,
         total: wp.array(dtype=real),
@@ -183,7 +181,9 @@ def _adjoints(real: type) -> dict[str, Any]:
         power = factor[p] * total[p] + extra[p]
         if power < real(0.0):
             slope = real(0.0)
-        pixel_adjoint[p] = slope * per_neper / ((wp.max(power, real(0.0)) + floor) * (high - low)) * factor[p]
+        pixel_adjoint[p] = (
+            slope * per_neper / ((wp.max(power, real(0.0)) + real(1.0)) * (high - low)) * factor[p]
+        )
 
     @wp.kernel(module="unique", enable_backward=False)
     def absolute_adjoint(
@@ -237,41 +237,3 @@ def _adjoints(real: type) -> dict[str, Any]:
         "absolute_adjoint": absolute_adjoint,
         "coefficient_adjoint": coefficient_adjoint,
     }
-
-
-def _adam(real: type) -> Any:
-    """The step of the coefficients."""
-    vec16 = wp.types.vector(COEFFICIENTS, real)
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def adam(
-        offset: int,
-        rate: vec16,
-        ridge: vec16,
-        first_decay: real,
-        second_decay: real,
-        first_correction: real,
-        second_correction: real,
-        epsilon: real,
-        initial: wp.array(dtype=real),
-        gradient: wp.array(dtype=vec16),
-        first: wp.array(dtype=vec16),
-        second: wp.array(dtype=vec16),
-        coefficients: wp.array(dtype=vec16),
-    ):
-        """One step of Adam (Kingma and Ba 2015) on a Gaussian, with a pull ``ridge`` towards the initial constant."""
-        i = offset + wp.tid()
-        a = coefficients[i]
-        away = a
-        away[0] -= initial[i]
-        g = gradient[i] + wp.cw_mul(ridge, away)
-        m = first_decay * first[i] + (real(1.0) - first_decay) * g
-        v = second_decay * second[i] + (real(1.0) - second_decay) * wp.cw_mul(g, g)
-        first[i] = m
-        second[i] = v
-        for k in range(COEFFICIENTS):
-            a[k] -= rate[k] * first_correction * m[k] / (wp.sqrt(second_correction * v[k]) + epsilon)
-        coefficients[i] = a
-        gradient[i] = vec16(real(0.0))
-
-    return adam

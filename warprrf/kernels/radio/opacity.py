@@ -67,19 +67,4 @@ def build(real: type) -> SimpleNamespace:
                 slope = response * (contribution[e] / alpha - behind / (real(1.0) - alpha))
             pair_adjoint[e] = pixel_adjoint[p] * slope
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def row_sums(
-        offset: int,
-        row_gaussian: wp.array(dtype=int),
-        row_start: wp.array(dtype=int),
-        pair_adjoint: wp.array(dtype=real),
-        gradient: wp.array(dtype=real),
-    ):
-        """``dL/do_g`` of the row's Gaussian: no other row of the batch has the same one."""
-        row = offset + wp.tid()
-        total = real(0.0)
-        for e in range(row_start[row], row_start[row + 1]):
-            total += pair_adjoint[e]
-        gradient[row_gaussian[row]] = total
-
-    return SimpleNamespace(blend=blend, blend_adjoint=blend_adjoint, row_sums=row_sums)
+    return SimpleNamespace(blend=blend, blend_adjoint=blend_adjoint)

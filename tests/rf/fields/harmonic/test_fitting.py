@@ -32,7 +32,6 @@ def synthetic_transport(receivers: int = 3, seed: int = 0) -> Transport:
         dominant=np.where(counts > 0, 0, -1).reshape(receivers, *SHAPE).astype(np.int32),
         expected_range=np.ones((receivers, *SHAPE), np.float32),
         rule="product",
-        dropped=(0.0, 0.0),
     )
 
 
@@ -45,7 +44,6 @@ def gain_target(problem: Problem, seed: int = 1, unit: np.ndarray | None = None)
         unit=unit,
         factor=rng.uniform(5.0, 50.0, shape),
         extra=np.where(rng.random(shape) < 0.1, 20.0, 0.0),
-        floor=1.0,
         low=0.0,
         high=40.0,
     )
@@ -92,7 +90,7 @@ def loss_by_hand(problem: Problem, target: Target, kind: str, table: np.ndarray)
     if target.mask is not None:
         return float((target.mask.ravel() * np.abs(total - target.image.ravel())).sum() / target.mask.sum())
     power = target.factor.ravel() * total + target.extra.ravel()
-    u = (10 * np.log10(power + target.floor) - target.low) / (target.high - target.low)
+    u = (10 * np.log10(power + 1.0) - target.low) / (target.high - target.low)
     u = u.reshape(target.image.shape)
     a, b = u, target.image
 

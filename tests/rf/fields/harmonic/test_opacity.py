@@ -47,7 +47,6 @@ def listed_pairs(seed: int = 0) -> Listed:
         dominant=np.where(counts > 0, 0, -1).reshape(2, *SHAPE).astype(np.int32),
         expected_range=np.ones((2, *SHAPE), np.float32),
         rule="product",
-        dropped=(0.0, 0.0),
     )
     return Listed(blank, rng.uniform(0.2, 1.0, len(gaussian)).astype(np.float32), 1 - 1e-6)
 
@@ -75,7 +74,7 @@ def test_gradient_by_opacity_against_finite_differences(with_unit: bool) -> None
     unit = rng.uniform(0.5, 2.0, len(problem.seen)) if with_unit else None
     target = Target(
         image=rng.uniform(0.1, 0.9, (2, *SHAPE)), initial=np.zeros(len(problem.seen)), unit=unit,
-        factor=rng.uniform(5.0, 50.0, (2, *SHAPE)), floor=1.0, low=0.0, high=40.0,
+        factor=rng.uniform(5.0, 50.0, (2, *SHAPE)), low=0.0, high=40.0,
     )  # fmt: skip
     table = rng.normal(0, 0.3, (len(problem.seen), 16))
     coefficients = problem.upload(table, problem.kernels.vec16)

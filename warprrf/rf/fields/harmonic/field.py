@@ -422,8 +422,6 @@ def _train(
             problem = Problem(seen_now, batch=options.batch, seed=options.seed, device=device)
     kept.remove()
     report = {
-        "pairs_per_pixel": seen.pairs / images.size,
-        "weight_dropped_mean": seen.dropped[1],
         "gaussians": len(gaussians),
         "gaussians_seen": len(problem.seen),
         "iterations": options.iterations,

@@ -20,6 +20,7 @@ import warp as wp
 
 from warprrf import tensor_files
 from warprrf.geometry.photos.photo_loss import WRAPPED, PhotoLoss
+from warprrf.kernels.adam import build_adam, corrections
 from warprrf.kernels.radio import harmonics as _kernels
 from warprrf.kernels.raster.sh import COEFFICIENTS as DEGREE_TO_COUNT
 from warprrf.rf.fields.harmonic.opacity import RATE as OPACITY_RATE
@@ -31,7 +32,6 @@ from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import directions_from_angles, to_db
 
 KINDS = {"exp": _kernels.EXPONENTIAL, "linear": _kernels.CLAMPED, "signed": _kernels.SIGNED}
-ADAM = (0.9, 0.999, 1e-15)  # decays and epsilon as RF-3DGS publishes them
 FINAL_RATE = 0.05  # the learning rate falls exponentially to this share of its first value
 SSIM_SHARE = 0.2  # of 1 - SSIM in the loss of a gain, the rest is L1: as RF-3DGS publishes it
 SAVED_EVERY = 50  # steps
@@ -51,7 +51,7 @@ class Target:
             a channel.
         extra: power added to a pixel [linear], shape ``(R, H, W)``; None for zero.
         mask: one where a channel's pixel counts, shape ``(R, H, W)``; None for a gain.
-        floor, low, high: N0 [linear, in the units of ``factor``] and the range of the dB image [dB].
+        low, high: range of the dB image [dB over N0]; ``factor`` and ``extra`` are in units of N0.
     """
 
     image: np.ndarray
@@ -61,7 +61,6 @@ class Target:
     factor: np.ndarray | None = None
     extra: np.ndarray | None = None
     mask: np.ndarray | None = None
-    floor: float = 1.0
     low: float = 0.0
     high: float = 1.0
 
@@ -220,7 +219,7 @@ class Layer:
         total, absolute, adjoint = self.scalars
         canvas, rows, width = self.loss.canvas(shape), shape[0] * shape[1], shape[2]
         place = width, len(canvas) // rows, WRAPPED
-        scale = (p.real(target.floor), p.real(target.low), p.real(target.high))
+        scale = p.real(target.low), p.real(target.high)
         count = rows * (width + 2 * WRAPPED)
         p.launch(k.to_image, count, *place, data.factor, data.extra, *scale, total, canvas)
         score, slopes = self.loss(data.image, moments, shape)
@@ -274,7 +273,8 @@ def fit_layer(
     )
     initial = p.upload(target.initial)
     losses = list(state.losses)
-    decay1, decay2, epsilon = ADAM
+    adam, width = build_adam(p.real), _kernels.COEFFICIENTS
+    moved = [_numbers(a) for a in (layer.gradient, first, second, coefficients)]
 
     def snapshot() -> State:
         logits = None if opacity is None else opacity.state
@@ -288,15 +288,22 @@ def fit_layer(
         ridge = firm * (pull / layer.data[index].count)
         falling = FINAL_RATE ** (step / max(steps - 1, 1))
         p.launch(
-            k.adam, len(p.seen), k.vec16(*(rate * falling).tolist()), k.vec16(*ridge.tolist()), p.real(decay1),
-            p.real(decay2), p.real(1 / (1 - decay1 ** (step + 1))), p.real(1 / (1 - decay2 ** (step + 1))),
-            p.real(epsilon), initial, layer.gradient, first, second, coefficients,
+            adam, len(p.seen), width, p.upload(rate * falling), *corrections(step + 1), p.upload(ridge), initial,
+            *moved,
         )  # fmt: skip
         if opacity is not None:
             opacity.step(layer.opacity_gradient, step + 1, OPACITY_RATE * falling)
         if each is not None:
             each(step + 1, snapshot)
     return snapshot()
+
+
+def _numbers(vectors: wp.array) -> wp.array:
+    """The memory of ``vectors``, which have to live on, as numbers."""
+    real = vectors.dtype._wp_scalar_type_
+    return wp.array(
+        ptr=vectors.ptr, dtype=real, shape=vectors.size * _kernels.COEFFICIENTS, device=vectors.device
+    )
 
 
 Y00 = 0.28209479177387814  # harmonic of degree 0
@@ -357,7 +364,6 @@ def targets(law: SingleBounce, ds: SpectrumDataset, images: np.ndarray, seen: Tr
             # in units of the floor, so that float32 works near one
             factor=factor * (gain_unit / floor),
             extra=extra / floor,
-            floor=1.0,
             low=low - 10 * np.log10(floor),
             high=high - 10 * np.log10(floor),
         )

@@ -18,6 +18,7 @@ from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import blend_weights
+from warprrf.kernels.adam import EPSILON, FIRST_DECAY, SECOND_DECAY, corrections
 from warprrf.kernels.radio import opacity as _kernels
 from warprrf.rf.fields.harmonic.problem import Problem
 from warprrf.rf.fields.harmonic.transport import Transport, cutoffs
@@ -26,7 +27,6 @@ THINNED = 0.5  # of each opacity, while lists are made
 LISTED = 32  # Gaussians kept per pixel
 THINNED_LEFT = 1e-4  # transmittance at which a thinned list ends: float32 weights give alpha to 0.1 % there
 RATE = 0.05  # Adam rate of the logits, as RF-3DGS publishes it
-DECAYS = (0.9, 0.999, 1e-15)
 LEAST, MOST = 1e-4, 1 - 1e-6  # opacities that logits are made of
 
 
@@ -157,23 +157,18 @@ class OpacityTraining:
             self.kernels.blend_adjoint, len(batch.pixel_start) - 1, self.alpha_max, batch.pixel_start,
             batch.pair_of_pixel, *self.pairs[index], self._opacity, contribution, total, adjoint, self._pair_adjoint,
         )  # fmt: skip
-        out = wp.zeros(len(p.seen), dtype=p.real, device=p.device)
-        p.launch(
-            self.kernels.row_sums, batch.rows, batch.row_gaussian, batch.row_start, self._pair_adjoint, out
-        )
-        return np.asarray(out.numpy(), np.float64)
+        owner = self.pairs[index][0].numpy()
+        return np.bincount(owner, weights=self._pair_adjoint.numpy()[: len(owner)], minlength=len(p.seen))
 
     def step(self, gradient: np.ndarray, count: int, rate: float) -> None:
         """Adam's step ``count`` (from 1) along the derivative by the opacities."""
         opacity = self.opacities
         slope = gradient * opacity * (1.0 - opacity)
-        decay1, decay2, epsilon = DECAYS
+        unbias1, unbias2 = corrections(count)
         logits, first, second = self.state
-        first = decay1 * first + (1 - decay1) * slope
-        second = decay2 * second + (1 - decay2) * slope**2
-        logits = logits - rate * (first / (1 - decay1**count)) / (
-            np.sqrt(second / (1 - decay2**count)) + epsilon
-        )
+        first = FIRST_DECAY * first + (1 - FIRST_DECAY) * slope
+        second = SECOND_DECAY * second + (1 - SECOND_DECAY) * slope**2
+        logits = logits - rate * unbias1 * first / (np.sqrt(unbias2 * second) + EPSILON)
         low, high = np.log(LEAST / (1 - LEAST)), np.log(MOST / (1 - MOST))
         self.state = np.stack([np.clip(logits, low, high), first, second])
         self._opacity = self.problem.upload(self.opacities)

@@ -13,7 +13,7 @@ An interaction point stands for the whole ray, as in the paper: the centre of th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +49,6 @@ class Transport:
         dominant: Gaussian with the largest weight, shape ``(R, H, W)`` int32, -1 where there is none.
         expected_range: blended mean of the peak ranges [m], shape ``(R, H, W)`` float32, NaN where there is none.
         rule: transmittance rule, ``"product"`` or ``"exp"``.
-        dropped: largest and mean weight per pixel that top-K left out.
     """
 
     shape: tuple[int, int]
@@ -60,7 +59,6 @@ class Transport:
     dominant: np.ndarray
     expected_range: np.ndarray
     rule: str
-    dropped: tuple[float, float]
 
     def subset(self, indices: Sequence[int] | np.ndarray) -> Transport:
         """The receivers at ``indices``, in that order."""
@@ -68,16 +66,14 @@ class Transport:
         pixels = self.shape[0] * self.shape[1]
         pieces = [slice(self.start[r * pixels], self.start[(r + 1) * pixels]) for r in chosen]
         counts = np.diff(self.start).reshape(len(self.receivers), pixels)[chosen].ravel()
-        return Transport(
-            shape=self.shape,
+        return replace(
+            self,
             receivers=self.receivers[chosen],
             start=np.concatenate([[0], np.cumsum(counts)]),
             gaussian=np.concatenate([self.gaussian[p] for p in pieces]),
             weight=np.concatenate([self.weight[p] for p in pieces]),
             dominant=self.dominant[chosen],
             expected_range=self.expected_range[chosen],
-            rule=self.rule,
-            dropped=self.dropped,
         )
 
     def at(self, receiver: ArrayLike) -> Transport:
@@ -93,11 +89,6 @@ class Transport:
                 f"receiver: got {position.tolist()}, which is none of the {len(self.receivers)} here"
             )
         return self.subset(found[:1])
-
-    @property
-    def pairs(self) -> int:
-        """Pairs of pixel and Gaussian in all."""
-        return len(self.gaussian)
 
     @cached_property
     def seen(self) -> np.ndarray:
@@ -169,7 +160,7 @@ def transport(
         )
         if progress is not None:
             progress("transport", i + 1, len(positions))
-    counts, gaussian, weight, dominant, expected, dropped = zip(*views, strict=True)
+    counts, gaussian, weight, dominant, expected = zip(*views, strict=True)
     return Transport(
         shape=(rows, columns),
         receivers=positions,
@@ -179,20 +170,19 @@ def transport(
         dominant=np.stack(dominant),
         expected_range=np.stack(expected),
         rule=rule,
-        dropped=(float(np.max([d.max() for d in dropped])), float(np.mean([d.mean() for d in dropped]))),
     )
 
 
 def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
-    """Pairs a pixel (H * W,), Gaussians and weights (E,), dominant Gaussian and mean range (H, W) of one receiver, and
-    the weight (H, W) that top-K left out."""
+    """Pairs a pixel (H * W,), Gaussians and weights (E,), dominant Gaussian and mean range (H, W) of one receiver."""
     weight, index = np.asarray(seen.weight, dtype=np.float64), np.asarray(seen.index)
     listed = (index >= 0) & (weight > 0)
     total = np.sum(weight, axis=-1, where=listed, initial=0.0)
-    dropped = np.asarray(seen.dropped, dtype=np.float64)
     keep = listed & (weight > MIN_WEIGHT * total[..., None])
     kept = np.sum(weight, axis=-1, where=keep, initial=0.0)
-    scale = np.divide(total + dropped, kept, out=np.zeros_like(kept), where=kept > 0)
+    scale = np.divide(
+        total + np.asarray(seen.dropped, np.float64), kept, out=np.zeros_like(kept), where=kept > 0
+    )
     expected = np.sum(weight * np.asarray(seen.range), axis=-1, where=keep, initial=0.0)
     expected = np.divide(expected, kept, out=np.full_like(kept, np.nan), where=kept > 0)
     return (
@@ -201,7 +191,6 @@ def _kept(seen: BlendWeights) -> tuple[np.ndarray, ...]:
         (weight * scale[..., None])[keep].astype(np.float32),
         np.where(kept > 0, np.asarray(seen.dominant), -1).astype(np.int32),
         expected.astype(np.float32),
-        dropped,
     )
 
 
