@@ -21,7 +21,7 @@ from benchmarks.report import Report, cell, table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.materials import Terms
 
 SHAPE = (18, 36)
 BEAM_RAD = np.deg2rad(6.0)

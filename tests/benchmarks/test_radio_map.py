@@ -12,7 +12,7 @@ from places import LOBBY
 from benchmarks import radio_map as bench
 from benchmarks.runner import Job
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset

@@ -4,9 +4,8 @@ import numpy as np
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 
 F, SHAPE, SIGMA = 300e9, (30, 60), np.radians(5.0)
 TX, SEES, BLOCKED = np.array([0.8, 0.9, 2.2]), np.array([4.2, 3.1, 1.2]), np.array([3.6, 3.3, 0.9])

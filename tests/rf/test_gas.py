@@ -17,12 +17,11 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.render import further_bounces, mirror_shown
 from warprrf.rf.fields.bistatic.response import respond
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.relevance.model import full_field

@@ -15,10 +15,10 @@ from warprrf.rf.em.materials import Material, load_materials, table_entry
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.rays import Illumination, RayGrid
 from warprrf.rf.fields.bistatic.scattering import resolve, scatter
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 
 F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F

@@ -14,7 +14,7 @@ import warprrf as wr
 from warprrf import cli
 from warprrf.rf.em.fresnel import lobe, slab_reflection
 from warprrf.rf.exact import ExactEngine
-from warprrf.rf.fields.bistatic.terms import Terms
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.interop import twin as twins
 from warprrf.rf.spectra.spectrum import to_db
 

@@ -13,8 +13,8 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.maps.links import BeamSearch, directivity, links_of
 from warprrf.rf.maps.radio_map import QUANTITIES, RadioMap, in_the_air
 from warprrf.rf.spectra.spectrum import pixel_directions, pixel_solid_angles

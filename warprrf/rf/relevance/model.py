@@ -20,10 +20,9 @@ from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface_table
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.materials import LOBES, Parameters, Terms
 from warprrf.rf.fields.bistatic.render import further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import LOBES, Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.paths.blockage import LIFT_M, SidePaths, diffracted, transmitted
 from warprrf.rf.spectra.beam import beam_operator

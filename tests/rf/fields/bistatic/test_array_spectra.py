@@ -12,12 +12,11 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import OWN_GAIN, Reading, Target
-from warprrf.rf.fields.bistatic.materials import Layout
+from warprrf.rf.fields.bistatic.materials import Layout, Terms
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame
 from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.response import jacobian, predict, respond
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.spectrum import directions_from_angles

@@ -9,8 +9,8 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.paths.polarisation import chain_reflection, turns
 from warprrf.rf.paths.trace import MirrorTracer
 

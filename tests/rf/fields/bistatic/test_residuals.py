@@ -13,10 +13,10 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import NEPER, Target
 from warprrf.rf.fields.bistatic.links import LinkTracer
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, Shares, fit_residual, gather_shares
 from warprrf.rf.fields.bistatic.surface import CELLS, ELEMENT_M, Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
 

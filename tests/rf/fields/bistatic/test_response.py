@@ -13,11 +13,10 @@ from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, join
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import Reading, Target
-from warprrf.rf.fields.bistatic.materials import Layout, Parameters
+from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import WeighedPaths, read
 from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 
 F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)

@@ -11,7 +11,7 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import Reading, Target, fit_groups
 from warprrf.rf.fields.bistatic.grouping import regroup
-from warprrf.rf.fields.bistatic.materials import Layout, Parameters
+from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.response import (
     Response,
@@ -21,7 +21,6 @@ from warprrf.rf.fields.bistatic.response import (
     with_further_bounces,
 )
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.fields.bistatic.transport import Transport
 from warprrf.rf.spectra.beam import BeamOperator

@@ -35,7 +35,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
-from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters
+from warprrf.rf.fields.bistatic.materials import MOST_NEPERS, Layout, Materials, Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import ArrayImage, read
 from warprrf.rf.fields.bistatic.observations import Frame, as_list, places_of, transmitters_of
 from warprrf.rf.fields.bistatic.paths import paths_of, strongest
@@ -43,7 +43,6 @@ from warprrf.rf.fields.bistatic.render import Rendered, images, path_powers, ren
 from warprrf.rf.fields.bistatic.suggest import SHAPE as SUGGEST_SHAPE
 from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns, suggest
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.fields.data import Data, Measured

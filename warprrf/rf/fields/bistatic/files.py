@@ -9,9 +9,8 @@ import numpy as np
 
 from warprrf.checks import check_type
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.uncertainty import ARRAYS as ERROR_ARRAYS
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 

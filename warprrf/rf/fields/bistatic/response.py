@@ -14,11 +14,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from warprrf.rf.em.fresnel import fresnel_curves
-from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters, mirror_power
+from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters, Terms, mirror_power
 from warprrf.rf.fields.bistatic.measured import Measurement, Superposition
 from warprrf.rf.fields.bistatic.render import mirror_shown, sent_on
 from warprrf.rf.fields.bistatic.scattering import resolve
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 
 NEGLIGIBLE = 1e-3

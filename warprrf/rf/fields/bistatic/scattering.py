@@ -19,9 +19,9 @@ import warp as wp
 from warprrf import device as _device
 from warprrf.kernels.radio import bounce
 from warprrf.rf.em.fresnel import COSINES, fresnel_curves, lobe_norm, reciprocal_factor
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.rays import Illumination
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 
 
 @lru_cache(maxsize=8)

@@ -27,7 +27,7 @@ from warprrf.rf.fields.bistatic.fit import (
     huber,
 )
 from warprrf.rf.fields.bistatic.grouping import BY_SHAPE, Regrouping, regroup
-from warprrf.rf.fields.bistatic.materials import Materials, Parameters
+from warprrf.rf.fields.bistatic.materials import Materials, Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import Frame, Place, as_list, observe, places_of
 from warprrf.rf.fields.bistatic.placing import moved, position_offset, with_azimuths
@@ -36,7 +36,6 @@ from warprrf.rf.fields.bistatic.residuals import QUICK as QUICK_RESIDUAL
 from warprrf.rf.fields.bistatic.residuals import ResidualFit, fit_residual, shares_of
 from warprrf.rf.fields.bistatic.response import Response, predict, respond, with_further_bounces
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport, traced
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
 from warprrf.rf.fields.data import Data, Measured

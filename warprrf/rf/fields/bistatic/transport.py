@@ -20,10 +20,10 @@ from warprrf.cache import Cache
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.elements import LIFT_M, ElementLinks
+from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.mirror_light import MIRROR_SLACK_M, MirrorIllumination, MirrorLight
 from warprrf.rf.fields.bistatic.rays import Hits, Illumination, RayGrid
 from warprrf.rf.fields.bistatic.surface import Surface
-from warprrf.rf.fields.bistatic.terms import Terms
 from warprrf.rf.paths.images import MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, zone_paths
 from warprrf.rf.spectra.spectrum import unit_beams

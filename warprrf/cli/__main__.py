@@ -1,8 +1,0 @@
-"""`python -m warprrf.cli`: the command line."""
-
-import sys
-
-from warprrf.cli import main
-
-if __name__ == "__main__":
-    sys.exit(main())
