@@ -315,7 +315,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "RadioField.spectra": _on(lambda p: p.field, receivers=POINTS),
     "RadioField.links": _on(lambda p: p.field, rx=POINTS, shape=(8, 16)),
     "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": "cpu"},
-    "RadioField.paths": _on(lambda p: p.field, receivers=POINTS[0], max_paths=20),
+    "RadioField.paths": _on(lambda p: p.field, rx=POINTS[0], max_paths=20),
     "RadioField.radio_map": _on(lambda p: p.field, height=1.2, cell=1.0),
     "RadioField.save": _on(lambda p: p.field, path="field.safetensors"),
     "RadioField.spectrum": _on(lambda p: p.field, rx=POINTS[0], transmitter=TRANSMITTER + 0.1),

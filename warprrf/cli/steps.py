@@ -274,7 +274,13 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
         lines.append(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
     for name, rows in wrong.items():
         lines.append(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
-    found = {"model": args.model, "receivers": places, "chains": chains, "unexplained": wrong}
+    found = {
+        "model": args.model,
+        "receivers": places,
+        "chains": chains,
+        "unexplained": wrong,
+        "noise_db": field.report.get("noise_db"),
+    }
     out.result("\n".join(lines), files=[args.out], **found)
 
 

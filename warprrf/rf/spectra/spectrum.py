@@ -400,7 +400,6 @@ def _least_falls(shape: tuple[int, int], sigma: float, device: str) -> tuple[wp.
     )
 
 
-@checked
 @dataclass(frozen=True)
 class Spectra:
     """Path gain by direction at many receivers; :meth:`RadioField.spectra` gives them.
@@ -422,6 +421,7 @@ class Spectra:
         return len(self.receivers)
 
 
+@checked
 @dataclass(frozen=True)
 class Spectrum:
     """The spatial spectrum of one receiver.

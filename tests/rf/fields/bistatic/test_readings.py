@@ -97,6 +97,18 @@ def test_wrong_readings_are_named_and_hardly_count(
     assert score(spoilt, test) > score(clean, test) - 1.0
 
 
+def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings) -> None:
+    """Noise and what the field cannot explain of clean readings add in power."""
+    noise = 10.0 ** (0.3 * np.random.default_rng(3).normal(size=len(turned)))  # 3 dB
+    power = np.maximum(np.where(turned.power > turned.floor, turned.power * noise, 0.0), turned.floor)
+    noisy = replace(turned, power=power, std_db=3.0)
+    clean, found = (
+        RadioField.fit(scene, r, quick=True).report["noise_db"]["readings"] for r in (turned, noisy)
+    )
+    assert clean < 1.0
+    assert found == pytest.approx(np.hypot(3.0, clean), rel=0.2)
+
+
 def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioScene, tmp_path: Path) -> None:
     second, third = np.array([4.3, 0.7, 2.0]), np.array([4.2, 3.4, 2.3])
     sets = [

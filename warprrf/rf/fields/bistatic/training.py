@@ -70,6 +70,8 @@ TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "i
 """Terms that a fit decides on where they are None."""
 KNOWN_BETTER = 2.0
 """By how much more readings count that hold line of sight alone: no material is in them. They tell a chain's gain."""
+CLEAR_DB = 10.0  # above its floor a reading's decibels err as they are
+NORMAL_MEDIAN = 1.4826  # standard deviation over the median size of normal errors
 MOST_RAYS = 500_000_000
 """Spectra with more rays than this are refused: what rays meet is kept during a fit."""
 RAY_BYTES = 40  # kept of each ray
@@ -546,14 +548,21 @@ class _Training:
 
     def _unexplained(self, materials: Materials) -> list[np.ndarray]:
         """Of each place the readings of tables that the fit misses by more than :attr:`Selection.unexplained` of their
-        standard deviations."""
+        standard deviations. What it misses the others by, in the median, is the noise of their table."""
         lit, sd, found = self._lit(materials), self.options.groups.noise_db, []
+        left: dict[str, list[float]] = {}
         for k, observed in enumerate(self.observed):
-            rows = np.zeros(0, int)
-            if isinstance(observed.measured, WeighedPaths):
-                error = observed.target.error(self._predicted(lit, k)) / sd
-                rows = np.flatnonzero(np.abs(error) > self.choose.unexplained)
+            rows, target = np.zeros(0, int), observed.target
+            trust, censored = target.trust, target.censored
+            if isinstance(observed.measured, WeighedPaths) and trust is not None and censored is not None:
+                error = target.error(self._predicted(lit, k))
+                rows = np.flatnonzero(np.abs(error) > self.choose.unexplained * sd)
+                clear = ~censored & (target.db > CLEAR_DB)
+                left.setdefault(self.names[observed.place.data], []).extend((error / trust)[clear])
             found.append(rows)
+        self.noise = {
+            name: NORMAL_MEDIAN * float(np.median(np.abs(errors))) for name, errors in left.items() if errors
+        }
         return found
 
     def offsets(self, materials: Materials) -> dict[int, list[tuple[Place, np.ndarray]]]:
@@ -609,6 +618,7 @@ class _Training:
             name: {"gain_db": NEPER * float(gain), "std_db": NEPER * float(np.sqrt(v))}
             for name, gain, v in zip(self.chains, fit.parameters.log_gains, variance, strict=True)
         }
+        report["noise_db"] = self.noise
         report["unexplained"] = {}
         for observed, rows in zip(self.observed, wrong, strict=True):
             if len(rows):
