@@ -280,10 +280,10 @@ def test_ctrl_c_ends_long_work_at_once(words: str, when: str, kept: str, room: P
 
 
 STUCK = """
-import ctypes, sys
+import ctypes, sys, threading
 from warprrf import cli
 def stuck(args, out):
-    out("stuck", 0, 1)
+    threading.Timer(0.5, out, ("stuck", 0, 1)).start()  # told from within the wait
     lock = ctypes.create_string_buffer(64)  # a mutex of zeros is open; who locks it twice waits for ever
     [ctypes.CDLL(None).pthread_mutex_lock(lock) for _ in range(2)]
 sys.exit(cli.run(cli.make_parser("stuck", "", "", [lambda add: add("stuck", stuck, "is stuck", "")])))
