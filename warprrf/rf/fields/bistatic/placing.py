@@ -105,10 +105,10 @@ def position_offset(
     s, paths, std = view.transport.surface, view.paths, one.position_std_m
     image = place.receiver + paths.arrival * paths.length_m[:, None]
     turn = np.tile(-np.eye(3), (len(paths), 1, 1))  # from arrival to departure
+    normals = np.concatenate([s.plane_normal, np.zeros((1, 3))])  # the last, -1, turns nothing
     for patch in paths.patch.T:  # from the transmitter on
-        normal = np.where((patch >= 0)[:, None], s.plane_normal[np.maximum(patch, 0)], 0.0)
+        normal = normals[patch]
         turn = turn - 2.0 * (turn @ normal[:, :, None]) * normal[:, None, :]
-    known = np.ones(len(target.db)) if target.trust is None else target.trust > 0
 
     def error(offset: np.ndarray) -> np.ndarray:
         out = image - place.receiver - offset
@@ -116,7 +116,7 @@ def position_offset(
         arrival = out / length[:, None]
         departure = (turn @ arrival[:, :, None])[..., 0]
         weight = path_weights(one, place.rows, arrival, departure, length / SPEED_OF_LIGHT)
-        missed = known * target.error(other + weight @ power) / fit.noise_db
+        missed = target.error(other + weight @ power) / fit.noise_db
         return np.concatenate([missed, offset / std])
 
     scale = fit.huber_db / fit.noise_db
