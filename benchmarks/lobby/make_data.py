@@ -17,7 +17,7 @@ kept, so that a killed run continues.
 
 examples:
   python -m benchmarks data
-  python -m benchmarks data --only spectra
+  python -m benchmarks data --only spectra --full      also the 800 receivers of the paper's size; resumable
   python -m benchmarks data --look plain --data data/lobby_plain --only scene photos
 """
 
@@ -30,13 +30,13 @@ class Options:
         data: folder to write.
         look: ``"patterned"`` all over, or ``"plain"`` walls, ceiling and pillars; spectra are the same for both.
         only: steps to do, of ``"scene"``, ``"photos"``, ``"spectra"``.
-        full: also all 800 receivers, beside the committed sample (``*_full.nc``).
+        full: also 800 receivers at the paper's size, beside the committed sample (``*_full.nc``).
     """
 
     data: str = option("data/lobby", "folder to write")
     look: str = option("patterned", "what walls look like", choices=scene.LOOKS)
     only: tuple[str, ...] = option(STEPS, "steps to do", choices=STEPS)
-    full: bool = option(False, "all 800 receivers too (spectra_full.nc and spectra_sionna_full.nc)")
+    full: bool = option(False, "the paper's size too: spectra_full.nc, spectra_sionna_full.nc (an hour or two)")
 
 
 def run(options: Options, job: Job) -> None:
