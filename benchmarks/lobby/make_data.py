@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.evaluation.runs import connected
 from benchmarks.lobby import photos, scene, spectra
 from benchmarks.runner import Benchmark, Job, option
 
@@ -17,7 +18,7 @@ kept, so that a killed run continues.
 
 examples:
   python -m benchmarks data
-  python -m benchmarks data --only spectra --full      also the 800 receivers of the paper's size; resumable
+  python -m benchmarks data --only spectra --full --workers 2      also the 800 receivers of the paper's size; resumable
   python -m benchmarks data --look plain --data data/lobby_plain --only scene photos
 """
 
@@ -30,12 +31,14 @@ class Options:
         data: folder to write.
         look: ``"patterned"`` all over, or ``"plain"`` walls, ceiling and pillars; spectra are the same for both.
         only: steps to do, of ``"scene"``, ``"photos"``, ``"spectra"``.
+        workers: processes of one thread each that simulate, by dask; 0: this one alone.
         full: also 800 receivers at the paper's size, beside the committed sample (``*_full.nc``).
     """
 
     data: str = option("data/lobby", "folder to write")
     look: str = option("patterned", "what walls look like", choices=scene.LOOKS)
     only: tuple[str, ...] = option(STEPS, "steps to do", choices=STEPS)
+    workers: int = option(0, "processes of one thread each that simulate; 0: this one alone")
     full: bool = option(False, "the paper's size too: spectra_full.nc, spectra_sionna_full.nc (an hour or two)")
 
 
@@ -57,8 +60,9 @@ def run(options: Options, job: Job) -> None:
     if "photos" in options.only:
         photos.make_photos(data, progress=job.progress)
     if "spectra" in options.only:
-        for whole in (False, True) if options.full else (False,):
-            spectra.make(data, full=whole, progress=job.progress, device=job.device)
+        with connected(None, options.workers, 1) as client:
+            for whole in (False, True) if options.full else (False,):
+                spectra.make(data, full=whole, client=client, progress=job.progress, device=job.device)
 
 
 BENCHMARKS = {"data": Benchmark("data", Options, run, HELP)}

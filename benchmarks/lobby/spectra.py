@@ -65,6 +65,7 @@ def make(
     engines: tuple[str, ...] = ("exact", "sionna"),
     workspace: str | os.PathLike[str] = "runs/data/spectra",
     replace: bool = False,
+    client: Any = None,
     progress: Progress | None = None,
     device: Any = None,
 ) -> None:
@@ -76,6 +77,7 @@ def make(
         engines: Which engines.
         workspace: Folder of finished receivers: a killed run goes on where it stopped.
         replace: Make files that are there already again.
+        client: A ``dask.distributed.Client`` whose workers compute.
     """
     folder = Path(data)
     scene = Scene.load(folder / "scene.xml")
@@ -104,6 +106,7 @@ def make(
             seed=SEED,
             roles=who.role[chosen],
             workspace=workspace,
+            client=client,
             progress=report,
             device=device,
         ).save(target, compact=not full)
