@@ -184,10 +184,7 @@ class Lab:
 
     def seen(self, receivers: str) -> Transport:
         """Blending weights of training receivers."""
-        everyone = self.geometry.weights(self.train, progress=self.job.progress)[0]
-        if receivers == "all":
-            return everyone
-        return self.kept("seen", receivers, lambda: everyone.subset(self.chosen[receivers]))  # type: ignore[no-any-return]
+        return self.geometry.weights(self.spectra(receivers), progress=self.job.progress)[0]
 
     @cached_property
     def seen_by_test(self) -> Transport:

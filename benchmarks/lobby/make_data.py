@@ -39,7 +39,9 @@ class Options:
     look: str = option("patterned", "what walls look like", choices=scene.LOOKS)
     only: tuple[str, ...] = option(STEPS, "steps to do", choices=STEPS)
     workers: int = option(0, "processes of one thread each that simulate; 0: this one alone")
-    full: bool = option(False, "the paper's size too: spectra_full.nc, spectra_sionna_full.nc (an hour or two)")
+    full: bool = option(
+        False, "the paper's size too: spectra_full.nc, spectra_sionna_full.nc (an hour or two)"
+    )
 
 
 def run(options: Options, job: Job) -> None:
