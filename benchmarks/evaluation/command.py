@@ -11,7 +11,7 @@ from benchmarks.data import GEOMETRY, VERSIONS, DataOptions, Geometry, checked, 
 from benchmarks.evaluation import comparison, conference, report
 from benchmarks.evaluation.lpips import Lpips
 from benchmarks.evaluation.paper_law import paper_law_spectra
-from benchmarks.evaluation.protocol import SPLITS, TRUTHS, Place, Setting, plan, truth_of
+from benchmarks.evaluation.protocol import EFFORT, SPLITS, TRUTHS, Place, Setting, plan, truth_of
 from benchmarks.evaluation.runs import Rows, estimate_s, missing, sweep
 from benchmarks.machine import machine
 from benchmarks.methods import METHODS, Effort
@@ -70,7 +70,7 @@ class Options(DataOptions):
     lpips: tuple[str, ...] = option(
         (), "files of LPIPS' weights: AlexNet's (torchvision) and the metric's (v0.1)"
     )
-    effort: Effort = Effort()
+    effort: Effort = EFFORT
 
     def __post_init__(self) -> None:
         for label, value, allowed in (

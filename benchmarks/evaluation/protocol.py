@@ -9,7 +9,7 @@ receivers there are left out and test receivers elsewhere are not asked.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -105,6 +105,9 @@ GROUPS = (
     Group(NETWORKS, FEW),
 )
 """All runs, the main ones first."""
+EFFORT = Effort(nerf2_iterations=4000, nerf2_rays=256, nerf2_samples=32, cgan_iterations=6000, cgan_batch=2)
+"""Networks train for a quarter of an hour or more on two cores; as published they take hours on a graphics card. Their
+learning curves say what more would bring."""
 
 
 def plan(
@@ -220,7 +223,7 @@ class Setting:
     places: tuple[tuple[str, Place], ...]
     scratch: str
     every: int = 1
-    effort: Effort = field(default_factory=Effort)
+    effort: Effort = EFFORT
     lpips: tuple[str, ...] = ()
     device: str | None = None
 
