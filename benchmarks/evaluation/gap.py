@@ -23,7 +23,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -510,19 +510,36 @@ def text_of(figures: Row) -> str:
     whole = [row for row in found if row["train"] == figures["train"]]
     for key, name in (("psnr_db", "dB images"), ("own_psnr_db", "pictures, each by its own range")):
         if whole:
-            best = {m: max(whole, key=lambda row, m=m: row[key][m])["choice"] for m in NAMES}  # type: ignore[misc]
-            widest = max(found, key=lambda row: row[key]["difference"])
-            likes = "; ".join(f"{NAMES[m]} likes best: {CHOICES[c].what}" for m, c in best.items())
-            said.append(
-                f"PSNR of {name}. {likes}. Largest difference: {widest[key]['difference']:+.2f} dB "
-                f"({CHOICES[widest['choice']].what}); published: {gap:+.2f} dB."
-            )
+            said.append(f"PSNR of {name}. {_extremes(found, whole, key)} Published: {gap:+.2f} dB.")
     about = figures["truth"]
     said.append(
         f"Truth: {about['name']}, {about['test']} test receivers, {about['blocked']} blocked, "
         f"{about['shape'][0]} x {about['shape'][1]} pixels; data {about['key'][:12]}; {figures['iterations']} steps."
     )
     return "\n\n".join(said)
+
+
+def _extremes(found: list[Row], whole: list[Row], key: str) -> str:
+    """Which choice each model likes best, and how far apart choices can bring the two models."""
+
+    def of(row: Row, end: str) -> float:
+        return float(row[key][end])
+
+    best = {m: max(whole, key=partial(of, end=m)) for m in NAMES}
+    worst, widest = min(whole, key=partial(of, end="rf3dgs")), max(found, key=partial(of, end="difference"))
+    likes = "; ".join(f"{NAMES[m]} likes best: {_named(row, m)}" for m, row in best.items())
+    apart = of(best["rf3dgs+"], "rf3dgs+") - of(worst, "rf3dgs")
+    return (
+        f"{likes}. Largest difference: {of(widest, 'difference'):+.2f} dB ({CHOICES[widest['choice']].what}). "
+        f"RF-3DGS+ as it likes it best, less RF-3DGS as it likes it least "
+        f"({_named(worst, 'rf3dgs')}): {apart:+.2f} dB."
+    )
+
+
+def _named(row: Row, model: str) -> str:
+    """The choice of a row, for a model that has a law or has none."""
+    what = CHOICES[row["choice"]].what
+    return what if model == "rf3dgs+" else what.partition("; law")[0]
 
 
 BENCHMARKS = {"gap": Benchmark("gap", Options, run, HELP)}
