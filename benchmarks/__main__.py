@@ -17,8 +17,14 @@ NAMES = {
     "lobby-plain": ("benchmarks.lobby.plain", "the lobby with plain walls: photos -> geometry -> one field"),
     "lobby-seeds": ("benchmarks.lobby.seeds", "the main job's figures over several seeds: mean and spread"),
     "data": ("benchmarks.lobby.make_data", "regenerate data/lobby/ from nothing (hours; resumable)"),
-    "table1": ("benchmarks.evaluation.command", "every method of the paper's table, and more, side by side"),
-    "sparsity": ("benchmarks.evaluation.command", "PSNR and SSIM over the number of training receivers"),
+    "paper": (
+        "benchmarks.evaluation.command",
+        "the paper's evaluation at its own size: every method, row by row",
+    ),
+    "gap": (
+        "benchmarks.evaluation.gap",
+        "RF-3DGS+ less RF-3DGS, with one of the paper's open choices changed",
+    ),
     "bistatic": (
         "benchmarks.bistatic.table",
         "the bistatic field beside other systems, and what its parts are worth",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -97,15 +98,15 @@ def scanned(mesh: wr.Mesh, places: np.ndarray, options: Options, seed: int) -> w
     return wr.Mesh(fine.vertices[used] + noise, faces.reshape(-1, 3))
 
 
-def named_by_part(mesh: wr.Mesh) -> wr.Scene:
+def named_by_part(mesh: wr.Mesh, materials: Sequence[wr.Material] = MATERIALS) -> wr.Scene:
     """``mesh`` with a material for its floor, ceiling and walls, and one for each size of the things in it."""
     part = components(len(mesh.faces), edge_pairs(mesh.welded_faces))
     area = np.bincount(part, mesh.areas)
-    things = 3 + np.unique(np.round(area, 2), return_inverse=True)[1].reshape(-1) % (len(MATERIALS) - 3)
+    things = 3 + np.unique(np.round(area, 2), return_inverse=True)[1].reshape(-1) % (len(materials) - 3)
     upward = mesh.face_normals[:, 2]
     low = mesh.triangles[:, :, 2].max(axis=1) < mesh.center[2]
     side = np.where(np.abs(upward) < 0.5, 2, np.where(low, 0, 1))
-    return wr.Scene(mesh, MATERIALS, np.where(part == area.argmax(), side, things[part]))
+    return wr.Scene(mesh, materials, np.where(part == area.argmax(), side, things[part]))
 
 
 def furnished(folder: str, options: Options, job: Job) -> tuple[wr.Scene, Truth]:

@@ -175,21 +175,29 @@ class Geometry:
     def weights(
         self, ds: SpectrumDataset, *, slot: str = "train", progress: Progress | None = None
     ) -> tuple[Transport, float]:
-        """Blending weights of the receivers of ``ds`` and the seconds that they took; one set is kept per slot."""
-        # Cutoffs follow from the range, so two truths share weights only if receivers and range are the same.
-        key = digest(ds.receivers, list(ds.range_db), list(ds.shape))
-        if self._weights.get(slot, ("",))[0] != key:
-            self._weights.pop(slot, None)  # hundreds of receivers fill gigabytes: not two sets at once
-            start = time.perf_counter()
-            seen = transport(
-                self.reconstruction.gaussians,
-                ds.receivers,
-                ds.shape,
-                range_db=ds.range_db,
-                device=self.device,
-                progress=progress,
-            )
-            self._weights[slot] = key, seen, time.perf_counter() - start
+        """Blending weights of the receivers of ``ds`` and the seconds that they took; one set is kept per slot, which also
+        serves some of its receivers."""
+        # Cutoffs follow from the range, so two truths share weights only if the range is the same.
+        key = digest(list(ds.range_db), list(ds.shape))
+        kept = self._weights.get(slot)
+        if kept is not None and kept[0] == key:
+            order = {tuple(place): k for k, place in enumerate(kept[1].receivers)}
+            rows = [order.get(tuple(place), -1) for place in ds.receivers]
+            if rows == list(range(len(order))):
+                return kept[1:]
+            if min(rows) >= 0:
+                return kept[1].subset(rows), kept[2] * len(rows) / len(order)
+        self._weights.pop(slot, None)  # hundreds of receivers fill gigabytes: not two sets at once
+        start = time.perf_counter()
+        seen = transport(
+            self.reconstruction.gaussians,
+            ds.receivers,
+            ds.shape,
+            range_db=ds.range_db,
+            device=self.device,
+            progress=progress,
+        )
+        self._weights[slot] = key, seen, time.perf_counter() - start
         return self._weights[slot][1:]
 
     def forget(self) -> None:

@@ -28,7 +28,7 @@ from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra import lookups, metrics
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, spread
+from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions, spread, to_db
 
 PERMITTIVITY_OFF, ROUGHNESS_OFF = 1.2, 1.5
 """Factors by which assumed materials are wrong, up or down: what a table for another sample of the material gives."""
@@ -141,7 +141,12 @@ class Method:
         return 1000 * VERSIONS["metrics"] + VERSIONS[self.code]
 
 
-def score(method: str, task: Task, keep: Path | None = None) -> tuple[Fitted, Row]:
+def score(
+    method: str,
+    task: Task,
+    keep: Path | None = None,
+    perceptual: Callable[[np.ndarray, np.ndarray], float] | None = None,
+) -> tuple[Fitted, Row]:
     """Fit a method and ask it for every test receiver.
 
     Returns:
@@ -149,13 +154,28 @@ def score(method: str, task: Task, keep: Path | None = None) -> tuple[Fitted, Ro
 
     Args:
         keep: file to leave the fitted field in, if it is one.
+        perceptual: a distance of two images ``(H, W)`` of 0 to 1, whose mean is ``lpips``.
     """
     fitted = METHODS[method].fit(task)
     if keep is not None and fitted.field is not None:
         write_atomically(keep, fitted.field.save)
     row: Row = {"transport_s": fitted.transport_s, "fit_s": fitted.fit_s}
-    row |= metrics.evaluate(task.test, fitted.predict, progress=task.progress)
+    predicted: list[np.ndarray] = []
+
+    def predict(receiver: Any) -> Spectrum:
+        found = fitted.predict(receiver)
+        predicted.append(found.path_gain)
+        return found
+
+    row |= metrics.evaluate(task.test, predict, progress=task.progress)
     row["seconds_per_spectrum"] += fitted.before_s
+    if perceptual is not None:
+        low, high = task.test.range_db
+        shown = [
+            [np.clip((to_db(gain, task.test.floor) - low) / (high - low), 0.0, 1.0) for gain in pair]
+            for pair in zip(predicted, task.test.path_gain, strict=True)
+        ]
+        row |= {"lpips": float(np.mean([perceptual(*pair) for pair in shown])), "lpips_reason": None}
     return fitted, row
 
 

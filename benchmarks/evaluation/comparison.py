@@ -32,6 +32,8 @@ def _mean(group: list[Row]) -> Row:
     first = group[0]
     merged: Row = {name: first[name] for name in ("truth", "split", "count", "method", "note")}
     merged |= {
+        "rooms": sorted({row["room"] for row in group}),
+        "loss_curve": first.get("loss_curve"),
         "variants": sorted({row["variant"] for row in group}),
         "seeds": len(group),
         "keys": [row["key"] for row in group],
@@ -46,13 +48,44 @@ def _mean(group: list[Row]) -> Row:
         numbers = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
         if name not in merged and len(numbers) + values.count(None) == len(values):
             merged[name] = ends.get(name, np.mean)(numbers) if numbers else None
+    for name in SPREAD:
+        given = [float(row[name]) for row in group if row.get(name) is not None]
+        merged[f"{name}_std"] = float(np.std(given, ddof=1)) if len(given) > 1 else None
     spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in group]
     merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
     merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
     on_gpu = [row["peak_gpu_bytes"] for row in group if row.get("peak_gpu_bytes") is not None]
     merged["peak_gpu_gib"] = max(on_gpu) / 2**30 if on_gpu else None
     merged["model_mib"] = None if merged.get("model_bytes") is None else merged["model_bytes"] / 2**20
-    return {k: v for k, v in merged.items() if k not in ("per_receiver", "details", "shown", "seed")}
+    return {
+        k: v
+        for k, v in merged.items()
+        if k not in ("details", "shown", "seed", "variant", "key", "data", "room")
+    }
+
+
+MARGINS = (
+    "psnr_db", "ssim", "rmse_db", "direction_within_3deg", "beam_gain_loss_db",
+)  # fmt: skip
+
+
+def margins(rows: Sequence[Row]) -> list[Row]:
+    """The bistatic field less every other method, on the same spectra (or against one that sees none), all and blocked."""
+    ours = {(r["truth"], r["split"], r["count"]): r for r in rows if r["method"] == "bistatic"}
+    found = []
+    for (truth, split, count), own in ours.items():
+        for other in rows:
+            same = (other["truth"], other["split"]) == (truth, split) and other["count"] in (count, 0)
+            if not same or other["method"] == "bistatic":
+                continue
+            line: Row = {"truth": truth, "split": split, "count": count, "method": other["method"]}
+            for key in (*MARGINS, *(f"{name}_blocked" for name in MARGINS)):
+                a, b = own.get(key), other.get(key)
+                line[key] = None if a is None or b is None else a - b
+            a, b = own.get("psnr_db_std"), other.get("psnr_db_std")
+            line["psnr_db_std"] = None if a is None or b is None else float(np.hypot(a, b))
+            found.append(line)
+    return found
 
 
 def paper_finding(rows: Sequence[Row]) -> list[Row]:

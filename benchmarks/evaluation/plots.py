@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.evaluation.protocol import TRUTHS
+from benchmarks.evaluation.protocol import FEW, TRUTHS
 from benchmarks.pictures import METHODS, figure_of
 from benchmarks.report import Row
 from warprrf.device import require
@@ -97,7 +97,8 @@ def spectra_grid(
 
 def speed_against_error(rows: Sequence[Row]) -> Any:
     """RMSE against the time of a spectrum and against training time, every method a point, a row of panels a count."""
-    counts = sorted({row["count"] for row in rows if row["count"]})
+    every = sorted({row["count"] for row in rows if row["count"]})
+    counts = [n for n in every if n in FEW] or every[:3]
     figure = require("matplotlib.figure", extra="plots").Figure(
         figsize=(13.5, 4.6 * len(counts) + 0.4), layout="constrained"
     )
@@ -142,7 +143,7 @@ def _points(ax: Any, rows: Sequence[tuple[Row, float]], number: dict[str, int], 
 def law_bars(rows: Sequence[Row]) -> Any:
     """PSNR of RF-3DGS+ less that of RF-3DGS against training receivers, a curve a truth."""
     figure, (left, right) = figure_of(2, size=(11.0, 4.0))
-    colours = {"exact": "#b3123c", "sionna": "#0b6e99", "paper-law": "#3a7d44"}
+    colours = {"exact": "#b3123c", "sionna": "#0b6e99", "conference": "#c77f00", "paper-law": "#3a7d44"}
     for ax, key, name in ((left, "psnr_db", "PSNR [dB]"), (right, "ssim", "SSIM")):
         for truth in dict.fromkeys(row["truth"] for row in rows):
             own = [row for row in rows if row["truth"] == truth]
@@ -161,4 +162,21 @@ def law_bars(rows: Sequence[Row]) -> Any:
         ax.set_ylabel(f"RF-3DGS+ less RF-3DGS, {name}")
         ax.grid(alpha=0.3)
     left.legend(fontsize=9)
+    return figure
+
+
+def learning_curves(rows: Sequence[Row]) -> Any:
+    """Loss of each network's steps over the share of them done, relative to the first, a panel a method."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    figure, axes = figure_of(len(methods), size=(5.5 * len(methods), 4.0))
+    for ax, method in zip(axes, methods, strict=True):
+        for row in (row for row in rows if row["method"] == method):
+            curve = np.asarray(row["loss_curve"]) / row["loss_curve"][0]
+            share = np.linspace(0.0, row["fit_s"] / 60.0, len(curve))
+            ax.plot(share, curve, label=f"{TRUTHS[row['truth']]}, {row['count']} spectra")
+        ax.set_title(METHODS[method][0], fontsize=10)
+        ax.set_xlabel("training time [min]")
+        ax.set_ylabel("loss over that of the first fortieth")
+        ax.grid(alpha=0.3)
+        ax.legend(fontsize=8)
     return figure

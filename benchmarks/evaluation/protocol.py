@@ -1,4 +1,4 @@
-"""What the paper's evaluation consists of: runs, sizes, splits of the receivers, and the truths.
+"""What the paper's evaluation consists of: truths, splits of the receivers, and the runs at the paper's own size.
 
 A run is one method with one number of training receivers of one truth, one seed and one split. Test receivers are the
 same for every method, training subsets are nested. ``random``: test receivers are scattered among the others, as in the
@@ -8,9 +8,8 @@ receivers there are left out and test receivers elsewhere are not asked.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,16 +17,16 @@ from benchmarks.data import Truth
 from benchmarks.methods import METHODS, Effort
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
-TRUTHS = {"exact": "exact", "sionna": "Sionna RT", "paper-law": "paper's law"}
-"""Truths and their names; ``paper-law`` is made from the exact engine's paths, see :mod:`.paper_law`."""
+TRUTHS = {
+    "exact": "exact",
+    "sionna": "Sionna RT",
+    "conference": "conference room, Sionna RT",
+    "paper-law": "paper's law",
+}
+"""Truths and their names: two engines in the lobby, another room (:mod:`.conference`), and the lobby by the paper's law
+(:mod:`.paper_law`)."""
 SPLITS = ("random", "region")
 HELD_OUT = 0.25  # of the receivers' extent along the longer side
-
-TABLE_METHODS = tuple(m for m in METHODS if m != "rf3dgs+los")
-CURVE_METHODS = ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "idw", "constant")
-OPACITY_METHODS = ("rf3dgs+alpha", "rf3dgs-alpha")
-LAW_METHODS = ("rf3dgs+", "rf3dgs")
-"""Methods that the paper's law is tried on: its finding is about these two."""
 
 
 @dataclass(frozen=True, order=True)
@@ -58,123 +57,85 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Scale:
-    """How large an evaluation is.
+class Group:
+    """Runs of a kind: every combination of these, seed after seed, the largest sets first.
 
     Attributes:
-        name: "small" or "paper".
-        table_counts: training receivers of the table.
-        curve_counts: training receivers of the sparsity curves.
-        network_counts: those of them that NeRF2 and the GAN are trained on.
-        network_truths: truths that they are trained on.
-        opacity_counts: those of them that opacity is trained on, too.
-        seeds, truths, splits: which.
-        region_counts: training receivers of the region split.
-        every: each how-manieth test receiver counts.
-        effort: how long iterative methods may work.
-        least_shape: rows and columns that spectra should have at least.
+        methods: of :data:`METHODS`.
+        counts: training receivers; methods that see no spectrum run once.
+        truths, splits: which.
+        seeds: orders of the training receivers.
     """
 
-    name: str
-    table_counts: tuple[int, ...]
-    curve_counts: tuple[int, ...]
-    network_counts: tuple[int, ...]
-    network_truths: tuple[str, ...]
-    opacity_counts: tuple[int, ...]
-    seeds: tuple[int, ...]
-    truths: tuple[str, ...]
-    splits: tuple[str, ...]
-    region_counts: tuple[int, ...]
-    every: int
-    effort: Effort
-    least_shape: tuple[int, int]
+    methods: tuple[str, ...]
+    counts: tuple[int, ...]
+    truths: tuple[str, ...] = ("exact", "sionna")
+    splits: tuple[str, ...] = ("random",)
+    seeds: tuple[int, ...] = (0,)
+
+    def runs(self) -> Iterable[Run]:
+        """Every run."""
+        for truth in self.truths:
+            for split in self.splits:
+                for seed in self.seeds:
+                    for count in sorted(self.counts, reverse=True):
+                        for method in self.methods:
+                            untaught = METHODS[method].untaught
+                            for variant in METHODS[method].variants:
+                                yield Run(truth, split, 0 if untaught else count, seed, method, variant)
 
 
-PUBLISHED_COUNTS = (10, 15, 20, 25, 50, 100, 200, 400, 700)
-SCALES = {
-    "small": Scale(
-        name="small",
-        table_counts=(10, 50, 400),
-        curve_counts=(10, 15, 20, 25, 50, 100, 200, 400),
-        network_counts=(10, 50, 400),
-        network_truths=("exact",),
-        opacity_counts=(10, 50),
-        seeds=(0,),
-        truths=("exact", "paper-law"),
-        splits=("random", "region"),
-        region_counts=(50,),
-        every=4,
-        effort=Effort(
-            nerf2_iterations=500, nerf2_rays=256, nerf2_samples=32, cgan_iterations=500, cgan_batch=2
-        ),
-        least_shape=(60, 120),
-    ),
-    "paper": Scale(
-        name="paper",
-        table_counts=PUBLISHED_COUNTS,
-        curve_counts=PUBLISHED_COUNTS,
-        network_counts=PUBLISHED_COUNTS,
-        network_truths=("exact", "sionna"),
-        opacity_counts=PUBLISHED_COUNTS,
-        seeds=(0, 1, 2),
-        truths=("exact", "sionna", "paper-law"),
-        splits=("random", "region"),
-        region_counts=(50, 400),
-        every=1,
-        effort=Effort(
-            nerf2_iterations=30_000, nerf2_rays=8192, nerf2_samples=64, cgan_iterations=30_000, cgan_batch=8
-        ),
-        least_shape=(90, 180),
-    ),
-}
+COUNTS = (10, 20, 50, 100, 200, 400, 700)
+FEW = (10, 100, 700)
+LOOKUPS = ("nearest", "idw", "mean", "constant")
+FIELDS = ("bistatic", "rf3dgs+", "rf3dgs")
+LAW_METHODS = ("rf3dgs+", "rf3dgs")
+"""Methods that the paper's law is tried on: its finding is about these two."""
+OPACITY_METHODS = ("rf3dgs+alpha", "rf3dgs-alpha")
+NETWORKS = ("nerf2", "cgan")
+GROUPS = (
+    Group((*FIELDS, *LOOKUPS), COUNTS),
+    Group(("zero", "transmitter", "bistatic-quick"), FEW),
+    Group((*FIELDS, *LOOKUPS, "bistatic-quick"), (10, 100), truths=("conference",)),
+    Group((*FIELDS, *LOOKUPS), (100,), splits=("region",)),
+    Group(("sionna", "sionna-calibrated"), FEW),
+    Group(LAW_METHODS, FEW, truths=("paper-law",)),
+    Group((*FIELDS, *LOOKUPS), COUNTS, seeds=(1, 2)),
+    Group(OPACITY_METHODS, FEW),
+    Group(NETWORKS, FEW),
+)
+"""All runs, the main ones first."""
+EFFORT = Effort(nerf2_iterations=4000, nerf2_rays=256, nerf2_samples=32, cgan_iterations=6000, cgan_batch=2)
+"""Networks train for a quarter of an hour or more on two cores; as published they take hours on a graphics card. Their
+learning curves say what more would bring."""
 
 
 def plan(
-    kind: str,
-    scale: Scale,
+    held: Mapping[tuple[str, str], int],
     *,
-    methods: Sequence[str] | None = None,
-    held: Mapping[tuple[str, str], Sequence[int]],
+    methods: Sequence[str] = (),
+    counts: Sequence[int] = (),
+    seeds: Sequence[int] = (),
 ) -> list[Run]:
-    """The runs of a command, those of one set of training receivers beside each other.
+    """The runs, in the order in which they are worth having.
 
     Args:
-        kind: ``"table1"``: all methods; ``"sparsity"``: the curves of the paper's figure.
+        held: truths and splits that there are, and how many training receivers each can give; with all of them the order
+            of a seed changes nothing but the batches, so only the first seed has runs there.
         methods: only these.
-        held: numbers of training receivers that each truth and split can give.
+        counts: training receivers of every group instead of its own.
+        seeds: only these.
     """
-    chosen = TABLE_METHODS if kind == "table1" else CURVE_METHODS
-    if methods is not None:
-        chosen = tuple(m for m in chosen if m in methods)
-    runs: list[Run] = []
-    for truth in scale.truths:
-        for split in scale.splits:
-            if split != "random" and (kind != "table1" or truth == "paper-law"):
-                continue
-            wanted = scale.region_counts if split == "region" else _counts(kind, scale)
-            own = [m for m in chosen if truth != "paper-law" or m in LAW_METHODS]
-            counts = [n for n in wanted if n in held[truth, split]]
-            for seed in scale.seeds:
-                for count in counts:
-                    for method in (m for m in own if not METHODS[m].untaught):
-                        if not _wanted(method, truth, split, count, scale):
-                            continue
-                        runs += [Run(truth, split, count, seed, method, v) for v in METHODS[method].variants]
-            for method in (m for m in own if METHODS[m].untaught):
-                seeds = scale.seeds if METHODS[method].random else scale.seeds[:1]
-                runs += [Run(truth, split, 0, seed, method) for seed in seeds]
-    return runs
-
-
-def _wanted(method: str, truth: str, split: str, count: int, scale: Scale) -> bool:
-    """Whether a costly method is asked for this set."""
-    if METHODS[method].network:
-        return split == "random" and truth in scale.network_truths and count in scale.network_counts
-    return method not in OPACITY_METHODS or (split == "random" and count in scale.opacity_counts)
-
-
-def _counts(kind: str, scale: Scale) -> tuple[int, ...]:
-    return scale.table_counts if kind == "table1" else scale.curve_counts
+    runs: dict[Run, None] = {}
+    for group in GROUPS:
+        asked = replace(group, counts=tuple(counts)) if counts else group
+        for run in asked.runs():
+            most = held.get((run.truth, run.split), -1)
+            same = run.seed != 0 and (run.count == most or METHODS[run.method].untaught)
+            wanted = (not methods or run.method in methods) and (not seeds or run.seed in seeds)
+            if run.count <= most and wanted and not same:
+                runs.setdefault(run)
+    return list(runs)
 
 
 def held_out(data: SpectrumDataset) -> np.ndarray:
@@ -224,35 +185,48 @@ def shown_receivers(test: SpectrumDataset) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Setting:
-    """Where everything lies that a run reads, in plain values, so that it travels to another process or machine.
+class Place:
+    """Where the data of a truth and its room lie, in plain values, so that they travel to another process or machine.
 
     Attributes:
-        files: file of each truth.
-        keys: digest of each truth's file.
+        file: spectra (NetCDF).
+        made: digest of how they were made: receivers, grid, scene, engine and its settings.
+        content: digest of the file.
         geometry: folder of the reconstruction.
-        geometry_key: digest of the reconstruction and the true scene.
-        scene: true scene (XML).
+        geometry_made: digest of how it was made.
+        geometry_content: digest of the reconstruction.
+        xml: true scene.
+    """
+
+    file: str
+    made: str
+    content: str
+    geometry: str
+    geometry_made: str
+    geometry_content: str
+    xml: str
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all runs share.
+
+    Attributes:
+        places: of each truth.
         scratch: folder for half-done trainings and twins; workers on other machines need to see it for resuming only.
         every: each how-manieth test receiver of the random split counts.
         effort: how long iterative methods may work.
+        lpips: files of LPIPS' weights; see :mod:`.lpips`.
         device: Warp device.
     """
 
-    files: tuple[tuple[str, str], ...]
-    keys: tuple[tuple[str, str], ...]
-    geometry: str
-    geometry_key: str
-    scene: str
+    places: tuple[tuple[str, Place], ...]
     scratch: str
-    every: int
-    effort: Effort = field(default_factory=Effort)
+    every: int = 1
+    effort: Effort = EFFORT
+    lpips: tuple[str, ...] = ()
     device: str | None = None
 
-    def file(self, truth: str) -> Path:
-        """The file of a truth."""
-        return Path(dict(self.files)[truth])
-
-    def key(self, truth: str) -> str:
-        """The digest of a truth's file."""
-        return dict(self.keys)[truth]
+    def place(self, truth: str) -> Place:
+        """The place of a truth."""
+        return dict(self.places)[truth]

@@ -1,8 +1,5 @@
-"""The evaluation as tables and pictures, drawn from the kept runs alone.
-
-``table1`` sets every method beside the published figures; ``sparsity`` is the paper's figure. Both say what
-:mod:`~benchmarks.evaluation.comparison` found.
-"""
+"""The evaluation as tables and pictures, drawn from the kept runs alone: every method beside the published figures, the
+paper's figure, and what :mod:`~benchmarks.evaluation.comparison` found."""
 
 from __future__ import annotations
 
@@ -15,7 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.evaluation.plots import law_bars, sparsity_curves, spectra_grid, speed_against_error
+from benchmarks.evaluation.plots import (
+    law_bars,
+    learning_curves,
+    sparsity_curves,
+    spectra_grid,
+    speed_against_error,
+)
 from benchmarks.evaluation.protocol import TRUTHS, Run
 from benchmarks.evaluation.runs import pictures_of
 from benchmarks.methods import METHODS as KNOWN
@@ -48,6 +51,7 @@ LINEAR_AVERAGE = "in linear power"
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("psnr_db", "PSNR [dB]", "{:.2f}"),
+    ("psnr_db_std", "over seeds", "{:.2f}"),
     ("psnr_db_min", "min", "{:.1f}"),
     ("psnr_db_max", "max", "{:.1f}"),
     ("psnr_db_blocked", "blocked", "{:.2f}"),
@@ -85,28 +89,68 @@ line of sight, and must unlearn it from receiver to receiver."""
 # ------------------------------------------------------------------------------------------------------- the text
 
 
-def markdown(kind: str, found: dict[str, Any]) -> str:
+def markdown(found: dict[str, Any]) -> str:
     """Everything as Markdown."""
     rows = found["rows"]
-    parts = [_about(found)]
+    parts = [_statement(found), _about(found)]
     places = list(dict.fromkeys((row["truth"], row["split"]) for row in rows))
-    if kind == "table1":
-        for truth, split in places:
-            own = [row for row in rows if (row["truth"], row["split"]) == (truth, split)]
-            own.sort(key=lambda row: (row["count"], list(KNOWN).index(row["method"])))
-            published = PUBLISHED if (truth, split) == places[0] else ()
-            where = "" if split == "random" else ", a region held out"
-            parts += [f"### Methods, truth: {TRUTHS[truth]}{where}", method_table([*own, *published])]
-            if published:
-                parts.append(PUBLISHED_NOTE)
-        notes = {row["method"]: row["note"] for row in rows if row.get("note")}
-        parts.append("\n".join(f"- {METHODS[m][0]}: {note}." for m, note in notes.items()))
-    else:
-        for key, name in (("psnr_db", "PSNR [dB]"), ("ssim", "SSIM")):
-            parts += [f"### {name}: mean (least to most over the test receivers)", _curve_table(rows, key)]
+    for truth, split in places:
+        own = [row for row in rows if (row["truth"], row["split"]) == (truth, split)]
+        own.sort(key=lambda row: (row["count"], list(KNOWN).index(row["method"])))
+        published = PUBLISHED if (truth, split) == places[0] else ()
+        where = "" if split == "random" else ", a region held out"
+        parts += [f"### Methods, truth: {TRUTHS[truth]}{where}", method_table([*own, *published])]
+        if published:
+            parts.append(PUBLISHED_NOTE)
+    notes = {row["method"]: row["note"] for row in rows if row.get("note")}
+    parts.append("\n".join(f"- {METHODS[m][0]}: {note}." for m, note in notes.items()))
+    random = [row for row in rows if row["split"] == "random"]
+    for key, name in (("psnr_db", "PSNR [dB]"), ("ssim", "SSIM")):
+        parts += [f"### {name}: mean (least to most over the test receivers)", _curve_table(random, key)]
+    if found["margins"]:
+        parts += ["### The bistatic field less each other method", _margin_table(found["margins"])]
     if found["finding"]:
         parts += ["### RF-3DGS+ against RF-3DGS", _finding_text(found["finding"])]
     return "\n\n".join(part for part in parts if part)
+
+
+def _statement(found: dict[str, Any]) -> str:
+    """What the paper found, what is found here, and why."""
+    lines = [line for line in found["finding"] if line["split"] == "random" and not line["opacity"]]
+    own = [
+        line["psnr_db"]["difference"] for line in lines if line["truth"] in ("exact", "sionna", "conference")
+    ]
+    law = [line["psnr_db"]["difference"] for line in lines if line["truth"] == "paper-law"]
+    if not own:
+        return ""
+    published = {row["method"]: row["psnr_db"] for row in PUBLISHED}
+    text = (
+        f"The paper found RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:+.1f} dB above RF-3DGS. Here it is "
+        f"{np.mean(own):+.1f} dB in the mean ({min(own):+.1f} to {max(own):+.1f}) over {len(own)} sets. "
+    )
+    return text + LAW_TEXT + (
+        f" On targets that are made by the paper's law path by path the difference is {np.mean(law):+.1f} dB: there the law "
+        "holds for every path, but not for the blended Gaussians of a pixel alike." if law else ""
+    )  # fmt: skip
+
+
+def _margin_table(margins: Sequence[Row]) -> str:
+    forms = {
+        "psnr_db": "{:+.1f}", "ssim": "{:+.2f}", "rmse_db": "{:+.1f}", "direction_within_3deg": "{:+.0%}",
+        "beam_gain_loss_db": "{:+.1f}",
+    }  # fmt: skip
+    lines = [
+        [
+            TRUTHS[r["truth"]] + ("" if r["split"] == "random" else ", region"), str(r["count"]), METHODS[r["method"]][0],
+            *(f"{cell(r[k], form)} / {cell(r[f'{k}_blocked'], form)}" for k, form in forms.items()),
+            cell(r["psnr_db_std"], "{:.2f}"),
+        ]
+        for r in margins
+    ]  # fmt: skip
+    names = ("PSNR [dB]", "SSIM", "RMSE [dB]", "within 3 deg", "beam loss [dB]")
+    return table(
+        ["truth", "spectra", "against", *(f"{n}, all / blocked" for n in names), "over seeds [dB]"], lines
+    )
 
 
 def method_table(rows: Sequence[Row]) -> str:
@@ -151,20 +195,16 @@ def _about(found: dict[str, Any]) -> str:
         lines.append(
             f"{TRUTHS[truth]}, {split}: {data['test']} test receivers {where} ({data['blocked']} without line of "
             f"sight), {data['shape'][0]} x {data['shape'][1]} pixels, {data['frequency_hz'] / 1e9:g} GHz, range "
-            f"{data['range_db'][0]:.1f} to {data['range_db'][1]:.1f} dB"
-            + (
-                f"; not held: {', '.join(map(str, data['left_out']))} training receivers."
-                if data["left_out"]
-                else "."
-            )
+            f"{data['range_db'][0]:.1f} to {data['range_db'][1]:.1f} dB, data {data['content']}."
         )
-    if found["coarse"]:
-        lines.append(
-            f"These spectra are coarser than the {found['coarse'][0]} x {found['coarse'][1]} of scale "
-            f"{found['scale']}."
-        )
+    rooms = sorted({name for row in found["rows"] for name in row["rooms"]})
+    if found["missing"]:
+        lines.append(f"{len(found['missing'])} runs are missing.")
     devices = sorted({d for row in found["rows"] for d in row["devices"]})
-    lines.append(f"Scale {found['scale']}, {_seeds(found)}. Computed on {'; '.join(devices)}.")
+    lines.append(
+        f"{_seeds(found)}; reconstructions: {', '.join(rooms)}. Computed on {'; '.join(devices)}, "
+        f"{found['seconds'] / 3600.0:.1f} h."
+    )
     reason = next((row["lpips_reason"] for row in found["rows"] if row.get("lpips_reason")), None)
     if reason:
         lines.append(f"LPIPS: not computed, {reason}.")
@@ -177,10 +217,11 @@ def _about(found: dict[str, Any]) -> str:
 
 def _seeds(found: dict[str, Any]) -> str:
     count = max(row["seeds"] for row in found["rows"])
-    return "one seed" if count == 1 else f"means over {count} seeds"
+    return "One seed" if count == 1 else f"Means over up to {count} seeds"
 
 
 def _curve_table(rows: Sequence[Row], key: str) -> str:
+    rows = [row for row in rows if row["count"]]
     counts = sorted({row["count"] for row in rows if row["count"]})
     lines = []
     for truth in dict.fromkeys(row["truth"] for row in rows):
@@ -234,36 +275,38 @@ def _finding_text(finding: Sequence[Row]) -> str:
 
 
 def pictures(
-    kind: str, figures: dict[str, Any], folder: Path, runs: Mapping[str, Run]
+    figures: dict[str, Any], folder: Path, runs: Mapping[str, Run]
 ) -> dict[str, tuple[Callable[[], Any], str]]:
-    """What is drawn, by file name; the spectra of ``runs`` (by key) are read from ``folder``."""
+    """What is drawn, by file name; the spectra of ``runs`` (by key) are read from ``folder``, where they are there."""
     found: dict[str, tuple[Callable[[], Any], str]] = {}
     random = [row for row in figures["rows"] if row["split"] == "random"]
-    if kind == "sparsity":
-        found["sparsity.png"] = (
-            partial(sparsity_curves, random),
-            "PSNR and SSIM against the number of training receivers: mean, and bands from least to most over the test "
-            "receivers.",
+    found["sparsity.png"] = (
+        partial(sparsity_curves, [row for row in random if row["truth"] != "paper-law"]),
+        "PSNR and SSIM against the number of training receivers: mean, and bands from least to most over the test "
+        "receivers.",
+    )
+    for truth in dict.fromkeys(row["truth"] for row in random if row["truth"] != "paper-law"):
+        own = [row for row in random if row["truth"] == truth]
+        found[f"speed-{truth}.png"] = (
+            partial(speed_against_error, own),
+            "Error against the time of a spectrum and against training time; diamonds see no spectrum.",
         )
-    else:
-        for truth in dict.fromkeys(row["truth"] for row in random if row["truth"] != "paper-law"):
-            own = [row for row in random if row["truth"] == truth]
-            found[f"speed-{truth}.png"] = (
-                partial(speed_against_error, own),
-                "Error against the time of a spectrum and against training time; diamonds see no spectrum.",
-            )
-            drawn = _grid(own, runs, folder)
-            if drawn is not None:
-                found[f"spectra-{truth}.png"] = drawn
+        drawn = _grid(own, runs, folder)
+        if drawn is not None:
+            found[f"spectra-{truth}.png"] = drawn
+    learned = [row for row in random if row.get("loss_curve")]
+    if learned:
+        found["learning.png"] = partial(learning_curves, learned), "Loss of the networks over their steps."
     if figures["finding"]:
         lines = [line for line in figures["finding"] if line["split"] == "random" and not line["opacity"]]
         text = "RF-3DGS+ less RF-3DGS, by the law that the truth's scattering obeys."
-        found[f"{kind}-law.png"] = partial(law_bars, lines), text
+        found["law.png"] = partial(law_bars, lines), text
     return found
 
 
 def _grid(rows: Sequence[Row], runs: Mapping[str, Run], folder: Path) -> tuple[Callable[[], Any], str] | None:
     """Spectra of the shown receivers by every method, at a number of training receivers that all have."""
+    rows = [row for row in rows if (folder / pictures_of(runs[row["keys"][0]])).is_file()]
     counts = sorted({row["count"] for row in rows if row["count"]})
     most = max(counts, key=lambda n: (sum(row["count"] == n for row in rows), -n), default=None)
     if most is None:

@@ -1,22 +1,23 @@
-"""Runs carried out one by one, here or on the workers of a dask cluster; each finished one is a step that is kept.
+"""Runs carried out one by one, here or on the workers of a dask cluster; each finished one is a row that is kept.
 
 A worker takes a run and the setting, which is plain values and paths: on several machines they must see the same files.
 It returns figures and pictures, and the process that started the sweep keeps them. A worker that dies has written
 nothing: its run goes to another one. A sweep that is killed loses the runs at work; trainings of networks go on from
-their checkpoint.
+their checkpoint. Rows lie in one file, small enough to be kept with the code, so that a sweep goes on elsewhere.
 """
 
 from __future__ import annotations
 
+import json
 import os
-import platform
 import resource
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +25,17 @@ import numpy as np
 import warp as wp
 
 from benchmarks.data import Geometry, Truth
-from benchmarks.evaluation.protocol import Run, Setting, shown_receivers, truth_of
+from benchmarks.evaluation.lpips import Lpips
+from benchmarks.evaluation.protocol import Place, Run, Setting, shown_receivers, truth_of
 from benchmarks.machine import processor_name
 from benchmarks.methods import AFTER, METHODS, Fitted, Task, score
 from benchmarks.report import Row
 from warprrf.cluster import each
 from warprrf.device import Progress, require, resolve, threads
-from warprrf.files import write_arrays
+from warprrf.files import plain, write_arrays, write_text
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
-from warprrf.steps import Attempt, Steps
+from warprrf.steps import digest
 
 SPREAD = ("psnr_db", "ssim", "rmse_db", "beam_gain_loss_db")
 """Figures of which the smallest and the largest over the test receivers are kept."""
@@ -42,19 +44,65 @@ Result = tuple[Row, dict[str, np.ndarray]]
 Execute = Callable[..., Result]
 
 
+class Rows:
+    """Finished runs in a file, a JSON object a line.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._lines: dict[str, dict[str, Any]] = {}
+        text = self.path.read_text() if self.path.is_file() else ""
+        for number, line in enumerate(text.splitlines(), 1):
+            try:
+                one = json.loads(line)
+                self._lines[one["row"]["key"]] = {"known": str(one["known"]), "row": dict(one["row"])}
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(f"rows: line {number} of {self.path} is damaged: {error}") from error
+
+    def get(self, run: Run, known: str) -> Row | None:
+        """The row of ``run``, if what it depends on has the digest ``known``."""
+        one = self._lines.get(run.key)
+        return dict(one["row"]) if one is not None and one["known"] == known else None
+
+    def put(self, run: Run, known: str, row: Row) -> Row:
+        """Keep a row, as JSON holds it; the file is replaced at once."""
+        self._lines[run.key] = {"known": known, "row": plain(row)}
+        lines = [json.dumps(self._lines[key], allow_nan=False) for key in sorted(self._lines)]
+        write_text(self.path, "".join(f"{line}\n" for line in lines))
+        return dict(self._lines[run.key]["row"])
+
+    def __iter__(self) -> Iterator[Row]:
+        return (one["row"] for one in self._lines.values())
+
+
 class Lab:
-    """What a process keeps between runs: data sets and what receivers see of the geometry."""
+    """What a process keeps between runs: data sets, and what receivers see of the geometry of one room."""
 
     def __init__(self, setting: Setting) -> None:
         self.setting = setting
-        self.geometry = Geometry(Path(setting.geometry), Path(setting.scene), setting.device)
         self._data: dict[str, SpectrumDataset] = {}
+        self._room: tuple[str, Geometry] | None = None
 
     def truth(self, name: str, split: str) -> Truth:
         """The data set of a truth, with the receivers of a split."""
+        place = self.setting.place(name)
         if name not in self._data:
-            self._data[name] = SpectrumDataset.load(self.setting.file(name))
-        return truth_of(name, self.setting.key(name), self._data[name], split, self.setting.every)
+            self._data = {name: SpectrumDataset.load(place.file)}  # a set fills hundreds of megabytes
+        return truth_of(name, place.content, self._data[name], split, self.setting.every)
+
+    def geometry(self, place: Place) -> Geometry:
+        """The room of a truth."""
+        if self._room is None or self._room[0] != place.geometry:
+            self._room = place.geometry, Geometry(Path(place.geometry), Path(place.xml), self.setting.device)
+        return self._room[1]
+
+    @cached_property
+    def lpips(self) -> Lpips | str:
+        """The perceptual metric, or why there is none."""
+        return Lpips.found(self.setting.lpips)
 
 
 @lru_cache(maxsize=1)
@@ -73,7 +121,7 @@ def execute(
         budget_s: seconds that the run may take, where another one sets them; see :data:`AFTER`.
         progress: called with ``"transport"``, ``"fit"`` and ``"evaluate"``.
     """
-    lab, method = _lab(setting), METHODS[run.method]
+    start, lab, method, place = time.monotonic(), _lab(setting), METHODS[run.method], setting.place(run.truth)
     truth = lab.truth(run.truth, run.split)
     test = truth.test
     scratch = Path(setting.scratch) / run.key
@@ -81,7 +129,7 @@ def execute(
     task = Task(
         train=truth.data.subset([]) if method.untaught else truth.train(run.count, run.seed),
         test=test,
-        geometry=lab.geometry,
+        geometry=lab.geometry(place),
         scratch=scratch,
         progress=progress or (lambda stage, done, total: None),
         slot=f"{run.truth}-{run.split}",
@@ -92,25 +140,31 @@ def execute(
         budget_s=budget_s,
     )
     with peak_memory(setting.device) as peak:
-        fitted, found = score(run.method, task)
+        fitted, found = score(run.method, task, perceptual=None if isinstance(lab.lpips, str) else lab.lpips)
+    if isinstance(lab.lpips, str):
+        found["lpips_reason"] = lab.lpips
     shown = shown_receivers(test)
     images = [to_db(fitted.predict(test.receivers[i]).path_gain, test.floor) for i in shown]
     shutil.rmtree(scratch)
+    per_receiver = found.pop("per_receiver")
     row: Row = {
         **vars(run),
         "key": run.key,
+        "data": place.content[:12],
+        "room": place.geometry_content[:12],
         **found,
-        **_extremes(found["per_receiver"]),
+        **_extremes(per_receiver),
         **peak,
         "model_bytes": _size(fitted),
         **_ends(fitted.losses),
+        "loss_curve": _curve(fitted.losses) if method.network else None,
         "details": fitted.details,
         "note": method.note,
         "processor": processor_name(),
         "device": str(resolve(setting.device)),
         "cores": threads(),
-        "host": platform.node(),
         "shown": {"receivers": test.receivers[shown], "blocked": ~test.line_of_sight[shown]},
+        "wall_s": time.monotonic() - start,
     }
     arrays = {
         "prediction_db": np.stack(images).astype(np.float32),
@@ -118,6 +172,12 @@ def execute(
         "range_db": np.array(test.range_db),
     }
     return row, arrays
+
+
+def _curve(losses: list[float] | None, points: int = 40) -> list[float]:
+    """Mean loss of each of some equal parts of the steps."""
+    parts = np.array_split(np.asarray(losses or [], np.float64), points)
+    return [float(part.mean()) for part in parts if len(part)]
 
 
 def _extremes(per_receiver: dict[str, np.ndarray]) -> Row:
@@ -185,18 +245,20 @@ def _high_water_mark() -> int:
 
 
 def pictures_of(run: Run) -> str:
-    """The file of a run's pictures, beside the steps."""
+    """The file of a run's pictures, in the folder of results."""
     return f"runs/{run.key}.npz"
 
 
-def _inputs(run: Run, setting: Setting) -> list[Any]:
-    """What a run's figures depend on, besides its method's version."""
-    return [
-        setting.key(run.truth),
-        setting.geometry_key,
-        setting.every if run.split == "random" else 1,
-        _effort(run, setting),
-    ]
+def known(run: Run, setting: Setting) -> str:
+    """Digest of what a run's figures depend on.
+
+    Of data and reconstruction it holds how they were made: another machine makes them anew, and not to the same bits. A
+    row says which ones it is of.
+    """
+    place = setting.place(run.truth)
+    every = setting.every if run.split == "random" else 1
+    version = METHODS[run.method].version
+    return digest(version, place.made, place.geometry_made, every, _effort(run, setting))
 
 
 def _effort(run: Run, setting: Setting) -> dict[str, Any]:
@@ -211,22 +273,55 @@ def _effort(run: Run, setting: Setting) -> dict[str, Any]:
     return {k: v for k, v in vars(setting.effort).items() if k.startswith(felt)}
 
 
+_GUESS_S = {
+    "harmonic": 120.0,
+    "bistatic": 150.0,
+    "lookups": 3.0,
+    "networks": 1500.0,
+    "sionna": 600.0,
+    "metrics": 3.0,
+}
+"""Seconds of a run that no row tells of, by its method's code."""
+
+
+def estimate_s(pending: Iterable[Run], finished: Iterable[Row]) -> float:
+    """About how many seconds ``pending`` runs take: each as long as the finished one of its method whose number of
+    training receivers is nearest."""
+    times: dict[str, list[tuple[int, float]]] = {}
+    for row in finished:
+        times.setdefault(row["method"], []).append((row["count"], row["wall_s"]))
+    total = 0.0
+    for run in pending:
+        near = min(times.get(run.method, []), key=lambda one: abs(one[0] - run.count), default=None)
+        total += _GUESS_S[METHODS[run.method].code] if near is None else near[1]
+    return total
+
+
+def missing(runs: Iterable[Run], setting: Setting, rows: Rows) -> list[Run]:
+    """The runs that ``rows`` does not hold."""
+    return [run for run in dict.fromkeys(runs) if rows.get(run, known(run, setting)) is None]
+
+
 def sweep(
     runs: Iterable[Run],
     setting: Setting,
-    steps: Steps,
+    rows: Rows,
+    pictures: Path,
     *,
+    minutes: float | None = None,
     scheduler: str | None = None,
     workers: int = 1,
     progress: Progress | None = None,
     work: Execute = execute,
 ) -> dict[Run, Row]:
-    """Carry out the runs that ``steps`` does not hold and return the figures of all.
+    """Carry out the runs that ``rows`` does not hold and return the figures of all that are finished.
 
     Args:
         runs: what to do; see :func:`benchmarks.evaluation.protocol.plan`.
         setting: where everything lies.
-        steps: where finished runs are kept, pictures in ``runs/``.
+        rows: where finished runs are kept.
+        pictures: folder in which ``runs/`` gets a file of pictures for each run.
+        minutes: runs are begun for so long; those that were not are left out. None: all.
         scheduler: address of a running dask scheduler, such as ``"tcp://lab:8786"``.
         workers: processes of a local cluster otherwise, which share the cores; 0 works in this process, without dask.
         progress: called with ``"runs"``.
@@ -237,37 +332,25 @@ def sweep(
         RuntimeError: naming the run that failed; those that were finished are kept.
     """
     everything = list(dict.fromkeys(runs))
+    end = None if minutes is None else time.time() + 60.0 * minutes
     tell = progress or (lambda stage, done, total: None)
-    found: dict[Run, Row] = {}
-
-    for run in everything:
-        kept = steps.kept(run.key, **_known(run, setting))
-        if kept is not None:
-            found[run] = kept
+    pending = missing(everything, setting, rows)
+    todo = set(pending)
+    found = {run: rows.get(run, known(run, setting)) or {} for run in everything if run not in todo}
     tell("runs", len(found), len(everything))
-    pending = [run for run in everything if run not in found]
     # What takes another run's seconds comes after that run.
     parts = [[r for r in pending if (r.method in AFTER) == late] for late in (False, True)]
     with connected(scheduler, workers if pending else 0) as client:
-        do = partial(_named, work, setting, () if client is not None else (tell,))
+        do = partial(_named, work, setting, () if client is not None else (tell,), end)
         for part in parts:
             jobs = [(run, _budget(run, found)) for run in part]
-            for k, (row, arrays) in each(do, jobs, client):
-                found[part[k]] = steps.run(
-                    part[k].key,
-                    partial(_keep, steps.folder, part[k], row, arrays),
-                    **_known(part[k], setting),
-                )
+            for k, result in each(do, jobs, client):
+                if result is None:  # its time was over
+                    continue
+                write_arrays(pictures / pictures_of(part[k]), result[1])
+                found[part[k]] = rows.put(part[k], known(part[k], setting), result[0])
                 tell("runs", len(found), len(everything))
-    return {run: found[run] for run in everything}
-
-
-def _known(run: Run, setting: Setting) -> dict[str, Any]:
-    return {
-        "version": METHODS[run.method].version,
-        "inputs": _inputs(run, setting),
-        "outputs": (pictures_of(run),),
-    }
+    return {run: found[run] for run in everything if run in found}
 
 
 def _budget(run: Run, found: dict[Run, Row]) -> float | None:
@@ -279,18 +362,19 @@ def _budget(run: Run, found: dict[Run, Row]) -> float | None:
 
 
 def _named(
-    work: Execute, setting: Setting, progress: tuple[Any, ...], job: tuple[Run, float | None]
-) -> Result:
-    """Carry out a run; an error names it."""
+    work: Execute,
+    setting: Setting,
+    progress: tuple[Any, ...],
+    end: float | None,
+    job: tuple[Run, float | None],
+) -> Result | None:
+    """Carry out a run unless the time ``end`` is behind us; an error names it."""
+    if end is not None and time.time() >= end:
+        return None
     try:
         return work(job[0], setting, job[1], *progress)
     except Exception as error:
         raise RuntimeError(f"{job[0].key}: {type(error).__name__}: {error}") from error
-
-
-def _keep(folder: Path, run: Run, row: Row, arrays: dict[str, np.ndarray], _: Attempt) -> Row:
-    write_arrays(folder / pictures_of(run), arrays)
-    return row
 
 
 @contextmanager

@@ -22,23 +22,22 @@ from small_room import SHAPE, small_room
 
 import warprrf as wr
 from benchmarks.evaluation import command, comparison, protocol, report, runs
+from benchmarks.evaluation.lpips import Lpips
 from benchmarks.evaluation.paper_law import paper_law_spectra
-from benchmarks.evaluation.protocol import Run, Setting
-from benchmarks.evaluation.runs import pictures_of, sweep
+from benchmarks.evaluation.protocol import Place, Run, Setting
+from benchmarks.evaluation.runs import Rows, estimate_s, pictures_of, sweep
 from benchmarks.methods import METHODS, Effort
 from benchmarks.runner import Job, execute
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.metrics import angle_deg
 from warprrf.rf.spectra.spectrum import pixel_directions
-from warprrf.steps import Steps
+from warprrf.steps import digest
 
 EFFORT = Effort(
     harmonic_iterations=40, nerf2_iterations=3, nerf2_rays=16, nerf2_samples=4, cgan_iterations=2, cgan_batch=2,
     calibration_s=1.0, sionna_samples=20_000,
 )  # fmt: skip
-OPTIONS: dict[str, Any] = {
-    "counts": (4,), "splits": ("random",), "every": 1, "workers": 0, "effort": EFFORT,
-}  # fmt: skip
+OPTIONS: dict[str, Any] = {"counts": (4,), "splits": ("random",), "seeds": (0,), "effort": EFFORT}
 FILLED = (
     "psnr_db", "psnr_db_min", "psnr_db_max", "ssim", "rmse_db", "seconds_per_spectrum", "peak_memory_gib", "model_mib",
 )  # fmt: skip
@@ -49,31 +48,29 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return small_room(tmp_path_factory.mktemp("room"))
 
 
-def whole(kind: str, out: Path, data: Path, **changed: Any) -> dict[str, Any]:
+def whole(out: Path, data: Path, **changed: Any) -> dict[str, Any]:
     options = {"data": (str(data),), "geometry": str(data / "reconstruction"), **OPTIONS, **changed}
-    return execute(command.BENCHMARKS[kind], command.Options(**options), Job(out, device="cpu"))
+    return execute(command.BENCHMARKS["paper"], command.Options(**options), Job(out, device="cpu"))
 
 
 @pytest.fixture(scope="module")
 def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """Every method on four receivers of both truths that need no Sionna."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    return out, whole("table1", out, data, truths=("exact", "paper-law"))
+    return out, whole(out, data, truths=("exact", "paper-law"))
 
 
 def test_every_method_has_a_row_that_is_filled(finished: tuple[Path, dict[str, Any]]) -> None:
     out, found = finished
     rows = {(row["truth"], row["method"]): row for row in found["rows"]}
-    expected = {("exact", m) for m in protocol.TABLE_METHODS} | {
-        ("paper-law", m) for m in protocol.LAW_METHODS
-    }
-    assert set(rows) == expected
+    expected = {("exact", m) for m in METHODS if m != "rf3dgs+los"}
+    assert set(rows) == expected | {("paper-law", m) for m in protocol.LAW_METHODS}
     assert [(key, name) for key, row in rows.items() for name in FILLED if row.get(name) is None] == []
     for (_, method), row in rows.items():
         assert row["count"] == (0 if METHODS[method].untaught else 4)
         assert row["psnr_db_min"] <= row["psnr_db"] <= row["psnr_db_max"]
         assert row["receivers"] == 4
-    assert json.loads((out / "table1.json").read_text()) == found
+    assert json.loads((out / "paper.json").read_text()) == found
     assert rows["exact", "bistatic"]["psnr_db"] > rows["exact", "rf3dgs+"]["psnr_db"] + 3
     for method in ("rf3dgs+", "rf3dgs", "rf3dgs+alpha", "rf3dgs-alpha"):
         assert rows["exact", method]["loss_last"] < rows["exact", method]["loss_first"]
@@ -82,14 +79,14 @@ def test_every_method_has_a_row_that_is_filled(finished: tuple[Path, dict[str, A
 
 def test_tables_state_what_was_published_and_where_ours_stands(finished: tuple[Path, dict[str, Any]]) -> None:
     out, found = finished
-    text = (out / "table1.md").read_text()
+    text = (out / "paper.md").read_text()
     assert "| published | RF-3DGS+ (published) | 19.68 |" in text
     assert "other data and other hardware" in text
     assert "LPIPS: not computed" in text
-    for name in ("spectra-exact.png", "speed-exact.png", "table1-law.png"):
+    for name in ("spectra-exact.png", "speed-exact.png", "law.png", "sparsity.png", "learning.png"):
         assert f"({name})" in text
         assert (out / name).read_bytes()[:4] == b"\x89PNG"
-    with (out / "table1.csv").open() as lines:
+    with (out / "paper.csv").open() as lines:
         table = list(csv.DictReader(lines))
     assert len(table) == len(found["rows"]) + len(report.PUBLISHED)
     assert [row["psnr_db"] for row in table if row["published"] == "1"] == ["19.68", "13.5", "13.34", "10.33"]
@@ -97,33 +94,64 @@ def test_tables_state_what_was_published_and_where_ours_stands(finished: tuple[P
 
 def test_what_others_are_given_is_what_ours_took(finished: tuple[Path, dict[str, Any]]) -> None:
     out, _ = finished
-    ours, other = (
-        json.loads((out / f".steps/exact-random-4-s0-{m}.json").read_text())["figures"]
-        for m in ("bistatic", "sionna-calibrated")
-    )
+    kept = {row["method"]: row for row in Rows(out / "rows.jsonl") if row["truth"] == "exact"}
+    ours, other = kept["bistatic"], kept["sionna-calibrated"]
     assert other["details"]["budget_s"] == pytest.approx(ours["transport_s"] + ours["fit_s"])
     assert other["details"]["steps"] >= 1
     assert other["fit_s"] > 0.9 * other["details"]["budget_s"] or other["details"]["steps"] == 1
 
 
-def test_sparsity_shares_the_runs_and_draws_bands(
+def test_curves_reach_over_all_counts_and_the_finding_has_the_sign_of_every_set(
     finished: tuple[Path, dict[str, Any]], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "copy"
     shutil.copytree(finished[0], out)
     done = counted(monkeypatch)
-    found = whole("sparsity", out, data, truths=("exact", "paper-law"), counts=(4, 7))
-    assert all("-random-7-s0-" in key for key in done)  # those of 4 are there
-    methods = {
-        key.split("-s0-")[1].removesuffix("-exp").removesuffix("-linear").removesuffix("-db") for key in done
-    }
-    assert methods == set(protocol.CURVE_METHODS)
-    text = (out / "sparsity.md").read_text()
-    for name in ("sparsity.png", "sparsity-law.png"):
-        assert (out / name).read_bytes()[:4] == b"\x89PNG" and f"({name})" in text
-    assert "RF-3DGS+ is ahead on" in text
+    methods = ("rf3dgs+", "rf3dgs", "bistatic", "nearest")
+    found = whole(out, data, truths=("exact", "paper-law"), counts=(4, 7), methods=methods)
+    assert done and all("-random-7-s0-" in key for key in done)  # those of 4 are there
+    text = (out / "paper.md").read_text()
+    assert "RF-3DGS+ is ahead on" in text and "The paper found RF-3DGS+ +6.2 dB above RF-3DGS" in text
     pairs = {(line["truth"], line["count"]) for line in found["finding"]}
     assert pairs == {(t, n) for t in ("exact", "paper-law") for n in (4, 7)}
+    rows = {(row["method"], row["count"]): row["psnr_db"] for row in found["rows"] if row["truth"] == "exact"}
+    margin = next(m for m in found["margins"] if m["method"] == "nearest" and m["count"] == 7)
+    assert margin["psnr_db"] == pytest.approx(rows["bistatic", 7] - rows["nearest", 7])
+
+
+def test_rows_travel_without_their_folder_and_none_is_begun_after_the_time(
+    finished: tuple[Path, dict[str, Any]], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = counted(monkeypatch)
+    rows = tmp_path / "kept.jsonl"
+    shutil.copy(finished[0] / "rows.jsonl", rows)
+    ask = {
+        "truths": ("exact",),
+        "methods": ("nearest", "mean"),
+        "rows": str(rows),
+        "counts": (4, 7),
+        "minutes": 0.0,
+    }
+    found = whole(tmp_path / "elsewhere", data, **ask)
+    assert done == [] and {row["count"] for row in found["rows"]} == {4}
+    assert sorted(found["missing"]) == ["exact-random-7-s0-mean", "exact-random-7-s0-nearest"]
+    content = {row["data"] for row in Rows(rows) if row["truth"] == "exact"}
+    assert content == {digest(data / "spectra.nc")[:12]}  # every row says which data it is of
+    whole(tmp_path / "elsewhere", data, **{**ask, "minutes": None})
+    assert sorted(done) == sorted(found["missing"])
+    rows.write_text(rows.read_text() + '{"known": "')
+    with pytest.raises(ValueError, match=r"rows: line \d+ of .*kept\.jsonl is damaged"):
+        whole(tmp_path / "elsewhere", data, **ask)
+
+
+def test_an_estimate_is_the_time_of_the_nearest_finished_run() -> None:
+    runs = [Run("exact", "random", n, 0, "bistatic") for n in (10, 700)]
+    rows = [
+        {"method": "bistatic", "count": 20, "wall_s": 30.0},
+        {"method": "bistatic", "count": 400, "wall_s": 500.0},
+    ]
+    assert estimate_s(runs, rows) == 530.0
+    assert estimate_s([Run("exact", "random", 10, 0, "nerf2")], rows) > 900  # what no row tells of is guessed
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
@@ -146,46 +174,34 @@ def test_finished_runs_are_kept_and_changed_options_are_not_mistaken(
     shutil.copytree(finished[0], out)
     done = counted(monkeypatch)
     few = {"methods": ("rf3dgs", "nearest"), "truths": ("exact",)}
-    whole("table1", out, data, **few)
+    whole(out, data, **few)
     assert done == []
-    (out / "runs/exact-random-4-s0-nearest.npz").unlink()
-    whole("table1", out, data, **few)
-    assert done == ["exact-random-4-s0-nearest"]
-    done.clear()
-    whole("table1", out, data, **few, effort=replace(EFFORT, harmonic_iterations=41))
+    whole(out, data, **few, effort=replace(EFFORT, harmonic_iterations=41))
     # a lookup does not feel the effort
     assert done == [f"exact-random-4-s0-rf3dgs-{gain}" for gain in ("exp", "linear")]
-    done.clear()
-    (out / ".steps/exact-random-4-s0-nearest.json").write_text("{")
-    whole("table1", out, data, **few, effort=replace(EFFORT, harmonic_iterations=41))
-    assert done == ["exact-random-4-s0-nearest"]  # a damaged record is none
 
 
 # --------------------------------------------------------------------------------------------------- the sets
 
 
-def test_plan_has_nested_counts_one_run_for_what_is_untaught_and_networks_where_asked() -> None:
-    scale = protocol.SCALES["small"]
-    held = {(t, s): range(1, 401) for t in scale.truths for s in scale.splits}
-    planned = protocol.plan("table1", scale, held=held)
+def test_plan_has_every_run_that_the_paper_asks_for_and_none_twice() -> None:
+    held = {(t, "random"): 700 for t in ("exact", "sionna", "paper-law")} | {("conference", "random"): 100}
+    planned = protocol.plan({**held, ("exact", "region"): 500})
     assert len(planned) == len(set(planned))
-    networks = {(r.count, r.split) for r in planned if r.method == "nerf2"}
-    assert networks == {(10, "random"), (50, "random"), (400, "random")}
-    assert {(r.count, r.split) for r in planned if r.method == "rf3dgs-alpha"} == {
-        (10, "random"),
-        (50, "random"),
-    }
-    assert [r.count for r in planned if r.method == "zero" and r.split == "random"] == [0]
-    assert {r.method for r in planned if r.truth == "paper-law"} == set(protocol.LAW_METHODS)
-    assert {r.count for r in planned if r.split == "region"} == {0, 50}
-    curve = protocol.plan("sparsity", scale, held={**held, ("exact", "random"): range(1, 101)})
-    assert {r.count for r in curve if r.truth == "exact"} == {10, 15, 20, 25, 50, 100}
-    paper = protocol.SCALES["paper"]
-    everything = protocol.plan(
-        "table1", paper, held={(t, s): range(1, 701) for t in paper.truths for s in paper.splits}
-    )
-    assert {r.seed for r in everything if r.method == "bistatic"} == {0, 1, 2}
-    assert {r.count for r in everything if r.method == "nerf2"} == set(protocol.PUBLISHED_COUNTS)
+    where = lambda method: {(r.truth, r.split, r.count, r.seed) for r in planned if r.method == method}  # noqa: E731
+    counts, both = (10, 20, 50, 100, 200, 400), ("exact", "sionna")
+    seeds = {(t, "random", n, s) for t in both for n in counts for s in (0, 1, 2)}
+    # With all 700 the order of a seed changes nothing but the batches.
+    fields = seeds | {(t, "random", 700, 0) for t in both} | {("exact", "region", 100, 0)}
+    conference = {("conference", "random", n, 0) for n in (10, 100)}
+    assert where("bistatic") == where("nearest") == fields | conference
+    assert where("rf3dgs+") == fields | conference | {("paper-law", "random", n, 0) for n in (10, 100, 700)}
+    few = {(t, "random", n, 0) for t in both for n in (10, 100, 700)}
+    assert where("nerf2") == where("rf3dgs-alpha") == where("sionna-calibrated") == few
+    assert where("zero") == {(t, "random", 0, 0) for t in both}
+    assert {r.variant for r in planned if r.method == "rf3dgs"} == {"exp", "linear"}
+    few_held = protocol.plan({("exact", "random"): 60}, methods=("nearest", "nerf2"))
+    assert {(r.method, r.count) for r in few_held} == {("nearest", n) for n in (10, 20, 50)} | {("nerf2", 10)}
 
 
 def test_region_split_holds_out_a_part_of_the_room(data: Path) -> None:
@@ -231,6 +247,7 @@ def test_paper_law_scales_scattering_by_the_share_of_the_first_leg(data: Path) -
 
 def row(method: str, count: int, seed: int, variant: str = "", **figures: Any) -> dict[str, Any]:
     every = {"psnr_db": 20.0, "ssim": 0.5, "rmse_db": 5.0, "seconds_per_spectrum": 0.1, **figures}
+    every |= {"data": "d", "room": "r", "wall_s": 1.0}
     ends = {f"{n}_{e}": every.get(n, 1.0) for n in runs.SPREAD for e in ("min", "max")}
     return {
         "truth": "exact", "split": "random", "count": count, "seed": seed, "method": method, "variant": variant,
@@ -277,15 +294,16 @@ def slow_job(
     """Leaves a file named by run and process when it starts, and takes a while."""
     (Path(folder) / f"{run.count}.{os.getpid()}").touch()
     time.sleep(1.5)
-    return {**vars(run), "seconds": 1.5}, {"prediction_db": np.full((1, 2, 2), float(run.count))}
+    return {**vars(run), "key": run.key, "seconds": 1.5}, {
+        "prediction_db": np.full((1, 2, 2), float(run.count))
+    }
 
 
 def setting_of(data: Path) -> Setting:
-    return Setting(
-        files=(("exact", str(data / "spectra.nc")),), keys=(("exact", "m"),), geometry=str(data / "reconstruction"),
-        geometry_key="g", scene=str(data / "scene.xml"), scratch=str(data / "scratch"), every=1, effort=EFFORT,
-        device="cpu",
-    )  # fmt: skip
+    place = Place(
+        str(data / "spectra.nc"), "m", "c", str(data / "reconstruction"), "g", "h", str(data / "scene.xml")
+    )
+    return Setting(places=(("exact", place),), scratch=str(data / "scratch"), effort=EFFORT, device="cpu")
 
 
 def test_a_killed_worker_loses_nothing(data: Path, tmp_path: Path) -> None:
@@ -311,11 +329,10 @@ def test_a_killed_worker_loses_nothing(data: Path, tmp_path: Path) -> None:
         n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL"
     ) as cluster:
         killer.start()
-        with Steps(tmp_path) as steps:
-            rows = sweep(
-                planned, setting_of(data), steps, scheduler=cluster.scheduler_address,
-                work=partial(slow_job, str(started)),
-            )  # fmt: skip
+        rows = sweep(
+            planned, setting_of(data), Rows(tmp_path / "rows.jsonl"), tmp_path, scheduler=cluster.scheduler_address,
+            work=partial(slow_job, str(started)),
+        )  # fmt: skip
     killer.join()
     assert killed
     assert [rows[run]["count"] for run in planned] == [1, 2, 3, 4]
@@ -337,13 +354,13 @@ def test_a_killed_sweep_loses_the_run_it_was_at(data: Path, tmp_path: Path) -> N
         done.append(run.count)
         if len(done) == 2:
             raise KeyboardInterrupt
-        return vars(run) | {}, {"prediction_db": np.zeros((1, 2, 2))}
+        return {**vars(run), "key": run.key}, {"prediction_db": np.zeros((1, 2, 2))}
 
-    options = {"workers": 0, "work": job}
-    with pytest.raises(KeyboardInterrupt), Steps(tmp_path) as steps:
-        sweep(planned, setting_of(data), steps, **options)
-    with Steps(tmp_path) as steps:
-        rows = sweep(planned, setting_of(data), steps, **options)
+    options: dict[str, Any] = {"workers": 0, "work": job}
+    file = tmp_path / "rows.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        sweep(planned, setting_of(data), Rows(file), tmp_path, **options)
+    rows = sweep(planned, setting_of(data), Rows(file), tmp_path, **options)
     assert done == [1, 2, 2, 3]
     assert [rows[run]["count"] for run in planned] == [1, 2, 3]
 
@@ -353,11 +370,8 @@ def test_a_run_that_fails_is_named(data: Path, tmp_path: Path) -> None:
         raise OSError("disk full")
 
     planned = [Run("exact", "random", 1, 0, "nearest")]
-    with (
-        Steps(tmp_path) as steps,
-        pytest.raises(RuntimeError, match="exact-random-1-s0-nearest: OSError: disk full"),
-    ):
-        sweep(planned, setting_of(data), steps, workers=0, work=job)
+    with pytest.raises(RuntimeError, match="exact-random-1-s0-nearest: OSError: disk full"):
+        sweep(planned, setting_of(data), Rows(tmp_path / "rows.jsonl"), tmp_path, workers=0, work=job)
 
 
 # ------------------------------------------------------------------------------------------------- the command
@@ -369,7 +383,9 @@ def test_a_run_that_fails_is_named(data: Path, tmp_path: Path) -> None:
         ({"methods": ("nerf3",)}, "methods: got nerf3"),
         ({"counts": (0,)}, "counts: got"),
         ({"counts": (4000,), "methods": ("nearest",)}, "nothing is left to do"),
-        ({"scale": "huge"}, "scale: got huge"),
+        ({"minutes": -1.0}, "minutes: got -1.0"),
+        ({"truths": ("conference",)}, "truths: conference needs --room"),
+        ({"lpips": ("one",), "methods": ("nearest",)}, "lpips: got 1 files"),
         ({"truths": ("sionna", "fake")}, "truths: got fake"),
         ({"workers": -1, "methods": ("nearest",)}, "workers: got -1"),
         ({"geometry": "nowhere"}, "geometry: there is no folder nowhere"),
@@ -377,10 +393,60 @@ def test_a_run_that_fails_is_named(data: Path, tmp_path: Path) -> None:
 )
 def test_bad_options_are_named(data: Path, tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        whole("table1", tmp_path, data, **{"truths": ("exact",), **wrong})
+        whole(tmp_path, data, **{"truths": ("exact",), **wrong})
+
+
+def test_lpips_is_the_distance_of_normalised_features_weighted_by_channel(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    assert "nothing is downloaded" in str(Lpips.found())
+    r = torch.Generator().manual_seed(3)
+    sizes = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
+    backbone = {
+        f"features.{k}.weight": torch.randn(n, m, w, w, generator=r) / (w * m**0.5)
+        for k, (n, m, w) in sizes.items()
+    }
+    backbone |= {f"features.{k}.bias": torch.randn(n, generator=r) for k, (n, *_) in sizes.items()}
+    layers = {
+        f"lin{i}.model.1.weight": torch.rand(1, n, 1, 1, generator=r)
+        for i, (n, *_) in enumerate(sizes.values())
+    }
+    files = tmp_path / "alexnet.pth", tmp_path / "lpips.pth"
+    for state, file in zip((backbone, layers), files, strict=True):
+        torch.save(state, file)
+    found = Lpips.found([str(file) for file in files])
+    assert isinstance(found, Lpips)
+    one, other = np.random.default_rng(4).random((2, 64, 70))
+    # The same network from torch's own modules.
+    net, taps = torch.nn, {1: 0, 4: 1, 7: 2, 9: 3, 11: 4}
+    modules = [
+        net.Conv2d(3, 64, 11, 4, 2), net.ReLU(), net.MaxPool2d(3, 2), net.Conv2d(64, 192, 5, padding=2), net.ReLU(),
+        net.MaxPool2d(3, 2), net.Conv2d(192, 384, 3, padding=1), net.ReLU(), net.Conv2d(384, 256, 3, padding=1),
+        net.ReLU(), net.Conv2d(256, 256, 3, padding=1), net.ReLU(),
+    ]  # fmt: skip
+    network = net.Sequential(*modules)
+    network.load_state_dict({name.removeprefix("features."): value for name, value in backbone.items()})
+    expected, now = 0.0, []
+    for image in (one, other):
+        grey = torch.tensor(image, dtype=torch.float32).expand(1, 3, 64, 70)
+        shift, scale = (
+            torch.tensor(v).view(3, 1, 1) for v in ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450])
+        )
+        now.append((2 * grey - 1 - shift) / scale)
+    with torch.no_grad():
+        for k, module in enumerate(network):
+            now = [module(x) for x in now]
+            if k in taps:
+                a, b = (net.functional.normalize(x, dim=1) for x in now)
+                weight = layers[f"lin{taps[k]}.model.1.weight"]
+                expected += float(net.functional.conv2d((a - b) ** 2, weight).mean())
+    assert found(one, other) == pytest.approx(expected, rel=1e-5) and expected > 0.01
+    assert found(one, one) == 0.0
+    files[1].write_bytes(b"no weights")
+    with pytest.raises(ValueError, match=r"lpips: .*lpips\.pth is no file of weights"):
+        Lpips.found([str(file) for file in files])
 
 
 def test_shown_receivers_are_one_with_line_of_sight_and_one_without() -> None:
     gain = np.arange(1, 6, dtype=float)[:, None, None] * np.ones((5, 2, 2))
-    test = SimpleNamespace(path_gain=gain, line_of_sight=np.array([True, True, False, False, True]))
+    test: Any = SimpleNamespace(path_gain=gain, line_of_sight=np.array([True, True, False, False, True]))
     assert protocol.shown_receivers(test).tolist() == [1, 2]

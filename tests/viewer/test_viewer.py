@@ -281,6 +281,21 @@ def test_a_saved_page_shows_the_room_and_its_figures_without_a_server(viewer, pa
 
 
 @browsed
+def test_share_gives_the_browser_the_page_and_the_picture_as_files(viewer, page, tmp_path):
+    page.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})
+    _click(page, "Share")
+    for label, name, start in (
+        ("page (.html)", "warprrf.html", b"<!DOCTYPE html"),
+        ("picture (.png)", "warprrf.png", b"\x89PNG"),
+    ):
+        _click(page, label)
+        _until((tmp_path / name).is_file, 60)
+        found = (tmp_path / name).read_bytes()
+        assert found[:14].upper().startswith(start.upper()) and len(found) > 10_000
+    _click(page, "Channel")
+
+
+@browsed
 def test_a_drag_in_the_browser_changes_spectrum_and_picture(viewer, page):
     viewer.receiver = RECEIVER
     viewer.wait()
@@ -331,6 +346,13 @@ def _at(page, x, y):
     actions = ActionChains(page)
     actions.w3c_actions.pointer_action.move_to_location(x, y)
     return actions
+
+
+def _click(page, label):
+    """Click the button or tab of that name."""
+    path = f"//*[self::button or @role='tab'][normalize-space(.)='{label}']"
+    _until(lambda: page.find_elements("xpath", path), 20)
+    page.find_element("xpath", path).click()
 
 
 def _pixel(viewer, page, point):

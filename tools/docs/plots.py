@@ -52,7 +52,7 @@ def _name(method: str) -> str:
 
 @entry("psnr", "PSNR of held-out receivers over the number of training spectra")
 def _psnr() -> Any:
-    rows = results.read("sparsity")["rows"]
+    rows = results.read("paper")["rows"]
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
     for ax, (truth, name) in zip(axes, results.TRUTHS.items(), strict=True):
         for method, colour in COLOURS.items():
@@ -64,21 +64,17 @@ def _psnr() -> Any:
             if chosen:
                 ax.semilogx(*zip(*chosen, strict=True), "o-", ms=3.5, color=colour, label=_name(method))
         ax.set(xlabel="training spectra", title=f"truth: {name}")
-        ax.set_xticks([10, 50, 100, 400], ["10", "50", "100", "400"])
+        ax.set_xticks([10, 20, 50, 100, 200, 400, 700], ["10", "20", "50", "100", "200", "400", "700"])
         ax.minorticks_off()
     axes[0].set_ylabel("PSNR [dB]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7)
     return figure
 
 
-@entry("speed", "Error over the time of one spectrum and over training time, 50 spectra of the exact engine")
+@entry("speed", "Error over the time of one spectrum and over training time, 100 spectra of the exact engine")
 def _speed() -> Any:
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
-    rows = [
-        r
-        for r in results.read("table1")["rows"]
-        if (r["truth"], r["split"], r["count"]) == ("exact", "random", 50)
-    ]
+    rows = results.paper("exact", "random", 100)
     for ax, key, words in (
         (axes[0], "seconds_per_spectrum", "seconds a spectrum"),
         (axes[1], "train_s", "training [s]"),

@@ -295,56 +295,118 @@ def _transmitter() -> str:
 
 # ------------------------------------------------------------------------------------------- other methods
 
-SUBSETS = (
-    ("exact", "random", 10), ("exact", "random", 50), ("exact", "random", 400), ("sionna", "random", 10),
-    ("sionna", "random", 50), ("sionna", "random", 400), ("exact", "region", 50),
-)  # fmt: skip
+PLACES = {
+    ("exact", "random"): "exact engine",
+    ("sionna", "random"): "Sionna RT, depth 3",
+    ("conference", "random"): "conference room, Sionna RT",
+    ("exact", "region"): "exact engine, a region held out",
+    ("sionna", "region"): "Sionna RT, a region held out",
+}
 
 
-def _methods() -> list[str]:
-    found = {r["method"] for r in read("table1")["rows"]}
-    return [m for m in NAMES if m in found]
+def paper(truth: str, split: str, count: int | None = None) -> list[Row]:
+    """Rows of the paper's evaluation of one place, those of ``count`` spectra and of none where it is given."""
+    rows = [r for r in read("paper")["rows"] if (r["truth"], r["split"]) == (truth, split)]
+    rows = [r for r in rows if count is None or r["count"] in (count, 0)]
+    return sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
 
 
-def _table1(method: str, truth: str, split: str, count: int) -> Row | None:
-    rows = read("table1")["rows"]
-    same = {"method": method, "truth": truth, "split": split}
-    return _find(rows, **same, count=count) or _find(rows, **same, count=0)
+@entry("paper-psnr")
+def _paper_psnr() -> str:
+    parts = []
+    for place, name in PLACES.items():
+        rows = paper(*place)
+        counts = sorted({r["count"] for r in rows if r["count"]})
+        lines = []
+        for method in dict.fromkeys(r["method"] for r in rows):
+            own = {r["count"]: r for r in rows if r["method"] == method}
+            if 0 in own:
+                own = dict.fromkeys(counts[:1], own[0])
+            lines.append([NAMES[method], *(_psnr(own.get(count)) for count in counts)])
+        if lines:
+            parts += [f"**{name}**", markdown(("PSNR [dB], all / blocked", *map(str, counts)), lines)]
+    return "\n\n".join(parts)
 
 
-@entry("methods-psnr")
-def _methods_psnr() -> str:
+def _psnr(row: Row | None) -> str:
+    if row is None:
+        return ""
+    spread = "" if row["psnr_db_std"] is None else f" ± {row['psnr_db_std']:.1f}"
+    return f"{row['psnr_db']:.1f}{spread} / {show(row['psnr_db_blocked'])}"
+
+
+@entry("paper-detail")
+def _paper_detail() -> str:
+    parts = []
+    for place, name in PLACES.items():
+        lines = [
+            [
+                NAMES[r["method"]], show(r["ssim"], "{:.2f}"), show(r["rmse_db"]),
+                f"{r['direction_within_3deg']:.0%} / {show(r['direction_within_3deg_blocked'], '{:.0%}')}",
+                f"{r['beam_gain_loss_db']:.1f} / {show(r['beam_gain_loss_db_blocked'])}",
+                show(r["tof_error_median_ns"], "{:.2g}"), show(r.get("train_s"), "{:.3g}"),
+                show(1e3 * r["seconds_per_spectrum"], "{:.3g}"), show(r.get("peak_memory_gib"), "{:.1f}"),
+                show(r.get("model_mib"), "{:.2g}"),
+            ]
+            for r in paper(*place, 100)
+        ]  # fmt: skip
+        head = (
+            f"{name}, 100 spectra", "SSIM", "RMSE [dB]", "within 3°, all / blocked", "beam loss [dB], all / blocked",
+            "delay [ns]", "training [s]", "a spectrum [ms]", "memory [GiB]", "model [MiB]",
+        )  # fmt: skip
+        if lines:
+            parts.append(markdown(head, lines))
+    return "\n\n".join(parts)
+
+
+@entry("paper-statement")
+def _paper_statement() -> str:
+    lines = [r for r in read("paper")["finding"] if r["split"] == "random" and not r["opacity"]]
+    published = {r["method"]: r["psnr_db"] for r in read("paper")["published"]}
+    parts = [f"The paper reports RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:.1f} dB above RF-3DGS."]
+    for truth, name in (
+        *((t, n) for (t, split), n in PLACES.items() if split == "random"),
+        ("paper-law", "targets made by the paper's law"),
+    ):
+        own = [r["psnr_db"]["difference"] for r in lines if r["truth"] == truth]
+        if own:
+            parts.append(f"{name[0].upper()}{name[1:]}: {sum(own) / len(own):+.1f} dB over {len(own)} sizes.")
+    return " ".join(parts)
+
+
+@entry("paper-runs")
+def _paper_runs() -> str:
+    found = read("paper")
+    missing_runs = len(found["missing"])
+    data = "; ".join(
+        f"{PLACES.get((name.split('/')[0], 'random'), name.split('/')[0])} {about['content']}"
+        for name, about in found["data"].items()
+        if name.endswith("/random")
+    )
+    left = f" {missing_runs} runs of the plan are missing." if missing_runs else ""
+    return f"Data, by the hash of the file: {data}.{left}"
+
+
+@entry("paper-stage2")
+def _paper_stage2() -> str:
     lines = []
-    for method in _methods():
-        cells = [NAMES[method]]
-        for subset in SUBSETS:
-            r = _table1(method, *subset)
-            cells.append("" if r is None else f"{r['psnr_db']:.1f} / {r['psnr_db_blocked']:.1f}")
-        lines.append(cells)
-    head = [f"{t}, {'region held out' if s == 'region' else c}" for t, s, c in SUBSETS]
-    return markdown(("PSNR [dB], all / blocked", *head), lines)
-
-
-@entry("methods-detail")
-def _methods_detail() -> str:
-    lines = []
-    for method in _methods():
-        r = _table1(method, "exact", "random", 50)
-        if r is None:
-            continue
-        lines.append([
-            NAMES[method], show(r["ssim"], "{:.2f}"), show(r["rmse_db"]),
-            f"{r['direction_within_3deg']:.0%} / {r['direction_within_3deg_blocked']:.0%}",
-            f"{r['beam_gain_loss_db']:.1f} / {r['beam_gain_loss_db_blocked']:.1f}",
-            show(r["tof_error_median_ns"], "{:.2g}"), show(r.get("train_s"), "{:.3g}"),
-            show(1e3 * r["seconds_per_spectrum"], "{:.3g}"), show(r.get("peak_memory_gib"), "{:.1f}"),
-            show(r.get("model_mib"), "{:.2g}"),
-        ])  # fmt: skip
-    head = (
-        "exact, 50 spectra", "SSIM", "RMSE [dB]", "within 3°, all / blocked", "beam loss [dB], all / blocked",
-        "delay [ns]", "training [s]", "a spectrum [ms]", "memory [GiB]", "model [MiB]",
-    )  # fmt: skip
-    return markdown(head, lines)
+    for place, name in PLACES.items():
+        for r in paper(*place):
+            if r["count"] == 700 and r["method"] in ("bistatic", "bistatic-quick", "rf3dgs+", "rf3dgs"):
+                lines.append(
+                    [
+                        NAMES[r["method"]],
+                        name,
+                        show(r["transport_s"], "{:.0f}"),
+                        show(r["fit_s"], "{:.0f}"),
+                        show(r["train_s"], "{:.0f}"),
+                    ]
+                )
+    for r in read("paper")["published"][:2]:
+        lines.append(
+            [NAMES[r["method"]], "as published, NVIDIA RTX 4090", "", "", show(r["train_s"], "{:.0f}")]
+        )
+    return markdown(("stage 2, 700 spectra", "truth", "rays [s]", "fit [s]", "both [s]"), lines)
 
 
 @entry("published")
@@ -354,7 +416,7 @@ def _published() -> str:
             NAMES[r["method"]], show(r["psnr_db"], "{:.2f}"), show(r["ssim"], "{:.3f}"), show(r["train_s"], "{:.0f}"),
             show(1e3 * r["seconds_per_spectrum"], "{:.3g}"),
         ]
-        for r in read("table1")["published"]
+        for r in read("paper")["published"]
     ]  # fmt: skip
     return markdown(("as published", "PSNR [dB]", "SSIM", "training [s]", "a spectrum [ms]"), lines)
 
@@ -362,10 +424,10 @@ def _published() -> str:
 @entry("law")
 def _law() -> str:
     words = {"exact": "power that scatters as it does", "paper-law": "given the paper's factor, path by path"}
-    found = [r for r in read("table1")["finding"] if r["split"] == "random" and not r["opacity"]]
+    found = [r for r in read("paper")["finding"] if r["split"] == "random" and not r["opacity"]]
     lines = [
         [
-            words.get(r["truth"], TRUTHS.get(r["truth"], r["truth"])), str(r["count"]),
+            words.get(r["truth"], PLACES.get((r["truth"], "random"), r["truth"])), str(r["count"]),
             show(r["psnr_db"]["rf3dgs+"]), show(r["psnr_db"]["rf3dgs"]), show(r["psnr_db"]["difference"], "{:+.1f}"),
         ]
         for r in found

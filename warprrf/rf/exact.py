@@ -38,6 +38,7 @@ from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
     angles_from_directions,
+    beam_sums,
     check_shape,
     spread_paths,
     sub_pixel_directions,
@@ -199,7 +200,11 @@ class ExactEngine:
         rest = specular.length_m - np.linalg.norm(
             first[: len(specular.tau)] - self.tracer.transmitter, axis=1
         )
-        spread = spread_paths(directions, power, self.shape, self.beam_sigma_rad, device=self.device)
+        # Every receiver has the same lattice of directions, whose beams are summed once.
+        beam = self.shape, self.beam_sigma_rad
+        lattice = _lattice_beams(self.sub_pixels, *beam, str(self.device))[scattered.index]
+        beams = np.concatenate([beam_sums(specular.arrival, *beam, device=self.device), lattice])
+        spread = spread_paths(directions, power, *beam, beams=beams, device=self.device)
         delay_s, aod = strongest_delay_and_departure(
             spread.strongest, self.tracer.transmitter, first, np.concatenate([rest, scattered.range_m])
         )
@@ -251,3 +256,8 @@ class _SubPixels:
 def _sub_pixel_grid(shape: tuple[int, int], sub_pixels: int, device: str) -> _SubPixels:
     directions, solid_angles = sub_pixel_directions(shape, sub_pixels)
     return _SubPixels(directions, solid_angles, wp.array(directions, dtype=wp.vec3d, device=device))
+
+
+@lru_cache(maxsize=1)
+def _lattice_beams(sub_pixels: int, shape: tuple[int, int], sigma: float, device: str) -> np.ndarray:
+    return beam_sums(_sub_pixel_grid(shape, sub_pixels, device).directions, shape, sigma, device=device)

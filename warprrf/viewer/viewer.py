@@ -243,12 +243,14 @@ class Viewer:
         gui = self._page.gui
         gui.add_markdown("One file that opens in any browser, or a picture of the view and the spectrum.")
         page, picture = gui.add_button("page (.html)"), gui.add_button("picture (.png)")
-        page.on_click(lambda event: event.client.send_file_download("warprrf.html", self._html()))
+        page.on_click(
+            lambda event: event.client.send_file_download("warprrf.html", self._html(), save_immediately=True)
+        )
 
         @picture.on_click
         def _(event: Any) -> None:
             view = event.client.get_render(900, 1200, transport_format="jpeg")
-            event.client.send_file_download("warprrf.png", self._png(view))
+            event.client.send_file_download("warprrf.png", self._png(view), save_immediately=True)
 
     def _png(self, view: np.ndarray | None = None) -> bytes:
         return pictures.sheet(self.message.replace("**", ""), self._channel.images, view)

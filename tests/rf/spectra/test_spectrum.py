@@ -8,6 +8,7 @@ import pytest
 from warprrf.rf.spectra.spectrum import (
     Spectrum,
     angles_from_directions,
+    beam_sums,
     pixel_directions,
     pixel_of,
     pixel_solid_angles,
@@ -90,6 +91,14 @@ def test_the_strongest_path_is_the_one_that_gives_most():
     np.testing.assert_allclose(found.path_gain, images.sum(axis=0), rtol=1e-9)
     empty = images.max(axis=0) == 0
     np.testing.assert_array_equal(found.strongest, np.where(empty, -1, images.argmax(axis=0)))
+
+
+def test_known_beams_change_nothing_where_dark_paths_are_left_out():
+    d, powers = random_directions(40), np.where(np.arange(40) % 3 == 0, 0.0, 1e-9)
+    expected = spread_paths(d, powers, (30, 60), 0.1)
+    found = spread_paths(d, powers, (30, 60), 0.1, beams=beam_sums(d, (30, 60), 0.1))
+    np.testing.assert_allclose(found.path_gain, expected.path_gain, rtol=1e-13)
+    np.testing.assert_array_equal(found.strongest, expected.strongest)
 
 
 def test_paths_without_power_give_an_empty_spectrum():

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
-from typing import Any, ClassVar, Self, Unpack
+from typing import Any, ClassVar, Self, TypeAlias, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,24 +29,29 @@ from warprrf.checks import (
 from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.netcdf_files import Variable
+from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.channel.response import LinkOptions as LinkEnds
 from warprrf.rf.channel.response import frequency_response
 from warprrf.rf.em.absorption import Air, Gas
 from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
 from warprrf.rf.fields.batches import Batch, Delivery
-from warprrf.rf.fields.data import Data
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
 from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
+from warprrf.rf.spectra.readings import Readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_shape
 from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 """Attributes of every model that are numbers, under these names in the header of a file."""
 NARROWEST_BEAM_RAD = 1e-4
+Measured: TypeAlias = SpectrumDataset | Readings | ArraySpectra
+"""What fields are fitted to: a set of spectra, a table of readings, spectra of coherent arrays."""
+Data: TypeAlias = Measured | Sequence[Measured]
+"""One of them, or several."""
 
 
 @checked

@@ -230,6 +230,7 @@ def spread_paths(
     shape: tuple[int, int],
     sigma: float = BEAM_SIGMA_RAD,
     *,
+    beams: np.ndarray | None = None,
     device: DeviceLike = None,
 ) -> SpreadPaths:
     """Path gains spread by the receiver beam, and each pixel's strongest path.
@@ -239,6 +240,7 @@ def spread_paths(
         powers: Path gains, linear, not negative, shape ``(L,)``.
         shape: Rows and columns of the grid.
         sigma: Beam width, kappa = 1 / sigma^2 [rad].
+        beams: :func:`beam_sums` of the directions, where they are known: half of the work.
 
     Raises:
         ValueError: on a wrong shape, NaN, a negative gain, a direction of length zero, or a sigma that is not positive.
@@ -265,14 +267,12 @@ def spread_paths(
 
     where = _device.resolve(device)
     grid = _beam_grid((rows, columns), float(sigma), str(where))
-    count = len(positive)
+    known = beam_sums(d, shape, sigma, device=where) if beams is None else beams[positive]
+    near, total = np.ascontiguousarray(known[order].T)
     toward = wp.array(d[order], dtype=wp.vec3d, device=where)
-    nearest = wp.zeros(count, dtype=wp.float64, device=where)
-    total = wp.zeros(count, dtype=wp.float64, device=where)
-    cells = wp.array(cell[order], dtype=wp.int32, device=where)
+    nearest = wp.array(near, dtype=wp.float64, device=where)
     beam = [grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit]
-    _device.launch(beam_kernels.beam_normaliser, count, [toward, cells, *beam, nearest, total], device=where)
-    scaled = wp.array(power[order] / total.numpy(), dtype=wp.float64, device=where)
+    scaled = wp.array(power[order] / total, dtype=wp.float64, device=where)
     image = wp.zeros((rows, columns), dtype=wp.float64, device=where)
     best = wp.zeros((rows, columns), dtype=wp.int32, device=where)
     first = wp.array(starts, dtype=wp.int32, device=where)
@@ -280,6 +280,23 @@ def spread_paths(
     _device.launch(beam_kernels.gather_beams, rows * columns, inputs, device=where)
     index = best.numpy()
     return SpreadPaths(image.numpy(), np.where(index >= 0, positive[order][index], -1).astype(np.int32))
+
+
+def beam_sums(
+    directions: np.ndarray, shape: tuple[int, int], sigma: float, *, device: DeviceLike = None
+) -> np.ndarray:
+    """Squared chord from each unit vector ``directions`` (L, 3) to its pixel's centre, and the sum of its beam over all
+    pixels, one there, shape ``(L, 2)``."""
+    where = _device.resolve(device)
+    grid = _beam_grid(shape, float(sigma), str(where))
+    row, column = pixel_of(directions, shape)
+    sums = [wp.zeros(len(directions), dtype=wp.float64, device=where) for _ in range(2)]
+    inputs = [
+        wp.array(directions, dtype=wp.vec3d, device=where), wp.array(row * shape[1] + column, dtype=wp.int32, device=where),
+        grid.pixels, grid.solid_angles, grid.half_widths, grid.kappa, grid.chord_limit, *sums,
+    ]  # fmt: skip
+    _device.launch(beam_kernels.beam_normaliser, len(directions), inputs, device=where)
+    return np.stack([one.numpy() for one in sums], axis=1)
 
 
 def strongest_rays(

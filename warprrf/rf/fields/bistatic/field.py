@@ -31,7 +31,7 @@ from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import assumed_permittivity
 from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
-from warprrf.rf.fields.base import RadioField
+from warprrf.rf.fields.base import Data, Measured, RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
 from warprrf.rf.fields.bistatic.materials import ARRAYS as PARAMETER_ARRAYS
@@ -45,7 +45,6 @@ from warprrf.rf.fields.bistatic.suggest import Pointings, Sensitivity, Unknowns,
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.training import FitOptions, TrainingViews, train
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
-from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.antenna import Pattern

@@ -13,12 +13,12 @@ from warprrf.geometry.mesh import Mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.fit import NEPER, OWN_GAIN, Target, gain_of
 from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import ArrayImage, Measurement, SpectrumPixels, WeighedPaths
 from warprrf.rf.fields.bistatic.response import predict, respond
 from warprrf.rf.fields.bistatic.transport import ReceiverView
-from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset

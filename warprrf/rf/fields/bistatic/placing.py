@@ -16,12 +16,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.base import Measured
 from warprrf.rf.fields.bistatic.fit import GroupFit, Target
 from warprrf.rf.fields.bistatic.materials import Parameters, mirror_power
 from warprrf.rf.fields.bistatic.measured import direct_paths
 from warprrf.rf.fields.bistatic.observations import Place
 from warprrf.rf.fields.bistatic.transport import ReceiverView
-from warprrf.rf.fields.data import Measured
 from warprrf.rf.spectra.readings import Readings, path_weights
 
 STRONGEST = 20  # paths that count

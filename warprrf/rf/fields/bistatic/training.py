@@ -16,6 +16,7 @@ from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
 from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.fit import (
     NEPER,
     OWN_GAIN,
@@ -38,7 +39,6 @@ from warprrf.rf.fields.bistatic.response import Response, predict, respond, with
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport, traced
 from warprrf.rf.fields.bistatic.uncertainty import ErrorModel, learn_errors
-from warprrf.rf.fields.data import Data, Measured
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.readings import Readings
 
