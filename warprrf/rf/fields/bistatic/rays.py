@@ -51,9 +51,9 @@ class Hits:
     def points(self, ray: np.ndarray) -> np.ndarray:
         """Where the rays of index ``ray`` (N,) hit [m], shape ``(N, 3)``; NaN or infinite where they hit nothing."""
         origins, directions = self.origins.numpy(), self.directions.numpy()
-        start = origins[ray // (len(self.face) // len(origins))]
+        start, toward = mesh_rays.rays_of(origins, directions, len(self.face) // len(origins), ray)
         with np.errstate(invalid="ignore"):
-            return np.asarray(start + self.range_m.numpy()[ray, None] * directions[ray % len(directions)])
+            return np.asarray(start + self.range_m.numpy()[ray, None] * toward)
 
 
 @dataclass(frozen=True)
@@ -132,17 +132,14 @@ class RayGrid:
         )
 
     def _hit(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array, count: int) -> Hits:
-        toward = directions.numpy()
         hit = self.surface.mesh.cast(
-            np.repeat(origins, count // len(origins), axis=0) if len(origins) > 1 else origins,
-            np.tile(toward, (count // len(toward), 1)) if len(toward) < count else toward,
-            device=self.device,
+            origins, directions.numpy(), per_origin=max(count // max(len(origins), 1), 1), device=self.device,
             backend=self._backend(count),
-        )
+        )  # fmt: skip
         return Hits(
             wp.array(origins, dtype=wp.vec3d, device=self.device), directions, solid_angle,
             wp.array(hit.face, dtype=wp.int32, device=self.device, copy=False),
-            wp.array(np.maximum(hit.t, LEAST_M), dtype=wp.float64, device=self.device, copy=False),
+            wp.array(np.maximum(hit.t, LEAST_M, out=hit.t), dtype=wp.float64, device=self.device, copy=False),
         )  # fmt: skip
 
     def _backend(self, count: int) -> str:
@@ -158,7 +155,7 @@ class RayGrid:
         strength = found.strength.numpy()
         ray = np.flatnonzero(strength > 0)
         free = self.surface.mesh.visible(
-            np.asarray(source, float), point.numpy()[ray], clearance=self.surface.skin_m, device=self.device,
+            np.asarray(source, float), point.numpy().take(ray, axis=0), clearance=self.surface.skin_m, device=self.device,
             backend=self._backend(len(ray)),
         )  # fmt: skip
         strength[ray[~free]] = 0.0

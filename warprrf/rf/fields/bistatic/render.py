@@ -92,7 +92,7 @@ def images(view: ReceiverView, powers: PathPowers, by_ray: np.ndarray, beam: Bea
     if view.beams is None:
         raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
     count, shape, paths = len(view.receivers), view.transport.grid.shape, view.paths
-    pixels = by_ray.reshape(count, *shape, -1).sum(axis=-1)
+    pixels = np.einsum("...k->...", by_ray.reshape(count, *shape, -1))
     found = np.moveaxis(beam(np.ascontiguousarray(np.moveaxis(pixels, 0, -1))), -1, 0)
     sharp = powers.mirror.astype(np.float32)
     for image, own in zip(found, (paths.receiver == k for k in range(count)), strict=True):
@@ -112,7 +112,7 @@ def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | Non
     if terms.diffuse:
         face = view.hits.face
         power = scatter(t.surface, face, view.light, terms, p.weight, p.log_excess, t.wavelength_m)
-        single = power * (p.gain * materials.cell_gain())[t.surface.cell][face.numpy()]
+        single = power * (p.gain * materials.cell_gain())[t.surface.cell].take(face.numpy(), mode="wrap")
     return PathPowers(single, mirror, further_bounces(view, materials, sent), p)
 
 
@@ -120,7 +120,9 @@ def further_bounces(view: ReceiverView, materials: Materials, sent: np.ndarray |
     """What comes after a first bounce, residual and common gain included; arguments as for :func:`render`."""
     t, gain = view.transport, materials.parameters.gain
     on, (ray, shown) = sent_on(view, materials, sent), mirror_shown(view, materials, sent)
-    on *= (gain * materials.sent_gain(t.transmitter))[t.surface.cell][view.hits.face.numpy()]
+    on *= (gain * materials.sent_gain(t.transmitter))[t.surface.cell].take(
+        view.hits.face.numpy(), mode="wrap"
+    )
     return Further(on, (ray, gain * shown))
 
 
