@@ -275,8 +275,7 @@ class Mesh:
         Args:
             origins: Ray starts [m], shape ``(N, 3)`` or ``(3,)`` for all.
             directions: Ray directions, any length but zero, shape ``(N, 3)`` or ``(3,)`` for all.
-            per_origin: Rays that start at each of ``N / per_origin`` origins, one's after another's; directions may then be
-                as many, for every origin.
+            per_origin: Rays of each origin, one origin's after another's; directions may be as many, for all origins.
             device: Where the hierarchy is searched.
             backend: One of :data:`~warprrf.geometry.rays.BACKENDS`. All agree on distances; on an edge they may
                 name either face.

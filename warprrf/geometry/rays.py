@@ -92,8 +92,7 @@ class Hit:
 class RaySearch:
     """The hierarchies of one mesh, each built when first needed, by one thread.
 
-    Rays and segments hold one row or N of either end: one stands for all. Of rays there may also be ``per_origin`` from each
-    origin, along the same directions, one origin's after another's.
+    Rays and segments hold one row or N of either end: one stands for all. ``per_origin`` is as for :meth:`Mesh.cast`.
 
     Args:
         vertices: Positions [m], shape ``(V, 3)``.
@@ -246,9 +245,8 @@ class RaySearch:
     ) -> None:
         """Cast rays that met nothing and start within the bounds again, a little turned; fills ``t`` and ``face``."""
         missed = np.flatnonzero(face < 0)
-        start, toward = rays_of(o, d, per_origin, missed)
-        inside = ((self._bounds[0] <= start) & (start <= self._bounds[1])).all(axis=1)
-        missed = missed[inside]
+        start, _ = rays_of(o, d, per_origin, missed)
+        missed = missed[((self._bounds[0] <= start) & (start <= self._bounds[1])).all(axis=1)]
         rng = np.random.default_rng(0)
         for _ in range(_RECASTS):
             if len(missed) == 0:

@@ -115,26 +115,18 @@ class RayGrid:
     def hit(self, receivers: np.ndarray) -> Hits:
         """What the grid's rays from ``receivers``, (3,) or (O, 3), hit."""
         origins = np.asarray(receivers, float).reshape(-1, 3)
-        return self._hit(
-            origins,
-            self.device_directions,
-            self.device_solid_angle,
-            len(origins) * len(self.device_directions),
-        )
+        return self._hit(origins, self.device_directions, self.device_solid_angle, len(self.directions))
 
     def hit_along(self, origins: np.ndarray, directions: np.ndarray, solid_angle: np.ndarray) -> Hits:
         """What rays hit: ``origins`` (O, 3), a whole number of ``directions`` (K, 3) each."""
-        return self._hit(
-            origins,
-            wp.array(directions, dtype=wp.vec3d, device=self.device),
-            wp.array(solid_angle, dtype=wp.float32, device=self.device),
-            len(directions),
-        )
+        toward = wp.array(directions, dtype=wp.vec3d, device=self.device)
+        share = wp.array(solid_angle, dtype=wp.float32, device=self.device)
+        return self._hit(origins, toward, share, len(directions) // max(len(origins), 1))
 
-    def _hit(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array, count: int) -> Hits:
+    def _hit(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array, each: int) -> Hits:
         hit = self.surface.mesh.cast(
-            origins, directions.numpy(), per_origin=max(count // max(len(origins), 1), 1), device=self.device,
-            backend=self._backend(count),
+            origins, directions.numpy(), per_origin=max(each, 1), device=self.device,
+            backend=self._backend(each * len(origins)),
         )  # fmt: skip
         return Hits(
             wp.array(origins, dtype=wp.vec3d, device=self.device), directions, solid_angle,

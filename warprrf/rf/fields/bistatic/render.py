@@ -128,8 +128,8 @@ def further_bounces(view: ReceiverView, materials: Materials, sent: np.ndarray |
 
 def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> np.ndarray:
     """Light that surfaces send on along each ray, without residual and common gain, shape ``(R K,)``."""
-    t, p, hits = view.transport, materials.parameters, view.hits
-    found = send(t.surface, hits, sent, t.wavelength_m, t.grid.loss_per_m)
+    t, p = view.transport, materials.parameters
+    found = send(t, view.hits, sent)
     m = view.mirror_illumination if materials.terms.diffuse and materials.terms.mirror_scatter else None
     if m is not None and len(m.ray):
         power = scatter(t.surface, m.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
@@ -147,10 +147,8 @@ def mirror_shown(
     wanted = materials.terms.diffuse and materials.terms.scatter_mirror
     if not wanted or m is None or len(m.ray) == 0:
         return np.zeros(0, int), np.zeros(0)
-    wavelength = t.wavelength_m
-    power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, wavelength)
-    power = power + send(t.surface, m.hits, sent, wavelength, t.grid.loss_per_m)
-    return m.ray, mirror_share(p, m.group, m.cosine) * power * m.air
+    power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
+    return m.ray, mirror_share(p, m.group, m.cosine) * (power + send(t, m.hits, sent)) * m.air
 
 
 def sent_radiance(transport: Transport, materials: Materials) -> np.ndarray | None:

@@ -94,15 +94,6 @@ class ReceiverView:
         known, owner = self.paths.patch >= 0, self.transport.surface.patch_group
         return np.where(known, owner[np.where(known, self.paths.patch, 0)] if len(owner) else -1, -1)
 
-    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays that hit something, the faces that they hit, and the path gain of unit radiance there [m^2 sr],
-        ``(V,)`` each."""
-        t, face = self.transport, self.hits.face.numpy()
-        ray = np.flatnonzero(face >= 0)
-        solid_angle = t.grid.solid_angle[ray % len(t.grid.solid_angle)]
-        air = t.grid.transmittance(self.hits.range_m.numpy()[ray])
-        return ray, face[ray], (t.wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * air
-
 
 class Transport:
     """Geometry under one transmitter.
