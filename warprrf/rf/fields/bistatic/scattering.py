@@ -30,7 +30,7 @@ def _lobes(exponents: tuple[int, ...], reciprocal: bool, device: str) -> bounce.
     """A mix of lobes with its table, on the device."""
     cosine, found = np.linspace(0.0, 1.0, COSINES), bounce.Lobes()
     scale = [reciprocal_factor(n, cosine) if reciprocal else 1.0 / lobe_norm(n, cosine) for n in exponents]
-    found.exponent = wp.array(np.array(exponents, np.float32), dtype=wp.float32, device=device)
+    found.exponent = wp.array(exponents, dtype=wp.int32, device=device)
     found.scale = wp.array(np.array(scale, np.float32), dtype=wp.float32, device=device)
     found.reciprocal = int(reciprocal)
     return found
