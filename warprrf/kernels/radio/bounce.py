@@ -12,11 +12,15 @@ MOMENTS = 3
 
 @wp.struct
 class Surface:
-    """Faces of a mesh: their unit normals, those that scattering uses (which may be smoother), and their groups."""
+    """Faces of a mesh: their unit normals, those that scattering uses (which may be smoother), their groups, what the first
+    side of their elements faces, and these; the second side of element e is ``second_side + e``."""
 
     flat_normal: wp.array(dtype=wp.vec3d)
     normal: wp.array(dtype=wp.vec3)
     group: wp.array(dtype=wp.int32)
+    side_normal: wp.array(dtype=wp.vec3d)
+    element: wp.array(dtype=wp.int32)
+    second_side: int
 
 
 @wp.func
@@ -89,6 +93,29 @@ def light_surface(
             high = cos_s + half_width
             low = wp.max(cos_s - half_width, 0.01 * half_width)
             grazing[k] = wp.log(high / low) / (high - low)
+
+
+@wp.kernel
+def send_along(
+    offset: int,
+    surface: Surface,
+    directions: wp.array(dtype=wp.vec3d),
+    face: wp.array(dtype=wp.int32),
+    range_m: wp.array(dtype=wp.float64),
+    solid_angle: wp.array(dtype=wp.float32),
+    loss: wp.float64,
+    sent: wp.array(dtype=wp.float64),
+    power: wp.array(dtype=wp.float64),
+):
+    """Solid angle of each ray times the radiance that the side met sends; arguments as of :func:`light_surface`."""
+    k = offset + wp.tid()
+    f = face[k]
+    if f >= 0:
+        side = surface.element[f]
+        if wp.dot(surface.side_normal[f], directions[k % directions.shape[0]]) > wp.float64(0.0):
+            side += surface.second_side
+        air = wp.exp(-loss * range_m[k])
+        power[k] = air * wp.float64(solid_angle[k % solid_angle.shape[0]]) * sent[side]
 
 
 @wp.func

@@ -184,15 +184,14 @@ class Materials:
     residual: np.ndarray
     transmitter: np.ndarray
 
-    def cell_gain(self, cell: np.ndarray) -> np.ndarray | float:
-        """Gain of cells (K,) for single bounces."""
-        return np.asarray(np.exp(self.residual[0]))[cell] if self.terms.residual else 1.0
+    def cell_gain(self) -> np.ndarray:
+        """Gain of cells for single bounces, shape ``(X,)``."""
+        return np.asarray(np.exp(self.terms.residual * self.residual[0]))
 
-    def sent_gain(self, cell: np.ndarray, transmitter: np.ndarray) -> np.ndarray | float:
-        """Gain of cells (K,) for light of ``transmitter`` (3,) that they send on after others."""
-        if not self.terms.residual or not np.array_equal(transmitter, self.transmitter):
-            return 1.0
-        return np.asarray(np.exp(self.residual[1]))[cell]
+    def sent_gain(self, transmitter: np.ndarray) -> np.ndarray:
+        """Gain of cells for light of ``transmitter`` (3,) that they send on after others, shape ``(X,)``."""
+        known = self.terms.residual and np.array_equal(transmitter, self.transmitter)
+        return np.asarray(np.exp(known * self.residual[1]))
 
 
 class Layout:

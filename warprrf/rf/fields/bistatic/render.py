@@ -7,30 +7,15 @@ Pure functions: geometry (:class:`warprrf.rf.fields.bistatic.transport.ReceiverV
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from warprrf.rf.fields.bistatic.elements import RAYS
 from warprrf.rf.fields.bistatic.materials import Materials, Parameters, mirror_power, mirror_share
-from warprrf.rf.fields.bistatic.scattering import scatter
+from warprrf.rf.fields.bistatic.scattering import scatter, send
 from warprrf.rf.fields.bistatic.transport import ReceiverView, Transport
 from warprrf.rf.spectra.beam import BeamOperator
-
-
-@dataclass(frozen=True)
-class SentOn:
-    """Light that surfaces got from others and send on to a receiver, one row for each ray that sees some.
-
-    Attributes:
-        ray: of the view's grid, shape ``(M,)``.
-        face: that sends it, shape ``(M,)``.
-        power: path gain, shape ``(M,)``.
-    """
-
-    ray: np.ndarray
-    face: np.ndarray
-    power: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -38,19 +23,16 @@ class Further:
     """Path gain of everything after a first bounce, before any beam.
 
     Attributes:
-        rays: how many the view has.
-        sent: light that surfaces send on.
+        sent: of light that surfaces got from others and send on, by the ray that sees it, shape ``(R K,)``.
         shown: what mirrors show of the illuminated scene: rays and their path gain, shape ``(M,)`` each.
     """
 
-    rays: int
-    sent: SentOn
+    sent: np.ndarray
     shown: tuple[np.ndarray, np.ndarray]
 
     def by_ray(self) -> np.ndarray:
         """All of it by the ray that sees it, shape ``(R K,)``."""
-        found = np.bincount(self.sent.ray, self.sent.power, minlength=self.rays)
-        return np.asarray(found + np.bincount(*self.shown, minlength=self.rays))
+        return np.asarray(self.sent + np.bincount(*self.shown, minlength=len(self.sent)))
 
 
 @dataclass(frozen=True)
@@ -130,7 +112,7 @@ def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | Non
     if terms.diffuse:
         face = view.hits.face
         power = scatter(t.surface, face, view.light, terms, p.weight, p.log_excess, t.wavelength_m)
-        single = p.gain * power * materials.cell_gain(t.surface.cell[np.maximum(face.numpy(), 0)])
+        single = power * (p.gain * materials.cell_gain())[t.surface.cell][face.numpy()]
     return PathPowers(single, mirror, further_bounces(view, materials, sent), p)
 
 
@@ -138,26 +120,20 @@ def further_bounces(view: ReceiverView, materials: Materials, sent: np.ndarray |
     """What comes after a first bounce, residual and common gain included; arguments as for :func:`render`."""
     t, gain = view.transport, materials.parameters.gain
     on, (ray, shown) = sent_on(view, materials, sent), mirror_shown(view, materials, sent)
-    power = gain * on.power * materials.sent_gain(t.surface.cell[on.face], t.transmitter)
-    return Further(len(view.hits.face), replace(on, power=power), (ray, gain * shown))
+    on *= (gain * materials.sent_gain(t.transmitter))[t.surface.cell][view.hits.face.numpy()]
+    return Further(on, (ray, gain * shown))
 
 
-def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> SentOn:
-    """Light that surfaces send on, without residual and common gain."""
-    t, p = view.transport, materials.parameters
-    rows = [(np.zeros(0, int), np.zeros(0, np.int32), np.zeros(0))]
-    if sent is not None:
-        ray, face, unit = view.seen()
-        power = unit * sent[t.surface.side_met(face, t.grid.directions[ray % len(t.grid.directions)])]
-        some = power > 0
-        rows.append((ray[some], face[some], power[some]))
+def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> np.ndarray:
+    """Light that surfaces send on along each ray, without residual and common gain, shape ``(R K,)``."""
+    t, p, hits = view.transport, materials.parameters, view.hits
+    found = send(t.surface, hits, sent, t.wavelength_m, t.grid.loss_per_m)
     m = view.mirror_illumination if materials.terms.diffuse and materials.terms.mirror_scatter else None
     if m is not None and len(m.ray):
         power = scatter(t.surface, m.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
-        rows.append(
-            (m.ray, m.face.numpy(), power * mirror_share(p, t.surface.patch_group[m.patch], m.cosine))
-        )
-    return SentOn(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+        power = power * mirror_share(p, t.surface.patch_group[m.patch], m.cosine)
+        found += np.bincount(m.ray, power, minlength=len(found))
+    return found
 
 
 def mirror_shown(
@@ -169,14 +145,9 @@ def mirror_shown(
     wanted = materials.terms.diffuse and materials.terms.scatter_mirror
     if not wanted or m is None or len(m.ray) == 0:
         return np.zeros(0, int), np.zeros(0)
-    wavelength, face = t.wavelength_m, m.hits.face.numpy()
+    wavelength = t.wavelength_m
     power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, wavelength)
-    power = power.astype(float)
-    if sent is not None:
-        side = t.surface.side_met(np.maximum(face, 0), m.hits.directions.numpy())
-        radiance = np.where(face >= 0, sent[side], 0.0)
-        air = t.grid.transmittance(np.where(face >= 0, m.hits.range_m.numpy(), 0.0))
-        power += (wavelength / (4.0 * np.pi)) ** 2 * m.hits.solid_angle.numpy() * radiance * air
+    power = power + send(t.surface, m.hits, sent, wavelength, t.grid.loss_per_m)
     return m.ray, mirror_share(p, m.group, m.cosine) * power * m.air
 
 

@@ -99,11 +99,11 @@ def shares_of(
     """
     bare, surface = replace(materials, terms=replace(materials.terms, residual=False)), view.transport.surface
     powers, (bins, count) = path_powers(view, bare, sent), measured.bins(view)
-    on = powers.further.sent
-    own = gather_shares(bins, count, view.hits.face.numpy(), powers.single / unit, surface)
+    face = view.hits.face.numpy()
+    own = gather_shares(bins, count, face, powers.single / unit, surface)
     # Gains of light sent on are learned under one transmitter alone.
-    learned = on.power / unit * np.array_equal(view.transport.transmitter, materials.transmitter)
-    further = gather_shares(bins[on.ray], count, on.face, learned, surface)
+    learned = powers.further.sent / unit * np.array_equal(view.transport.transmitter, materials.transmitter)
+    further = gather_shares(bins, count, face, learned, surface)
     known = np.asarray((own + further).sum(axis=1)).reshape(-1, 1)
     rest = np.maximum(read(view, measured, powers) / unit - measured.of_bins(known)[:, 0], 0.0)
     return Shares(own, further, rest, measured, target)

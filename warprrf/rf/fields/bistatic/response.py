@@ -133,8 +133,9 @@ def with_further_bounces(
     """
     bins, count = measurement.bins(view)
     on = sent_on(view, materials, sent)
-    owner = view.transport.surface.group[on.face]
-    sender, read = _read_by_group(measurement, bins[on.ray], count, owner, on.power / floor)
+    ray = np.flatnonzero(on > 0)
+    owner = view.transport.surface.group[view.hits.face.numpy()[ray]]
+    sender, read = _read_by_group(measurement, bins[ray], count, owner, on[ray] / floor)
     read = np.maximum(read, 0.0)
     ray, power = mirror_shown(view, materials, sent)
     shown = _read_by_group(measurement, bins[ray], count, np.zeros(len(ray), int), power / floor)[1]

@@ -20,7 +20,7 @@ from warprrf import device as _device
 from warprrf.kernels.radio import bounce
 from warprrf.rf.em.fresnel import COSINES, fresnel_curves, lobe_norm, reciprocal_factor
 from warprrf.rf.fields.bistatic.materials import Terms
-from warprrf.rf.fields.bistatic.rays import Illumination
+from warprrf.rf.fields.bistatic.rays import Hits, Illumination
 from warprrf.rf.fields.bistatic.surface import Surface
 
 
@@ -64,6 +64,28 @@ def scatter(
         wp.array(weight * wavelength_m**2, dtype=wp.float32, device=where), power,
     ]  # fmt: skip
     _device.launch(bounce.scatter_bounces, len(face), inputs, device=where)
+    return np.asarray(power.numpy())
+
+
+def send(
+    surface: Surface, hits: Hits, sent: np.ndarray | None, wavelength_m: float, loss_per_m: float
+) -> np.ndarray:
+    """Path gain of what elements send along each ray, shape ``(K,)``.
+
+    Args:
+        surface: what was hit.
+        hits: where.
+        sent: radiance of elements' sides, shape ``(S,)``; None for none.
+        wavelength_m: wavelength.
+        loss_per_m: absorption by the air [neper/m].
+    """
+    where, power = hits.face.device, wp.zeros(len(hits.face), dtype=wp.float64, device=hits.face.device)
+    if sent is not None:
+        inputs = [
+            surface.on_device(where), *hits.inputs[2:], hits.solid_angle, loss_per_m,
+            wp.array(sent * (wavelength_m / (4.0 * np.pi)) ** 2, dtype=wp.float64, device=where), power,
+        ]  # fmt: skip
+        _device.launch(bounce.send_along, len(power), inputs, device=where)
     return np.asarray(power.numpy())
 
 

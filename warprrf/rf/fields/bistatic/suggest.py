@@ -93,13 +93,13 @@ class Sensitivity:
         t, view = self.transport, self.transport.view(place, self.materials.terms)
         found = path_powers(view, self.materials, self._sent)
         s, face, sent, count = t.surface, view.hits.face.numpy(), found.further.sent, SHAPE[0] * SHAPE[1]
-        elements, single = len(s.element_area), np.flatnonzero(found.single > 0)
+        elements, single, on = len(s.element_area), np.flatnonzero(found.single > 0), np.flatnonzero(sent > 0)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
         mirror = view.path_groups[:, 0]
         own = mirror >= 0
         parts = (
             (single, s.element[face[single]], found.single[single]),
-            (sent.ray, elements + s.element[sent.face], sent.power),
+            (on, elements + s.element[face[on]], sent[on]),
             (pixel[own], 2 * elements + mirror[own], found.mirror[own]),
         )
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -204,6 +204,9 @@ class Surface:
             s.flat_normal = wp.array(self.mesh.face_normals, dtype=wp.vec3d, device=where)
             s.normal = wp.array(self.normal, dtype=wp.vec3, device=where)
             s.group = wp.array(self.group, dtype=wp.int32, device=where)
+            s.side_normal = wp.array(self.side_normal, dtype=wp.vec3d, device=where)
+            s.element = wp.array(self.element, dtype=wp.int32, device=where)
+            s.second_side = self.element_sides - len(self.element_area)
             return s
 
         return self._uploaded.get(str(where), upload)
