@@ -210,3 +210,10 @@ def test_harmonics_on_the_device_are_the_textbooks() -> None:
     expected = harmonics_by_hand(pixel_directions(SHAPE).reshape(-1, 3))
     assert problem.basis.numpy() == pytest.approx(expected, abs=1e-12)
     assert problem.basis.dtype is wp.types.vector(16, wp.float64)
+
+
+def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any() -> None:
+    seen = synthetic_transport()
+    expected = np.bincount(seen.pixel, seen.weight, 3 * SHAPE[0] * SHAPE[1]).reshape(3, *SHAPE)
+    assert 0 < np.count_nonzero(expected == 0) < expected.size
+    assert np.allclose(seen.pixel_weight, expected, rtol=1e-12, atol=0)

@@ -103,8 +103,8 @@ class Transport:
     @property
     def pixel_weight(self) -> np.ndarray:
         """Sum of the weights per pixel, shape ``(R, H, W)`` float64; with the ``exp`` rule it can exceed one."""
-        cumulated = np.concatenate([[0.0], np.cumsum(self.weight, dtype=np.float64)])
-        return np.diff(cumulated[self.start]).reshape(len(self.receivers), *self.shape)
+        summed = np.add.reduceat(np.append(self.weight, np.float32(0)), self.start[:-1], dtype=np.float64)
+        return np.where(np.diff(self.start) > 0, summed, 0.0).reshape(len(self.receivers), *self.shape)
 
 
 def cutoffs(range_db: tuple[float, float], rule: str = "product") -> Blending:
