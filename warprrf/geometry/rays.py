@@ -52,7 +52,7 @@ _LONGEST = 1e18
 
 @dataclass(eq=False, repr=False)
 class Hit:
-    """What rays met, one entry a ray. Normals and points are computed when first asked for.
+    """What rays met, one entry a ray.
 
     Attributes:
         t: Distance along the unit direction [m], shape ``(N,)``, float64; inf where nothing was met.

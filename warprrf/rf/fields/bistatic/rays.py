@@ -136,10 +136,8 @@ class RayGrid:
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""
-        by_embree = (
-            not self.device.is_cuda and mesh_rays.open3d_installed() and count >= mesh_rays.EMBREE_RAYS
-        )
-        return "embree" if by_embree else "warp"
+        usable = not self.device.is_cuda and mesh_rays.open3d_installed()
+        return "embree" if usable and count >= mesh_rays.EMBREE_RAYS else "warp"
 
     def light(self, hits: Hits, source: np.ndarray) -> Illumination:
         """How a transmitter at ``source`` (3,) [m] illuminates what was hit; shadows included."""
@@ -162,9 +160,8 @@ class RayGrid:
         count = len(hits.face) if ray is None else len(ray)
         found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
         point = wp.empty(count, dtype=wp.vec3d, device=self.device)
-        chosen = np.zeros(0) if ray is None else ray
         inputs = [
-            self.surface.on_device(self.device), wp.array(chosen, dtype=wp.int32, device=self.device),
+            self.surface.on_device(self.device), wp.array([] if ray is None else ray, dtype=wp.int32, device=self.device),
             wp.array(np.reshape(sources, (-1, 3)), dtype=wp.vec3d, device=self.device), *hits.inputs,
             hits.solid_angle, float(self.half_width), NEAREST_M, self.loss_per_m, *found.inputs, point,
         ]  # fmt: skip
