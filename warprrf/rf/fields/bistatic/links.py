@@ -24,7 +24,7 @@ from warprrf.rf.spectra.spectrum import check_shape
 SHAPE = (20, 40)
 """Default grid of a link's rays."""
 SUB_PIXELS = 2  # square root of the rays per pixel
-RAYS_AT_A_TIME = 230_000  # of all receivers in one launch
+RAYS_AT_A_TIME = 400_000  # of all receivers in one launch
 
 
 class LinkTracer:
