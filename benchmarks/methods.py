@@ -121,9 +121,8 @@ class Method:
         fit: learns from a task.
         code: which of :data:`~benchmarks.data.VERSIONS` its figures depend on, with that of the metrics.
         variants: of which the better one counts.
-        network: whether it is a network, trained on fewer sets in a small evaluation.
+        network: whether it is a network, whose learning curve is kept.
         untaught: whether it sees no spectrum: one run for all numbers of training receivers.
-        random: whether it differs by seed though it sees no spectrum.
         note: how it is to be read.
     """
 
@@ -132,7 +131,6 @@ class Method:
     variants: tuple[str, ...] = ("",)
     network: bool = False
     untaught: bool = False
-    random: bool = False
     note: str = ""
 
     @property
@@ -432,7 +430,6 @@ METHODS: dict[str, Method] = {
         _assumed,
         "sionna",
         untaught=True,
-        random=True,
         note=f"Sionna RT on the true mesh, {_MISJUDGED}",
     ),
     "transmitter": Method(_transmitter, "metrics", untaught=True),

@@ -8,6 +8,7 @@ directional gain G at every point. Line of sight and mirror paths obey that law 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ from warprrf.device import Progress
 from warprrf.rf.exact import ExactEngine, strongest_delay_and_departure
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import spread_paths
 
 
 def paper_law_spectra(
@@ -33,13 +33,7 @@ def paper_law_spectra(
         point = receiver + scattered.range_m[:, None] * scattered.direction
         before = np.linalg.norm(point - like.transmitter, axis=1)
         power = scattered.power * (before / (before + scattered.range_m)) ** 2
-        spread = spread_paths(
-            np.concatenate([specular.arrival, scattered.direction]),
-            np.concatenate([specular.power, power]),
-            like.shape,
-            like.beam_sigma_rad,
-            device=device,
-        )
+        spread = engine.spread(specular, replace(scattered, power=power))
         first = np.where(specular.kind[:, None] == "los", receiver, np.nan_to_num(specular.vertices[:, 0]))
         rest = specular.length_m - np.linalg.norm(first - like.transmitter, axis=1)
         delay, departure = strongest_delay_and_departure(

@@ -373,6 +373,21 @@ def test_points_and_normals_are_computed_when_asked_for(where):
     np.testing.assert_allclose(np.abs(hit.normal).max(axis=1), 1.0)
 
 
+def test_the_same_directions_are_cast_from_every_origin(where):
+    mesh, origin, d = (
+        Mesh(*box(*ROOM)),
+        np.array([[0.5, 0.25, 1.5], [1.0, 0.5, 0.7], [0.2, 0.3, 0.4]]),
+        directions(1_500),
+    )
+    every = np.repeat(origin, len(d), axis=0), np.tile(d, (len(origin), 1))
+    for toward in (d, every[1]):
+        hit = mesh.cast(origin, toward, per_origin=len(d), **where)
+        np.testing.assert_allclose(hit.t, box_exit(*every, *ROOM), rtol=1e-12)
+        np.testing.assert_allclose(hit.point, every[0] + hit.t[:, None] * every[1], atol=1e-12)
+    with pytest.raises(ValueError, match=r"^directions: got 7 for 4500 origins"):
+        mesh.cast(origin, d[:7], per_origin=len(d), **where)
+
+
 def test_points_stand_whatever_is_cast_later(where):
     mesh, rng = Mesh(*box(*ROOM)), np.random.default_rng(20)
     origin, toward, hits = rng.uniform(0.5, 1.5, (6, 3_001, 3)), rng.standard_normal((6, 3_001, 3)), []

@@ -19,7 +19,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
-from warprrf.rf.fields.bistatic.render import further_bounces, mirror_shown
+from warprrf.rf.fields.bistatic.render import mirror_shown, path_powers
 from warprrf.rf.fields.bistatic.response import respond
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.training import trace
@@ -291,8 +291,8 @@ def test_an_indirect_radiance_has_the_receivers_leg(scene: RadioScene, dry: Spec
     rays = view.transport.grid.solid_angle * passed(view.hits.range_m.numpy())
     expected = (WAVELENGTH / (4.0 * np.pi)) ** 2 * rays.sum()
     view = humid.view(SEEN)
-    found = further_bounces(view, humid.materials, humid.sent_radiance(view.transport))
-    assert found.by_ray().sum() == pytest.approx(expected, rel=1e-9)
+    found = path_powers(view, humid.materials, humid.sent_radiance(view.transport))
+    assert found.further.sum() == pytest.approx(expected, rel=1e-9)
     measured = SpectrumPixels(BeamOperator(SHAPE, humid.beam_sigma_rad), np.arange(SHAPE[0] * SHAPE[1]))
     response = respond(view, measured, humid.terms, humid.floor)  # what a fit of it is made on
     assert response.indirect.sum() * humid.floor == pytest.approx(expected, rel=1e-5)

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import LARGEST_M, check_array, check_number, checked, one_line
+from warprrf.checks import LARGEST_M, check_array, check_count, check_number, checked, one_line
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
@@ -262,13 +262,20 @@ class Mesh:
         return self._rays.on_device(_device.resolve(device))[0]
 
     def cast(
-        self, origins: ArrayLike, directions: ArrayLike, *, device: DeviceLike = None, backend: str = "auto"
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        *,
+        per_origin: int = 1,
+        device: DeviceLike = None,
+        backend: str = "auto",
     ) -> Hit:
         """The nearest surface along rays; one that passes through a ray's very start is not met.
 
         Args:
             origins: Ray starts [m], shape ``(N, 3)`` or ``(3,)`` for all.
             directions: Ray directions, any length but zero, shape ``(N, 3)`` or ``(3,)`` for all.
+            per_origin: Rays of each origin, one origin's after another's; directions may be as many, for all origins.
             device: Where the hierarchy is searched.
             backend: One of :data:`~warprrf.geometry.rays.BACKENDS`. All agree on distances; on an edge they may
                 name either face.
@@ -281,13 +288,14 @@ class Mesh:
             ValueError: on a wrong shape, NaN, a direction of length zero, an unknown back end, or Embree on a GPU.
             ImportError: if Embree is asked for and Open3D is not installed.
         """
-        o, d = check_rows(("origins", origins), ("directions", directions))
+        per_origin = check_count("per_origin", per_origin)
+        o, d = check_rows(("origins", origins), ("directions", directions), per_origin)
         where = _device.resolve(device)
-        t, face = self._rays.nearest(o, d, device=where, backend=backend)
+        t, face = self._rays.nearest(o, d, per_origin=per_origin, device=where, backend=backend)
         if face.min(initial=0) < 0 and self.is_closed:
-            self._rays.recast(o, d, t, face, device=where, backend=backend)
+            self._rays.recast(o, d, t, face, per_origin=per_origin, device=where, backend=backend)
         # Points may be asked for after the caller has changed its arrays.
-        return Hit(t, face, self.face_normals, o.copy(), d.copy())
+        return Hit(t, face, self.face_normals, o.copy(), d.copy(), per_origin)
 
     def visible(
         self,

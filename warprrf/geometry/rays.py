@@ -52,7 +52,7 @@ _LONGEST = 1e18
 
 @dataclass(eq=False, repr=False)
 class Hit:
-    """What rays met, one entry a ray. Normals and points are computed when first asked for.
+    """What rays met, one entry a ray.
 
     Attributes:
         t: Distance along the unit direction [m], shape ``(N,)``, float64; inf where nothing was met.
@@ -64,6 +64,7 @@ class Hit:
     _face_normals: np.ndarray
     _origins: np.ndarray
     _directions: np.ndarray
+    _per_origin: int
 
     def __repr__(self) -> str:
         return f"Hit({np.count_nonzero(self.valid)} of {len(self.t)} rays met a face)"
@@ -84,14 +85,14 @@ class Hit:
     def point(self) -> np.ndarray:
         """Point met [m], shape ``(N, 3)``, float64; NaN where nothing was met."""
         t = np.where(self.valid, self.t, np.nan)[:, None]
-        length = np.linalg.norm(self._directions, axis=1, keepdims=True)
-        return self._origins + t * (self._directions / length)
+        o, d = rays_of(self._origins, self._directions, self._per_origin, np.arange(len(t)))
+        return o + t * (d / np.linalg.norm(d, axis=1, keepdims=True))
 
 
 class RaySearch:
     """The hierarchies of one mesh, each built when first needed, by one thread.
 
-    Rays and segments hold one row or N of either end: one stands for all.
+    Rays and segments hold one row or N of either end: one stands for all. ``per_origin`` is as for :meth:`Mesh.cast`.
 
     Args:
         vertices: Positions [m], shape ``(V, 3)``.
@@ -133,6 +134,7 @@ class RaySearch:
         o: np.ndarray,
         d: np.ndarray,
         *,
+        per_origin: int = 1,
         reach: np.ndarray | float = np.inf,
         clearance: float = 0.0,
         device: wp.Device,
@@ -145,16 +147,16 @@ class RaySearch:
         Raises:
             ValueError: if a ray is not finite or has no direction, or on an unknown back end, or Embree on a GPU.
         """
-        count = max(len(o), len(d)) if min(len(o), len(d)) else 0
+        count = max(len(o) * per_origin, len(d)) if min(len(o), len(d)) else 0
         if choose_backend(backend, device, count) == "embree" and count:
-            t, face = self._nearest_embree(o, d, clearance, device)
+            t, face = self._nearest_embree(o, d, per_origin, clearance, device)
         else:
             mesh, planes = self.on_device(device)
             distance = wp.empty(count, dtype=wp.float64, device=device)
             found = wp.empty(count, dtype=wp.int32, device=device)
             inputs = [
-                mesh.id, *self._frame, planes, clearance, _given(o, wp.vec3d, device), _given(d, wp.vec3d, device),
-                _given(np.atleast_1d(reach), wp.float64, device), distance, found,
+                mesh.id, *self._frame, planes, clearance, _given(o, wp.vec3d, device), per_origin,
+                _given(d, wp.vec3d, device), _given(np.atleast_1d(reach), wp.float64, device), distance, found,
             ]  # fmt: skip
             _device.launch(cast_rays, count, inputs, device=device)
             t, face = distance.numpy(), found.numpy()
@@ -166,47 +168,38 @@ class RaySearch:
     def _frame(self) -> tuple[wp.vec3d, float]:
         return wp.vec3d(*self._center), self._radius
 
-    def _pack(
-        self, o: np.ndarray, d: np.ndarray, clearance: float, start: np.ndarray, cpu: wp.Device
-    ) -> np.ndarray:
-        """Rays as Embree takes them, shape (N, 6), float32, from ``start`` (N) [m] on, or from ``clearance`` if empty."""
-        count = max(len(o), len(d))
-        rays = np.empty((count, 6), dtype=np.float32)
-        inputs = [
-            *self._frame, clearance, _given(start, wp.float64, cpu), _given(o, wp.vec3d, cpu),
-            _given(d, wp.vec3d, cpu), _given(rays.reshape(-1, 3), wp.vec3, cpu),
-        ]  # fmt: skip
-        _device.launch(pack_rays, count, inputs, device=cpu)
-        return rays
-
     def _nearest_embree(
-        self, o: np.ndarray, d: np.ndarray, clearance: float, cpu: wp.Device
+        self,
+        o: np.ndarray,
+        d: np.ndarray,
+        per_origin: int,
+        clearance: float,
+        cpu: wp.Device,
+        start: np.ndarray | None = None,
+        rounds: int = _ROUNDS,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`nearest`. Rays that met a surface at their start are cast again from behind it; the few that glide
-        along it go on in the kernel, where a step costs less."""
-        scene, planes = self._embree, _given(self._planes, wp.vec4d, cpu)
-        count = max(len(o), len(d))
-        t, face = np.empty(count), np.full(count, AGAIN, dtype=np.int32)
-        which: slice | np.ndarray = slice(None)
-        start = np.empty(0)
-        for _ in range(_ROUNDS):
-            origin, toward = rows(o, which), rows(d, which)
-            near, met = scene.cast(self._pack(origin, toward, clearance, start, cpu))
-            distance, found = np.empty(len(met)), np.empty(len(met), dtype=np.int32)
-            inputs = [
-                *self._frame, planes, clearance, _given(start, wp.float64, cpu), _given(origin, wp.vec3d, cpu),
-                _given(toward, wp.vec3d, cpu), _given(near, wp.float32, cpu), _given(met, wp.int32, cpu),
-                _given(distance, wp.float64, cpu), _given(found, wp.int32, cpu),
-            ]  # fmt: skip
-            _device.launch(place_hits, len(met), inputs, device=cpu)
-            t[which], face[which] = distance, found
-            which = np.flatnonzero(face == AGAIN)
-            if len(which) == 0:
-                return t, face
-            start = t[which]
-        t[which], face[which] = self.nearest(
-            rows(o, which), rows(d, which), clearance=clearance, device=cpu, backend="warp"
-        )
+        """As :meth:`nearest`, from ``start`` (N) [m] on, or from ``clearance``. Rays that met a surface at their start are
+        cast again from behind it; the few that glide along it go on in the kernel, where a step costs less."""
+        count = max(len(o) * per_origin, len(d))
+        begin = _given(np.empty(0) if start is None else start, wp.float64, cpu)
+        ends = _given(o, wp.vec3d, cpu), per_origin, _given(d, wp.vec3d, cpu)
+        rays = np.empty((count, 6), dtype=np.float32)
+        inputs = [*self._frame, clearance, begin, *ends, _given(rays.reshape(-1, 3), wp.vec3, cpu)]
+        _device.launch(pack_rays, count, inputs, device=cpu)
+        near, met = self._embree.cast(rays)
+        t, face = np.empty(count), np.empty(count, dtype=np.int32)
+        inputs = [
+            *self._frame, _given(self._planes, wp.vec4d, cpu), clearance, begin, *ends, _given(near, wp.float32, cpu),
+            _given(met, wp.int32, cpu), _given(t, wp.float64, cpu), _given(face, wp.int32, cpu),
+        ]  # fmt: skip
+        _device.launch(place_hits, count, inputs, device=cpu)
+        which = np.flatnonzero(face == AGAIN)
+        if len(which):
+            some = rays_of(o, d, per_origin, which)
+            if rounds > 1:
+                t[which], face[which] = self._nearest_embree(*some, 1, clearance, cpu, t[which], rounds - 1)
+            else:
+                t[which], face[which] = self.nearest(*some, clearance=clearance, device=cpu, backend="warp")
         return t, face
 
     def free(
@@ -232,9 +225,10 @@ class RaySearch:
         if chosen == "embree" and len(which):
             # Most segments are free, and to find out that nothing is met at all takes half as long as what is met.
             which = np.flatnonzero(self._embree.blocked(rays))
-        inner, start = length[which] - clearance, rows(a, which)
-        way = (rows(b, which) - start)[: len(which)]
-        t, _ = self.nearest(start, way, reach=inner, clearance=clearance, device=device, backend=chosen)
+        inner, (start, end) = length[which] - clearance, rays_of(a, b, 1, which)
+        t, _ = self.nearest(
+            start, end - start, reach=inner, clearance=clearance, device=device, backend=chosen
+        )
         free[which] = t >= inner
         return free
 
@@ -245,17 +239,19 @@ class RaySearch:
         t: np.ndarray,
         face: np.ndarray,
         *,
+        per_origin: int,
         device: wp.Device,
         backend: str,
     ) -> None:
         """Cast rays that met nothing and start within the bounds again, a little turned; fills ``t`` and ``face``."""
-        inside = ((self._bounds[0] <= o) & (o <= self._bounds[1])).all(axis=1)
-        missed = np.flatnonzero((face < 0) & inside)
+        missed = np.flatnonzero(face < 0)
+        start, _ = rays_of(o, d, per_origin, missed)
+        missed = missed[((self._bounds[0] <= start) & (start <= self._bounds[1])).all(axis=1)]
         rng = np.random.default_rng(0)
         for _ in range(_RECASTS):
             if len(missed) == 0:
                 return
-            start, toward = rows(o, missed), rows(d, missed)
+            start, toward = rays_of(o, d, per_origin, missed)
             toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
             turned = toward + _JITTER * rng.standard_normal((len(missed), 3))
             near, found = self.nearest(start, turned, device=device, backend=backend)
@@ -336,13 +332,18 @@ def choose_backend(backend: str, device: wp.Device, count: int) -> str:
     return "embree" if count >= least and not device.is_cuda and open3d_installed() else "warp"
 
 
-def rows(array: np.ndarray, which: slice | np.ndarray) -> np.ndarray:
-    """Rows of an array that may hold one row for all."""
-    return array if len(array) == 1 else array[which]
+def rays_of(
+    o: np.ndarray, d: np.ndarray, per_origin: int, which: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of some rays of a :class:`RaySearch`, a row for each."""
+    return o.take(which // per_origin % len(o), axis=0), d.take(which % len(d), axis=0)
 
 
-def check_rows(first: tuple[str, Any], second: tuple[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Two named arrays of vectors as float64 rows, one or N of each; they may hold numbers that are not finite.
+def check_rows(
+    first: tuple[str, Any], second: tuple[str, Any], per_first: int = 1
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two named arrays of vectors as float64 rows, one or N of each; they may hold numbers that are not finite. If there are
+    N / ``per_first`` of the first, there may be as many of the second as ``per_first``.
 
     Raises:
         ValueError: on a wrong shape, or as many rows of neither one nor the other.
@@ -353,8 +354,8 @@ def check_rows(first: tuple[str, Any], second: tuple[str, Any]) -> tuple[np.ndar
         if array.ndim != 2 or array.shape[1] != 3:
             raise ValueError(f"{name}: got shape {array.shape}, expected (N, 3) or (3,)")
         arrays.append(array)
-    one, other = map(len, arrays)
-    if one != other and 1 not in (one, other):
+    one, other = len(arrays[0]) * per_first, len(arrays[1])
+    if one not in (1, other) and other not in (1, per_first):
         raise ValueError(f"{second[0]}: got {other} for {one} {first[0]}, expected as many, or one of either")
     return arrays[0], arrays[1]
 

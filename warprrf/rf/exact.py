@@ -37,6 +37,7 @@ from warprrf.rf.paths.trace import MirrorTracer
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
+    SpreadPaths,
     angles_from_directions,
     beam_sums,
     check_shape,
@@ -186,13 +187,24 @@ class ExactEngine:
             )
         return DiffusePaths(direction, power, reach, positive)
 
+    def spread(self, specular: Paths, scattered: DiffusePaths) -> SpreadPaths:
+        """Paths of both kinds on the grid, the specular ones counted first."""
+        beam = self.shape, self.beam_sigma_rad
+        # Every receiver has the same lattice of directions, whose beams are summed once.
+        lattice = _lattice_beams(self.sub_pixels, *beam, str(self.device))[scattered.index]
+        return spread_paths(
+            np.concatenate([specular.arrival, scattered.direction]),
+            np.concatenate([specular.power, scattered.power]),
+            *beam,
+            beams=np.concatenate([beam_sums(specular.arrival, *beam, device=self.device), lattice]),
+            device=self.device,
+        )
+
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         point = check_array("receiver", receiver, (3,))
         specular = self.tracer.trace(point, 1).with_gas(self.air)
         scattered = self.diffuse(point)
-        directions = np.concatenate([specular.arrival, scattered.direction])
-        power = np.concatenate([specular.power, scattered.power])
         first = np.where(
             specular.kind[:, None] == "los", point, np.nan_to_num(specular.vertices[:, 0])
         )  # the first point after the transmitter
@@ -200,11 +212,7 @@ class ExactEngine:
         rest = specular.length_m - np.linalg.norm(
             first[: len(specular.tau)] - self.tracer.transmitter, axis=1
         )
-        # Every receiver has the same lattice of directions, whose beams are summed once.
-        beam = self.shape, self.beam_sigma_rad
-        lattice = _lattice_beams(self.sub_pixels, *beam, str(self.device))[scattered.index]
-        beams = np.concatenate([beam_sums(specular.arrival, *beam, device=self.device), lattice])
-        spread = spread_paths(directions, power, *beam, beams=beams, device=self.device)
+        spread = self.spread(specular, scattered)
         delay_s, aod = strongest_delay_and_departure(
             spread.strongest, self.tracer.transmitter, first, np.concatenate([rest, scattered.range_m])
         )

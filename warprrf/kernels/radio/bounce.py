@@ -135,7 +135,7 @@ class Lobes:
     ``scale`` holds 1 / norm at the angle of incidence; if ``reciprocal`` is 1, a factor that counts at both angles.
     """
 
-    exponent: wp.array(dtype=wp.float32)
+    exponent: wp.array(dtype=wp.int32)
     scale: wp.array2d(dtype=wp.float32)
     reciprocal: int
 
@@ -144,9 +144,16 @@ class Lobes:
 def lobe_value(lobes: Lobes, which: int, cos_in: float, cos_out: float, cos_mirror: float, grazing: float):
     """f_s / cos(theta_s) [1/sr] of lobe ``which``; exponent 0 is Lambertian, whose cosine cancels."""
     value = INV_PI
-    n = lobes.exponent[which]
-    if n > 0.0:
-        value = wp.pow(0.5 * (1.0 + cos_mirror), n)
+    n = int(lobes.exponent[which])
+    if n > 0:
+        power = wp.float64(1.0)
+        square = wp.float64(0.5 * (1.0 + cos_mirror))
+        while n > 0:
+            if n & 1 == 1:
+                power *= square
+            square *= square
+            n = n >> 1
+        value = wp.float32(power)
         if lobes.reciprocal == 1:
             value *= table_value(lobes.scale, which, cos_in) * table_value(lobes.scale, which, cos_out)
         else:

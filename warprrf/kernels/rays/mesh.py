@@ -4,6 +4,8 @@ Hierarchies keep geometry in float32, so a query answers *which* face; its dista
 face's plane. Rays come in float64 and positions are made relative to the mesh's centre before they are rounded. A
 search starts a little before its ray, by what float32 may err, and steps over surfaces that float64 places at the
 ray's start or before it: so a ray from a point on a surface meets the next surface, whatever the rounding.
+
+Ray i starts at origin i / ``per_origin``, the last of them if there are fewer, along direction i modulo their number.
 """
 
 import warp as wp
@@ -118,6 +120,7 @@ def cast_rays(
     planes: wp.array(dtype=wp.vec4d),
     clearance: wp.float64,
     origins: wp.array(dtype=wp.vec3d),
+    per_origin: int,
     directions: wp.array(dtype=wp.vec3d),
     reach: wp.array(dtype=wp.float64),
     distance: wp.array(dtype=wp.float64),
@@ -125,8 +128,8 @@ def cast_rays(
 ):
     """Nearest face along each ray beyond ``clearance`` and within ``reach`` [m], and its distance in float64."""
     i = offset + wp.tid()
-    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
-    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    origin = origins[wp.min(i / per_origin, origins.shape[0] - 1)] - center
+    direction = directions[i % directions.shape[0]]
     length = wp.length(direction)
     scale = rounding_scale(origin, radius)
     if is_bad(scale, length):
@@ -147,6 +150,7 @@ def pack_rays(
     clearance: wp.float64,
     start: wp.array(dtype=wp.float64),
     origins: wp.array(dtype=wp.vec3d),
+    per_origin: int,
     directions: wp.array(dtype=wp.vec3d),
     rays: wp.array(dtype=wp.vec3),
 ):
@@ -155,8 +159,8 @@ def pack_rays(
     Rays begin at ``start`` [m]; if that is empty, at ``clearance``, less the rounding.
     """
     i = offset + wp.tid()
-    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
-    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    origin = origins[wp.min(i / per_origin, origins.shape[0] - 1)] - center
+    direction = directions[i % directions.shape[0]]
     unit = direction / wp.length(direction)
     begin = clearance - _ROUNDING * rounding_scale(origin, radius)
     if start.shape[0] > 0:
@@ -202,6 +206,7 @@ def place_hits(
     clearance: wp.float64,
     start: wp.array(dtype=wp.float64),
     origins: wp.array(dtype=wp.vec3d),
+    per_origin: int,
     directions: wp.array(dtype=wp.vec3d),
     met_at: wp.array(dtype=wp.float32),
     met: wp.array(dtype=wp.int32),
@@ -213,8 +218,8 @@ def place_hits(
     Where a surface at the ray's start was met, ``face`` becomes AGAIN and ``distance`` that at which to go on.
     """
     i = offset + wp.tid()
-    origin = origins[wp.min(i, origins.shape[0] - 1)] - center
-    direction = directions[wp.min(i, directions.shape[0] - 1)]
+    origin = origins[wp.min(i / per_origin, origins.shape[0] - 1)] - center
+    direction = directions[i % directions.shape[0]]
     length = wp.length(direction)
     scale = rounding_scale(origin, radius)
     name = met[i]

@@ -21,7 +21,7 @@ from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection, surface
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import LOBES, Parameters, Terms
-from warprrf.rf.fields.bistatic.render import further_bounces
+from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.paths.blockage import LIFT_M, SidePaths, diffracted, transmitted
@@ -425,5 +425,5 @@ def _further_image(field: BistaticField, view: ReceiverView) -> np.ndarray:
     division of the same mesh into groups."""
     transport = field.transport()
     own = transport.complete(replace(view, transport=transport), field.terms)
-    found = further_bounces(own, field.materials, field.sent_radiance(transport))
-    return found.by_ray().reshape(*field.shape, -1).sum(axis=-1)
+    found = path_powers(own, field.materials, field.sent_radiance(transport))
+    return found.further.reshape(*field.shape, -1).sum(axis=-1)

@@ -60,7 +60,7 @@ def shares_of(field: BistaticField, planted: np.ndarray) -> list[Shares]:
         per_pixel = len(powers.single) // pixels
         pixel, face = np.arange(len(powers.single)) // per_pixel, view.hits.face.numpy()
         single = gather_shares(pixel, pixels, face, powers.single / field.floor, surface)
-        further = gather_shares(pixel, pixels, face, powers.further.sent / field.floor, surface)
+        further = gather_shares(pixel, pixels, face, powers.sent / field.floor, surface)
         image = replace(field, residual=planted).render(view).image / field.floor
         specular = np.tensordot(powers.mirror, view.beams, axes=1).ravel() / field.floor
         found.append(Shares(single, further, specular, MEASURED, Target(NEPER * np.log1p(image.ravel()))))

@@ -20,6 +20,7 @@ from warprrf.rf.fields.bistatic.response import (
     respond,
     with_further_bounces,
 )
+from warprrf.rf.fields.bistatic.scattering import send
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.fields.bistatic.transport import Transport
@@ -259,8 +260,8 @@ def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
     for sub_pixels in (1, 3):
         transport = Transport.of(surface, np.array([1.0, 0.5, 0.0]), F, shape, sub_pixels)
         view = transport.view(np.array([0.5, -0.3, 0.2]), Terms(mirror_order=0))
-        ray, _, unit = view.seen()
-        assert radiance * unit.sum() == pytest.approx(
+        power = send(transport, view.hits, np.full(surface.element_sides, radiance))
+        assert power.sum() == pytest.approx(
             (WAVELENGTH / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6
         )
-        assert np.array_equal(np.unique(ray // sub_pixels**2), np.arange(12 * 24))
+        assert (power.reshape(-1, sub_pixels**2).sum(axis=1) > 0).all()

@@ -354,8 +354,7 @@ class BistaticField(RadioField):
         for first in range(0, len(receivers), batch):
             some = np.arange(first, min(first + batch, len(receivers)))
             view = transport.view(receivers[some], self.terms, paths=paths.of(some))
-            powers = path_powers(view, self.materials, sent)
-            found[some] = images(view, powers, powers.single + powers.further.by_ray(), self._beam)
+            found[some] = images(view, path_powers(view, self.materials, sent), self._beam)
         return found
 
     def array_spectrum(

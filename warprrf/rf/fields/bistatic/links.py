@@ -98,13 +98,13 @@ class LinkTracer:
     def _by_ray(self, view: ReceiverView, powers: PathPowers) -> tuple[np.ndarray, np.ndarray]:
         """Path gain and delay [s] of every ray, ``(R, K)`` each; rays that hit nothing have neither."""
         grid, count = view.transport.grid, len(view.receivers)
-        hit, per_pixel, further = view.hits.face.numpy() >= 0, grid.sub_pixels**2, powers.further
+        hit, per_pixel = view.hits.face.numpy() >= 0, grid.sub_pixels**2
         # What mirrors show is known by pixel: it goes to the pixel's rays in equal shares.
-        ray, power = further.shown
+        ray, power = powers.shown
         shown = np.bincount(ray // per_pixel, power, minlength=len(hit) // per_pixel)
         among = hit.reshape(-1, per_pixel).sum(axis=1)
         share = np.divide(shown, among, out=np.zeros(len(among)), where=among > 0)
-        whole = powers.single + further.sent + np.where(hit, np.repeat(share, per_pixel), 0.0)
+        whole = powers.single + powers.sent + np.where(hit, np.repeat(share, per_pixel), 0.0)
         range_m = np.where(hit, view.hits.range_m.numpy(), 0.0).reshape(count, -1)
         way = view.receivers[:, None] - view.transport.transmitter + range_m[..., None] * grid.directions
         delay = (np.sqrt(np.einsum("rkx,rkx->rk", way, way)) + range_m) / SPEED_OF_LIGHT

@@ -51,7 +51,7 @@ class Measurement(Protocol):
 def read(view: ReceiverView, measurement: Measurement, powers: PathPowers) -> np.ndarray:
     """Readings of the paths of one receiver, shape ``(N,)``."""
     bins, count = measurement.bins(view)
-    own, power = bins >= 0, powers.single + powers.further.by_ray()
+    own, power = bins >= 0, powers.single + powers.further
     table = np.bincount(bins[own], power[own], minlength=count)[:, None]
     together = measurement.together
     if together is None:

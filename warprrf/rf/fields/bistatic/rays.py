@@ -51,9 +51,9 @@ class Hits:
     def points(self, ray: np.ndarray) -> np.ndarray:
         """Where the rays of index ``ray`` (N,) hit [m], shape ``(N, 3)``; NaN or infinite where they hit nothing."""
         origins, directions = self.origins.numpy(), self.directions.numpy()
-        start = origins[ray // (len(self.face) // len(origins))]
+        start, toward = mesh_rays.rays_of(origins, directions, len(self.face) // len(origins), ray)
         with np.errstate(invalid="ignore"):
-            return np.asarray(start + self.range_m.numpy()[ray, None] * directions[ray % len(directions)])
+            return np.asarray(start + self.range_m.numpy()[ray, None] * toward)
 
 
 @dataclass(frozen=True)
@@ -115,42 +115,29 @@ class RayGrid:
     def hit(self, receivers: np.ndarray) -> Hits:
         """What the grid's rays from ``receivers``, (3,) or (O, 3), hit."""
         origins = np.asarray(receivers, float).reshape(-1, 3)
-        return self._hit(
-            origins,
-            self.device_directions,
-            self.device_solid_angle,
-            len(origins) * len(self.device_directions),
-        )
+        return self._hit(origins, self.device_directions, self.device_solid_angle, len(self.directions))
 
     def hit_along(self, origins: np.ndarray, directions: np.ndarray, solid_angle: np.ndarray) -> Hits:
         """What rays hit: ``origins`` (O, 3), a whole number of ``directions`` (K, 3) each."""
-        return self._hit(
-            origins,
-            wp.array(directions, dtype=wp.vec3d, device=self.device),
-            wp.array(solid_angle, dtype=wp.float32, device=self.device),
-            len(directions),
-        )
+        toward = wp.array(directions, dtype=wp.vec3d, device=self.device)
+        share = wp.array(solid_angle, dtype=wp.float32, device=self.device)
+        return self._hit(origins, toward, share, len(directions) // max(len(origins), 1))
 
-    def _hit(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array, count: int) -> Hits:
-        toward = directions.numpy()
+    def _hit(self, origins: np.ndarray, directions: wp.array, solid_angle: wp.array, each: int) -> Hits:
         hit = self.surface.mesh.cast(
-            np.repeat(origins, count // len(origins), axis=0) if len(origins) > 1 else origins,
-            np.tile(toward, (count // len(toward), 1)) if len(toward) < count else toward,
-            device=self.device,
-            backend=self._backend(count),
-        )
+            origins, directions.numpy(), per_origin=max(each, 1), device=self.device,
+            backend=self._backend(each * len(origins)),
+        )  # fmt: skip
         return Hits(
             wp.array(origins, dtype=wp.vec3d, device=self.device), directions, solid_angle,
             wp.array(hit.face, dtype=wp.int32, device=self.device, copy=False),
-            wp.array(np.maximum(hit.t, LEAST_M), dtype=wp.float64, device=self.device, copy=False),
+            wp.array(np.maximum(hit.t, LEAST_M, out=hit.t), dtype=wp.float64, device=self.device, copy=False),
         )  # fmt: skip
 
     def _backend(self, count: int) -> str:
         """Embree is worth being loaded for a grid of rays, whether it is in use yet or not."""
-        by_embree = (
-            not self.device.is_cuda and mesh_rays.open3d_installed() and count >= mesh_rays.EMBREE_RAYS
-        )
-        return "embree" if by_embree else "warp"
+        usable = not self.device.is_cuda and mesh_rays.open3d_installed()
+        return "embree" if usable and count >= mesh_rays.EMBREE_RAYS else "warp"
 
     def light(self, hits: Hits, source: np.ndarray) -> Illumination:
         """How a transmitter at ``source`` (3,) [m] illuminates what was hit; shadows included."""
@@ -158,7 +145,7 @@ class RayGrid:
         strength = found.strength.numpy()
         ray = np.flatnonzero(strength > 0)
         free = self.surface.mesh.visible(
-            np.asarray(source, float), point.numpy()[ray], clearance=self.surface.skin_m, device=self.device,
+            np.asarray(source, float), point.numpy().take(ray, axis=0), clearance=self.surface.skin_m, device=self.device,
             backend=self._backend(len(ray)),
         )  # fmt: skip
         strength[ray[~free]] = 0.0
@@ -173,9 +160,8 @@ class RayGrid:
         count = len(hits.face) if ray is None else len(ray)
         found = Illumination(*(wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(5)))
         point = wp.empty(count, dtype=wp.vec3d, device=self.device)
-        chosen = np.zeros(0) if ray is None else ray
         inputs = [
-            self.surface.on_device(self.device), wp.array(chosen, dtype=wp.int32, device=self.device),
+            self.surface.on_device(self.device), wp.array([] if ray is None else ray, dtype=wp.int32, device=self.device),
             wp.array(np.reshape(sources, (-1, 3)), dtype=wp.vec3d, device=self.device), *hits.inputs,
             hits.solid_angle, float(self.half_width), NEAREST_M, self.loss_per_m, *found.inputs, point,
         ]  # fmt: skip

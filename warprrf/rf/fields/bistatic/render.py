@@ -19,37 +19,27 @@ from warprrf.rf.spectra.beam import BeamOperator
 
 
 @dataclass(frozen=True)
-class Further:
-    """Path gain of everything after a first bounce, before any beam.
-
-    Attributes:
-        sent: of light that surfaces got from others and send on, by the ray that sees it, shape ``(R K,)``.
-        shown: what mirrors show of the illuminated scene: rays and their path gain, shape ``(M,)`` each.
-    """
-
-    sent: np.ndarray
-    shown: tuple[np.ndarray, np.ndarray]
-
-    def by_ray(self) -> np.ndarray:
-        """All of it by the ray that sees it, shape ``(R K,)``."""
-        return np.asarray(self.sent + np.bincount(*self.shown, minlength=len(self.sent)))
-
-
-@dataclass(frozen=True)
 class PathPowers:
     """Path gain of everything that receivers get, before any beam.
 
     Attributes:
         single: of each ray's single bounce, shape ``(R K,)``.
         mirror: of each line-of-sight and mirror path, shape ``(L,)``.
-        further: of what comes after a first bounce.
+        sent: of light that surfaces got from others and send on, by the ray that sees it, shape ``(R K,)``.
+        shown: what mirrors show of the illuminated scene: rays and their path gain, shape ``(M,)`` each.
         parameters: under which they are.
     """
 
     single: np.ndarray
     mirror: np.ndarray
-    further: Further
+    sent: np.ndarray
+    shown: tuple[np.ndarray, np.ndarray]
     parameters: Parameters
+
+    @property
+    def further(self) -> np.ndarray:
+        """Of everything after a first bounce, by the ray that sees it, shape ``(R K,)``."""
+        return np.asarray(self.sent + np.bincount(*self.shown, minlength=len(self.sent)))
 
 
 @dataclass(frozen=True)
@@ -77,14 +67,12 @@ def render(view: ReceiverView, materials: Materials, beam: BeamOperator, sent: n
         sent: what elements send on under these materials; see :func:`sent_radiance`.
     """
     powers = path_powers(view, materials, sent)
-    further = powers.further.by_ray()
-    (image,) = images(view, powers, powers.single + further, beam)
-    return Rendered(powers, further.reshape(*view.transport.grid.shape, -1).sum(axis=-1), image)
+    (image,) = images(view, powers, beam)
+    return Rendered(powers, powers.further.reshape(*view.transport.grid.shape, -1).sum(axis=-1), image)
 
 
-def images(view: ReceiverView, powers: PathPowers, by_ray: np.ndarray, beam: BeamOperator) -> np.ndarray:
-    """Spectra (R, H, W) of the receivers of ``view``: line of sight and mirrors of ``powers``, and what else each ray sees
-    ``by_ray`` (R K,), through the receivers' beam.
+def images(view: ReceiverView, powers: PathPowers, beam: BeamOperator) -> np.ndarray:
+    """Spectra (R, H, W) of the receivers of ``view``: ``powers`` through the receivers' beam.
 
     Raises:
         ValueError: for a view that was traced without a beam.
@@ -92,7 +80,7 @@ def images(view: ReceiverView, powers: PathPowers, by_ray: np.ndarray, beam: Bea
     if view.beams is None:
         raise ValueError("view: it was traced without a receiver's beam, expected one of a spectrum")
     count, shape, paths = len(view.receivers), view.transport.grid.shape, view.paths
-    pixels = by_ray.reshape(count, *shape, -1).sum(axis=-1)
+    pixels = np.einsum("...k->...", (powers.single + powers.further).reshape(count, *shape, -1))
     found = np.moveaxis(beam(np.ascontiguousarray(np.moveaxis(pixels, 0, -1))), -1, 0)
     sharp = powers.mirror.astype(np.float32)
     for image, own in zip(found, (paths.receiver == k for k in range(count)), strict=True):
@@ -108,26 +96,20 @@ def path_powers(view: ReceiverView, materials: Materials, sent: np.ndarray | Non
     mirror = mirror_power(view.friis, view.path_groups, paths.cosine, paths.turn, p)[0] * p.gain
     kept = (paths.order <= terms.mirror_order) & ((paths.order > 0) | terms.line_of_sight)
     mirror = np.where(kept, mirror, 0.0)
-    single = np.zeros(len(view.hits.face))
+    face = view.hits.face.numpy()
+    single = np.zeros(len(face))
     if terms.diffuse:
-        face = view.hits.face
-        power = scatter(t.surface, face, view.light, terms, p.weight, p.log_excess, t.wavelength_m)
-        single = power * (p.gain * materials.cell_gain())[t.surface.cell][face.numpy()]
-    return PathPowers(single, mirror, further_bounces(view, materials, sent), p)
-
-
-def further_bounces(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> Further:
-    """What comes after a first bounce, residual and common gain included; arguments as for :func:`render`."""
-    t, gain = view.transport, materials.parameters.gain
+        power = scatter(t.surface, view.hits.face, view.light, terms, p.weight, p.log_excess, t.wavelength_m)
+        single = power * (p.gain * materials.cell_gain())[t.surface.cell].take(face, mode="wrap")
     on, (ray, shown) = sent_on(view, materials, sent), mirror_shown(view, materials, sent)
-    on *= (gain * materials.sent_gain(t.transmitter))[t.surface.cell][view.hits.face.numpy()]
-    return Further(on, (ray, gain * shown))
+    on *= (p.gain * materials.sent_gain(t.transmitter))[t.surface.cell].take(face, mode="wrap")
+    return PathPowers(single, mirror, on, (ray, p.gain * shown), p)
 
 
 def sent_on(view: ReceiverView, materials: Materials, sent: np.ndarray | None) -> np.ndarray:
     """Light that surfaces send on along each ray, without residual and common gain, shape ``(R K,)``."""
-    t, p, hits = view.transport, materials.parameters, view.hits
-    found = send(t.surface, hits, sent, t.wavelength_m, t.grid.loss_per_m)
+    t, p = view.transport, materials.parameters
+    found = send(t, view.hits, sent)
     m = view.mirror_illumination if materials.terms.diffuse and materials.terms.mirror_scatter else None
     if m is not None and len(m.ray):
         power = scatter(t.surface, m.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
@@ -145,10 +127,8 @@ def mirror_shown(
     wanted = materials.terms.diffuse and materials.terms.scatter_mirror
     if not wanted or m is None or len(m.ray) == 0:
         return np.zeros(0, int), np.zeros(0)
-    wavelength = t.wavelength_m
-    power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, wavelength)
-    power = power + send(t.surface, m.hits, sent, wavelength, t.grid.loss_per_m)
-    return m.ray, mirror_share(p, m.group, m.cosine) * power * m.air
+    power = scatter(t.surface, m.hits.face, m.light, materials.terms, p.weight, p.log_excess, t.wavelength_m)
+    return m.ray, mirror_share(p, m.group, m.cosine) * (power + send(t, m.hits, sent)) * m.air
 
 
 def sent_radiance(transport: Transport, materials: Materials) -> np.ndarray | None:

@@ -102,7 +102,7 @@ def shares_of(
     face = view.hits.face.numpy()
     own = gather_shares(bins, count, face, powers.single / unit, surface)
     # Gains of light sent on are learned under one transmitter alone.
-    learned = powers.further.sent / unit * np.array_equal(view.transport.transmitter, materials.transmitter)
+    learned = powers.sent / unit * np.array_equal(view.transport.transmitter, materials.transmitter)
     further = gather_shares(bins, count, face, learned, surface)
     known = np.asarray((own + further).sum(axis=1)).reshape(-1, 1)
     rest = np.maximum(read(view, measured, powers) / unit - measured.of_bins(known)[:, 0], 0.0)

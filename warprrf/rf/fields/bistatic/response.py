@@ -17,7 +17,7 @@ from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.fields.bistatic.materials import Layout, Materials, Parameters, Terms, mirror_power
 from warprrf.rf.fields.bistatic.measured import Measurement, Superposition
 from warprrf.rf.fields.bistatic.render import mirror_shown, sent_on
-from warprrf.rf.fields.bistatic.scattering import resolve
+from warprrf.rf.fields.bistatic.scattering import resolve, send
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 
 NEGLIGIBLE = 1e-3
@@ -104,8 +104,8 @@ def respond(view: ReceiverView, measurement: Measurement, terms: Terms, floor: f
     read = measurement.of_bins(images.reshape(count, -1), quick=True) / np.float32(floor)
     bounce = np.ascontiguousarray(read.T).reshape(*images.shape[1:], len(read))
     strong = np.abs(bounce).max(axis=(1, 2, 3), initial=0.0) > NEGLIGIBLE
-    ray, face, unit = view.seen()
-    seen, indirect = _read_by_group(measurement, bins[ray], count, t.surface.group[face], unit / floor)
+    unit = send(t, view.hits, np.ones(t.surface.element_sides))
+    seen, indirect = _read_by_group(measurement, view, unit / floor)
     path = measurement.of_paths(view)
     none = np.zeros((0, path.shape[1]), np.float32)
     return Response(
@@ -131,15 +131,12 @@ def with_further_bounces(
         sent: see :func:`warprrf.rf.fields.bistatic.render.sent_radiance`.
         follow: whether what surfaces send on of it follows their parameters, which costs columns, or is held too.
     """
-    bins, count = measurement.bins(view)
-    on = sent_on(view, materials, sent)
-    ray = np.flatnonzero(on > 0)
-    owner = view.transport.surface.group[view.hits.face.numpy()[ray]]
-    sender, read = _read_by_group(measurement, bins[ray], count, owner, on[ray] / floor)
+    sender, read = _read_by_group(measurement, view, sent_on(view, materials, sent) / floor)
     read = np.maximum(read, 0.0)
-    ray, power = mirror_shown(view, materials, sent)
-    shown = _read_by_group(measurement, bins[ray], count, np.zeros(len(ray), int), power / floor)[1]
-    offset = np.maximum(shown.sum(axis=0), 0.0).astype(np.float32)
+    (bins, count), (ray, power) = measurement.bins(view), mirror_shown(view, materials, sent)
+    own = bins[ray] >= 0
+    shown = np.bincount(bins[ray[own]], power[own] / floor, minlength=count)[:, None]
+    offset = np.maximum(measurement.of_bins(shown)[:, 0], 0.0).astype(np.float32)
     if not follow:
         return replace(response, offset=(read.sum(axis=0) + offset).astype(np.float32))
     share = np.maximum(materials.parameters.scattered_share[sender], 1e-12)
@@ -147,14 +144,14 @@ def with_further_bounces(
 
 
 def _read_by_group(
-    measurement: Measurement, bins: np.ndarray, count: int, group: np.ndarray, power: np.ndarray
+    measurement: Measurement, view: ReceiverView, power: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Groups of rays (M,), and readings of the power of each group, shape ``(B, N)``."""
-    own = bins >= 0
-    bins, group, power = bins[own], group[own], power[own]
-    found, column = np.unique(group, return_inverse=True)
-    cell = bins * len(found) + column.reshape(-1)
-    table = np.bincount(cell, power, minlength=count * len(found)).reshape(count, len(found))
+    """Groups that send ``power`` (K,) along rays, and readings of that of each group, shape ``(B, N)``."""
+    bins, count = measurement.bins(view)
+    ray = np.flatnonzero((bins >= 0) & (power > 0))
+    found, column = np.unique(view.transport.surface.group[view.hits.face.numpy()[ray]], return_inverse=True)
+    cell = bins[ray] * len(found) + column.reshape(-1)
+    table = np.bincount(cell, power[ray], minlength=count * len(found)).reshape(count, len(found))
     return found, np.ascontiguousarray(measurement.of_bins(table).T, np.float32)
 
 

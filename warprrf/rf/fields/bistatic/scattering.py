@@ -22,6 +22,7 @@ from warprrf.rf.em.fresnel import COSINES, fresnel_curves, lobe_norm, reciprocal
 from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.fields.bistatic.rays import Hits, Illumination
 from warprrf.rf.fields.bistatic.surface import Surface
+from warprrf.rf.fields.bistatic.transport import Transport
 
 
 @lru_cache(maxsize=8)
@@ -29,7 +30,7 @@ def _lobes(exponents: tuple[int, ...], reciprocal: bool, device: str) -> bounce.
     """A mix of lobes with its table, on the device."""
     cosine, found = np.linspace(0.0, 1.0, COSINES), bounce.Lobes()
     scale = [reciprocal_factor(n, cosine) if reciprocal else 1.0 / lobe_norm(n, cosine) for n in exponents]
-    found.exponent = wp.array(np.array(exponents, np.float32), dtype=wp.float32, device=device)
+    found.exponent = wp.array(exponents, dtype=wp.int32, device=device)
     found.scale = wp.array(np.array(scale, np.float32), dtype=wp.float32, device=device)
     found.reciprocal = int(reciprocal)
     return found
@@ -67,23 +68,14 @@ def scatter(
     return np.asarray(power.numpy())
 
 
-def send(
-    surface: Surface, hits: Hits, sent: np.ndarray | None, wavelength_m: float, loss_per_m: float
-) -> np.ndarray:
-    """Path gain of what elements send along each ray, shape ``(K,)``.
-
-    Args:
-        surface: what was hit.
-        hits: where.
-        sent: radiance of elements' sides, shape ``(S,)``; None for none.
-        wavelength_m: wavelength.
-        loss_per_m: absorption by the air [neper/m].
-    """
+def send(transport: Transport, hits: Hits, sent: np.ndarray | None) -> np.ndarray:
+    """Path gain (K,) along each ray of ``hits`` if elements' sides send radiance ``sent`` (S,); None for none."""
     where, power = hits.face.device, wp.zeros(len(hits.face), dtype=wp.float64, device=hits.face.device)
     if sent is not None:
+        unit = (transport.wavelength_m / (4.0 * np.pi)) ** 2
         inputs = [
-            surface.on_device(where), *hits.inputs[2:], hits.solid_angle, loss_per_m,
-            wp.array(sent * (wavelength_m / (4.0 * np.pi)) ** 2, dtype=wp.float64, device=where), power,
+            transport.surface.on_device(where), *hits.inputs[2:], hits.solid_angle, transport.grid.loss_per_m,
+            wp.array(unit * sent, dtype=wp.float64, device=where), power,
         ]  # fmt: skip
         _device.launch(bounce.send_along, len(power), inputs, device=where)
     return np.asarray(power.numpy())

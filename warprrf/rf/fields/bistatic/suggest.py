@@ -92,7 +92,7 @@ class Sensitivity:
         """Power that is due to each gain in each pixel at ``place`` (3,), shape ``(P, U)``, and all power ``(P,)``."""
         t, view = self.transport, self.transport.view(place, self.materials.terms)
         found = path_powers(view, self.materials, self._sent)
-        s, face, sent, count = t.surface, view.hits.face.numpy(), found.further.sent, SHAPE[0] * SHAPE[1]
+        s, face, sent, count = t.surface, view.hits.face.numpy(), found.sent, SHAPE[0] * SHAPE[1]
         elements, single, on = len(s.element_area), np.flatnonzero(found.single > 0), np.flatnonzero(sent > 0)
         pixel = np.ravel_multi_index(pixel_of(view.paths.arrival, SHAPE), SHAPE)
         mirror = view.path_groups[:, 0]
@@ -104,7 +104,7 @@ class Sensitivity:
         )
         row, unknown, power = (np.concatenate(column) for column in zip(*parts, strict=True))
         table = csr_matrix((power, (row, unknown)), shape=(count, 2 * elements + s.groups))
-        ray, shown = found.further.shown  # known, as line of sight is
+        ray, shown = found.shown  # known, as line of sight is
         rest = np.bincount(np.append(ray, pixel[~own]), np.append(shown, found.mirror[~own]), minlength=count)
         return table, np.asarray(table.sum(axis=1)).ravel() + rest
 

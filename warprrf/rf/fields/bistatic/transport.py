@@ -94,15 +94,6 @@ class ReceiverView:
         known, owner = self.paths.patch >= 0, self.transport.surface.patch_group
         return np.where(known, owner[np.where(known, self.paths.patch, 0)] if len(owner) else -1, -1)
 
-    def seen(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays that hit something, the faces that they hit, and the path gain of unit radiance there [m^2 sr],
-        ``(V,)`` each."""
-        t, face = self.transport, self.hits.face.numpy()
-        ray = np.flatnonzero(face >= 0)
-        solid_angle = t.grid.solid_angle[ray % len(t.grid.solid_angle)]
-        air = t.grid.transmittance(self.hits.range_m.numpy()[ray])
-        return ray, face[ray], (t.wavelength_m / (4.0 * np.pi)) ** 2 * solid_angle * air
-
 
 class Transport:
     """Geometry under one transmitter.
@@ -171,9 +162,8 @@ class Transport:
 
     def on_grid(self, shape: tuple[int, int], sub_pixels: int, mirror_sub_pixels: int) -> Transport:
         """The same for receivers with other rays and no beams; what belongs to the transmitter is shared."""
-        g = self.grid
         other = copy(self)
-        other.grid = RayGrid(self.surface, shape, sub_pixels, loss_per_m=g.loss_per_m, device=g.device)
+        other.grid = self._grid(shape, sub_pixels)
         other.beam_sigma_rad, other.mirror_sub_pixels = None, mirror_sub_pixels
         return other
 
@@ -191,12 +181,8 @@ class Transport:
     def images(self) -> MirrorImages:
         """Images of the transmitter in the surface's mirrors."""
 
-        def make() -> MirrorImages:
-            return MirrorImages(
-                self.surface.patches, self.transmitter, slack_m=MIRROR_SLACK_M, device=self.grid.device
-            )
-
-        return self._made.get("images", make)
+        where: dict[str, Any] = {"slack_m": MIRROR_SLACK_M, "device": self.grid.device}
+        return self._made.get("images", lambda: MirrorImages(self.surface.patches, self.transmitter, **where))
 
     def paths(self, receivers: np.ndarray, order: int, progress: Progress | None = None) -> MirrorPaths:
         """Line of sight and mirror paths of ``receivers`` (R, 3) with at most ``order`` reflections."""
@@ -238,16 +224,15 @@ class Transport:
             view = replace(view, mirror_shown=self._mirror_shown(view.receivers))
         return view
 
-    def _mirror_grid(self) -> RayGrid:
+    def _grid(self, shape: tuple[int, int], sub_pixels: int) -> RayGrid:
         g = self.grid
-        return RayGrid(
-            self.surface, g.shape, self.mirror_sub_pixels, loss_per_m=g.loss_per_m, device=g.device
-        )
+        return RayGrid(self.surface, shape, sub_pixels, loss_per_m=g.loss_per_m, device=g.device)
 
     def _mirror_shown(self, receivers: np.ndarray) -> MirrorShown:
         """Turn rays of ``receivers`` (R, 3) at the patches that they hit, and see how the transmitter lights the rest."""
         s, per_pixel = self.surface, self.grid.sub_pixels**2
-        grid = self._made.get(("mirror grid", self.grid.shape, self.mirror_sub_pixels), self._mirror_grid)
+        kind = self.grid.shape, self.mirror_sub_pixels
+        grid = self._made.get(kind, lambda: self._grid(*kind))
         first_hits = grid.hit(receivers)
         face = first_hits.face.numpy()
         ray = np.flatnonzero(face >= 0)
