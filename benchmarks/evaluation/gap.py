@@ -156,13 +156,8 @@ class Lab:
     def __init__(
         self, train: SpectrumDataset, test: SpectrumDataset, geometry: Geometry, job: Job, iterations: int
     ) -> None:
-        self.train, self.test, self.geometry, self.job, self.iterations = (
-            train,
-            test,
-            geometry,
-            job,
-            iterations,
-        )
+        self.train, self.test, self.geometry = train, test, geometry
+        self.job, self.iterations = job, iterations
         away = np.linalg.norm(train.receivers - train.transmitter, axis=1)
         few = min(FEW, max(1, len(train) // 2))
         shell = np.argsort(np.abs(away - np.median(away)), kind="stable")[:few]
@@ -248,10 +243,10 @@ def _task(lab: Lab, choice: Choice, model: str) -> Task:
     lengths = lab.lengths(seen)
     image, least, back, span_db = pictures(choice.fitted, ds)
     solid_angle = pixel_solid_angles(ds.shape)[:, None]
-    usual = float(np.max(_factor(law, lengths) / solid_angle))
+    largest = float(np.max(_factor(law, lengths) / solid_angle))
 
     def terms(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray | float]:
-        factor = _factor(law, lengths) / usual
+        factor = _factor(law, lengths) / largest
         if choice.fitted == "amplitude":
             return np.sqrt(factor), 0.0
         if not choice.picture:
@@ -270,7 +265,7 @@ def _task(lab: Lab, choice: Choice, model: str) -> Task:
     # A pixel pulls with the change of its image by a neper of gain, about its value; see fit_layer.
     low, high = math.log1p(SMALL), math.log1p(2 * SMALL)
     pull = (high - low) * float(np.median(image[lit]))
-    usual_rates = Rates()
+    rates = Rates()
     exponential = choice.gain == "exp"
     target = Target(
         image=(np.log1p(SMALL * (1 + image)) - low) / (high - low),
@@ -285,11 +280,7 @@ def _task(lab: Lab, choice: Choice, model: str) -> Task:
     middle = float(np.median(start))
     return Task(
         target,
-        replace(
-            usual_rates,
-            ridge=usual_rates.ridge * pull,
-            ridge_directional=usual_rates.ridge_directional * pull,
-        ),
+        replace(rates, ridge=rates.ridge * pull, ridge_directional=rates.ridge_directional * pull),
         math.log(middle) / Y00 if exponential else middle / Y00,
         terms,
         back,
