@@ -435,6 +435,24 @@ def _law() -> str:
     return markdown(("truth", "spectra", "RF-3DGS+ [dB]", "RF-3DGS [dB]", "difference [dB]"), lines)
 
 
+@entry("gap")
+def _gap() -> str:
+    found = read("gap")
+    what = {r["choice"]: r["what"] for r in found["differences"]}
+    lines = []
+    for r in found["differences"]:
+        cells = [what[r["choice"]], str(r["train"])]
+        for key in ("psnr_db", "own_psnr_db"):
+            cells += [show(r[key][m], "{:.1f}") for m in ("rf3dgs+", "rf3dgs")]
+            cells.append(show(r[key]["difference"], "{:+.1f}"))
+        lines.append(cells)
+    head = (
+        "changed", "spectra", "RF-3DGS+, PSNR [dB]", "RF-3DGS", "difference", "RF-3DGS+, each picture by its own range",
+        "RF-3DGS", "difference",
+    )  # fmt: skip
+    return markdown(head, lines)
+
+
 # ------------------------------------------------------------------------------------------------ the engine
 
 
