@@ -466,7 +466,7 @@ def differences(rows: list[Row]) -> list[Row]:
         plus, plain = both["rf3dgs+"], both["rf3dgs"]
         if plus is None or plain is None:
             continue
-        line: Row = {"choice": name, "train": plus["train"]}
+        line: Row = {"choice": name, "what": CHOICES[name].what, "train": plus["train"]}
         for key in (
             f"{k}{end}" for k in ("psnr_db", "ssim", "own_psnr_db", "own_ssim") for end in ("", "_blocked")
         ):
