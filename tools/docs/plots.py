@@ -52,19 +52,21 @@ def _name(method: str) -> str:
 
 @entry("psnr", "PSNR of held-out receivers over the number of training spectra")
 def _psnr() -> Any:
-    rows = results.read("paper")["rows"]
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True)
-    for ax, (truth, name) in zip(axes, results.TRUTHS.items(), strict=True):
+    places = {
+        t: name
+        for (t, split), name in results.PLACES.items()
+        if split == "random" and results.paper(t, split)
+    }
+    figure, axes = plt.subplots(1, len(places), figsize=(4.5 * len(places), 3.4), sharey=True)
+    for ax, (truth, name) in zip(axes, places.items(), strict=True):
+        rows = results.paper(truth, "random")
         for method, colour in COLOURS.items():
-            chosen = sorted(
-                (r["count"], r["psnr_db"])
-                for r in rows
-                if r["truth"] == truth and r["method"] == method and r["split"] == "random" and r["count"]
-            )
+            chosen = sorted((r["count"], r["psnr_db"]) for r in rows if r["method"] == method and r["count"])
             if chosen:
                 ax.semilogx(*zip(*chosen, strict=True), "o-", ms=3.5, color=colour, label=_name(method))
+        counts = sorted({r["count"] for r in rows if r["count"]})
         ax.set(xlabel="training spectra", title=f"truth: {name}")
-        ax.set_xticks([10, 20, 50, 100, 200, 400, 700], ["10", "20", "50", "100", "200", "400", "700"])
+        ax.set_xticks(counts, list(map(str, counts)))
         ax.minorticks_off()
     axes[0].set_ylabel("PSNR [dB]")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7)

@@ -383,8 +383,10 @@ def _paper_runs() -> str:
         for name, about in found["data"].items()
         if name.endswith("/random")
     )
-    left = f" {missing_runs} runs of the plan are missing." if missing_runs else ""
-    return f"Data, by the hash of the file: {data}.{left}"
+    left = f" {missing_runs} of their runs are missing." if missing_runs else ""
+    absent = [name for (t, split), name in PLACES.items() if f"{t}/{split}" not in found["data"]]
+    none = f" Not run yet: {', '.join(absent)}." if absent else ""
+    return f"Data, by the hash of the file: {data}.{left}{none}"
 
 
 @entry("paper-stage2")
