@@ -204,10 +204,13 @@ def test_a_bug_is_json_and_a_traceback(
 
 def interrupted(words: list[str], when: str, folder: Path, file: str = "*") -> tuple[str, float]:
     """What a real process says on SIGINT, sent once it has told ``when`` and made ``file``, and how long it takes to end."""
+    # A job in the background ignores SIGINT, and so do its children.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
         [sys.executable, "-m", *words, "--json", "--device", "cpu"], cwd=folder, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
+    signal.signal(signal.SIGINT, before)
     assert process.stdout is not None
     for line in process.stdout:
         if when in line:
