@@ -45,7 +45,7 @@ Execute = Callable[..., Result]
 
 
 class Rows:
-    """Finished runs in a file, a JSON object a line.
+    """Finished runs in a file, a JSON object a line; runs on other data stand beside each other.
 
     Raises:
         ValueError: if the file is damaged.
@@ -53,29 +53,32 @@ class Rows:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        self._lines: dict[str, dict[str, Any]] = {}
+        self._lines: dict[tuple[str, str], Row] = {}
         text = self.path.read_text() if self.path.is_file() else ""
         for number, line in enumerate(text.splitlines(), 1):
             try:
                 one = json.loads(line)
-                self._lines[one["row"]["key"]] = {"known": str(one["known"]), "row": dict(one["row"])}
+                self._lines[one["row"]["key"], str(one["known"])] = dict(one["row"])
             except (KeyError, TypeError, ValueError) as error:
                 raise ValueError(f"rows: line {number} of {self.path} is damaged: {error}") from error
 
     def get(self, run: Run, known: str) -> Row | None:
         """The row of ``run``, if what it depends on has the digest ``known``."""
-        one = self._lines.get(run.key)
-        return dict(one["row"]) if one is not None and one["known"] == known else None
+        row = self._lines.get((run.key, known))
+        return None if row is None else dict(row)
 
     def put(self, run: Run, known: str, row: Row) -> Row:
         """Keep a row, as JSON holds it; the file is replaced at once."""
-        self._lines[run.key] = {"known": known, "row": plain(row)}
-        lines = [json.dumps(self._lines[key], allow_nan=False) for key in sorted(self._lines)]
+        self._lines[run.key, known] = plain(row)
+        lines = [
+            json.dumps({"known": made, "row": one}, allow_nan=False)
+            for (_, made), one in sorted(self._lines.items(), key=lambda item: item[0])
+        ]
         write_text(self.path, "".join(f"{line}\n" for line in lines))
-        return dict(self._lines[run.key]["row"])
+        return dict(self._lines[run.key, known])
 
     def __iter__(self) -> Iterator[Row]:
-        return (one["row"] for one in self._lines.values())
+        return iter(self._lines.values())
 
 
 class Lab:

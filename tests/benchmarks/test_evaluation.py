@@ -21,6 +21,7 @@ import pytest
 from small_room import SHAPE, small_room
 
 import warprrf as wr
+from benchmarks.data import Geometry
 from benchmarks.evaluation import command, comparison, protocol, report, runs
 from benchmarks.evaluation.lpips import Lpips
 from benchmarks.evaluation.paper_law import paper_law_spectra
@@ -142,6 +143,26 @@ def test_rows_travel_without_their_folder_and_none_is_begun_after_the_time(
     rows.write_text(rows.read_text() + '{"known": "')
     with pytest.raises(ValueError, match=r"rows: line \d+ of .*kept\.jsonl is damaged"):
         whole(tmp_path / "elsewhere", data, **ask)
+
+
+def test_rows_of_other_data_stand_beside_each_other(tmp_path: Path) -> None:
+    run, rows = Run("exact", "random", 10, 0, "nearest"), Rows(tmp_path / "rows.jsonl")
+    for made, psnr in (("sample", 20.0), ("full", 30.0)):
+        rows.put(run, made, {"key": run.key, "psnr_db": psnr})
+    again = Rows(rows.path)
+    found = [again.get(run, made) for made in ("sample", "full", "other")]
+    assert [row and row["psnr_db"] for row in found] == [20.0, 30.0, None]
+
+
+def test_weights_of_some_receivers_are_taken_from_those_of_all(data: Path) -> None:
+    ds = wr.SpectrumDataset.load(data / "spectra.nc")
+    place, alone = (Geometry(data / "reconstruction", data / "scene.xml", "cpu") for _ in range(2))
+    seconds = place.weights(ds)[1]
+    found, share = place.weights(ds.subset([5, 2]))
+    expected = alone.weights(ds.subset([5, 2]))[0]
+    assert share == pytest.approx(seconds * 2 / len(ds))
+    for name in ("receivers", "start", "gaussian", "weight", "dominant", "expected_range"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 def test_an_estimate_is_the_time_of_the_nearest_finished_run() -> None:

@@ -404,7 +404,7 @@ def _paper_stage2() -> str:
                         show(r["train_s"], "{:.0f}"),
                     ]
                 )
-    for r in read("paper")["published"][:2]:
+    for r in read("paper")["published"][:1]:
         lines.append(
             [NAMES[r["method"]], "as published, NVIDIA RTX 4090", "", "", show(r["train_s"], "{:.0f}")]
         )
