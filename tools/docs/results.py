@@ -394,7 +394,7 @@ def _paper_stage2() -> str:
     lines = []
     for place, name in PLACES.items():
         for r in paper(*place):
-            if r["count"] == 700 and r["method"] in ("bistatic", "bistatic-quick", "rf3dgs+", "rf3dgs"):
+            if r["count"] == 700 and r["method"] in ("bistatic", "bistatic-quick", "rf3dgs+"):
                 lines.append(
                     [
                         NAMES[r["method"]],
