@@ -140,7 +140,7 @@ def run(options: Options, job: Job) -> Report:
     summary = comparison.summarise(found.values())
     figures: dict[str, Any] = {
         "rows": summary,
-        "margins": comparison.margins(summary),
+        "margins": comparison.margins(found.values()),
         "finding": comparison.paper_finding(summary),
         "published": [dict(row) for row in report.PUBLISHED],
         "data": about,

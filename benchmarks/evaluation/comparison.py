@@ -13,6 +13,9 @@ from benchmarks.report import Row
 
 PAIRS = {"rf3dgs+": "rf3dgs", "rf3dgs+alpha": "rf3dgs-alpha"}
 """What the paper's finding compares: with lengths, and without."""
+FIGURES = ("psnr_db", "ssim", "rmse_db", "direction_within_3deg", "beam_gain_loss_db")
+COMPARED = (*FIGURES, *(f"{name}_blocked" for name in FIGURES))
+"""What has a spread over seeds and a margin, at all test receivers and at the blocked ones."""
 
 
 def summarise(rows: Iterable[Row]) -> list[Row]:
@@ -20,12 +23,24 @@ def summarise(rows: Iterable[Row]) -> list[Row]:
 
     Of smallest and largest values the smallest and largest over seeds are kept.
     """
-    seeds: dict[tuple[Any, ...], dict[int, Row]] = {}
+    return [_mean(list(group.values())) for group in _by_seed(rows).values()]
+
+
+def _by_seed(rows: Iterable[Row]) -> dict[tuple[str, str, int, str], dict[int, Row]]:
+    """The better variant of each seed, by truth, split, count and method."""
+    found: dict[tuple[str, str, int, str], dict[int, Row]] = {}
     for row in rows:
-        place = seeds.setdefault((row["truth"], row["split"], row["count"], row["method"]), {})
-        if row["seed"] not in place or row["psnr_db"] > place[row["seed"]]["psnr_db"]:
-            place[row["seed"]] = row
-    return [_mean(list(group.values())) for group in seeds.values()]
+        seeds = found.setdefault((row["truth"], row["split"], row["count"], row["method"]), {})
+        if row["seed"] not in seeds or row["psnr_db"] > seeds[row["seed"]]["psnr_db"]:
+            seeds[row["seed"]] = row
+    return found
+
+
+def _mean_and_spread(values: Sequence[float | None]) -> tuple[float | None, float | None]:
+    """Mean and standard deviation of what is there; no deviation of fewer than two."""
+    given = [float(v) for v in values if v is not None]
+    spread = float(np.std(given, ddof=1)) if len(given) > 1 else None
+    return float(np.mean(given)) if given else None, spread
 
 
 def _mean(group: list[Row]) -> Row:
@@ -48,9 +63,8 @@ def _mean(group: list[Row]) -> Row:
         numbers = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
         if name not in merged and len(numbers) + values.count(None) == len(values):
             merged[name] = ends.get(name, np.mean)(numbers) if numbers else None
-    for name in SPREAD:
-        given = [float(row[name]) for row in group if row.get(name) is not None]
-        merged[f"{name}_std"] = float(np.std(given, ddof=1)) if len(given) > 1 else None
+    for name in COMPARED:
+        merged[f"{name}_std"] = _mean_and_spread([row.get(name) for row in group])[1]
     spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in group]
     merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
     merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
@@ -64,26 +78,32 @@ def _mean(group: list[Row]) -> Row:
     }
 
 
-MARGINS = (
-    "psnr_db", "ssim", "rmse_db", "direction_within_3deg", "beam_gain_loss_db",
-)  # fmt: skip
-
-
-def margins(rows: Sequence[Row]) -> list[Row]:
-    """The bistatic field less every other method, on the same spectra (or against one that sees none), all and blocked."""
-    ours = {(r["truth"], r["split"], r["count"]): r for r in rows if r["method"] == "bistatic"}
+def margins(rows: Iterable[Row]) -> list[Row]:
+    """The bistatic field less every other method: mean and spread over seeds of the differences on the same spectra, or
+    against the one run of a method that sees none."""
+    runs = _by_seed(rows)
     found = []
-    for (truth, split, count), own in ours.items():
-        for other in rows:
-            same = (other["truth"], other["split"]) == (truth, split) and other["count"] in (count, 0)
-            if not same or other["method"] == "bistatic":
+    for (truth, split, count, method), ours in runs.items():
+        if method != "bistatic":
+            continue
+        for place, theirs in runs.items():
+            if place[:2] != (truth, split) or place[2] not in (count, 0) or place[3] == method:
                 continue
-            line: Row = {"truth": truth, "split": split, "count": count, "method": other["method"]}
-            for key in (*MARGINS, *(f"{name}_blocked" for name in MARGINS)):
-                a, b = own.get(key), other.get(key)
-                line[key] = None if a is None or b is None else a - b
-            a, b = own.get("psnr_db_std"), other.get("psnr_db_std")
-            line["psnr_db_std"] = None if a is None or b is None else float(np.hypot(a, b))
+            others = theirs if place[2] else dict.fromkeys(ours, theirs[0])
+            pairs = [(row, others[seed]) for seed, row in ours.items() if seed in others]
+            if not pairs:
+                continue
+            line: Row = {
+                "truth": truth,
+                "split": split,
+                "count": count,
+                "method": place[3],
+                "seeds": len(pairs),
+            }
+            for name in COMPARED:
+                both = [(own.get(name), other.get(name)) for own, other in pairs]
+                differences = [None if a is None or b is None else a - b for a, b in both]
+                line[name], line[f"{name}_std"] = _mean_and_spread(differences)
             found.append(line)
     return found
 

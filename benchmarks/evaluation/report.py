@@ -143,13 +143,14 @@ def _margin_table(margins: Sequence[Row]) -> str:
         [
             TRUTHS[r["truth"]] + ("" if r["split"] == "random" else ", region"), str(r["count"]), METHODS[r["method"]][0],
             *(f"{cell(r[k], form)} / {cell(r[f'{k}_blocked'], form)}" for k, form in forms.items()),
-            cell(r["psnr_db_std"], "{:.2f}"),
+            cell(r["psnr_db_std"], "{:.2f}"), str(r["seeds"]),
         ]
         for r in margins
     ]  # fmt: skip
     names = ("PSNR [dB]", "SSIM", "RMSE [dB]", "within 3 deg", "beam loss [dB]")
     return table(
-        ["truth", "spectra", "against", *(f"{n}, all / blocked" for n in names), "over seeds [dB]"], lines
+        ["truth", "spectra", "against", *(f"{n}, all / blocked" for n in names), "over seeds [dB]", "seeds"],
+        lines,
     )
 
 

@@ -306,6 +306,19 @@ def test_finding_has_the_sign_that_was_found() -> None:
     assert finding["psnr_db"]["difference"] == -1.5
 
 
+def test_margins_pair_runs_of_the_same_spectra() -> None:
+    rows = [
+        *(row("bistatic", 10, seed, psnr_db=psnr) for seed, psnr in enumerate((30.0, 34.0, 35.0))),
+        *(row("nearest", 10, seed, psnr_db=psnr) for seed, psnr in enumerate((20.0, 24.0))),
+        row("zero", 0, 0, psnr_db=24.0),
+        row("mean", 50, 0, psnr_db=40.0),
+    ]
+    nearest, zero = sorted(comparison.margins(rows), key=lambda line: line["method"])
+    assert (nearest["psnr_db"], nearest["psnr_db_std"], nearest["seeds"]) == (10.0, 0.0, 2)
+    assert (zero["psnr_db"], zero["seeds"]) == (9.0, 3)
+    assert zero["psnr_db_std"] == pytest.approx(np.std([6.0, 10.0, 11.0], ddof=1))
+
+
 # ---------------------------------------------------------------------------------------- workers of a cluster
 
 

@@ -335,6 +335,41 @@ def _psnr(row: Row | None) -> str:
     return f"{row['psnr_db']:.1f}{spread} / {show(row['psnr_db_blocked'])}"
 
 
+@entry("paper-margins")
+def _paper_margins() -> str:
+    forms = (
+        ("PSNR [dB]", "psnr_db", 1.0, "{:+.1f}"), ("SSIM", "ssim", 1.0, "{:+.2f}"), ("RMSE [dB]", "rmse_db", 1.0, "{:+.1f}"),
+        ("within 3° [%]", "direction_within_3deg", 100.0, "{:+.0f}"),
+        ("beam loss [dB]", "beam_gain_loss_db", 1.0, "{:+.1f}"),
+    )  # fmt: skip
+
+    def cell(row: Row, figure: str, scale: float, form: str) -> str:
+        if row[figure] is None:
+            return ""
+        spread = row[f"{figure}_std"]
+        unsigned = form.replace("+", "")
+        return form.format(scale * row[figure]) + (
+            "" if spread is None else f" ± {unsigned.format(scale * spread)}"
+        )
+
+    parts = []
+    for (truth, split), name in PLACES.items():
+        rows = [
+            r for r in read("paper")["margins"] if (r["truth"], r["split"], r["count"]) == (truth, split, 100)
+        ]
+        lines = [
+            [
+                NAMES[r["method"]],
+                *(f"{cell(r, f, *how)} / {cell(r, f'{f}_blocked', *how)}" for _, f, *how in forms),
+            ]
+            for r in sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
+        ]
+        if lines:
+            head = (f"{name}, 100 spectra: ours less", *(f"{label}, all / blocked" for label, *_ in forms))
+            parts.append(markdown(head, lines))
+    return "\n\n".join(parts)
+
+
 @entry("paper-detail")
 def _paper_detail() -> str:
     parts = []
@@ -938,29 +973,34 @@ def _benchmarks() -> str:
 
 
 def readme() -> str:
-    """README's table between its markers: the main job's methods on both truths, mean and spread over seeds."""
-    rows = {row["key"]: row for row in read("lobby_seeds")["rows"]}
-
-    def cell(method: str, group: str, figure: str, form: str) -> str:
-        row = rows[f"{group}.{method}.{figure}"]
-        scale = 100.0 if "%" in form else 1.0
-        shown = form.replace("%", "").format(scale * row["mean"]) + " ± "
-        return shown + form.replace("%", "").format(scale * row["spread"]) + (" %" if "%" in form else "")
-
+    """README's table between its markers: 100 spectra of the lobby by both engines and of the second room."""
     columns = (
-        ("PSNR [dB]", "psnr_db", "{:.1f}"),
-        ("within 3°", "direction_within_3deg", "{:.0f}%"),
-        ("within 3°, blocked", "direction_within_3deg_blocked", "{:.0f}%"),
+        ("PSNR [dB]", "psnr_db", 1.0, "{:.1f}"),
+        ("within 3° [%]", "direction_within_3deg", 100.0, "{:.0f}"),
+        ("blocked, within 3° [%]", "direction_within_3deg_blocked", 100.0, "{:.0f}"),
     )
-    groups = {"methods": TRUTHS["exact"], "methods_sionna": TRUTHS["sionna"]}
-    lines = [
-        [
-            NAMES[method],
-            *(cell(method, group, figure, form) for group in groups for _, figure, form in columns),
-        ]
-        for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "mean")
-    ]
-    head = ["50 spectra", *(f"{truth}: {name}" for truth in groups.values() for name, *_ in columns)]
+    shown = {
+        place: columns[:2] if place[0] == "conference" else columns
+        for place in PLACES
+        if place[1] == "random"
+    }
+
+    def cell(row: Row | None, figure: str, scale: float, form: str) -> str:
+        if row is None or row[figure] is None:
+            return ""
+        spread = row.get(f"{figure}_std")
+        return form.format(scale * row[figure]) + (
+            "" if spread is None else f" ± {form.format(scale * spread)}"
+        )
+
+    lines = []
+    for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "mean"):
+        cells = [NAMES[method]]
+        for place, figures in shown.items():
+            row = _find(paper(*place, 100), method=method)
+            cells += [cell(row, *how) for _, *how in figures]
+        lines.append(cells)
+    head = ["100 spectra", *(f"{PLACES[place]}: {name}" for place, how in shown.items() for name, *_ in how)]
     return f"{MARKERS[0]}\n{markdown(head, lines)}\n{MARKERS[1]}"
 
 
