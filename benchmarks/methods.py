@@ -432,6 +432,12 @@ METHODS: dict[str, Method] = {
         untaught=True,
         note=f"Sionna RT on the true mesh, {_MISJUDGED}",
     ),
+    "sionna-again": Method(
+        lambda task: _sionna(task.geometry.scene, task),
+        "sionna",
+        untaught=True,
+        note="the truth's own engine and scene under another seed: two samples of the same noise apart",
+    ),
     "transmitter": Method(_transmitter, "metrics", untaught=True),
     "zero": Method(_zero, "bistatic", untaught=True, note="our mesh, every surface taken for the prior"),
 }

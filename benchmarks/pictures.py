@@ -27,6 +27,7 @@ METHODS = {
     "cgan": ("CGAN", "#7f4f24"),
     "sionna": ("Sionna RT, assumed materials", "#33415c"),
     "sionna-calibrated": ("Sionna RT, calibrated", "#5c7aea"),
+    "sionna-again": ("Sionna RT, another seed", "#222222"),
 }
 """Name and colour of each method."""
 

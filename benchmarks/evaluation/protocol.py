@@ -99,6 +99,7 @@ GROUPS = (
     Group((*FIELDS, *LOOKUPS, "bistatic-quick"), (10, 100), truths=("conference",)),
     Group((*FIELDS, *LOOKUPS), (100,), splits=("region",)),
     Group(("sionna", "sionna-calibrated"), FEW),
+    Group(("sionna-again",), FEW, truths=("sionna", "conference")),
     Group(LAW_METHODS, FEW, truths=("paper-law",)),
     Group((*FIELDS, *LOOKUPS), COUNTS, seeds=(1, 2)),
     Group(OPACITY_METHODS, FEW),

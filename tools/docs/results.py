@@ -31,6 +31,7 @@ NAMES = {
     "cgan": "conditional GAN",
     "sionna-calibrated": "Sionna RT, calibrated materials",
     "sionna": "Sionna RT, true mesh, assumed materials",
+    "sionna-again": "Sionna RT, the truth under another seed",
     "nearest": "nearest receiver's spectrum",
     "idw": "inverse-distance average",
     "mean": "mean image",
