@@ -15,9 +15,8 @@ import numpy as np
 
 import warprrf as wr
 from benchmarks.data import DATA
-from benchmarks.evaluation.runs import connected, peak_memory
 from benchmarks.lobby.spectra import FILES
-from benchmarks.machine import machine
+from benchmarks.machine import connected, machine, peak_memory
 from benchmarks.report import Report, Row, columns_table
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import require

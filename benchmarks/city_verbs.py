@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from benchmarks.evaluation.runs import peak_memory
+from benchmarks.machine import peak_memory
 
 FREQUENCY_HZ = 3.5e9
 SCATTERING = 0.4

@@ -1,13 +1,20 @@
-"""What figures were measured on: processor, cores, system, versions."""
+"""What figures were measured on: processor, cores, versions; the workers of a cluster, and the memory that a run took."""
 
 from __future__ import annotations
 
+import os
 import platform
+import resource
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from warprrf.device import resolve, threads
+import warp as wp
+
+from warprrf.device import require, resolve, threads
 
 PACKAGES = (
     "warprrf",
@@ -53,3 +60,70 @@ def machine(device: Any = None) -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": versions,
     }
+
+
+@contextmanager
+def connected(scheduler: str | None, workers: int, share: int | None = None) -> Iterator[Any]:
+    """A client of the scheduler at an address, or of a local cluster of processes with ``share`` threads each, equal parts
+    of the cores by default; None for no workers.
+
+    Raises:
+        ImportError: without dask.distributed, where it is needed.
+    """
+    if scheduler is None and workers == 0:
+        yield None
+        return
+    distributed = require("distributed", extra="cluster")
+    if scheduler is not None:
+        with distributed.Client(scheduler, set_as_default=False) as client:
+            yield client
+        return
+    threads_each = str(share or max(1, (os.cpu_count() or 1) // workers))
+    with (
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,  # a part may need what the machine has: no worker is stopped for it
+            dashboard_address=None,
+            env={"WARPRRF_THREADS": threads_each, "OMP_NUM_THREADS": threads_each},
+            silence_logs="CRITICAL",
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def peak_memory(device: Any = None) -> Iterator[dict[str, Any]]:
+    """Fills what it yields with the process's largest resident memory inside the block, and the GPU's where one works.
+
+    ``peak_memory_bytes`` is of the whole process, what was loaded before included. Where the kernel does not let the
+    mark be reset it is that of the process's life.
+    """
+    found: dict[str, Any] = {}
+    reset_mark = Path("/proc/self/clear_refs")
+    try:
+        reset_mark.write_text("5")  # resets VmHWM, man 5 proc
+    except OSError:
+        found["peak_memory_of_life"] = True
+    where = resolve(device)
+    torch = sys.modules.get("torch") if where.is_cuda else None
+    if torch is not None:
+        torch.cuda.reset_peak_memory_stats()
+    yield found
+    found["peak_memory_bytes"] = _high_water_mark()
+    if where.is_cuda:
+        torch = sys.modules.get("torch")
+        warp_bytes = wp.get_mempool_used_mem_high(where)
+        found["peak_gpu_bytes"] = int(warp_bytes) + (
+            int(torch.cuda.max_memory_allocated()) if torch is not None else 0
+        )
+
+
+def _high_water_mark() -> int:
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return 1024 * int(line.split()[1])
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

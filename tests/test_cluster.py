@@ -14,7 +14,7 @@ import warp as wp
 from golden import make
 
 import warprrf as wr
-from benchmarks.evaluation.runs import connected
+from benchmarks.machine import connected
 from warprrf import device
 from warprrf.cluster import each
 from warprrf.device import threads

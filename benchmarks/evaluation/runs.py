@@ -10,28 +10,24 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from benchmarks.data import Geometry, Truth
 from benchmarks.evaluation.lpips import Lpips
 from benchmarks.evaluation.protocol import Place, Run, Setting, shown_receivers, truth_of
-from benchmarks.machine import processor_name
+from benchmarks.machine import connected, peak_memory, processor_name
 from benchmarks.methods import AFTER, METHODS, Fitted, Task, score
 from benchmarks.report import Row
 from warprrf.cluster import each
-from warprrf.device import Progress, require, resolve, threads
+from warprrf.device import Progress, resolve, threads
 from warprrf.files import plain, write_arrays, write_text
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
@@ -211,42 +207,6 @@ def _size(fitted: Fitted) -> int | None:
         return file.stat().st_size
 
 
-@contextmanager
-def peak_memory(device: Any = None) -> Iterator[Row]:
-    """Fills what it yields with the process's largest resident memory inside the block, and the GPU's where one works.
-
-    ``peak_memory_bytes`` is of the whole process, what was loaded before included. Where the kernel does not let the
-    mark be reset it is that of the process's life.
-    """
-    found: Row = {}
-    reset_mark = Path("/proc/self/clear_refs")
-    try:
-        reset_mark.write_text("5")  # resets VmHWM, man 5 proc
-    except OSError:
-        found["peak_memory_of_life"] = True
-    where = resolve(device)
-    torch = sys.modules.get("torch") if where.is_cuda else None
-    if torch is not None:
-        torch.cuda.reset_peak_memory_stats()
-    yield found
-    found["peak_memory_bytes"] = _high_water_mark()
-    if where.is_cuda:
-        torch = sys.modules.get("torch")
-        warp_bytes = wp.get_mempool_used_mem_high(where)
-        found["peak_gpu_bytes"] = int(warp_bytes) + (
-            int(torch.cuda.max_memory_allocated()) if torch is not None else 0
-        )
-
-
-def _high_water_mark() -> int:
-    status = Path("/proc/self/status")
-    if status.is_file():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-
-
 def pictures_of(run: Run) -> str:
     """The file of a run's pictures, in the folder of results."""
     return f"runs/{run.key}.npz"
@@ -378,34 +338,3 @@ def _named(
         return work(job[0], setting, job[1], *progress)
     except Exception as error:
         raise RuntimeError(f"{job[0].key}: {type(error).__name__}: {error}") from error
-
-
-@contextmanager
-def connected(scheduler: str | None, workers: int, share: int | None = None) -> Iterator[Any]:
-    """A client of the scheduler at an address, or of a local cluster of processes with ``share`` threads each, equal parts
-    of the cores by default; None for no workers.
-
-    Raises:
-        ImportError: without dask.distributed, where it is needed.
-    """
-    if scheduler is None and workers == 0:
-        yield None
-        return
-    distributed = require("distributed", extra="cluster")
-    if scheduler is not None:
-        with distributed.Client(scheduler, set_as_default=False) as client:
-            yield client
-        return
-    threads_each = str(share or max(1, (os.cpu_count() or 1) // workers))
-    with (
-        distributed.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            memory_limit=0,  # a part may need what the machine has: no worker is stopped for it
-            dashboard_address=None,
-            env={"WARPRRF_THREADS": threads_each, "OMP_NUM_THREADS": threads_each},
-            silence_logs="CRITICAL",
-        ) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        yield client

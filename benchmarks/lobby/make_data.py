@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.evaluation.runs import connected
 from benchmarks.lobby import photos, scene, spectra
+from benchmarks.machine import connected
 from benchmarks.runner import Benchmark, Job, option
 
 STEPS = ("scene", "photos", "spectra")
