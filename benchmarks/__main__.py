@@ -27,7 +27,7 @@ NAMES = {
     ),
     "bistatic": (
         "benchmarks.bistatic.table",
-        "the bistatic field beside other systems, and what its parts are worth",
+        "what the bistatic field's parts are worth, its uncertainty, delays, another transmitter",
     ),
     "beams": ("benchmarks.beams.run", "beams chosen from the field, beside pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),

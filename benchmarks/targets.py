@@ -35,7 +35,7 @@ def _margins() -> tuple[Target, ...]:
     }
     return tuple(
         Target(
-            f"margins.{truth}.{count}.{base}",
+            f"margins.truth={truth}&split=random&count={count}&method={base}.psnr_db",
             f"PSNR over {base}, {truth}, {count} spectra",
             least,
             True,
@@ -83,9 +83,17 @@ TARGETS: dict[str, tuple[Target, ...]] = {
         Target("geometry.mesh_distance_p90_m", "the same, 90th percentile", 0.15, unit="m"),
         Target("bistatic.psnr_db", "bistatic field, 10 exact spectra", 33.0, True, "dB"),
     ),
-    "bistatic": (
+    "paper": (
         *_margins(),
-        Target("margins.sionna.50.psnr_db", "PSNR, Sionna RT, 50 spectra", 28.0, True, "dB"),
+        Target(
+            "rows.truth=sionna&split=random&count=50&method=bistatic.psnr_db",
+            "PSNR, Sionna RT, 50 spectra",
+            28.0,
+            True,
+            "dB",
+        ),
+    ),
+    "bistatic": (
         *(
             Target(
                 f"calibration.truth={truth}&n_train={count}.within_{k}_sigma",

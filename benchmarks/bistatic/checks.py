@@ -169,35 +169,6 @@ def _quantiles(errors_ns: np.ndarray) -> dict[str, float | None]:
     return {"median_ns": float(median), "p90_ns": float(p90)}
 
 
-def repeat(truth: Truth, count: int, geometry: Geometry, attempt: Attempt) -> Row:
-    """How well a sampled truth predicts itself: another seed of the same engine, on ``count`` test receivers.
-
-    No prediction can be expected to score better than this on the data set.
-    """
-    chosen = np.unique(np.linspace(0, len(truth.test) - 1, min(count, len(truth.test))).round().astype(int))
-    test = truth.test.subset(chosen)
-    settings = {name: int(test.attributes[name]) for name in ("depth", "samples") if name in test.attributes}
-    again = wr.simulate(
-        geometry.scene,
-        transmitter=test.transmitter,
-        receivers=test.receivers,
-        frequency_hz=test.frequency_hz,
-        shape=test.shape,
-        engine=test.engine,
-        beam_sigma_rad=test.beam_sigma_rad,
-        refraction=bool(test.attributes.get("refraction", 0)),
-        seed=test.seed + 1,
-        floor=test.floor,
-        workspace=attempt.folder,
-        progress=attempt.progress,
-        device=geometry.device,
-        **settings,  # type: ignore[arg-type]
-    )
-    place = {receiver.tobytes(): again[i] for i, receiver in enumerate(again.receivers)}
-    found = metrics.evaluate(test, lambda receiver: place[np.asarray(receiver).tobytes()])
-    return {**found, "seconds_per_spectrum": None, "seeds": [test.seed, test.seed + 1], **settings}
-
-
 def second_spectra(truth: Truth, transmitter: Any, geometry: Geometry, attempt: Attempt) -> SpectrumDataset:
     """Spectra of all test receivers under another transmitter, by the exact engine."""
     test = truth.data.split(truth.few)[1]

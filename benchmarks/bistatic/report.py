@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.pictures import METHODS, figure_of, spectrum_rows
+from benchmarks.pictures import METHODS, figure_of
 from benchmarks.report import Row, cell, columns_table, table
 from warprrf.rf.fields.bistatic.uncertainty import OUTLIERS
 
@@ -18,7 +17,6 @@ ASKED_WITHIN = {1: (0.60, 0.76), 2: (0.90, 0.98)}
 TRUTH_NAMES = {"exact": "exact", "sionna": "Sionna RT"}
 WHOLE = "everything"  # the ablation's row that leaves nothing out
 VARIANT_NAMES = {"exp": "gain exp", "linear": "gain linear"}
-AVERAGE_NAMES = {"db": "in dB", "linear": "in linear power"}
 
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("psnr_db", "PSNR [dB]", "{:.2f}"),
@@ -44,15 +42,6 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 def text(found: dict[str, Any]) -> str:
     """All tables as Markdown."""
     parts = [_about(found)]
-    for truth in found["data"]:
-        rows = [{**row, "name": _name(row)} for row in found["rows"] if row["truth"] == truth]
-        columns = (("n_train", "receivers", "{}"), ("name", "method", "{}"), *COLUMNS)
-        parts += [f"### Methods, truth: {TRUTH_NAMES[truth]}", columns_table(columns, rows)]
-    if found["repeat"]:
-        rows = [{**row, "name": TRUTH_NAMES[row["truth"]]} for row in found["repeat"]]
-        about = "Two solves with different seeds: no prediction can be expected to score better."
-        columns = (("name", "truth", "{}"), ("receivers", "receivers", "{}"), *COLUMNS)
-        parts += ["### The truth against itself", about, columns_table(columns, rows)]
     if found["second"]:
         parts += ["### A transmitter never seen in training", _second_table(found["second"])]
     parts += ["### What each part is worth", _ablation_table(found["ablation"])]
@@ -74,7 +63,7 @@ def _about(found: dict[str, Any]) -> str:
     machine = found["machine"]
     parts.append(
         f"{machine['cores']} cores, {machine['processor']}, {machine['device']}; {found['seconds']:.0f} s in all. "
-        "Of RF-3DGS+ and IDW the better variant of each row stands here. `blocked`: receivers without line of sight "
+        "Of RF-3DGS+ the better variant stands here. `blocked`: receivers without line of sight "
         "alone. A spectrum's time is from nothing, a fit's is with transport cached."
     )
     return " ".join(parts)
@@ -162,79 +151,24 @@ def _pair(row: Row) -> str:
     return " / ".join("-" if row[key] is None else f"{row[key]:.2g}" for key in ("median_ns", "p90_ns"))
 
 
-def _case(row: Row) -> str:
-    return f"{TRUTH_NAMES[row['truth']]}, {row['n_train']} receivers"
-
-
 def _name(row: Row) -> str:
     name = METHODS[row["method"]][0]
     variant = row.get("variant") or ""
-    said = AVERAGE_NAMES if row["method"] == "idw" else VARIANT_NAMES
-    return f"{name} ({said[variant]})" if variant else name
+    return f"{name} ({VARIANT_NAMES[variant]})" if variant else name
 
 
 # --------------------------------------------------------------------------------------------------- pictures
 
 
-def pictures(found: dict[str, Any], folder: Path) -> dict[str, tuple[Callable[[], Any], str]]:
-    """What is drawn, by file name; the shown spectra are read from ``folder``."""
+def pictures(found: dict[str, Any]) -> dict[str, tuple[Callable[[], Any], str]]:
+    """What is drawn, by file name."""
     drawn: dict[str, tuple[Callable[[], Any], str]] = {
-        "psnr.png": (
-            partial(psnr_curves, found["rows"]),
-            "PSNR on the test receivers against the number of training receivers.",
-        ),
         "ablation.png": (partial(ablation_bars, found["ablation"]), "PSNR with parts of the model left out."),
     }
     if any(row.get("shares") for row in found["calibration"]):
         caption = "Share of test pixels within the stated interval, against the share that was stated."
         drawn["reliability.png"] = partial(reliability, found["calibration"]), caption
-    for shown in found["shown"]:
-        with np.load(folder / shown["file"], allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        low, high = (float(v) for v in arrays["range_db"])
-        for index, blocked in enumerate(shown["blocked"]):
-            state = "blocked" if blocked else "line of sight"
-            predictions = {
-                _name({"method": m, "variant": v}): arrays[m][index] for m, v in shown["methods"].items()
-            }
-            at = ", ".join(f"{x:.2f}" for x in shown["receivers"][index])
-            caption = (
-                f"Receiver at ({at}) m, {state}: {TRUTH_NAMES[shown['truth']]} truth, predictions from "
-                f"{shown['n_train']} spectra, and their differences from the truth."
-            )
-            picture = partial(spectrum_rows, arrays["truth"][index], predictions, low, high)
-            drawn[f"spectra-{shown['truth']}-{state.replace(' ', '_')}.png"] = picture, caption
     return drawn
-
-
-def psnr_curves(rows: list[Row]) -> Any:
-    """PSNR against training receivers, a panel a truth, a curve a method; what sees no spectrum is a level."""
-    truths = list(dict.fromkeys(row["truth"] for row in rows))
-    figure, axes = figure_of(len(truths), size=(7.0 * len(truths), 5.2))
-    for ax, truth in zip(axes, truths, strict=True):
-        for method, (name, colour) in METHODS.items():
-            own = sorted(
-                (r["n_train"], r["psnr_db"]) for r in rows if (r["truth"], r["method"]) == (truth, method)
-            )
-            if not own:
-                continue
-            if own[0][0] == 0:
-                ax.axhline(own[0][1], color=colour, linestyle="--", linewidth=1.4, label=name)
-            else:
-                ax.plot(*zip(*own, strict=True), color=colour, marker="o", markersize=5, label=name)
-        counts = sorted({r["n_train"] for r in rows if r["truth"] == truth and r["n_train"]})
-        ax.set_xscale("log")
-        ax.set_xticks(counts, [str(n) for n in counts])
-        ax.minorticks_off()
-        if len(counts) == 1:
-            ax.set_xlim(0.7 * counts[0], 1.4 * counts[0])
-        ax.set_title(f"truth: {TRUTH_NAMES[truth]}")
-        ax.set_xlabel("training receivers")
-        ax.set_ylabel("PSNR [dB]")
-        ax.grid(alpha=0.3)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
-    return figure
 
 
 def ablation_bars(rows: list[Row]) -> Any:

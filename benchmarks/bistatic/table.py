@@ -12,8 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import warprrf as wr
 from benchmarks.bistatic import checks, report
 from benchmarks.data import TRUTHS, VERSIONS, DataOptions, Geometry, Truth, checked, files
@@ -22,21 +20,17 @@ from benchmarks.methods import METHODS, Effort, Task, score
 from benchmarks.report import Report, Row
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.device import Progress
-from warprrf.files import write_arrays, write_atomically
-from warprrf.rf.spectra import lookups
+from warprrf.files import write_atomically
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import to_db
 from warprrf.steps import Attempt, Steps, digest
 
-COMPARED = ("bistatic", "rf3dgs+", "rf3dgs+los", "nearest", "idw", "constant", "mean")
-UNTAUGHT = ("transmitter", "zero")
 HARMONIC = ("rf3dgs+", "rf3dgs+los")
 CHECKS_VERSION = 1  # counted up by hand when a check computes something else
 
 HELP = """\
-Fits the bistatic field, RF-3DGS+ and lookups on the same receivers and scores them on held-out ones; then ablation,
-stated uncertainty, delays, a second transmitter, Sionna against itself. Every row is kept: a killed run loses one, and a
-row is made again only if its data, geometry, options or version changed.
+What each part of the bistatic model is worth, how often errors lie within the stated uncertainty, delays path by path,
+and a transmitter that was never measured. Beside other methods it stands in `python -m benchmarks paper`. Every row is
+kept: a killed run loses one, and a row is made again only if its data, geometry, options or version changed.
 
 examples:
   python -m benchmarks bistatic
@@ -53,7 +47,6 @@ class Options(DataOptions):
         counts: training receivers; those that a data set does not hold are left out.
         truths: ``"exact"``, ``"sionna"`` or both.
         every: each how-manieth test receiver counts.
-        repeat: test receivers of Sionna's second solve; 0 leaves it out.
         second: spectra of the test receivers under another transmitter; made by the exact engine by default.
         second_at: place of that transmitter [m], where its spectra are made: at the other end of the lobby.
         effort: how long RF-3DGS+ may work.
@@ -62,29 +55,27 @@ class Options(DataOptions):
     counts: tuple[int, ...] = option((10, 50, 400), "training receivers")
     truths: tuple[str, ...] = option(TRUTHS, "exact, sionna or both")
     every: int = option(1, "each K-th test receiver")
-    repeat: int = option(10, "receivers of Sionna's second solve; 0: none")
     second: str | None = option(None, "spectra under another transmitter (made by default)")
     second_at: tuple[float, float, float] = (2.2, 1.6, 2.5)
     effort: Effort = Effort()
 
     def __post_init__(self) -> None:
         checked("every", self.every, 1)
-        checked("repeat", self.repeat, 0)
 
 
 def run(options: Options, job: Job) -> Report:
-    """Make every row that is missing; leaves fields in ``fields/`` and shown spectra in ``shown-*.npz``.
+    """Make every row that is missing; leaves fields in ``fields/``.
 
     Raises:
         ValueError: on missing or broken data, or another run at work in ``job.out``.
-        ImportError: if the extra ``plots`` is missing, or ``sionna`` where Sionna's truth is repeated.
+        ImportError: if the extra ``plots`` is missing.
     """
     place = options.place(job.device)
     found = [Truth.load(file, options.counts, options.every) for file in files(options.data, options.truths)]
     with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
         figures = _Rows(options, job, steps, place, found).figures()
         figures["seconds"] = steps.seconds()
-    return Report("bistatic", figures, report.text(figures), report.pictures(figures, job.out))
+    return Report("bistatic", figures, report.text(figures), report.pictures(figures))
 
 
 class _Rows:
@@ -100,13 +91,10 @@ class _Rows:
         table = self._table()
         return {
             "rows": [_brief(row) for row in table],
-            "margins": _margins(table),
             "ablation": [_brief(row) for row in self._ablation(table)],
             "calibration": self._of_fields("calibration", checks.calibration),
             "delays": self._of_fields("delays", checks.delays, scene=True),
-            "repeat": [_brief(row) for row in self._repeat()],
             "second": self._second(table),
-            "shown": self._shown(table),
             "data": {
                 t.name: {"counts": t.counts, "left_out": t.left_out, "every": t.every, **t.about}
                 for t in self.truths
@@ -131,17 +119,15 @@ class _Rows:
     def _field(self, file: str) -> Any:
         return wr.RadioField.load(self.job.out / file, device=self.job.device)
 
-    # ------------------------------------------------------------------------------------------ the main table
+    # ------------------------------------------------------------------------------------------ fields
 
     def _table(self) -> list[Row]:
-        """One row a truth, number of training receivers and method, the better of its variants."""
-        rows = [self._method(truth, 0, method) for truth in self.truths for method in UNTAUGHT]
-        for count in sorted({n for t in self.truths for n in t.counts}):
-            for (
-                truth
-            ) in self.truths:  # receivers are the same, so what was traced for one may serve the other
-                if count in truth.counts:
-                    rows += [self._method(truth, count, m) for m in COMPARED]
+        """A row a truth and field: the bistatic one on every number of training receivers, others on the smallest."""
+        rows = []
+        for truth in self.truths:
+            rows.append(self._method(truth, 0, "zero"))
+            rows += [self._method(truth, count, "bistatic") for count in truth.counts]
+            rows += [self._method(truth, truth.few, method) for method in HARMONIC]
         self.place.forget()
         return rows
 
@@ -209,18 +195,6 @@ class _Rows:
                 rows.append({"truth": truth.name, "n_train": count, **row})
         return rows
 
-    def _repeat(self) -> list[Row]:
-        """Engines that sample, solved again with another seed."""
-        count, rows = self.options.repeat, []
-        for truth in self.truths:
-            if truth.name == "exact" or count == 0:
-                continue
-            make = partial(checks.repeat, truth, count, self.place)
-            inputs = [truth.key, truth.every, count, self.place.scene_key]
-            row = self._row(_slug("repeat", truth.name), make, VERSIONS["sionna"], inputs)
-            rows.append({"truth": truth.name, **row})
-        return rows
-
     def _second(self, table: list[Row]) -> list[Row]:
         """Fields of the smallest training set of the exact truth, asked for another transmitter."""
         truth = next((t for t in self.truths if t.name == "exact"), None)
@@ -257,64 +231,6 @@ class _Rows:
                 }
             )
         return rows
-
-    def _shown(self, table: list[Row]) -> list[Row]:
-        """Spectra of a blocked receiver and one with line of sight, those of median PSNR, by some methods."""
-        rows = []
-        for truth in self.truths:
-            ours = _find(table, truth.name, truth.few, "bistatic")
-            others = [_find(table, truth.name, truth.few, m) for m in ("rf3dgs+", "rf3dgs+los", "nearest")]
-            test = truth.test
-            file = f"{_slug('shown', truth.name)}.npz"
-            indices = _middle(np.array(ours["per_receiver"]["psnr_db"], float), ~test.line_of_sight)
-            arrays = {
-                "truth": _images(test, [test[i] for i in indices]),
-                "range_db": np.array(test.range_db),
-            }
-            for row in (ours, *others):
-                ask = lookups.nearest(truth.train(truth.few)) if row["field"] is None else None
-                ask = ask or self._field(row["field"]).spectrum
-                arrays[row["method"]] = _images(test, [ask(test.receivers[i]) for i in indices])
-            write_arrays(self.job.out / file, arrays)
-            rows.append(
-                {
-                    "truth": truth.name,
-                    "n_train": truth.few,
-                    "receivers": test.receivers[indices],
-                    "blocked": ~test.line_of_sight[indices],
-                    "methods": {row["method"]: row["variant"] for row in (ours, *others)},
-                    "file": file,
-                }
-            )
-        return rows
-
-
-def _margins(table: list[Row]) -> dict[str, dict[str, Row]]:
-    """PSNR of the bistatic field, and less that of each baseline, by truth and number of training receivers."""
-    found: dict[str, dict[str, Row]] = {}
-    for row in table:
-        if row["method"] != "bistatic":
-            continue
-        line = {"psnr_db": row["psnr_db"]}
-        for base in HARMONIC:
-            line[base] = row["psnr_db"] - _find(table, row["truth"], row["n_train"], base)["psnr_db"]
-        found.setdefault(row["truth"], {})[str(row["n_train"])] = line
-    return found
-
-
-def _images(test: SpectrumDataset, spectra: list[Any]) -> np.ndarray:
-    """dB images of spectra by the floor of ``test``, shape ``(S, H, W)`` float32."""
-    return np.stack([to_db(s.path_gain, test.floor) for s in spectra]).astype(np.float32)
-
-
-def _middle(psnr: np.ndarray, blocked: np.ndarray) -> np.ndarray:
-    """The receivers of median PSNR with line of sight and without, where there are such."""
-    chosen = []
-    for where in (~blocked, blocked):
-        index = np.flatnonzero(where)
-        if len(index):
-            chosen.append(index[np.argsort(psnr[index])][(len(index) - 1) // 2])
-    return np.array(chosen, dtype=int)
 
 
 def _find(table: list[Row], truth: str, count: int, method: str) -> Row:

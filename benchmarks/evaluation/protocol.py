@@ -102,6 +102,7 @@ GROUPS = (
     Group(("sionna-again",), FEW, truths=("sionna", "conference")),
     Group(LAW_METHODS, FEW, truths=("paper-law",)),
     Group((*FIELDS, *LOOKUPS), COUNTS, seeds=(1, 2)),
+    Group(("rf3dgs+los",), (10, 50, 400)),
     Group(OPACITY_METHODS, FEW),
     Group(NETWORKS, FEW),
 )

@@ -27,7 +27,7 @@ from benchmarks.evaluation.lpips import Lpips
 from benchmarks.evaluation.paper_law import paper_law_spectra
 from benchmarks.evaluation.protocol import Place, Run, Setting
 from benchmarks.evaluation.runs import Rows, estimate_s, pictures_of, sweep
-from benchmarks.methods import METHODS, Effort
+from benchmarks.methods import METHODS, Effort, Task, score
 from benchmarks.runner import Job, execute
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.spectra.metrics import angle_deg
@@ -237,6 +237,22 @@ def test_region_split_holds_out_a_part_of_the_room(data: Path) -> None:
     assert np.array_equal(protocol.split_data(ds, "random").receivers, ds.receivers)
     with pytest.raises(ValueError, match="split: got 'half'"):
         protocol.split_data(ds, "half")
+
+
+@pytest.mark.slow
+def test_another_seed_of_sionna_is_near_but_not_the_same(data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
+    geometry = Geometry(data / "reconstruction", data / "scene.xml")
+    like = wr.SpectrumDataset.load(data / "spectra.nc").subset([0])
+    truth = wr.simulate(
+        geometry.scene, transmitter=like.transmitter, receivers=like.receivers, frequency_hz=300e9, shape=SHAPE,
+        engine="sionna", depth=2, samples=200_000, beam_sigma_rad=like.beam_sigma_rad, roles=["test"],
+    )  # fmt: skip
+    task = Task(
+        train=truth.subset([]), test=truth, geometry=geometry, scratch=tmp_path, progress=lambda *_: None,
+        effort=Effort(sionna_samples=200_000), depth=2,
+    )  # fmt: skip
+    assert 20 < score("sionna-again", task)[1]["psnr_db"] < 100
 
 
 def test_paper_law_scales_scattering_by_the_share_of_the_first_leg(data: Path) -> None:

@@ -198,43 +198,6 @@ def _find(rows: list[Row], **wanted: Any) -> Row | None:
     return next((r for r in rows if all(r.get(k) == v for k, v in wanted.items())), None)
 
 
-@entry("fields")
-def _fields() -> str:
-    rows, head = read("bistatic")["rows"], ["spectra"]
-    shown = ("bistatic", "rf3dgs+", "rf3dgs+los", "nearest")
-    for name in TRUTHS.values():
-        head += [f"{name}: {NAMES[m].strip('*')}" for m in shown[:1]] + [NAMES[m] for m in shown[1:]]
-    lines = []
-    for count in sorted({r["n_train"] for r in rows if r["n_train"]}):
-        cells = [str(count)]
-        for truth in TRUTHS:
-            for method in shown:
-                found = _find(rows, truth=truth, n_train=count, method=method)
-                value = show(found and found["psnr_db"])
-                cells.append(f"**{value}**" if method == "bistatic" else value)
-        lines.append(cells)
-    return markdown(head, lines)
-
-
-@entry("fields-blocked")
-def _fields_blocked() -> str:
-    rows = read("bistatic")["rows"]
-    lines = []
-    for truth, name in TRUTHS.items():
-        for r in (r for r in rows if r["truth"] == truth and r["method"] == "bistatic"):
-            lines.append([
-                f"{name}, {r['n_train']}", show(r["psnr_db"]), show(r["psnr_db_blocked"]),
-                show(r["direction_within_3deg"], "{:.0%}"), show(r["direction_within_3deg_blocked"], "{:.0%}"),
-                show(r["beam_gain_loss_db"]), show(r["beam_gain_loss_db_blocked"]),
-                show(r["tof_error_median_ns_blocked"], "{:.2f}"),
-            ])  # fmt: skip
-    head = (
-        "truth, training receivers", "PSNR [dB]", "blocked", "within 3°", "blocked", "beam loss [dB]", "blocked",
-        "delay, blocked [ns]",
-    )  # fmt: skip
-    return markdown(head, lines)
-
-
 @entry("ablation")
 def _ablation() -> str:
     rows = read("bistatic")["ablation"]
