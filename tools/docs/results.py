@@ -334,6 +334,29 @@ def _paper_margins() -> str:
     return "\n\n".join(parts)
 
 
+@entry("paper-behind")
+def _paper_behind() -> str:
+    better = {"rmse_db": -1.0, "beam_gain_loss_db": -1.0}  # of the others more is better
+    words = {
+        "psnr_db": "PSNR [dB]", "ssim": "SSIM", "rmse_db": "RMSE [dB]", "direction_within_3deg": "within 3°",
+        "beam_gain_loss_db": "beam loss [dB]",
+    }  # fmt: skip
+    margins = read("paper")["margins"]
+    lines, compared = [], 0
+    for r in margins:
+        for figure, word in words.items():
+            for part, who in (("", ""), ("_blocked", ", blocked")):
+                margin = r[figure + part]
+                compared += margin is not None
+                if margin is not None and better.get(figure, 1.0) * margin < 0.0:
+                    place = PLACES.get((r["truth"], r["split"]), r["truth"])
+                    lines.append([place, str(r["count"]), NAMES[r["method"]], word + who, f"{margin:+.2g}"])
+    text = f"Of {compared} comparisons the bistatic field is behind in {len(lines)}"
+    if not lines:
+        return text + "."
+    return text + ":\n\n" + markdown(("truth", "spectra", "behind", "in", "by"), lines)
+
+
 @entry("paper-detail")
 def _paper_detail() -> str:
     parts = []

@@ -153,7 +153,9 @@ class SionnaEngine:
             self._scene.remove("rx")
         self._solved += 1
         if self._solved % _RECEIVERS_PER_FLUSH == 0:
-            self._flush()
+            drjit = _device.require("drjit", extra="sionna")
+            drjit.flush_malloc_cache()
+            drjit.flush_kernel_cache()
         return found
 
     @property
@@ -182,42 +184,37 @@ class SionnaEngine:
             "diffuse": (kinds == DIFFUSE).any(axis=0)[valid],
             "bounces": (kinds != 0).sum(axis=0)[valid],
         }
-        # Sionna stores paths in the order in which its threads end; sorted, one seed's numbers are always the same
-        order = np.lexsort([*found["aod"].T, *found["arrival"].T, found["power"], found["tau"]])
+        # Sionna stores paths as its threads end; few have equal delays, and sorting by all keys takes long
+        order = np.argsort(found["tau"], kind="stable")
+        same = np.diff(found["tau"][order], prepend=-1.0, append=-1.0) == 0
+        tied = np.flatnonzero(same[1:] | same[:-1])
+        keys = [found[name][order[tied]].T for name in ("aod", "arrival", "power", "tau")]
+        order[tied] = order[tied][np.lexsort(np.vstack(keys))]
+        sharp = np.flatnonzero(~found["diffuse"][order])
+        keys = [found[name][order[sharp]] for name in ("tau", "arrival", "aod", "bounces")]
+        order = np.delete(order, sharp[repeated(*keys)])
         found = {name: values[order] for name, values in found.items()}
         if self.air is not None:
             through = self.air.transmittance(self.frequency_hz, SPEED_OF_LIGHT * found["tau"])
-            found["power"] = found["power"] * through
-            found["jones"] = found["jones"] * np.sqrt(through)[:, None, None]
-        sharp = np.flatnonzero(~found["diffuse"])
-        copies = sharp[repeated(*(found[name][sharp] for name in ("tau", "arrival", "aod", "bounces")))]
-        return {name: np.delete(values, copies, axis=0) for name, values in found.items()}
-
-    def _flush(self) -> None:
-        drjit = _device.require("drjit", extra="sionna")
-        drjit.flush_malloc_cache()
-        drjit.flush_kernel_cache()
+            found["power"] *= through
+            found["jones"] *= np.sqrt(through)[:, None, None]
+        return found
 
     def receive(self, receiver: ArrayLike) -> ReceivedPaths:
         """The spectrum of one receiver (3,)."""
         found = self.solve(receiver)
-        spread = spread_paths(
-            found["arrival"], found["power"], self.shape, self.beam_sigma_rad, device=self.device
-        )
+        power = found["power"]
+        spread = spread_paths(found["arrival"], power, self.shape, self.beam_sigma_rad, device=self.device)
         filled = spread.strongest >= 0
         index = spread.strongest[filled]
         delay_s, aod = np.full(self.shape, np.nan), np.full((*self.shape, 2), np.nan)
         delay_s[filled], aod[filled] = found["tau"][index], found["aod"][index]
         direct, diffuse = found["bounces"] == 0, found["diffuse"]
-        power = found["power"]
+        kinds = {"los": direct, "mirror": ~direct & ~diffuse, "diffuse": diffuse}
         return ReceivedPaths(
             path_gain=spread.path_gain,
             delay_s=delay_s,
             aod=aod,
             line_of_sight=bool(direct.any()),
-            totals={
-                "los": float(power[direct].sum()),
-                "mirror": float(power[~direct & ~diffuse].sum()),
-                "diffuse": float(power[diffuse].sum()),
-            },
+            totals={kind: float(power[own].sum()) for kind, own in kinds.items()},
         )

@@ -151,8 +151,8 @@ class FitOptions:
         diffuse_order: diffuse bounces on a path: 1, 2 or 3.
         indirect: a non-negative radiance of each group, constant in direction.
         residual: gains of what differs within a group.
-        sub_pixels: square root of the rays per pixel (None: 3; in the lobby 4 has the same image error and puts the
-            delay of scattering right to 0.02 instead of 0.06 ns, 2 costs 0.2 dB of PSNR and halves the time).
+        sub_pixels: square root of the rays per pixel (None: 3); 4 gives better delays of scattering, 2 takes half the
+            time.
         quick: try no term: what is not given here is taken from :data:`QUICK`.
         gain_offset: fit one gain common to all paths, for a receiver that was not calibrated; see ``report``.
         iterations: most steps of the groups' fit.
