@@ -185,8 +185,13 @@ def fit_bistatic(
         geometry.reconstruction, train, model="bistatic", device=geometry.device, progress=progress, **options
     )
     spent = found.report
+    details = {name: spent[name] for name in ("choices", "materials")}
     return Fitted(
-        found.spectrum, transport_s=spent["transport_time_s"], fit_s=spent["fit_time_s"], field=found
+        found.spectrum,
+        transport_s=spent["transport_time_s"],
+        fit_s=spent["fit_time_s"],
+        field=found,
+        details=details,
     )
 
 

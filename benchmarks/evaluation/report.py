@@ -281,13 +281,12 @@ def pictures(
     """What is drawn, by file name; the spectra of ``runs`` (by key) are read from ``folder``, where they are there."""
     found: dict[str, tuple[Callable[[], Any], str]] = {}
     random = [row for row in figures["rows"] if row["split"] == "random"]
-    found["sparsity.png"] = (
-        partial(sparsity_curves, [row for row in random if row["truth"] != "paper-law"]),
-        "PSNR and SSIM against the number of training receivers: mean, and bands from least to most over the test "
-        "receivers.",
-    )
-    for truth in dict.fromkeys(row["truth"] for row in random if row["truth"] != "paper-law"):
-        own = [row for row in random if row["truth"] == truth]
+    rooms = [row for row in random if row["truth"] != "paper-law"]
+    if rooms:
+        text = "PSNR and SSIM against the number of training receivers: mean, and bands from least to most over the test receivers."
+        found["sparsity.png"] = partial(sparsity_curves, rooms), text
+    for truth in dict.fromkeys(row["truth"] for row in rooms):
+        own = [row for row in rooms if row["truth"] == truth]
         found[f"speed-{truth}.png"] = (
             partial(speed_against_error, own),
             "Error against the time of a spectrum and against training time; diamonds see no spectrum.",

@@ -255,6 +255,11 @@ def test_another_seed_of_sionna_is_near_but_not_the_same(data: Path, tmp_path: P
     assert 20 < score("sionna-again", task)[1]["psnr_db"] < 100
 
 
+def test_a_region_alone_is_a_report(data: Path, tmp_path: Path) -> None:
+    found = whole(tmp_path, data, truths=("exact",), splits=("region",), methods=("nearest",), counts=(2,))
+    assert [(row["split"], row["count"]) for row in found["rows"]] == [("region", 2)]
+
+
 def test_paper_law_scales_scattering_by_the_share_of_the_first_leg(data: Path) -> None:
     ds = wr.SpectrumDataset.load(data / "spectra.nc")
     scene = wr.Scene.load(data / "scene.xml")
