@@ -299,6 +299,17 @@ def _psnr(row: Row | None) -> str:
     return f"{row['psnr_db']:.1f}{spread} / {show(row['psnr_db_blocked'])}"
 
 
+def _spread(row: Row | None, figure: str, scale: float, form: str) -> str:
+    """A figure of a row with its spread over seeds, where there are several."""
+    if row is None or row[figure] is None:
+        return ""
+    spread = row[f"{figure}_std"]
+    unsigned = form.replace("+", "")
+    return form.format(scale * row[figure]) + (
+        "" if spread is None else f" ± {unsigned.format(scale * spread)}"
+    )
+
+
 @entry("paper-margins")
 def _paper_margins() -> str:
     forms = (
@@ -306,15 +317,6 @@ def _paper_margins() -> str:
         ("within 3° [%]", "direction_within_3deg", 100.0, "{:+.0f}"),
         ("beam loss [dB]", "beam_gain_loss_db", 1.0, "{:+.1f}"),
     )  # fmt: skip
-
-    def cell(row: Row, figure: str, scale: float, form: str) -> str:
-        if row[figure] is None:
-            return ""
-        spread = row[f"{figure}_std"]
-        unsigned = form.replace("+", "")
-        return form.format(scale * row[figure]) + (
-            "" if spread is None else f" ± {unsigned.format(scale * spread)}"
-        )
 
     parts = []
     for (truth, split), name in PLACES.items():
@@ -324,7 +326,7 @@ def _paper_margins() -> str:
         lines = [
             [
                 NAMES[r["method"]],
-                *(f"{cell(r, f, *how)} / {cell(r, f'{f}_blocked', *how)}" for _, f, *how in forms),
+                *(f"{_spread(r, f, *how)} / {_spread(r, f'{f}_blocked', *how)}" for _, f, *how in forms),
             ]
             for r in sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
         ]
@@ -972,20 +974,12 @@ def readme() -> str:
         if place[1] == "random"
     }
 
-    def cell(row: Row | None, figure: str, scale: float, form: str) -> str:
-        if row is None or row[figure] is None:
-            return ""
-        spread = row.get(f"{figure}_std")
-        return form.format(scale * row[figure]) + (
-            "" if spread is None else f" ± {form.format(scale * spread)}"
-        )
-
     lines = []
     for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "mean"):
         cells = [NAMES[method]]
         for place, figures in shown.items():
             row = _find(paper(*place, 100), method=method)
-            cells += [cell(row, *how) for _, *how in figures]
+            cells += [_spread(row, *how) for _, *how in figures]
         lines.append(cells)
     head = ["100 spectra", *(f"{PLACES[place]}: {name}" for place, how in shown.items() for name, *_ in how)]
     return f"{MARKERS[0]}\n{markdown(head, lines)}\n{MARKERS[1]}"
