@@ -28,7 +28,7 @@ VERSIONS = {
     "metrics": 1,
     "exact": 1,
     "sionna": 1,
-    "bistatic": 1,
+    "bistatic": 2,
     "harmonic": 1,
     "lookups": 1,
     "networks": 1,

@@ -64,7 +64,9 @@ def _mean(group: list[Row]) -> Row:
             merged[name] = ends.get(name, np.mean)(numbers) if numbers else None
     for name in COMPARED:
         merged[f"{name}_std"] = _mean_and_spread([row.get(name) for row in group])[1]
-    spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in group]
+    most = max(row["cores"] for row in group)  # runs side by side have fewer, and take longer
+    timed = [row for row in group if row["cores"] == most]
+    spent = [[row[k] for k in ("transport_s", "fit_s") if row[k] is not None] for row in timed]
     merged["train_s"] = float(np.mean([sum(s) for s in spent])) if any(spent) else None
     merged["peak_memory_gib"] = max(row["peak_memory_bytes"] for row in group) / 2**30
     on_gpu = [row["peak_gpu_bytes"] for row in group if row.get("peak_gpu_bytes") is not None]

@@ -114,9 +114,9 @@ class Selection:
     least_receivers: int = 4
     least_held_out: int = 2
     held_out: float = 0.25
-    most_held_out: int = 10
+    most_held_out: int = 30
     few_receivers: int = 20
-    most_to_choose: int = 12
+    most_to_choose: int = 24
     short_steps: int = 10
     better: float = 0.995
     much_better: float = 0.5
@@ -136,7 +136,7 @@ class Selection:
 class FitOptions:
     """Options of a bistatic fit; :meth:`BistaticField.fit` takes each of them as a keyword.
 
-    A term given as None is kept only if it lowers the error on receivers held out of the data set (a quarter, ten at
+    A term given as None is kept only if it lowers the error on receivers held out of the data set (a quarter, 30 at
     most); with fewer than eight receivers, :data:`FEW` is modelled, or :data:`SINGLE` if it fits much better.
 
     Attributes:
