@@ -975,7 +975,7 @@ def readme() -> str:
     }
 
     lines = []
-    for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest", "mean"):
+    for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest"):
         cells = [NAMES[method]]
         for place, figures in shown.items():
             row = _find(paper(*place, 100), method=method)

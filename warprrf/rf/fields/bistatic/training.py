@@ -51,21 +51,15 @@ MORE: tuple[tuple[str, Any], ...] = (
     ("scatter_mirror", True),
 )
 """Bounces that may be added to single ones, in the order in which they are tried."""
-QUICK: dict[str, Any] = {
-    "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": True,
-    "residual": True, "sub_pixels": 1,
-}  # fmt: skip
-"""What a quick fit takes for given: light of more than one bounce is even but for the residual, one ray a pixel."""
-FEW: dict[str, Any] = {
-    "mirror_order": 2, "mirror_scatter": True, "scatter_mirror": False, "diffuse_order": 3, "indirect": False,
-    "residual": True,
-}  # fmt: skip
-"""What a fit tries first on receivers too few to choose terms by: bounces that rooms have, which bring no parameters."""
 SINGLE: dict[str, Any] = {
     "mirror_order": 1, "mirror_scatter": False, "scatter_mirror": False, "diffuse_order": 1, "indirect": False,
     "residual": True,
 }  # fmt: skip
-"""What it takes where that fits much worse, with an indirect radiance if that is better still."""
+"""What a fit takes where :data:`FEW` fits much worse, with an indirect radiance if that is better still."""
+QUICK = SINGLE | {"indirect": True, "sub_pixels": 1}
+"""What a quick fit takes for given: light of more than one bounce is even but for the residual, one ray a pixel."""
+FEW = SINGLE | {"mirror_order": 2, "mirror_scatter": True, "diffuse_order": 3}
+"""What a fit tries first on receivers too few to choose terms by: bounces that rooms have, which bring no parameters."""
 TERMS = ("mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order", "indirect", "residual")
 """Terms that a fit decides on where they are None."""
 KNOWN_BETTER = 2.0
@@ -501,10 +495,9 @@ class _Training:
 
     def run(self) -> Trained:
         """Choose terms where some are free, fit to all receivers, and report."""
-        o, everyone = self.options, np.arange(self.count)
-        terms, errors = o.terms(), None
+        terms, errors = self.options.terms(), None
         start = Parameters.prior(int(self.material.max()) + 1, len(terms.lobes))
-        free = any(getattr(o, name) is None for name in TERMS)
+        free = any(getattr(self.options, name) is None for name in TERMS)
         if len(self.held) >= (self.choose.least_held_out if free else 1):
             first = self._fit_groups(terms, start, self._few(1), self.choose.short_steps * 2)
             best = self._choose(_Candidate(terms, first, self._held_error(terms, first)))
@@ -514,23 +507,25 @@ class _Training:
         if len(self.held):
             residual, errors = self._held_in_turn(best)
             terms = replace(terms, residual=residual)
-        # Chosen terms come with a fit to most receivers, under which light that goes on is settled: one round is left.
-        fit = self._fit_groups(terms, start, everyone, o.iterations, rounds=1)
-        materials = self._materials(terms, fit)
-        if terms.residual:
-            materials = replace(materials, residual=self._residual(materials, everyone))
+        fit, materials = self._fit_everyone(terms, start)
         wrong = self._unexplained(materials)
         if any(len(rows) for rows in wrong):
             self._leave_out(wrong)
-            fit = self._fit_groups(terms, fit.parameters, everyone, o.iterations, rounds=1)
-            materials = self._materials(terms, fit)
-            if terms.residual:
-                materials = replace(materials, residual=self._residual(materials, everyone))
+            fit, materials = self._fit_everyone(terms, fit.parameters)
         if errors is not None:
             errors = replace(errors, covariance=self._covariance(fit))
         total = (1 + self.steps) * self.count
         self.progress("fit", total, total)
         return Trained(self.surface, materials, self.material, errors, self._report(fit, wrong))
+
+    def _fit_everyone(self, terms: Terms, start: Parameters) -> tuple[Fitted, Materials]:
+        """The chosen terms, fitted to all receivers; light that goes on is settled: one round."""
+        everyone = np.arange(self.count)
+        fit = self._fit_groups(terms, start, everyone, self.options.iterations, rounds=1)
+        materials = self._materials(terms, fit)
+        if terms.residual:
+            materials = replace(materials, residual=self._residual(materials, everyone))
+        return fit, materials
 
     def _planned(self) -> int:
         """Most fits of groups and residuals, each of which is a step of the progress that is told."""
