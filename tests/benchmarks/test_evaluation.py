@@ -313,6 +313,13 @@ def test_the_better_variant_of_each_seed_counts_and_seeds_are_averaged() -> None
     assert report.name_of(found) == "RF-3DGS+ (gain exp or gain linear)"
 
 
+def test_training_time_is_of_runs_that_had_all_cores() -> None:
+    (found,) = comparison.summarise(
+        [row("bistatic", 10, 0), row("bistatic", 10, 1, cores=1, transport_s=3.0, fit_s=20.0)]
+    )
+    assert (found["train_s"], found["seeds"]) == (3.0, 2)
+
+
 def test_finding_has_the_sign_that_was_found() -> None:
     rows = comparison.summarise(
         [

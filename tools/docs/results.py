@@ -418,7 +418,8 @@ def _paper_stage2() -> str:
     lines = []
     for place, name in PLACES.items():
         for r in paper(*place):
-            if r["count"] == 700 and r["method"] in ("bistatic", "rf3dgs+"):  # quick fits were timed beside others
+            # Quick fits were timed side by side.
+            if r["count"] == 700 and r["method"] in ("bistatic", "rf3dgs+"):
                 lines.append(
                     [
                         NAMES[r["method"]],
