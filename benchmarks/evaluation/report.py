@@ -282,15 +282,16 @@ def pictures(
     found: dict[str, tuple[Callable[[], Any], str]] = {}
     random = [row for row in figures["rows"] if row["split"] == "random"]
     rooms = [row for row in random if row["truth"] != "paper-law"]
-    if rooms:
+    if any(row["count"] for row in rooms):
         text = "PSNR and SSIM against the number of training receivers: mean, and bands from least to most over the test receivers."
         found["sparsity.png"] = partial(sparsity_curves, rooms), text
     for truth in dict.fromkeys(row["truth"] for row in rooms):
         own = [row for row in rooms if row["truth"] == truth]
-        found[f"speed-{truth}.png"] = (
-            partial(speed_against_error, own),
-            "Error against the time of a spectrum and against training time; diamonds see no spectrum.",
-        )
+        if any(row["count"] for row in own):
+            found[f"speed-{truth}.png"] = (
+                partial(speed_against_error, own),
+                "Error against the time of a spectrum and against training time; diamonds see no spectrum.",
+            )
         drawn = _grid(own, runs, folder)
         if drawn is not None:
             found[f"spectra-{truth}.png"] = drawn

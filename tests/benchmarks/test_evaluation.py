@@ -93,6 +93,15 @@ def test_tables_state_what_was_published_and_where_ours_stands(finished: tuple[P
     assert [row["psnr_db"] for row in table if row["published"] == "1"] == ["19.68", "13.5", "13.34", "10.33"]
 
 
+def test_methods_that_see_no_spectrum_have_no_curve(
+    finished: tuple[Path, dict[str, Any]], data: Path, tmp_path: Path
+) -> None:
+    ask = {"truths": ("exact",), "methods": ("zero", "transmitter"), "minutes": 0.0}
+    whole(tmp_path, data, rows=str(finished[0] / "rows.jsonl"), **ask)
+    text = (tmp_path / "paper.md").read_text()
+    assert "| none |" in text and "(sparsity.png)" not in text and "(speed-exact.png)" not in text
+
+
 def test_what_others_are_given_is_what_ours_took(finished: tuple[Path, dict[str, Any]]) -> None:
     out, _ = finished
     kept = {row["method"]: row for row in Rows(out / "rows.jsonl") if row["truth"] == "exact"}
