@@ -177,6 +177,7 @@ def learning_curves(rows: Sequence[Row]) -> Any:
         ax.set_title(METHODS[method][0], fontsize=10)
         ax.set_xlabel("training time [min]")
         ax.set_ylabel("loss over that of the first fortieth")
-        ax.grid(alpha=0.3)
+        ax.set_yscale("log")
+        ax.grid(alpha=0.3, which="both")
         ax.legend(fontsize=8)
     return figure

@@ -12,6 +12,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import results  # noqa: E402
 
+from benchmarks.evaluation.plots import learning_curves  # noqa: E402
+
 STYLE = {
     "svg.fonttype": "none", "svg.hashsalt": "warprrf", "font.family": "sans-serif", "font.size": 9, "axes.grid": True,
     "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False, "figure.constrained_layout.use": True,
@@ -95,6 +97,11 @@ def _speed() -> Any:
         ax.margins(x=0.25)
     axes[0].set_ylabel("rms error of the dB image [dB]")
     return figure
+
+
+@entry("learning", "Loss of the networks over their training time")
+def _learning() -> Any:
+    return learning_curves([r for place in results.PLACES for r in results.paper(*place) if r["loss_curve"]])
 
 
 @entry("knobs", "Error and time of each setting of the renderer")
