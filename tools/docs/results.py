@@ -418,6 +418,30 @@ def _paper_runs() -> str:
     return f"Data, by the hash of the file: {data}.{left}{none}"
 
 
+@entry("paper-networks")
+def _paper_networks() -> str:
+    effort = read("paper")["effort"]
+    lines = [
+        [
+            NAMES[r["method"]], name, str(r["count"]), show(r["fit_s"] / 60.0, "{:.0f}"),
+            show(r["loss_curve"][-1] / r["loss_curve"][0], "{:.2f}"),
+            show(r["loss_curve"][-1] / r["loss_curve"][len(r["loss_curve"]) // 2], "{:.2f}"), show(r["psnr_db"]),
+        ]
+        for place, name in PLACES.items()
+        for r in paper(*place)
+        if r["loss_curve"]
+    ]  # fmt: skip
+    head = (
+        "network", "truth", "spectra", "training [min]", "last loss over first", "last loss over that at half time", "PSNR [dB]",
+    )  # fmt: skip
+    text = (
+        f"NeRF2 trains for {effort['nerf2_iterations']} steps of {effort['nerf2_rays']} rays with "
+        f"{effort['nerf2_samples']} samples each (as published: 30000 of 8192 with 64), the GAN for "
+        f"{effort['cgan_iterations']} steps of {effort['cgan_batch']} spectra."
+    )
+    return f"{text}\n\n{markdown(head, lines)}"
+
+
 @entry("paper-stage2")
 def _paper_stage2() -> str:
     lines = []
@@ -981,7 +1005,7 @@ def readme() -> str:
     }
 
     lines = []
-    for method in ("bistatic", "rf3dgs+", "rf3dgs", "nearest"):
+    for method in ("bistatic", "rf3dgs+", "rf3dgs", "nerf2", "cgan", "nearest"):
         cells = [NAMES[method]]
         for place, figures in shown.items():
             row = _find(paper(*place, 100), method=method)
