@@ -240,7 +240,9 @@ def test_simulate_goes_on_where_ctrl_c_ended_it(
     # A hundred receivers last for seconds: when Python loses the signal in a __del__, a second later the command ends all
     # the same.
     words = "simulate room.xml --transmitter 0.7 0.7 0.9 --receivers receivers.csv --shape 45 90".split()
-    message, took = interrupted(["warprrf", *words, "-o", "i.nc"], '"simulate"', room, "i.nc.receivers/[!.]*.npz")
+    message, took = interrupted(
+        ["warprrf", *words, "-o", "i.nc"], '"simulate"', room, "i.nc.receivers/[!.]*.npz"
+    )
     assert (
         message == "interrupted; finished work is kept in i.nc.receivers, the same command goes on from there"
     )

@@ -9,7 +9,6 @@ Predictions are drawn at noise zero, the most likely one, and so are repeatable.
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -103,7 +102,6 @@ class CGAN(ImageModel):
         how, batch = how or Training(), whole_number("batch", batch)
         chosen = options or CGANOptions.around(known.receivers)
         seed, where = int(how.seed), torch_device(how.device)
-        start = time.perf_counter()
         generator = cls._build(chosen, known.shape, seed).to(where)
         with seeded(seed + 1):
             critic = _discriminator(torch, chosen).to(where)
@@ -136,7 +134,7 @@ class CGAN(ImageModel):
 
         learner = Learner({"generator": generator, "critic": critic}, adams, step)
         about = {"batch": batch, "loss": "L1 of the generator"}
-        return cls._trained(known, chosen, learner, how, start, about)
+        return cls._trained(known, chosen, learner, how, about)
 
     def image(self, rx: Any, transmitter: Any = None) -> np.ndarray:
         """The picture at ``rx`` (3,) [m], shape ``(H, W)`` float32 in [0, 1]; it holds for the training transmitter."""

@@ -14,7 +14,6 @@ Published schedule: 30 000 iterations of 8192 rays with 64 samples each, Adam of
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -107,7 +106,6 @@ class NeRF2(ImageModel):
         known = SpectrumImages.of(data)
         how, rays = how or Training(), whole_number("rays", rays)
         seed, where = int(how.seed), torch_device(how.device)
-        start = time.perf_counter()
         network = cls._build(options, known.shape, seed).to(where)
         optimiser = torch.optim.Adam(network.parameters(), lr=ADAM_RATE, weight_decay=ADAM_DECAY)
 
@@ -131,7 +129,7 @@ class NeRF2(ImageModel):
             return float(loss.detach())
 
         learner = Learner({"network": network}, {"adam": optimiser}, step)
-        return cls._trained(known, options, learner, how, start, {"rays": rays})
+        return cls._trained(known, options, learner, how, {"rays": rays})
 
     def image(self, rx: Any, transmitter: Any = None) -> np.ndarray:
         """The picture at ``rx`` (3,) [m], shape ``(H, W)`` float32, not below zero.

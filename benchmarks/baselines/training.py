@@ -26,7 +26,7 @@ from warprrf.rf.spectra.spectrum import Spectrum
 from warprrf.steps import digest
 
 FORMAT = "warprrf baseline 1"
-CHECKPOINT_FORMAT = "warprrf baseline checkpoint 1"
+CHECKPOINT_FORMAT = "warprrf baseline checkpoint 2"
 CHECKPOINT_S = 20.0  # a killed training loses at most this much, and saving costs little beside it
 
 
@@ -106,8 +106,11 @@ class Learner:
     step: Callable[[int], float]
 
 
-def train(learner: Learner, how: Training, identity: str) -> list[float]:
-    """Do every step, from where the checkpoint stands, and return the loss of each.
+def train(learner: Learner, how: Training, identity: str) -> tuple[list[float], float]:
+    """Do every step, from where the checkpoint stands.
+
+    Returns:
+        The loss of each step, and the seconds that all of them took, those of earlier processes included.
 
     Args:
         identity: digest of everything that the result depends on.
@@ -118,6 +121,7 @@ def train(learner: Learner, how: Training, identity: str) -> list[float]:
     """
     path = None if how.checkpoint is None else Path(how.checkpoint)
     losses: list[float] = []
+    before_s = 0.0
     if path is not None and path.exists():
         tensors, header = tensor_files.read(path, CHECKPOINT_FORMAT)
         if header.get("identity") != identity:
@@ -125,8 +129,8 @@ def train(learner: Learner, how: Training, identity: str) -> list[float]:
                 f"checkpoint: {path} belongs to a training with other data or options; delete it or name another file"
             )
         _restore(learner.networks, learner.optimisers, tensors)
-        losses = list(header["losses"])
-    saved = time.monotonic()
+        losses, before_s = list(header["losses"]), header["seconds"]
+    start = saved = time.monotonic()
     for i in range(len(losses), how.iterations):
         losses.append(learner.step(i))
         if not np.isfinite(losses[-1]):
@@ -139,13 +143,13 @@ def train(learner: Learner, how: Training, identity: str) -> list[float]:
             tensor_files.write(
                 path,
                 _state(learner.networks, learner.optimisers),
-                {"identity": identity, "losses": losses},
+                {"identity": identity, "losses": losses, "seconds": before_s + time.monotonic() - start},
                 CHECKPOINT_FORMAT,
             )
             saved = time.monotonic()
     if path is not None:
         path.unlink(missing_ok=True)
-    return losses
+    return losses, before_s + time.monotonic() - start
 
 
 def _array(tensor: Any) -> np.ndarray:
@@ -298,15 +302,15 @@ class ImageModel(ABC):
         options: Any,
         learner: Learner,
         how: Training,
-        started: float,
         about: dict[str, Any],
     ) -> Self:
         """The model whose network is the first of ``learner``'s, trained by :func:`train`.
 
-        ``started`` is when the fit began, by ``time.perf_counter``; ``about`` is what the result depends on besides, and
-        part of the report.
+        ``about`` is what the result depends on besides, and part of the report.
         """
-        losses = train(learner, how, digest(cls.__name__, options, how.iterations, how.seed, about, known))
+        losses, seconds = train(
+            learner, how, digest(cls.__name__, options, how.iterations, how.seed, about, known)
+        )
         return cls(
             options=options,
             network=next(iter(learner.networks.values())).eval(),
@@ -316,7 +320,7 @@ class ImageModel(ABC):
             range_db=known.range_db,
             report={
                 "receivers": len(known),
-                "fit_time_s": time.perf_counter() - started,
+                "fit_time_s": seconds,
                 "losses": losses,
                 "seed": int(how.seed),
                 "iterations": how.iterations,

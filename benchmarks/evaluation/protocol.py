@@ -107,7 +107,7 @@ GROUPS = (
     Group(NETWORKS, FEW),
 )
 """All runs, the main ones first."""
-EFFORT = Effort(nerf2_iterations=4000, nerf2_rays=256, nerf2_samples=32, cgan_iterations=8000, cgan_batch=2)
+EFFORT = Effort(nerf2_iterations=4000, nerf2_rays=256, nerf2_samples=32, cgan_iterations=4000, cgan_batch=2)
 """Networks train for a quarter of an hour or more on two cores; as published they take hours on a graphics card. Their
 learning curves say what more would bring."""
 

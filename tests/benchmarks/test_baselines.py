@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,8 @@ def test_resumed_training_ends_as_an_uninterrupted_one(
 
     def killed(stage: str, step: int, total: int) -> None:
         done.append(step)
+        if step == 1:
+            time.sleep(1.0)
         if step == 5:
             raise KeyboardInterrupt
 
@@ -124,6 +127,7 @@ def test_resumed_training_ends_as_an_uninterrupted_one(
     resumed = fit(name, train, iterations=9, checkpoint=file, progress=lambda _, step, __: done.append(step))
     assert done == [5, 6, 7, 8, 9]  # the step at which it was killed had not been saved yet
     assert resumed.report["losses"] == whole.report["losses"]
+    assert resumed.report["fit_time_s"] > 1.0  # the time before counts
     assert np.array_equal(resumed.image(test.receivers[0]), whole.image(test.receivers[0]))
     assert not file.exists()
 
