@@ -423,7 +423,7 @@ def _paper_networks() -> str:
     effort = read("paper")["effort"]
     lines = [
         [
-            NAMES[r["method"]], name, str(r["count"]), show(r["fit_s"] / 60.0, "{:.0f}"),
+            NAMES[r["method"]], name, str(r["count"]), show(r["fit_s"] / 60.0, "{:.0f}"), "; ".join(r["devices"]),
             show(r["loss_curve"][-1] / r["loss_curve"][0], "{:.2f}"),
             show(r["loss_curve"][-1] / r["loss_curve"][len(r["loss_curve"]) // 2], "{:.2f}"), show(r["psnr_db"]),
         ]
@@ -432,7 +432,8 @@ def _paper_networks() -> str:
         if r["loss_curve"]
     ]  # fmt: skip
     head = (
-        "network", "truth", "spectra", "training [min]", "last loss over first", "last loss over that at half time", "PSNR [dB]",
+        "network", "truth", "spectra", "training [min]", "on", "last loss over first", "last loss over that at half time",
+        "PSNR [dB]",
     )  # fmt: skip
     text = (
         f"NeRF2 trains for {effort['nerf2_iterations']} steps of {effort['nerf2_rays']} rays with "
