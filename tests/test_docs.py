@@ -20,6 +20,20 @@ def test_the_readme_is_short_and_its_table_is_current():
     assert results.readme() in README, "run: python tools/docs/results.py readme"
 
 
+def test_where_the_field_is_behind_is_a_line_a_figure_with_the_worst_margin(monkeypatch):
+    figures = ("psnr_db", "ssim", "rmse_db", "direction_within_3deg", "beam_gain_loss_db")
+    even = {figure + part: 0.0 for figure in figures for part in ("", "_blocked")}
+    place = {"truth": "exact", "split": "random", "method": "nearest"}
+    # ahead in PSNR at 10 and in RMSE at 100, behind in RMSE at 10 and in PSNR at 100 and 20
+    at = {10: (1.0, 0.5), 100: (-3.0, -0.5), 20: (-2.0, 0.0)}
+    rows = [{**place, **even, "count": n, "psnr_db": p, "rmse_db": e} for n, (p, e) in at.items()]
+    monkeypatch.setattr(results, "read", lambda name: {"margins": rows})
+    text = results._paper_behind()
+    assert "Of 30 comparisons the bistatic field is behind in 3:" in text
+    assert "| PSNR [dB] | 20, 100 | -3 |" in text and "| RMSE [dB] | 10 | +0.5 |" in text
+    assert text.count("exact engine") == 2
+
+
 def test_every_table_that_a_page_names_can_be_made():
     named = {name for page in PAGES for name in re.findall(r"<!-- table: ([\w-]+) -->", page.read_text())}
     assert named >= set(results.TABLES), "a table that no page shows"
