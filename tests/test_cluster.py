@@ -91,6 +91,18 @@ def test_a_task_takes_one_thread_and_its_error_comes_back(
     assert [k for k, _ in each(str, range(3))] == [0, 1, 2]  # in order, without a cluster
 
 
+def test_a_part_that_kills_every_worker_is_named(client: Any) -> None:
+    def deaths(allowed: int, dask_scheduler: Any = None) -> None:
+        dask_scheduler.allowed_failures = allowed
+
+    client.run_on_scheduler(deaths, 0)
+    try:
+        with pytest.raises(RuntimeError, match="each worker that took 9 died"):
+            list(each(os._exit, [9], client))
+    finally:
+        client.run_on_scheduler(deaths, 3)
+
+
 def test_a_task_takes_one_thread_unless_told(monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
     monkeypatch.delenv("WARPRRF_THREADS", raising=False)
