@@ -241,6 +241,10 @@ class _GradientEngine(SionnaEngine):
         weight = real((slope / scale).reshape(-1).astype(np.float32))
         drjit.backward(drjit.sum(image * weight))
         found = np.array([float(drjit.grad(v).numpy().reshape(-1)[0]) for v in variables])
+        # Sionna evaluates the materials of all scenes in memory: left on, gradients would be recorded in each solve.
+        for material in self._materials:
+            for name in names:
+                setattr(material, name, drjit.detach(getattr(material, name)))
         self._solved += 1
         if self._solved % 20 == 0:
             drjit.flush_malloc_cache()

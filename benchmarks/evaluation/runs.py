@@ -306,7 +306,7 @@ def sweep(
     with connected(scheduler, workers if pending else 0) as client:
         do = partial(_named, work, setting, () if client is not None else (tell,), end)
         for part in parts:
-            jobs = [(run, _budget(run, found)) for run in part]
+            jobs = [(run, _budget(run, setting, rows)) for run in part]
             for k, result in each(do, jobs, client):
                 if result is None:  # its time was over
                     continue
@@ -316,12 +316,13 @@ def sweep(
     return {run: found[run] for run in everything if run in found}
 
 
-def _budget(run: Run, found: dict[Run, Row]) -> float | None:
-    """Seconds that the run before took from raw spectra to a model."""
+def _budget(run: Run, setting: Setting, rows: Rows) -> float | None:
+    """Seconds that the run before took from raw spectra to a model, whenever that was."""
     if run.method not in AFTER:
         return None
-    other = found.get(Run(run.truth, run.split, run.count, run.seed, AFTER[run.method]))
-    return None if other is None else float(other["transport_s"]) + float(other["fit_s"])
+    other = Run(run.truth, run.split, run.count, run.seed, AFTER[run.method])
+    row = rows.get(other, known(other, setting))
+    return None if row is None else float(row["transport_s"]) + float(row["fit_s"])
 
 
 def _named(

@@ -111,6 +111,19 @@ def test_what_others_are_given_is_what_ours_took(finished: tuple[Path, dict[str,
     assert other["fit_s"] > 0.9 * other["details"]["budget_s"] or other["details"]["steps"] == 1
 
 
+def test_what_ours_took_is_known_from_an_earlier_sweep(data: Path, tmp_path: Path) -> None:
+    rows, setting, given = Rows(tmp_path / "rows.jsonl"), setting_of(data), []
+    ours, other = (Run("exact", "random", 4, 0, method) for method in ("bistatic", "sionna-calibrated"))
+
+    def work(run: Run, setting: Setting, budget_s: float | None, *progress: Any) -> Any:
+        given.append(budget_s)
+        return {**vars(run), "key": run.key, "transport_s": 2.0, "fit_s": 5.0}, {}
+
+    for run in (ours, other):
+        sweep([run], setting, rows, tmp_path, workers=0, work=work)
+    assert given == [None, 7.0]
+
+
 def test_curves_reach_over_all_counts_and_the_finding_has_the_sign_of_every_set(
     finished: tuple[Path, dict[str, Any]], data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from benchmarks.baselines.sionna_calibration import (
     _unbound,
     calibrate_sionna,
 )
+from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 
 
 def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) -> None:
@@ -42,6 +44,20 @@ def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) ->
     learned = found.scene.materials[walls].scattering_coefficient(300e9)
     assert abs(learned - truth[walls]) < 0.5 * (0.5 * truth[walls])  # it began at half of the truth
     assert found.scene.materials[walls].name == "concrete"
+    # Sionna evaluates the materials of all scenes in memory: none may go on recording gradients.
+    drjit = pytest.importorskip("drjit")
+    recorded = []
+
+    class Engine(SionnaEngine):
+        def _read(self, paths: Any) -> dict[str, np.ndarray]:
+            recorded.append(any(drjit.grad_enabled(part) for part in paths.a))
+            return super()._read(paths)
+
+    Engine(
+        found.scene, transmitter=train.transmitter, frequency_hz=train.frequency_hz, shape=train.shape,
+        sampling=Sampling(depth=1, samples=20_000), device="cpu",
+    ).solve(train.receivers[0])  # fmt: skip
+    assert recorded == [False]
 
 
 def test_unbound_values_go_there_and_back_and_slopes_are_theirs(tmp_path: Path) -> None:
