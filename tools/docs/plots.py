@@ -10,7 +10,8 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
-import results  # noqa: E402
+from tables.common import NAMES, TRUTHS, read  # noqa: E402
+from tables.paper import PLACES, paper  # noqa: E402
 
 from benchmarks.evaluation.plots import learning_curves  # noqa: E402
 
@@ -49,19 +50,15 @@ def entry(name: str, caption: str) -> Callable[[Callable[[], Any]], Callable[[],
 
 
 def _name(method: str) -> str:
-    return results.NAMES[method].replace("*", "")
+    return NAMES[method].replace("*", "")
 
 
 @entry("psnr", "PSNR of held-out receivers over the number of training spectra")
 def _psnr() -> Any:
-    places = {
-        t: name
-        for (t, split), name in results.PLACES.items()
-        if split == "random" and results.paper(t, split)
-    }
+    places = {t: name for (t, split), name in PLACES.items() if split == "random" and paper(t, split)}
     figure, axes = plt.subplots(1, len(places), figsize=(4.5 * len(places), 3.4), sharey=True)
     for ax, (truth, name) in zip(axes, places.items(), strict=True):
-        rows = results.paper(truth, "random")
+        rows = paper(truth, "random")
         for method, colour in COLOURS.items():
             chosen = sorted((r["count"], r["psnr_db"]) for r in rows if r["method"] == method and r["count"])
             if chosen:
@@ -78,7 +75,7 @@ def _psnr() -> Any:
 @entry("speed", "Error over the time of one spectrum and over training time, 100 spectra of the exact engine")
 def _speed() -> Any:
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
-    rows = results.paper("exact", "random", 100)
+    rows = paper("exact", "random", 100)
     for ax, key, words in (
         (axes[0], "seconds_per_spectrum", "seconds a spectrum"),
         (axes[1], "train_s", "training [s]"),
@@ -101,12 +98,12 @@ def _speed() -> Any:
 
 @entry("learning", "Loss of the networks over their training time")
 def _learning() -> Any:
-    return learning_curves([r for place in results.PLACES for r in results.paper(*place) if r["loss_curve"]])
+    return learning_curves([r for place in PLACES for r in paper(*place) if r["loss_curve"]])
 
 
 @entry("knobs", "Error and time of each setting of the renderer")
 def _knobs() -> Any:
-    engine = results.read("engine")
+    engine = read("engine")
     words = {"alpha_min": "least alpha that counts", "top_k": "Gaussians kept a pixel"}
     figure, axes = plt.subplots(1, 3, figsize=(9, 3.2))
     for ax, (knob, title) in zip(axes, words.items(), strict=False):
@@ -130,12 +127,10 @@ def _knobs() -> Any:
 
 @entry("ablation", "What each part of the bistatic model is worth, ten spectra")
 def _ablation() -> Any:
-    rows = results.read("bistatic")["ablation"]
+    rows = read("bistatic")["ablation"]
     names = [n for n in dict.fromkeys(r["model"] for r in rows) if not n.startswith("RF-3DGS")]
     figure, ax = plt.subplots(figsize=(8, 3.4))
-    for shift, (truth, name), colour in zip(
-        (-0.2, 0.2), results.TRUTHS.items(), ("#0b6e99", "#c4570f"), strict=True
-    ):
+    for shift, (truth, name), colour in zip((-0.2, 0.2), TRUTHS.items(), ("#0b6e99", "#c4570f"), strict=True):
         found = [next(r["psnr_db"] for r in rows if r["model"] == n and r["truth"] == truth) for n in names]
         ax.barh([i + shift for i in range(len(names))], found, 0.38, color=colour, label=name)
     ax.set_yticks(range(len(names)), names)

@@ -1,6 +1,6 @@
 """What Sphinx does not do alone: reference pages, tables and plots from result files, equations as MathML.
 
-A page names a table by ``<!-- table: NAME -->`` and a figure by ``<!-- figure: NAME -->``; see :mod:`results` and
+A page names a table by ``<!-- table: NAME -->`` and a figure by ``<!-- figure: NAME -->``; see :mod:`tables` and
 :mod:`plots`.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import plots
 import reference
-import results
+import tables
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.domains.python import PyObject
@@ -54,9 +54,7 @@ def put_tables(app: Any, name: str, source: list[str]) -> None:
 
     def put(found: re.Match[str]) -> str:
         kind, what = found.groups()
-        return (
-            results.table(what) if kind == "table" else f"![{plots.CAPTIONS[what]}]({up}figures/{what}.svg)"
-        )
+        return tables.table(what) if kind == "table" else f"![{plots.CAPTIONS[what]}]({up}figures/{what}.svg)"
 
     source[0] = MADE.sub(put, source[0])
 

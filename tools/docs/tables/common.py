@@ -1,0 +1,101 @@
+"""Result files, the names of methods and truths, and Markdown."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[3]
+FOLDER = ROOT / "benchmarks" / "results"
+
+NAMES = {
+    "bistatic": "**bistatic**",
+    "bistatic-quick": "**bistatic, quick fit**",
+    "rf3dgs+": "RF-3DGS+",
+    "rf3dgs+los": "RF-3DGS+ with line of sight",
+    "rf3dgs": "RF-3DGS",
+    "rf3dgs+alpha": "RF-3DGS+, opacity trained",
+    "rf3dgs-alpha": "RF-3DGS, opacity trained",
+    "nerf2": "NeRF2",
+    "cgan": "conditional GAN",
+    "sionna-calibrated": "Sionna RT, calibrated materials",
+    "sionna": "Sionna RT, true mesh, assumed materials",
+    "sionna-again": "Sionna RT, the truth under another seed",
+    "nearest": "nearest receiver's spectrum",
+    "idw": "inverse-distance average",
+    "mean": "mean image",
+    "constant": "constant image",
+    "zero": "our geometry, no spectra",
+    "transmitter": "point at the transmitter",
+}
+TRUTHS = {"exact": "exact engine", "sionna": "Sionna RT, depth 3"}
+Row = dict[str, Any]
+TABLES: dict[str, Callable[[], str]] = {}
+
+
+def table(name: str) -> str:
+    """The Markdown of a table.
+
+    Raises:
+        KeyError: for a name that no table has.
+    """
+    if name.startswith("machine-"):
+        return _machine(name.removeprefix("machine-"))
+    return TABLES[name]()
+
+
+@cache
+def read(name: str) -> Row:
+    """A result file."""
+    found: Row = json.loads((FOLDER / f"{name}.json").read_text())
+    return found
+
+
+def measured(name: str) -> Row | None:
+    """A result file that a checkout may lack; :func:`missing` is then what a page says."""
+    return read(name) if (FOLDER / f"{name}.json").is_file() else None
+
+
+def missing(command: str) -> str:
+    """What a page says in the place of a table without a result file."""
+    return f"*Not measured here yet: `{command}` makes these figures.*"
+
+
+def entry(name: str) -> Callable[[Callable[[], str]], Callable[[], str]]:
+    """Enters a table under its name."""
+
+    def enter(function: Callable[[], str]) -> Callable[[], str]:
+        TABLES[name] = function
+        return function
+
+    return enter
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Rows of cells under a head; all but the first column set right."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def show(value: Any, form: str = "{:.1f}") -> str:
+    """A value in a format, or nothing for None."""
+    return "" if value is None else form.format(value)
+
+
+def _machine(name: str) -> str:
+    found = read(name)
+    m = found["machine"]
+    device = "" if m["device"] == "cpu" else f", {m['device']}"
+    versions = m["versions"]
+    return (
+        f"Measured on {m['processor']}, {m['cores']} cores{device}, Python {m['python']}, Warp {versions['warp-lang']}; "
+        f"every figure is in `benchmarks/results/{name}.json`."
+    )
+
+
+def find(rows: list[Row], **wanted: Any) -> Row | None:
+    """The first row with these values."""
+    return next((r for r in rows if all(r.get(k) == v for k, v in wanted.items())), None)

@@ -1,0 +1,191 @@
+"""Channels, radio maps, city scenes and beams."""
+
+from __future__ import annotations
+
+from tables.common import Row, entry, find, markdown, measured, missing, read, show
+
+
+@entry("map")
+def _map() -> str:
+    found = read("map")
+    lines = []
+    for r in found["ours"]:
+        mean = ", mean of four places a cell" if r["average"] > 1 else ""
+        lines.append([f"field, {r['rays']} rays a cell, up to {r['mirrors']} mirrors{mean}", *_map_errors(r)])
+    for r in found["sionna"]:
+        lines.append([f"RadioMapSolver, {r['samples']:.0e} samples", *_map_errors(r)])
+    return markdown(("map", "rms [dB]", "median [dB]", "line of sight", "blocked", "core seconds"), lines)
+
+
+def _map_errors(r: Row) -> list[str]:
+    keys = ("rms_db", "median_db", "rms_seen_db", "rms_blocked_db")
+    return [*(show(r[k], "{:.2f}") for k in keys), show(r["core_s"])]
+
+
+@entry("channel")
+def _channel() -> str:
+    found = read("channel")
+    names = {
+        "friis": "one path over 100 m",
+        "two_ray": "two rays over a slab, V and H",
+        "images": "four images in a corner",
+    }
+    lines = [
+        [f"closed form: {names[k]}", f"gain {v['gain']:.1e}, phase {v['phase_rad']:.1e} rad"]
+        for k, v in found["closed_forms"].items()
+    ]
+    r, s = found["lobby"], found["small"]
+    lines += [
+        [
+            f"{r['paths']} paths of {r['receivers']} receivers beside Sionna RT's",
+            f"gain {r['gain_db']:.3f} dB, delay {r['tau_s']:.1e} s, angles {r['departure_rad']:.0e} rad",
+        ],
+        [
+            "the same, paths with a leg shorter than 0.2 m included (Sionna RT's points are float32)",
+            f"gain {r['gain_db_all']:.3f} dB",
+        ],
+        ["paths that only Sionna RT has / only we have", f"{r['sionna_only']} / {r['ours_only']}"],
+        [
+            f"response of {s['paths']} paths, 64 x 4 elements, 256 frequencies",
+            f"{1e3 * s['grid_seconds']:.0f} ms, error {s['grid_error']:.0e}",
+        ],
+        ["the same by Sionna RT", f"{1e3 * s['sionna_seconds']:.0f} ms, error {s['sionna_error']:.0e}"],
+        [
+            "the same, dense sum in float64",
+            f"{1e3 * s['dense_seconds']:.0f} ms, error {s['dense_error']:.0e}",
+        ],
+    ]
+    return markdown(("figure", "value"), lines)
+
+
+@entry("plane-wave")
+def _plane_wave() -> str:
+    rows = read("channel")["plane_wave"]
+    away = sorted({r["distance_m"] for r in rows})
+    lines = []
+    for elements in sorted({r["elements"] for r in rows}):
+        side = round(elements**0.5)
+        losses = (find(rows, elements=elements, distance_m=d) for d in away)
+        lines.append([f"{side} x {side}", *(show(r and r["beam_loss_db"], "{:.2g}") for r in losses)])
+    return markdown(("elements", *(f"{d:g} m" for d in away)), lines)
+
+
+@entry("city-paths")
+def _city_paths() -> str:
+    found = measured("city_paths")
+    if found is None or "machine" not in found:
+        return missing("python -m benchmarks city-paths")
+    head = (
+        "scene", "triangles", "receivers", "of PathSolver's paths", "delay error [s]", "gain error [dB]", "only ours",
+        "load [s]", "one receiver [s]", "all [s]", "PathSolver, one [s]", "all [s]",
+    )  # fmt: skip
+    lines = []
+    for r in found["scenes"]:
+        gain = f"{r['gain_error_db']:.4f}"
+        if r["gain_apart"]:
+            gain += f" ({r['gain_apart_near_origin_db']:.4f})"
+        times = (r["load_s"], r["patches_s"] + r["one_receiver_s"], r["patches_s"] + r["all_receivers_s"])
+        times += (r["sionna_one_receiver_s"], r["sionna_all_receivers_s"])
+        lines.append(
+            [r["scene"], str(r["faces"]), str(r["receivers"]), f"{r['found']} of {r['paths_of_sionna']}"]
+            + [f"{r['delay_error_s']:.0e}", gain, str(r["only_ours"]), *(f"{t:.2g}" for t in times)]
+        )
+    apart = [
+        f"`{r['scene']}`: {r['gain_apart']} of {r['found']} gains differ by more than 0.05 dB, by {r['gain_error_db']:.3f} dB "
+        f"at most. It is PathSolver's single precision: solved near the origin they differ by "
+        f"{r['gain_apart_near_origin_db']:.4f} dB."
+        for r in found["scenes"]
+        if r["gain_apart"]
+    ]
+    return "\n\n".join(
+        [markdown(head, lines), *apart, *_roofs([r["roofs"] for r in found["scenes"] if r.get("roofs")])]
+    )
+
+
+def _roofs(cities: list[dict[str, int]]) -> list[str]:
+    """What share of places the library takes for places in a building; nothing without cities."""
+    if not cities:
+        return []
+    roofed, indoors, under_sky, wrong = (
+        sum(city[key] for city in cities) for key in ("roofed", "roofed_refused", "open", "open_refused")
+    )
+    return [
+        f"Of {roofed} places below a roof in {len(cities)} scenes with streets {100 * indoors / roofed:.1f} % are taken for "
+        f"places in a building (others are passages), of {under_sky} under the sky {100 * wrong / under_sky:.2f} %."
+    ]
+
+
+@entry("city-verbs")
+def _city_verbs() -> str:
+    found = measured("city_paths")
+    if found is None or "verbs" not in found:
+        return missing("python -m benchmarks city-paths")
+    lines = [
+        [
+            r["scene"],
+            f"{r['verb']}",
+            f"{r['wall_s']:.2g}",
+            show(r["again_wall_s"], "{:.2g}"),
+            f"{r['core_s']:.2g}",
+        ]
+        + [f"{r['peak_bytes'] / 1e9:.2f}"]
+        for r in found["verbs"]
+    ]
+    head = ("scene", "call", "first [s]", "again [s]", "core [s]", "peak memory [GB]")
+    busy = f"Load average of the machine when it ended: {found['load_average']:.1f} on {found['machine']['cores']} cores."
+    return "\n\n".join([markdown(head, lines), busy])
+
+
+BEAMS = {
+    "exhaustive": "exhaustive search, its pilots counted",
+    "powers": "true power of every path, no phases",
+    "bistatic": "**bistatic field**",
+    "zero": "our geometry, no spectra",
+    "rf3dgs+": "RF-3DGS+",
+    "nearest": "nearest receiver's beam",
+    "transmitter": "point at the transmitter",
+    "hierarchical": "hierarchical search",
+    "random": "random",
+}
+
+
+@entry("beams")
+def _beams() -> str:
+    found = measured("beams")
+    if found is None:
+        return missing("python -m benchmarks beams")
+    rows = found["truths"]["exact"]["links"]
+    ends = [e for e in ("rx 16", "rx 256", "rx 4096", "tx 256", "tx 64, rx 64") if find(rows, ends=e)]
+    last = "rx 4096" if "rx 4096" in ends else ends[-1]
+    lines = []
+    for method, count in dict.fromkeys((r["method"], r["n_train"]) for r in rows):
+        own = [find(rows, ends=e, method=method, n_train=count) for e in ends]
+        best = find(rows, ends=last, method=method, n_train=count)
+        lines.append([
+            BEAMS[method], str(count or ""),
+            *(show(r and 100 * r["within"], "{:.0f}") + show(r and 100 * r["within_blocked"], " / {:.0f} %") for r in own),
+            show(best and best["efficiency_los"], "{:.2f}") + show(best and best["efficiency_blocked"], " / {:.2f}"),
+        ])  # fmt: skip
+    lines.sort(key=lambda line: list(BEAMS.values()).index(line[0]))
+    return markdown(("within 1 dB, all / blocked", "spectra", *ends, f"bit/s/Hz, {last}"), lines)
+
+
+@entry("beams-users")
+def _beams_users() -> str:
+    found = measured("beams")
+    rows = found["truths"]["exact"].get("users", []) if found else []
+    if not rows:
+        return missing("python -m benchmarks beams")
+    choices = list(dict.fromkeys(r["choice"] for r in rows))
+    words = {
+        "alone": "own best beams", "together": "beams minding interference", "mr": "maximum ratio", "zf": "zero forcing",
+        "slnr": "SLNR",
+    }  # fmt: skip
+    lines = []
+    for users, method, count in dict.fromkeys((r["users"], r["method"], r["n_train"]) for r in rows):
+        cells = [find(rows, users=users, method=method, n_train=count, choice=c) for c in choices]
+        if any(cells):
+            name = BEAMS.get(method, "true channel of every element")
+            values = (show(c and c["efficiency"], "{:.2f}") for c in cells)
+            lines.append([f"{users} users: {name}", str(count or ""), *values])
+    return markdown(("sum, bit/s/Hz", "spectra", *(words.get(c, c) for c in choices)), lines)

@@ -1,0 +1,166 @@
+"""The lobby: its reconstruction and its field by both engines; a room that was filmed."""
+
+from __future__ import annotations
+
+from tables.common import NAMES, TRUTHS, Row, entry, find, markdown, measured, missing, read, show
+
+
+@entry("lobby-geometry")
+def _lobby_geometry() -> str:
+    r = read("lobby")
+    g = r["geometry"]
+    rows = [
+        ("photos posed", f"{g['posed']} of {g['photos']}"),
+        ("PSNR of photos held out", f"{r['photo_psnr_db']:.1f} dB"),
+        ("the same of two renderings of one photo with other noise", f"{r['photo_noise_psnr_db']:.1f} dB"),
+        (
+            f"camera positions, rms error, scale from {g['surveyed']} surveyed ones",
+            f"{1e3 * r['camera_rms_m']:.1f} mm",
+        ),
+        (
+            "mesh to the true surface where a photo sees it, median",
+            f"{1e3 * r['mesh_distance_median_m']:.1f} mm",
+        ),
+        ("the same, 90th percentile", f"{1e3 * r['mesh_distance_p90_m']:.1f} mm"),
+        ("direction of the mesh's normals, median error", f"{r['mesh_normal_median_deg']:.2f}°"),
+        ("Gaussians, triangles, planar patches", f"{g['gaussians']}, {g['triangles']}, {g['patches']}"),
+    ]
+    return markdown(("figure", "value"), rows)
+
+
+SCORES = (
+    ("psnr_db", "PSNR [dB]", "{:.1f}"),
+    ("psnr_db_blocked", "blocked", "{:.1f}"),
+    ("ssim", "SSIM", "{:.2f}"),
+    ("rmse_db", "RMSE [dB]", "{:.1f}"),
+    ("direction_within_3deg", "within 3°", "{:.0%}"),
+    ("direction_within_3deg_blocked", "blocked", "{:.0%}"),
+    ("beam_gain_loss_db", "beam loss [dB]", "{:.1f}"),
+    ("tof_error_median_ns", "delay [ns]", "{:.2g}"),
+)
+
+
+def _scored(found: dict[str, Row]) -> str:
+    rows = [
+        [
+            NAMES[m],
+            *(show(row[k], f) for k, _, f in SCORES),
+            show(1e3 * row["seconds_per_spectrum"], "{:.2g}"),
+        ]
+        for m, row in found.items()
+    ]
+    return markdown(("model", *(h for _, h, _ in SCORES), "a spectrum [ms]"), rows)
+
+
+@entry("lobby-exact")
+def _lobby_exact() -> str:
+    return _scored(read("lobby")["methods"])
+
+
+@entry("lobby-sionna")
+def _lobby_sionna() -> str:
+    return _scored(read("lobby")["methods_sionna"])
+
+
+@entry("lobby-stages")
+def _lobby_stages() -> str:
+    r = read("lobby")
+    rows = [(name, f"{stage['seconds']:.0f}") for name, stage in r["stages"].items()]
+    return markdown(("step", "seconds"), [*rows, ("**all**", f"**{r['pipeline_time_s']:.0f}**")])
+
+
+@entry("lobby-seeds")
+def _lobby_seeds() -> str:
+    found = measured("lobby_seeds")
+    if found is None:
+        return missing("python -m benchmarks lobby-seeds")
+    lines = [
+        [r["figure"], *(show(r[k], "{:.4g}") for k in ("mean", "spread", "least", "most"))]
+        for r in found["rows"]
+        if not r["key"].startswith("methods")
+        and not r["key"].endswith("time_s")  # what a machine decides, not a seed
+        or ("bistatic" in r["key"] or "rf3dgs+" in r["key"])
+        and "psnr" in r["key"]
+    ]
+    return markdown(
+        (f"seeds {', '.join(map(str, found['seeds']))}", "mean", "spread", "least", "most"), lines
+    )
+
+
+@entry("ablation")
+def _ablation() -> str:
+    rows = read("bistatic")["ablation"]
+    words = {
+        "everything": "everything",
+        "zero spectra": "the same geometry, no spectra at all",
+        "RF-3DGS+ with line of sight": "RF-3DGS+ with an explicit line of sight",
+        "no residual per element": "no correction per surface element",
+        "true mesh, its materials as groups": "everything, on the true mesh with its materials as groups",
+    }
+    lines = []
+    for model in dict.fromkeys(r["model"] for r in rows):
+        lines.append([
+            words.get(model, model),
+            *(show((found := find(rows, truth=t, model=model)) and found["psnr_db"]) for t in TRUTHS),
+        ])  # fmt: skip
+    return markdown(("model, ten spectra", *(f"{n} [dB]" for n in TRUTHS.values())), lines)
+
+
+@entry("uncertainty")
+def _uncertainty() -> str:
+    lines = [
+        [
+            f"{TRUTHS[r['truth']]}, {r['n_train']}", show(r["rms_error_db"]),
+            show(r["within_1_sigma"], "{:.0%}"), show(r["within_2_sigma"], "{:.0%}"),
+        ]
+        for r in read("bistatic")["calibration"]
+    ]  # fmt: skip
+    return markdown(
+        ("truth, training receivers", "rms error [dB]", "within one standard deviation", "within two"), lines
+    )
+
+
+@entry("delays")
+def _delays() -> str:
+    lines = [
+        [
+            f"{TRUTHS[r['truth']]}, {r['n_train']}", show(r["mirror"]["found"], "{:.0%}"),
+            show(r["mirror"]["median_ns"], "{:.4f}"), show(r["scattering"]["median_by_power_ns"], "{:.3f}"),
+        ]
+        for r in read("bistatic")["delays"]
+    ]  # fmt: skip
+    head = ("truth, training receivers", "mirror paths found", "their delay error [ns]", "scattering's [ns]")
+    return markdown(head, lines)
+
+
+@entry("transmitter")
+def _transmitter() -> str:
+    lines = [
+        [
+            NAMES[r["method"]], show(r["seen"]["psnr_db"]), show(r["psnr_db"]),
+            show(r["direction_within_3deg"], "{:.0%}"), show(r["direction_within_3deg_blocked"], "{:.0%}"),
+        ]
+        for r in read("bistatic")["second"]
+    ]  # fmt: skip
+    head = ("model, ten spectra", "fitted transmitter [dB]", "another one [dB]", "within 3°", "blocked")
+    return markdown(head, lines)
+
+
+@entry("filmed")
+def _filmed() -> str:
+    found = measured("filmed")
+    if found is None:
+        return missing("python -m benchmarks filmed")
+    rows = {
+        "distance": "mesh to reference", "back": "reference to mesh", "laid_on_distance": "mesh to reference, laid on it",
+        "laid_on_back": "reference to mesh, laid on it",
+    }  # fmt: skip
+    lines = [
+        [
+            name,
+            *(f"{100 * found[f'{key}_{part}_m']:.1f}" for part in ("median", "p90")),
+            f"{100 * found[f'{key}_within_5_cm']:.0f} %",
+        ]
+        for key, name in rows.items()
+    ]
+    return markdown(("distance", "median [cm]", "90th percentile [cm]", "within 5 cm"), lines)

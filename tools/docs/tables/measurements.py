@@ -1,0 +1,97 @@
+"""What a field is fitted to: readings, arrays, meshes without names; which effects a scene needs."""
+
+from __future__ import annotations
+
+from tables.common import TRUTHS, entry, find, markdown, measured, missing, read, show
+
+
+@entry("measurements")
+def _measurements() -> str:
+    found = measured("measurements")
+    if found is None:
+        return missing("python -m benchmarks measurements")
+    columns = (
+        ("psnr_db", "PSNR [dB]", "{:.1f}"), ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
+        ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"), ("total_rms_db", "total power, rms [dB]", "{:.2f}"),
+        ("total_rms_db_blocked", "blocked", "{:.2f}"), ("gain_error_db", "chain's gain off [dB]", "{:+.2f}"),
+        ("zero_error_deg", "zero off [degrees]", "{:+.1f}"), ("named", "named", "{}"),
+    )  # fmt: skip
+    lines = [[r["readings"], *(show(r.get(key), form) for key, _, form in columns)] for r in found["rows"]]
+    return markdown(("fitted to", *(title for _, title, _ in columns)), lines)
+
+
+@entry("suggest")
+def _suggest() -> str:
+    found = measured("suggest")
+    if found is None:
+        return missing("python -m benchmarks suggest")
+    lines = [
+        [
+            r["readings"], str(r["draws"]), f"{r['psnr_db']:.2f}", f"{r['psnr_std_db']:.2f}",
+            f"{r['direction_within_3deg_blocked']:.0%}", f"{r['beam_gain_loss_db']:.2f}", f"{r['total_rms_db']:.2f}",
+        ]
+        for r in found["rows"]
+    ]  # fmt: skip
+    wanted = "blocked: within 3 degrees", "beam loss [dB]", "total power, rms [dB]"
+    return markdown(("spectra of", "draws", "PSNR [dB]", "spread", *wanted), lines)
+
+
+@entry("arrays")
+def _arrays() -> str:
+    found = measured("arrays")
+    if found is None:
+        return missing("python -m benchmarks arrays")
+    lines = [
+        [
+            f"{r['carrier_ghz']:g}",
+            r["method"],
+            *(show(r[key]) for key in ("psnr_db", "gained_db", "psnr_db_blocked")),
+        ]
+        for r in found["rows"]
+    ]
+    head = ("carrier [GHz]", "prediction", "PSNR [dB]", "over the nearest [dB]", "where blocked [dB]")
+    return markdown(head, lines)
+
+
+@entry("bare-mesh")
+def _bare_mesh() -> str:
+    found = measured("bare_mesh")
+    if found is None:
+        return missing("python -m benchmarks bare-mesh")
+    meshes = {"named": "names", "bare": "no names, no colours", "scan": "the same, scanned"}
+    head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "where blocked [dB]")
+    lines = []
+    for r in found["rows"]:
+        figures = (show(r["psnr_db"]), show(r["lost_db"], "{:.2f}"), show(r["psnr_db_blocked"]))
+        lines.append([r["room"], TRUTHS[r["truth"]], str(r["n_train"]), meshes[r["mesh"]], *figures])
+    return markdown(head, lines)
+
+
+EFFECTS = {
+    "line_of_sight": "line of sight",
+    "mirror_1": "mirror reflections, one",
+    "mirror_2": "mirror reflections, two",
+    "diffuse_1": "scattering, one bounce",
+    "mirror_scatter": "surfaces lit by mirrors",
+    "scatter_mirror": "lit surfaces seen in mirrors",
+    "diffuse_2": "scattering, two bounces and more",
+    "lobe_0": "the widest scattering lobe",
+    "lobe_4": "scattering lobe of exponent 4",
+    "lobe_10": "scattering lobe of exponent 10",
+    "unseen": "surfaces that no receiver sees",
+    "gas": "absorption by the air (ITU-R P.676)",
+    "diffraction": "diffraction (knife edge, ITU-R P.526)",
+    "transmission": "transmission through walls (ITU-R P.2040)",
+}
+
+
+@entry("relevance")
+def _relevance() -> str:
+    cases = read("relevance")["cases"]
+    lines = []
+    for effect, words in EFFECTS.items():
+        worth = [find(c["effects"], name=effect) for c in cases]
+        if any(worth):
+            lines.append([words, *(show(w and w["worth_db"], "{:.2g}") for w in worth)])
+    head = [f"{c['frequency_hz'] / 1e9:.0f} GHz, {c['roughness']}" for c in cases]
+    return markdown(("effect left out [dB]", *head), lines)

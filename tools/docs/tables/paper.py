@@ -1,0 +1,258 @@
+"""The evaluation of the paper: every method beside every other."""
+
+from __future__ import annotations
+
+from tables.common import NAMES, Row, entry, markdown, read, show
+
+PLACES = {
+    ("exact", "random"): "exact engine",
+    ("sionna", "random"): "Sionna RT, depth 3",
+    ("conference", "random"): "conference room, Sionna RT",
+    ("exact", "region"): "exact engine, a region held out",
+    ("sionna", "region"): "Sionna RT, a region held out",
+}
+PAPER_TRUTHS = {truth: name for (truth, split), name in PLACES.items() if split == "random"}
+PAPER_TRUTHS["paper-law"] = "targets made by the paper's law"
+
+
+def paper(truth: str, split: str, count: int | None = None) -> list[Row]:
+    """Rows of the paper's evaluation of one place, those of ``count`` spectra and of none where it is given."""
+    rows = [r for r in read("paper")["rows"] if (r["truth"], r["split"]) == (truth, split)]
+    rows = [r for r in rows if count is None or r["count"] in (count, 0)]
+    return sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
+
+
+@entry("paper-psnr")
+def _paper_psnr() -> str:
+    parts = []
+    for place, name in PLACES.items():
+        rows = paper(*place)
+        counts = sorted({r["count"] for r in rows if r["count"]})
+        lines = []
+        for method in dict.fromkeys(r["method"] for r in rows):
+            own = {r["count"]: r for r in rows if r["method"] == method}
+            if 0 in own:
+                own = dict.fromkeys(counts[:1], own[0])
+            lines.append([NAMES[method], *(_psnr(own.get(count)) for count in counts)])
+        if lines:
+            parts += [f"**{name}**", markdown(("PSNR [dB], all / blocked", *map(str, counts)), lines)]
+    return "\n\n".join(parts)
+
+
+def _psnr(row: Row | None) -> str:
+    if row is None:
+        return ""
+    spread = "" if row["psnr_db_std"] is None else f" ± {row['psnr_db_std']:.1f}"
+    return f"{row['psnr_db']:.1f}{spread} / {show(row['psnr_db_blocked'])}"
+
+
+def with_spread(row: Row | None, figure: str, scale: float, form: str) -> str:
+    """A figure of a row with its spread over seeds, where there are several."""
+    if row is None or row[figure] is None:
+        return ""
+    spread = row[f"{figure}_std"]
+    unsigned = form.replace("+", "")
+    return form.format(scale * row[figure]) + (
+        "" if spread is None else f" ± {unsigned.format(scale * spread)}"
+    )
+
+
+@entry("paper-margins")
+def _paper_margins() -> str:
+    forms = (
+        ("PSNR [dB]", "psnr_db", 1.0, "{:+.1f}"), ("SSIM", "ssim", 1.0, "{:+.2f}"), ("RMSE [dB]", "rmse_db", 1.0, "{:+.1f}"),
+        ("within 3° [%]", "direction_within_3deg", 100.0, "{:+.0f}"),
+        ("beam loss [dB]", "beam_gain_loss_db", 1.0, "{:+.1f}"),
+    )  # fmt: skip
+
+    parts = []
+    for (truth, split), name in PLACES.items():
+        rows = [
+            r for r in read("paper")["margins"] if (r["truth"], r["split"], r["count"]) == (truth, split, 100)
+        ]
+        lines = [
+            [
+                NAMES[r["method"]],
+                *(
+                    f"{with_spread(r, f, *how)} / {with_spread(r, f'{f}_blocked', *how)}"
+                    for _, f, *how in forms
+                ),
+            ]
+            for r in sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
+        ]
+        if lines:
+            head = (f"{name}, 100 spectra: ours less", *(f"{label}, all / blocked" for label, *_ in forms))
+            parts.append(markdown(head, lines))
+    return "\n\n".join(parts)
+
+
+@entry("paper-behind")
+def _paper_behind() -> str:
+    better = {"rmse_db": -1.0, "beam_gain_loss_db": -1.0}  # of the others more is better
+    words = {
+        "psnr_db": "PSNR [dB]", "ssim": "SSIM", "rmse_db": "RMSE [dB]", "direction_within_3deg": "within 3°",
+        "beam_gain_loss_db": "beam loss [dB]",
+    }  # fmt: skip
+    behind: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
+    compared = 0
+    for r in read("paper")["margins"]:
+        for figure, word in words.items():
+            for part, who in (("", ""), ("_blocked", ", blocked")):
+                margin = r[figure + part]
+                compared += margin is not None
+                if margin is not None and better.get(figure, 1.0) * margin < 0.0:
+                    place = PLACES.get((r["truth"], r["split"]), r["truth"])
+                    key = (place, NAMES[r["method"]], word + who)
+                    behind.setdefault(key, []).append((r["count"], margin))
+    text = f"Of {compared} comparisons the bistatic field is behind in {sum(map(len, behind.values()))}"
+    if not behind:
+        return text + "."
+    lines = []
+    for (place, method, figure), found in behind.items():
+        counts, margins = zip(*sorted(found), strict=True)
+        worst = f"{max(margins, key=abs):+.2g}"
+        lines.append([place, method, figure, ", ".join(map(str, counts)), worst])
+    return text + ":\n\n" + markdown(("truth", "behind", "in", "spectra", "by at most"), lines)
+
+
+@entry("paper-detail")
+def _paper_detail() -> str:
+    parts = []
+    for place, name in PLACES.items():
+        lines = [
+            [
+                NAMES[r["method"]], show(r["ssim"], "{:.2f}"), show(r["rmse_db"]),
+                f"{r['direction_within_3deg']:.0%} / {show(r['direction_within_3deg_blocked'], '{:.0%}')}",
+                f"{r['beam_gain_loss_db']:.1f} / {show(r['beam_gain_loss_db_blocked'])}",
+                show(r["tof_error_median_ns"], "{:.2g}"), show(r.get("train_s"), "{:.3g}"),
+                show(1e3 * r["seconds_per_spectrum"], "{:.3g}"), show(r.get("peak_memory_gib"), "{:.1f}"),
+                show(r.get("model_mib"), "{:.2g}"),
+            ]
+            for r in paper(*place, 100)
+        ]  # fmt: skip
+        head = (
+            f"{name}, 100 spectra", "SSIM", "RMSE [dB]", "within 3°, all / blocked", "beam loss [dB], all / blocked",
+            "delay [ns]", "training [s]", "a spectrum [ms]", "memory [GiB]", "model [MiB]",
+        )  # fmt: skip
+        if lines:
+            parts.append(markdown(head, lines))
+    return "\n\n".join(parts)
+
+
+@entry("paper-statement")
+def _paper_statement() -> str:
+    lines = [r for r in read("paper")["finding"] if r["split"] == "random" and not r["opacity"]]
+    published = {r["method"]: r["psnr_db"] for r in read("paper")["published"]}
+    parts = [f"The paper reports RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:.1f} dB above RF-3DGS."]
+    for truth, name in PAPER_TRUTHS.items():
+        own = [r["psnr_db"]["difference"] for r in lines if r["truth"] == truth]
+        if own:
+            parts.append(f"{name[0].upper()}{name[1:]}: {sum(own) / len(own):+.1f} dB over {len(own)} sizes.")
+    return " ".join(parts)
+
+
+@entry("paper-runs")
+def _paper_runs() -> str:
+    found = read("paper")
+    missing_runs = len(found["missing"])
+    data = "; ".join(
+        f"{name} {found['data'][f'{truth}/random']['content']}"
+        for truth, name in PAPER_TRUTHS.items()
+        if f"{truth}/random" in found["data"]
+    )
+    left = f" {missing_runs} of their runs are missing." if missing_runs else ""
+    absent = [name for (t, split), name in PLACES.items() if f"{t}/{split}" not in found["data"]]
+    none = f" Not run yet: {', '.join(absent)}." if absent else ""
+    return f"Data, by the hash of the file: {data}.{left}{none}"
+
+
+@entry("paper-networks")
+def _paper_networks() -> str:
+    effort = read("paper")["effort"]
+    lines = [
+        [
+            NAMES[r["method"]], name, str(r["count"]), show(r["fit_s"] / 60.0, "{:.0f}"), "; ".join(r["devices"]),
+            show(r["loss_curve"][-1] / r["loss_curve"][0], "{:.2f}"),
+            show(r["loss_curve"][-1] / r["loss_curve"][len(r["loss_curve"]) // 2], "{:.2f}"), show(r["psnr_db"]),
+        ]
+        for place, name in PLACES.items()
+        for r in paper(*place)
+        if r["loss_curve"]
+    ]  # fmt: skip
+    head = (
+        "network", "truth", "spectra", "training [min]", "on", "last loss over first", "last loss over that at half time",
+        "PSNR [dB]",
+    )  # fmt: skip
+    text = (
+        f"NeRF2 trains for {effort['nerf2_iterations']} steps of {effort['nerf2_rays']} rays with "
+        f"{effort['nerf2_samples']} samples each (as published: 30000 of 8192 with 64), the GAN for "
+        f"{effort['cgan_iterations']} steps of {effort['cgan_batch']} spectra."
+    )
+    return f"{text}\n\n{markdown(head, lines)}"
+
+
+@entry("paper-stage2")
+def _paper_stage2() -> str:
+    lines = []
+    for place, name in PLACES.items():
+        for r in paper(*place):
+            # Quick fits were timed side by side.
+            if r["count"] == 700 and r["method"] in ("bistatic", "rf3dgs+"):
+                lines.append(
+                    [
+                        NAMES[r["method"]],
+                        name,
+                        show(r["transport_s"], "{:.0f}"),
+                        show(r["fit_s"], "{:.0f}"),
+                        show(r["train_s"], "{:.0f}"),
+                    ]
+                )
+    for r in read("paper")["published"][:1]:
+        lines.append(
+            [NAMES[r["method"]], "as published, NVIDIA RTX 4090", "", "", show(r["train_s"], "{:.0f}")]
+        )
+    return markdown(("stage 2, 700 spectra", "truth", "rays [s]", "fit [s]", "both [s]"), lines)
+
+
+@entry("published")
+def _published() -> str:
+    lines = [
+        [
+            NAMES[r["method"]], show(r["psnr_db"], "{:.2f}"), show(r["ssim"], "{:.3f}"), show(r["train_s"], "{:.0f}"),
+            show(1e3 * r["seconds_per_spectrum"], "{:.3g}"),
+        ]
+        for r in read("paper")["published"]
+    ]  # fmt: skip
+    return markdown(("as published", "PSNR [dB]", "SSIM", "training [s]", "a spectrum [ms]"), lines)
+
+
+@entry("law")
+def _law() -> str:
+    words = {"exact": "power that scatters as it does", "paper-law": "given the paper's factor, path by path"}
+    found = [r for r in read("paper")["finding"] if r["split"] == "random" and not r["opacity"]]
+    lines = [
+        [
+            words.get(r["truth"], PLACES.get((r["truth"], "random"), r["truth"])), str(r["count"]),
+            show(r["psnr_db"]["rf3dgs+"]), show(r["psnr_db"]["rf3dgs"]), show(r["psnr_db"]["difference"], "{:+.1f}"),
+        ]
+        for r in found
+    ]  # fmt: skip
+    return markdown(("truth", "spectra", "RF-3DGS+ [dB]", "RF-3DGS [dB]", "difference [dB]"), lines)
+
+
+@entry("gap")
+def _gap() -> str:
+    found = read("gap")
+    what = {r["choice"]: r["what"] for r in found["differences"]}
+    lines = []
+    for r in found["differences"]:
+        cells = [what[r["choice"]], str(r["train"])]
+        for key in ("psnr_db", "own_psnr_db"):
+            cells += [show(r[key][m], "{:.1f}") for m in ("rf3dgs+", "rf3dgs")]
+            cells.append(show(r[key]["difference"], "{:+.1f}"))
+        lines.append(cells)
+    head = (
+        "changed", "spectra", "RF-3DGS+, PSNR [dB]", "RF-3DGS", "difference", "RF-3DGS+, each picture by its own range",
+        "RF-3DGS", "difference",
+    )  # fmt: skip
+    return markdown(head, lines)
