@@ -24,7 +24,7 @@ METHODS = {
     "transmitter": ("point at the transmitter", "#c9a227"),
     "zero": ("our geometry, zero spectra", "#e58aa4"),
     "nerf2": ("NeRF2", "#2a9d8f"),
-    "cgan": ("CGAN", "#7f4f24"),
+    "cgan": ("conditional GAN", "#7f4f24"),
     "sionna": ("Sionna RT, assumed materials", "#33415c"),
     "sionna-calibrated": ("Sionna RT, calibrated", "#5c7aea"),
     "sionna-again": ("Sionna RT, another seed", "#222222"),
