@@ -82,7 +82,7 @@ class Training:
         iterations: steps.
         seed: of weights and of every step's random choices.
         device: "cpu" or "cuda:0"; CUDA where there is a GPU by default.
-        checkpoint: file to save progress to every 20 s and go on from; removed when training is done.
+        checkpoint: file to save progress to every 20 s and when training is done, and to go on from.
         progress: called with the stage ``"fit"``.
     """
 
@@ -139,7 +139,8 @@ def train(learner: Learner, how: Training, identity: str) -> tuple[list[float], 
             )
         if how.progress is not None:
             how.progress("fit", i + 1, how.iterations)
-        if path is not None and time.monotonic() - saved > CHECKPOINT_S:
+        last = i + 1 == how.iterations
+        if path is not None and (last or time.monotonic() - saved > CHECKPOINT_S):
             tensor_files.write(
                 path,
                 _state(learner.networks, learner.optimisers),
@@ -147,8 +148,6 @@ def train(learner: Learner, how: Training, identity: str) -> tuple[list[float], 
                 CHECKPOINT_FORMAT,
             )
             saved = time.monotonic()
-    if path is not None:
-        path.unlink(missing_ok=True)
     return losses, before_s + time.monotonic() - start
 
 

@@ -127,7 +127,25 @@ def test_resumed_training_ends_as_an_uninterrupted_one(
     assert done == [5, 6, 7, 8, 9]  # the step at which it was killed had not been saved yet
     assert resumed.report["losses"] == whole.report["losses"]
     assert np.array_equal(resumed.image(test.receivers[0]), whole.image(test.receivers[0]))
-    assert not file.exists()
+
+
+@pytest.mark.parametrize("name", FIT)
+def test_a_finished_training_is_not_done_again(name: str, tmp_path: Path) -> None:
+    train, test = spectra().split(4)
+    done: list[int] = []
+    first, again = (
+        fit(
+            name,
+            train,
+            iterations=5,
+            checkpoint=tmp_path / "done",
+            progress=lambda _, step, __: done.append(step),
+        )
+        for _ in range(2)
+    )
+    assert done == [1, 2, 3, 4, 5]
+    assert again.report["losses"] == first.report["losses"]
+    assert np.array_equal(again.image(test.receivers[0]), first.image(test.receivers[0]))
 
 
 def test_the_time_of_a_training_includes_what_came_before_a_kill(
