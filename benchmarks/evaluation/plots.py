@@ -166,18 +166,25 @@ def law_bars(rows: Sequence[Row]) -> Any:
 
 
 def learning_curves(rows: Sequence[Row]) -> Any:
-    """Loss of each network's steps over the share of them done, relative to the first, a panel a method."""
-    methods = list(dict.fromkeys(row["method"] for row in rows))
+    """Loss of each network's steps over its training time, relative to the first; a panel a method, a colour a truth, a
+    line style a number of spectra."""
+    methods, truths, counts = (
+        list(dict.fromkeys(row[k] for row in rows)) for k in ("method", "truth", "count")
+    )
+    styles = dict(zip(sorted(counts, reverse=True), ("-", "--", ":", "-."), strict=False))
     figure, axes = figure_of(len(methods), size=(5.5 * len(methods), 4.0))
     for ax, method in zip(axes, methods, strict=True):
         for row in (row for row in rows if row["method"] == method):
             curve = np.asarray(row["loss_curve"]) / row["loss_curve"][0]
-            share = np.linspace(0.0, row["fit_s"] / 60.0, len(curve))
-            ax.plot(share, curve, label=f"{TRUTHS[row['truth']]}, {row['count']} spectra")
+            minutes = np.linspace(0.0, row["fit_s"] / 60.0, len(curve))
+            ax.plot(
+                minutes, curve, styles.get(row["count"], "-"), color=f"C{truths.index(row['truth'])}",
+                label=f"{TRUTHS[row['truth']]}, {row['count']} spectra",
+            )  # fmt: skip
         ax.set_title(METHODS[method][0], fontsize=10)
         ax.set_xlabel("training time [min]")
         ax.set_ylabel("loss over that of the first fortieth")
         ax.set_yscale("log")
         ax.grid(alpha=0.3, which="both")
-        ax.legend(fontsize=8)
+        ax.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15))
     return figure

@@ -19,7 +19,7 @@ def paper(truth: str, split: str, count: int | None = None) -> list[Row]:
     """Rows of the paper's evaluation of one place, those of ``count`` spectra and of none where it is given."""
     rows = [r for r in read("paper")["rows"] if (r["truth"], r["split"]) == (truth, split)]
     rows = [r for r in rows if count is None or r["count"] in (count, 0)]
-    return sorted(rows, key=lambda r: list(NAMES).index(r["method"]))
+    return sorted(rows, key=lambda r: (list(NAMES).index(r["method"]), r["count"]))
 
 
 @entry("paper-psnr")
