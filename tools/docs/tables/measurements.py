@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from tables.common import TRUTHS, entry, find, markdown, measured, missing, read, show
+from tables.common import TRUTHS, entry, find, markdown, read, show
 
 
 @entry("measurements")
 def _measurements() -> str:
-    found = measured("measurements")
-    if found is None:
-        return missing("python -m benchmarks measurements")
+    found = read("measurements")
     columns = (
         ("psnr_db", "PSNR [dB]", "{:.1f}"), ("direction_within_3deg_blocked", "blocked: within 3 degrees", "{:.0%}"),
         ("beam_gain_loss_db", "beam loss [dB]", "{:.2f}"), ("total_rms_db", "total power, rms [dB]", "{:.2f}"),
@@ -22,9 +20,7 @@ def _measurements() -> str:
 
 @entry("suggest")
 def _suggest() -> str:
-    found = measured("suggest")
-    if found is None:
-        return missing("python -m benchmarks suggest")
+    found = read("suggest")
     lines = [
         [
             r["readings"], str(r["draws"]), f"{r['psnr_db']:.2f}", f"{r['psnr_std_db']:.2f}",
@@ -38,9 +34,7 @@ def _suggest() -> str:
 
 @entry("arrays")
 def _arrays() -> str:
-    found = measured("arrays")
-    if found is None:
-        return missing("python -m benchmarks arrays")
+    found = read("arrays")
     lines = [
         [
             f"{r['carrier_ghz']:g}",
@@ -55,9 +49,7 @@ def _arrays() -> str:
 
 @entry("bare-mesh")
 def _bare_mesh() -> str:
-    found = measured("bare_mesh")
-    if found is None:
-        return missing("python -m benchmarks bare-mesh")
+    found = read("bare_mesh")
     meshes = {"named": "names", "bare": "no names, no colours", "scan": "the same, scanned"}
     head = ("room", "truth", "spectra", "mesh", "PSNR [dB]", "lost [dB]", "where blocked [dB]")
     lines = []

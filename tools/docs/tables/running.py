@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 
-from tables.common import ROOT, entry, markdown, measured, missing, show
+from tables.common import ROOT, entry, markdown, read, show
 
 THREADS = 100 * 16  # of a hundred machines
 LINK = 1.25e9  # bytes a second: 10 Gbit/s
@@ -13,9 +13,7 @@ LINK = 1.25e9  # bytes a second: 10 Gbit/s
 
 @entry("batches")
 def _batches() -> str:
-    found = measured("batches")
-    if found is None:
-        return missing("python -m benchmarks batches")
+    found = read("batches")
     columns = (
         ("receivers", "receivers", "{}"), ("wall_ms", "each [ms]", "{:.0f}"), ("core_ms", "core time [ms]", "{:.0f}"),
         ("over", "over one by one", "{:.2f}"), ("faster", "over one worker", "{:.2f}"), ("same_bits", "same bits", "{}"),
@@ -29,9 +27,7 @@ def _batches() -> str:
 
 @entry("cluster-cost")
 def _cluster_cost() -> str:
-    found, city = measured("batches"), measured("city_paths")
-    if found is None or city is None:
-        return missing("python -m benchmarks batches")
+    found, city = read("batches"), read("city_paths")
     sent, rows = found["sent"], {r["figure"]: r for r in found["rows"]}
     lobby = rows["spectra, exact truth, one worker"]["core_ms"] / 1e3
     response = next(r for r in found["rows"] if "gigabytes" in r)
