@@ -23,6 +23,7 @@ CONVOLUTIONS = ((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1))  # index
 POOLED = (3, 6)  # convolutions that a maximum over 3 x 3 pixels at a stride of 2 precedes
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of the three colours
 LEAST = 1e-10  # added to a feature's length
+SIDE = 31  # pixels that leave one to the last convolution
 
 
 class Lpips:
@@ -51,13 +52,18 @@ class Lpips:
             ) from error
 
     @classmethod
-    def found(cls, files: Sequence[str] = ()) -> Lpips | str:
-        """The metric from ``files`` (AlexNet's, the metric's), or by default from torch's cache and the package ``lpips``;
-        why there is none otherwise.
+    def found(cls, files: Sequence[str] = (), shape: Sequence[int] = (SIDE, SIDE)) -> Lpips | str:
+        """The metric of images of ``shape`` from ``files`` (AlexNet's, the metric's), or by default from torch's cache and
+        the package ``lpips``; why there is none otherwise.
 
         Raises:
-            FileNotFoundError, ValueError: if ``files`` are named and do not serve.
+            FileNotFoundError, ValueError: if ``files`` are named and do not serve, or not for such images.
         """
+        if min(shape) < SIDE:
+            small = f"got images of {' x '.join(map(str, shape))} pixels, AlexNet takes at least {SIDE} x {SIDE}"
+            if files:
+                raise ValueError(f"lpips: {small}")
+            return small
         if files:
             if len(files) != 2:
                 raise ValueError(f"lpips: got {len(files)} files, expected two: AlexNet's weights and LPIPS'")

@@ -206,9 +206,11 @@ def _about(found: dict[str, Any]) -> str:
         f"{_seeds(found)}; reconstructions: {', '.join(rooms)}. Computed on {'; '.join(devices)}, "
         f"{found['seconds'] / 3600.0:.1f} h."
     )
-    reason = next((row["lpips_reason"] for row in found["rows"] if row.get("lpips_reason")), None)
-    if reason:
-        lines.append(f"LPIPS: not computed, {reason}.")
+    unseen = [row for row in found["rows"] if row["lpips"] is None]
+    if unseen:
+        lines.append(
+            f"LPIPS: not computed for {len(unseen)} of {len(found['rows'])} rows, {unseen[0]['lpips_reason']}."
+        )
     lines.append(
         "Training time is from raw spectra, transport included; a spectrum's is from nothing. Peak memory is that of "
         "the whole process. `blocked`: receivers without line of sight alone. Of variants the better one stands here."

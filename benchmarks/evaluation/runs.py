@@ -14,7 +14,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +98,6 @@ class Lab:
             self._room = place.geometry, Geometry(Path(place.geometry), Path(place.xml), self.setting.device)
         return self._room[1]
 
-    @cached_property
-    def lpips(self) -> Lpips | str:
-        """The perceptual metric, or why there is none."""
-        return Lpips.found(self.setting.lpips)
-
 
 @lru_cache(maxsize=1)
 def _lab(setting: Setting) -> Lab:
@@ -123,6 +118,7 @@ def execute(
     start, lab, method, place = time.monotonic(), _lab(setting), METHODS[run.method], setting.place(run.truth)
     truth = lab.truth(run.truth, run.split)
     test = truth.test
+    lpips = Lpips.found(setting.lpips, test.shape)
     scratch = Path(setting.scratch) / run.key
     scratch.mkdir(parents=True, exist_ok=True)
     task = Task(
@@ -139,9 +135,9 @@ def execute(
         budget_s=budget_s,
     )
     with peak_memory(setting.device) as peak:
-        fitted, found = score(run.method, task, perceptual=None if isinstance(lab.lpips, str) else lab.lpips)
-    if isinstance(lab.lpips, str):
-        found["lpips_reason"] = lab.lpips
+        fitted, found = score(run.method, task, perceptual=None if isinstance(lpips, str) else lpips)
+    if isinstance(lpips, str):
+        found["lpips_reason"] = lpips
     shown = shown_receivers(test)
     images = [to_db(fitted.predict(test.receivers[i]).path_gain, test.floor) for i in shown]
     shutil.rmtree(scratch)
@@ -261,8 +257,12 @@ def estimate_s(pending: Iterable[Run], finished: Iterable[Row]) -> float:
 
 
 def missing(runs: Iterable[Run], setting: Setting, rows: Rows) -> list[Run]:
-    """The runs that ``rows`` does not hold."""
-    return [run for run in dict.fromkeys(runs) if rows.get(run, known(run, setting)) is None]
+    """The runs that ``rows`` does not hold, or holds without LPIPS where its weights are named."""
+
+    def complete(row: Row | None) -> bool:
+        return row is not None and not (setting.lpips and row.get("lpips") is None)
+
+    return [run for run in dict.fromkeys(runs) if not complete(rows.get(run, known(run, setting)))]
 
 
 def sweep(
@@ -277,7 +277,8 @@ def sweep(
     progress: Progress | None = None,
     work: Execute = execute,
 ) -> dict[Run, Row]:
-    """Carry out the runs that ``rows`` does not hold and return the figures of all that are finished.
+    """Carry out the runs that are :func:`missing` and return the figures of all that are finished, those without LPIPS
+    among them.
 
     Args:
         runs: what to do; see :func:`benchmarks.evaluation.protocol.plan`.
@@ -298,9 +299,10 @@ def sweep(
     end = None if minutes is None else time.time() + 60.0 * minutes
     tell = progress or (lambda stage, done, total: None)
     pending = missing(everything, setting, rows)
-    todo = set(pending)
-    found = {run: rows.get(run, known(run, setting)) or {} for run in everything if run not in todo}
-    tell("runs", len(found), len(everything))
+    done = len(everything) - len(pending)
+    kept = ((run, rows.get(run, known(run, setting))) for run in everything)
+    found = {run: row for run, row in kept if row is not None}
+    tell("runs", done, len(everything))
     # What takes another run's seconds comes after that run.
     parts = [[r for r in pending if (r.method in AFTER) == late] for late in (False, True)]
     with connected(scheduler, workers if pending else 0) as client:
@@ -312,7 +314,8 @@ def sweep(
                     continue
                 write_arrays(pictures / pictures_of(part[k]), result[1])
                 found[part[k]] = rows.put(part[k], known(part[k], setting), result[0])
-                tell("runs", len(found), len(everything))
+                done += 1
+                tell("runs", done, len(everything))
     return {run: found[run] for run in everything if run in found}
 
 

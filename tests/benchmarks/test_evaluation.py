@@ -26,7 +26,7 @@ from benchmarks.evaluation import command, comparison, conference, protocol, rep
 from benchmarks.evaluation.lpips import Lpips
 from benchmarks.evaluation.paper_law import paper_law_spectra
 from benchmarks.evaluation.protocol import Place, Run, Setting
-from benchmarks.evaluation.runs import Rows, estimate_s, pictures_of, sweep
+from benchmarks.evaluation.runs import Rows, estimate_s, missing, pictures_of, sweep
 from benchmarks.methods import METHODS, Effort, Task, score
 from benchmarks.runner import Job, execute
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -495,9 +495,10 @@ def test_bad_options_are_named(data: Path, tmp_path: Path, wrong: dict[str, Any]
         whole(tmp_path, data, **{"truths": ("exact",), **wrong})
 
 
-def test_lpips_is_the_distance_of_normalised_features_weighted_by_channel(tmp_path: Path) -> None:
+@pytest.fixture
+def weights(tmp_path: Path) -> tuple[Path, Path]:
+    """Files of random weights, shaped as AlexNet's and LPIPS' are."""
     torch = pytest.importorskip("torch")
-    assert "nothing is downloaded" in str(Lpips.found())
     r = torch.Generator().manual_seed(3)
     sizes = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
     backbone = {
@@ -512,7 +513,16 @@ def test_lpips_is_the_distance_of_normalised_features_weighted_by_channel(tmp_pa
     files = tmp_path / "alexnet.pth", tmp_path / "lpips.pth"
     for state, file in zip((backbone, layers), files, strict=True):
         torch.save(state, file)
-    found = Lpips.found([str(file) for file in files])
+    return files
+
+
+def test_lpips_is_the_distance_of_normalised_features_weighted_by_channel(
+    weights: tuple[Path, Path],
+) -> None:
+    torch = pytest.importorskip("torch")
+    assert "nothing is downloaded" in str(Lpips.found())
+    backbone, layers = (torch.load(file, weights_only=True) for file in weights)
+    found = Lpips.found([str(file) for file in weights])
     assert isinstance(found, Lpips)
     one, other = np.random.default_rng(4).random((2, 64, 70))
     # The same network from torch's own modules.
@@ -540,9 +550,35 @@ def test_lpips_is_the_distance_of_normalised_features_weighted_by_channel(tmp_pa
                 expected += float(net.functional.conv2d((a - b) ** 2, weight).mean())
     assert found(one, other) == pytest.approx(expected, rel=1e-5) and expected > 0.01
     assert found(one, one) == 0.0
-    files[1].write_bytes(b"no weights")
+    weights[1].write_bytes(b"no weights")
     with pytest.raises(ValueError, match=r"lpips: .*lpips\.pth is no file of weights"):
-        Lpips.found([str(file) for file in files])
+        Lpips.found([str(file) for file in weights])
+
+
+def test_rows_without_lpips_are_made_anew_once_its_weights_are_named(
+    data: Path, weights: tuple[Path, Path], tmp_path: Path
+) -> None:
+    rows, planned = Rows(tmp_path / "rows.jsonl"), [Run("exact", "random", 1, 0, "nearest")]
+    setting = setting_of(data)
+    small = replace(setting, lpips=tuple(map(str, weights)))
+    with pytest.raises(
+        RuntimeError, match="lpips: got images of 12 x 24 pixels, AlexNet takes at least 31 x 31"
+    ):
+        sweep(planned, small, rows, tmp_path, workers=0)
+    like = wr.SpectrumDataset.load(data / "spectra.nc")
+    wr.simulate(
+        wr.Scene.load(data / "scene.xml"), transmitter=like.transmitter, receivers=like.receivers[:3], shape=(31, 62),
+        frequency_hz=300e9, beam_sigma_rad=like.beam_sigma_rad, roles=["train", "test", "test"], device="cpu",
+    ).save(tmp_path / "spectra.nc")  # fmt: skip
+    place = replace(setting.place("exact"), file=str(tmp_path / "spectra.nc"))
+    without = replace(setting, places=(("exact", place),))
+    named = replace(without, lpips=small.lpips)
+    (first,) = sweep(planned, without, rows, tmp_path, workers=0).values()
+    assert first["lpips"] is None and "nothing is downloaded" in first["lpips_reason"]
+    assert sweep(planned, named, rows, tmp_path, workers=0, minutes=0.0) == {planned[0]: first}
+    (second,) = sweep(planned, named, rows, tmp_path, workers=0).values()
+    assert second["lpips"] > 0.0 and second["psnr_db"] == first["psnr_db"]
+    assert not missing(planned, named, rows) and not missing(planned, without, rows)
 
 
 def test_shown_receivers_are_one_with_line_of_sight_and_one_without() -> None:
