@@ -25,8 +25,9 @@ HELP = """\
 Every method on the same receivers: bistatic, RF-3DGS+ and RF-3DGS (opacity frozen and trained), NeRF2, a conditional
 GAN, Sionna RT with assumed and with calibrated materials, lookups; in the lobby, and with --room in a second room. A
 finished run is a row of the file --rows, a killed sweep loses the run at work, and a run is done again only if the way
-that its data were made, its options or its version changed. The truth `paper-law` is made: scattering that falls with the
-whole path's length, as the paper's law has it. Needs the extras plots, baselines and sionna; cluster with --workers.
+that its data were made, its options or its version changed, or if --lpips names weights and its row has no LPIPS. The
+truth `paper-law` is made: scattering that falls with the whole path's length, as the paper's law has it. Needs
+the extras plots, baselines and sionna; cluster with --workers.
 
 examples:
   python -m benchmarks data --only spectra --full                     the data of the paper's size first

@@ -60,7 +60,9 @@ class Lpips:
             FileNotFoundError, ValueError: if ``files`` are named and do not serve, or not for such images.
         """
         if min(shape) < SIDE:
-            small = f"got images of {' x '.join(map(str, shape))} pixels, AlexNet takes at least {SIDE} x {SIDE}"
+            small = (
+                f"got images of {' x '.join(map(str, shape))} pixels, AlexNet takes at least {SIDE} x {SIDE}"
+            )
             if files:
                 raise ValueError(f"lpips: {small}")
             return small
