@@ -61,7 +61,8 @@ def _mean(group: list[Row]) -> Row:
         values = [row.get(name) for row in group]
         numbers = [float(v) for v in values if isinstance(v, int | float) and not isinstance(v, bool)]
         if name not in merged and len(numbers) + values.count(None) == len(values):
-            merged[name] = ends.get(name, np.mean)(numbers) if numbers else None
+            whole = len(numbers) == len(values)  # of some seeds alone it would not compare
+            merged[name] = ends.get(name, np.mean)(numbers) if whole else None
     for name in COMPARED:
         merged[f"{name}_std"] = _mean_and_spread([row.get(name) for row in group])[1]
     most = max(row["cores"] for row in group)  # runs side by side have fewer, and take longer

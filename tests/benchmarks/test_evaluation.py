@@ -325,7 +325,7 @@ def test_the_better_variant_of_each_seed_counts_and_seeds_are_averaged() -> None
     rows = [
         row("rf3dgs+", 10, 0, "exp", psnr_db=21.0, psnr_db_min=10.0),
         row("rf3dgs+", 10, 0, "linear", psnr_db=22.0, psnr_db_min=9.0),
-        row("rf3dgs+", 10, 1, "exp", psnr_db=26.0, psnr_db_min=12.0),
+        row("rf3dgs+", 10, 1, "exp", psnr_db=26.0, psnr_db_min=12.0, lpips=0.1),
         row("rf3dgs+", 10, 1, "linear", psnr_db=25.0, psnr_db_min=2.0),
     ]
     (found,) = comparison.summarise(rows)
