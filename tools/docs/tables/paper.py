@@ -121,7 +121,7 @@ def _paper_detail() -> str:
     for place, name in PLACES.items():
         lines = [
             [
-                NAMES[r["method"]], show(r["ssim"], "{:.2f}"), show(r["rmse_db"]),
+                NAMES[r["method"]], show(r["ssim"], "{:.2f}"), show(r["lpips"], "{:.3f}"), show(r["rmse_db"]),
                 f"{r['direction_within_3deg']:.0%} / {show(r['direction_within_3deg_blocked'], '{:.0%}')}",
                 f"{r['beam_gain_loss_db']:.1f} / {show(r['beam_gain_loss_db_blocked'])}",
                 show(r["tof_error_median_ns"], "{:.2g}"), show(r.get("train_s"), "{:.3g}"),
@@ -131,8 +131,8 @@ def _paper_detail() -> str:
             for r in paper(*place, 100)
         ]  # fmt: skip
         head = (
-            f"{name}, 100 spectra", "SSIM", "RMSE [dB]", "within 3°, all / blocked", "beam loss [dB], all / blocked",
-            "delay [ns]", "training [s]", "a spectrum [ms]", "memory [GiB]", "model [MiB]",
+            f"{name}, 100 spectra", "SSIM", "LPIPS", "RMSE [dB]", "within 3°, all / blocked",
+            "beam loss [dB], all / blocked", "delay [ns]", "training [s]", "a spectrum [ms]", "memory [GiB]", "model [MiB]",
         )  # fmt: skip
         if lines:
             parts.append(markdown(head, lines))
@@ -174,6 +174,7 @@ def _paper_networks() -> str:
             NAMES[r["method"]], name, str(r["count"]), show(r["fit_s"] / 60.0, "{:.0f}"), "; ".join(r["devices"]),
             show(r["loss_curve"][-1] / r["loss_curve"][0], "{:.2f}"),
             show(r["loss_curve"][-1] / r["loss_curve"][len(r["loss_curve"]) // 2], "{:.2f}"), show(r["psnr_db"]),
+            show(r["lpips"], "{:.2f}"),
         ]
         for place, name in PLACES.items()
         for r in paper(*place)
@@ -181,7 +182,7 @@ def _paper_networks() -> str:
     ]  # fmt: skip
     head = (
         "network", "truth", "spectra", "training [min]", "on", "last loss over first", "last loss over that at half time",
-        "PSNR [dB]",
+        "PSNR [dB]", "LPIPS",
     )  # fmt: skip
     text = (
         f"NeRF2 trains for {effort['nerf2_iterations']} steps of {effort['nerf2_rays']} rays with "
@@ -218,12 +219,12 @@ def _paper_stage2() -> str:
 def _published() -> str:
     lines = [
         [
-            NAMES[r["method"]], show(r["psnr_db"], "{:.2f}"), show(r["ssim"], "{:.3f}"), show(r["train_s"], "{:.0f}"),
-            show(1e3 * r["seconds_per_spectrum"], "{:.3g}"),
+            NAMES[r["method"]], show(r["psnr_db"], "{:.2f}"), show(r["ssim"], "{:.3f}"), show(r["lpips"], "{:.3f}"),
+            show(r["train_s"], "{:.0f}"), show(1e3 * r["seconds_per_spectrum"], "{:.3g}"),
         ]
         for r in read("paper")["published"]
     ]  # fmt: skip
-    return markdown(("as published", "PSNR [dB]", "SSIM", "training [s]", "a spectrum [ms]"), lines)
+    return markdown(("as published", "PSNR [dB]", "SSIM", "LPIPS", "training [s]", "a spectrum [ms]"), lines)
 
 
 @entry("law")
