@@ -75,8 +75,15 @@ def entry(name: str) -> Callable[[Callable[[], str]], Callable[[], str]]:
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Rows of cells under a head; all but the first column set right."""
+    """Rows of cells under a head; all but the first column set right.
+
+    Raises:
+        ValueError: for a row that has not one cell a column.
+    """
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    for line in lines:
+        if len(line) != len(head):
+            raise ValueError(f"rows: got {len(line)} cells, expected {len(head)}: {', '.join(head)}")
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
