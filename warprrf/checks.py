@@ -153,6 +153,14 @@ def _number(value: object) -> float:
         return np.nan
 
 
+def users_level() -> int:
+    """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
+        frame, level = frame.f_back, level + 1
+    return level
+
+
 LARGEST_M = 1e8
 """No coordinate is larger [m]: beyond, single precision overflows in products of lengths."""
 _KINDS = {"f": "real numbers", "i": "whole numbers", "u": "unsigned ones", "b": "truth values"}

@@ -14,14 +14,13 @@ surfaces, or out of the same number of solids; in a court, under a bridge or bel
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, users_level
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -271,7 +270,7 @@ def warn_of_unmodelled(
         f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
         "of sight may get more power than is found here; warprrf.relevance estimates how much",
         UserWarning,
-        stacklevel=_users_level(),
+        stacklevel=users_level(),
     )
 
 
@@ -325,14 +324,6 @@ def _is_within(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
     if is_open_air(mesh, device=device):
         return bool(under_a_roof(mesh, point[None], device=device)[0])
     return bool(_mean_side(mesh.look_around(point[None], lattice(_DIRECTIONS), device=device)[1])[0] < 0)
-
-
-def _users_level() -> int:
-    """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
-    frame, level = inspect.currentframe(), 0
-    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
-        frame, level = frame.f_back, level + 1
-    return level
 
 
 def _sky_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
