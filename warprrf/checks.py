@@ -7,7 +7,7 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
@@ -159,6 +159,12 @@ def users_level() -> int:
     while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
         frame, level = frame.f_back, level + 1
     return level
+
+
+def some_of(rows: Sequence[int] | np.ndarray, most: int = 8) -> str:
+    """Rows of a table, for a message: the first ones and how many more."""
+    told = ", ".join(str(int(row)) for row in rows[:most])
+    return told + f" and {len(rows) - most} more" * (len(rows) > most)
 
 
 LARGEST_M = 1e8

@@ -85,7 +85,7 @@ class Readings:
         samples: independent samples of fading that each reading is the mean of: 1 for narrowband power at one place,
             None where fading is averaged out. Fading is taken for Rayleigh's.
         air: whose absorption is in the powers; None for none.
-        name: by which a report tells these readings from others.
+        name: by which a report tells these readings from others; several of one name are numbered in the order given.
         azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
             from line of sight and mirrors. Give readings whose zeros differ as several data sets.
         position_std_m: standard deviation of each coordinate of the receivers [m]; above 0 a fit finds where they stood.

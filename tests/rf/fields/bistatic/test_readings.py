@@ -91,11 +91,22 @@ def test_wrong_readings_are_named_and_hardly_count(
     wrong = np.sort(rng.choice(above, len(above) // 10, replace=False))
     power = turned.power.copy()
     power[wrong] *= 100.0
-    clean, spoilt = (RadioField.fit(scene, r, quick=True) for r in (turned, replace(turned, power=power)))
+    clean = RadioField.fit(scene, turned, quick=True)
+    with pytest.warns(UserWarning, match=rf"of {len(turned)} readings .* left out .*rows {wrong[0]}, "):
+        spoilt = RadioField.fit(scene, replace(turned, power=power), quick=True)
     named = spoilt.report["unexplained"]["readings"]
     assert np.isin(wrong, named).mean() >= 0.9
     assert len(named) < 2 * len(wrong) + 3
     assert score(spoilt, test) > score(clean, test) - 1.0
+
+
+def test_data_sets_of_one_name_are_told_apart_in_a_report(scene: RadioScene, turned: Readings) -> None:
+    power = turned.power.copy()
+    power[[0, len(power) // 2]] *= 1e3  # a row of each half
+    halves = [replace(turned, power=power).subset(part) for part in np.split(np.arange(len(turned)), 2)]
+    report = RadioField.fit(scene, halves, quick=True).report
+    assert report["noise_db"].keys() == {"readings 1", "readings 2"}
+    assert all(0 in report["unexplained"][name] for name in ("readings 1", "readings 2"))
 
 
 def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings) -> None:
