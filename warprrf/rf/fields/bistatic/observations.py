@@ -39,8 +39,6 @@ READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
 TOTAL_ERROR_DB = 0.5
 """The same of all power of a place: errors of single directions average out."""
-MOST_POINTINGS_BYTES = 256_000_000
-"""A table that the places of a data set share is no larger: 9,000 pointings of a horn."""
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 
 
@@ -248,13 +246,11 @@ def observe(
 
 def _pointings(one: Readings, view: ReceiverView) -> tuple[np.ndarray, np.ndarray] | None:
     """What each pointing of a receiving antenna reads of unit power in each pixel, shape ``(D, P)`` float32, and which one
-    each reading is, shape ``(N,)``; None where arrival is not all that counts, or too many pointings differ."""
+    each reading is, shape ``(N,)``; None where arrival is not all that counts."""
     if one.arrival is None or one.departure is not None or one.delay_s is not None:
         return None
     first, row = np.unique(one.arrival, axis=0, return_index=True, return_inverse=True)[1:]
     toward = pixel_means(view.transport.grid)
-    if len(first) * len(toward) * np.dtype(np.float32).itemsize > MOST_POINTINGS_BYTES:
-        return None
     return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row.reshape(-1)
 
 
