@@ -10,7 +10,8 @@ import numpy as np
 from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.maps.radio_map import QUANTITIES, in_the_air
+from warprrf.rf.maps.radio_map import QUANTITIES
+from warprrf.rf.positions import in_the_air
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import Readings
