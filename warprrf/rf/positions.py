@@ -3,8 +3,9 @@
 Only a closed surface has an inside (:attr:`warprrf.Mesh.closed_parts`: a scan's with small holes too); a sheet, or walls
 with an open side or a doorway, have none, however they are wound. A place is in the same air as another that sees it, or
 that the same closed surfaces hold. Else what is entered on the way from one to the other parts them, unless as many
-are left (another room), or only walls with two surfaces are left (the open air). Where no place is known to be in the air, a closed
-surface that holds most of the rest is a room's, and so is one that is all there is.
+are left (another room), or only walls with two surfaces are left (the open air); a solid's hollow, wound the other way,
+is air. Where no place is known to be in the air, a closed surface that holds most of the rest is a room's, and so is one
+that is all there is.
 
 A city's mesh is no closed room: buildings often have no floors, and the ground is one sheet. So under the sky places are
 judged by rays upward besides. In a building low, slanting, steep and vertical ones all cross an odd number of surfaces, or out of
@@ -48,7 +49,8 @@ _BANDS = 3  # of rays upward: low, slanting, steep; a fourth of as many is overh
 _OVERHEAD = 0.98  # least sine of the elevation there
 _SKY = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
 _PLACES = 5  # along each side of a scene, at which the sky is looked for
-_WALL = 0.5  # least size of the inner surface of a room's walls, as a share of the outer one's
+_ROOM = 0.1  # least share of the box around a scene that its room takes
+_WALL = 0.5  # least share of what a room's walls hold that their inner surface does
 _SAMPLES = 1000  # faces whose places tell what a surface holds
 _LEAK = 0.02  # share of rays that may leave a closed room: its walls need not meet exactly
 _FLOOR = 0.1  # least share of a plan with something below, for a scene with a floor
@@ -107,14 +109,15 @@ def check_positions(
     apart = parted(mesh, points, reference, device=device)
     if (
         known is None
-        and apart[1:].sum() > 0.5 * (len(points) - 1)
+        and (len(points) == 1 or apart[1:].mean() > 0.5)
         and parted(mesh, transmitter[None], None, device=device)[0]
     ):
-        apart, reference = np.arange(len(points)) == 0, points[1]
+        apart = np.arange(len(points)) == 0
     outside = ((points < mesh.bounds[0]) | (points > mesh.bounds[1])).any(axis=1)
     if outside.any():
-        outside &= _is_sealed(mesh, reference, device)
-        _refuse(outside, "outside the scene", points, labels, mesh)
+        air = points[~outside & ~apart]
+        sealed = _is_sealed(mesh, air[0], device) if len(air) else apart[0]
+        _refuse(outside & sealed, "outside the scene", points, labels, mesh)
     if not on_surfaces:
         near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
         _refuse(near, "on a surface", points, labels, mesh)
@@ -158,12 +161,16 @@ def parted(
         return found
     own, rooms = points[asked], _rooms(mesh) if known is None else ()
     entered, left = np.zeros(len(own), int), np.zeros(len(own), int)
-    for k, part in enumerate(mesh.closed_parts):
+    solids: list[Mesh] = []
+    for k, part in sorted(
+        enumerate(mesh.closed_parts), key=lambda item: -np.ptp(item[1].bounds, axis=0).prod()
+    ):
         inside = holds(part, own, device=device)
         if k in rooms or (known is not None and holds(part, known[None], device=device)[0]):
             left += ~inside
-        else:
-            entered += inside
+        elif inside.any():
+            entered += np.where(_is_cavity(part, solids), -1, 1) * inside
+            solids.append(part)
     found[asked] = (entered != left) & ((entered > 0) | (left % 2 == 1))
     if is_open_air(mesh, device=device):
         roofed = under_a_roof(mesh, own, device=device)
@@ -339,10 +346,10 @@ def _rooms(mesh: Mesh) -> list[int]:
     """Which closed parts of a scene have its air inside: those that hold most of what is left, from the outermost inward,
     or are all that is left: the scene's only surface, or the inner one of its walls."""
     rooms = list[int]()
-    size = [float(np.linalg.norm(np.ptp(part.bounds, axis=0))) for part in mesh.closed_parts]
-    least = _WALL * float(np.linalg.norm(np.ptp(mesh.bounds, axis=0)))
-    for k in sorted(range(len(size)), key=lambda k: -size[k]):
-        if size[k] < least:
+    volume = [abs(_volume(part)) for part in mesh.closed_parts]
+    least = _ROOM * float(np.ptp(mesh.bounds, axis=0).prod())
+    for k in sorted(range(len(volume)), key=lambda k: -volume[k]):
+        if volume[k] < least:
             break
         rest = np.flatnonzero(~np.isin(mesh.closed_part_of[mesh.distinct_faces], [*rooms, k]))
         rest = mesh.distinct_faces[
@@ -351,7 +358,26 @@ def _rooms(mesh: Mesh) -> list[int]:
         held = holds(mesh.closed_parts[k], mesh.triangles[rest].mean(axis=1))
         if not len(rest) or mesh.areas[rest[held]].sum() > 0.5 * mesh.areas[rest].sum():
             rooms.append(k)
+            least = _WALL * volume[k]
     return rooms
+
+
+def _is_cavity(part: Mesh, solids: list[Mesh]) -> bool:
+    """Whether a closed surface bounds a hollow in one of ``solids``: it lies within that, and is wound the other way."""
+    for solid in solids:
+        if (part.bounds[0] >= solid.bounds[0]).all() and (part.bounds[1] <= solid.bounds[1]).all():
+            if (
+                _volume(part) * _volume(solid) < 0
+                and holds(solid, part.triangles.mean(axis=1)[:_DIRECTIONS]).mean() > 0.5
+            ):
+                return True
+    return False
+
+
+def _volume(part: Mesh) -> float:
+    """What a closed surface encloses [m^3], negative where it is wound inward."""
+    a, b, c = np.moveaxis(part.triangles - part.center, 1, 0)
+    return float(np.einsum("fi,fi->", a, np.cross(b, c))) / 6.0
 
 
 def _is_sealed(mesh: Mesh, known: np.ndarray, device: DeviceLike) -> bool:
