@@ -31,7 +31,7 @@ from warprrf.rf.positions import (
 )
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_beam, check_shape
 from warprrf.steps import Steps, digest
 
 ENGINES = ("exact", "sionna")
@@ -114,7 +114,7 @@ def simulate(
     warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, transmission=through, device=device)
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
-    common |= {"shape": check_shape(shape), "beam_sigma_rad": beam_sigma_rad}
+    common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
     versions = _versions(engine)
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver = (sampling, _versions(engine, solver_only=True)) if engine == "sionna" else None

@@ -42,12 +42,11 @@ from warprrf.rf.positions import check_positions, check_receivers
 from warprrf.rf.spectra.antenna import Pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_shape
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_beam, check_shape
 from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 """Attributes of every model that are numbers, under these names in the header of a file."""
-NARROWEST_BEAM_RAD = 1e-4
 Measured: TypeAlias = SpectrumDataset | Readings | ArraySpectra
 """What fields are fitted to: a set of spectra, a table of readings, spectra of coherent arrays."""
 Data: TypeAlias = Measured | Sequence[Measured]
@@ -472,7 +471,7 @@ class RadioField(ABC):
         low, high = (check_number("range_db", value, -1e4, 1e4) for value in self.range_db)
         if not low <= high:
             raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
-        check_number("beam_sigma_rad", self.beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
+        check_beam(self.beam_sigma_rad)
         if self.fitted_on is not None:
             known = check_array("fitted_on", self.fitted_on, (None, 3))
             if self.fitted_under is not None:

@@ -26,6 +26,7 @@ from warprrf.device import Progress
 from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import (
+    NARROWEST_BEAM_RAD,
     Spectrum,
     check_whole,
     directions_from_angles,
@@ -35,7 +36,6 @@ from warprrf.rf.spectra.spectrum import (
 )
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
-NARROWEST_BEAM_RAD = 1e-4
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 

@@ -26,6 +26,8 @@ from warprrf.kernels.radio import beam as beam_kernels
 BEAM_SIGMA_RAD = float(np.deg2rad(2.0))
 """Default beam width: kappa = 1 / sigma^2 [rad]."""
 
+NARROWEST_BEAM_RAD = 1e-4
+
 DEFAULT_SHAPE = (90, 180)
 """Default grid: 2 by 2 degrees."""
 
@@ -58,6 +60,15 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     if rows * columns > MOST_PIXELS:
         raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {MOST_PIXELS} in all")
     return rows, columns
+
+
+def check_beam(beam_sigma_rad: float) -> float:
+    """``beam_sigma_rad`` as a beam width from :data:`NARROWEST_BEAM_RAD` to pi.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    return check_number("beam_sigma_rad", beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
 
 
 def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:

@@ -156,6 +156,11 @@ class HarmonicField(RadioField):
             ValueError: for an option's value that is not allowed, receivers that are not inside the scene, spectra
                 without power, or a checkpoint of another fit.
         """
+        if not (hasattr(ds, "path_gain") and hasattr(ds, "transmitter")):
+            raise TypeError(
+                f"ds: got {type(ds).__name__}, expected a SpectrumDataset: model {model!r} is fitted to whole spectra; "
+                'a model="bistatic" takes readings and arrays too'
+            )
         chosen = FieldOptions.of(options, {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
