@@ -67,8 +67,8 @@ def simulate(
 
     Args:
         scene: The :class:`Scene`.
-        transmitter: Position [m], shape ``(3,)``.
-        receivers: Positions [m], shape ``(R, 3)``.
+        transmitter: Position [m], shape ``(3,)``: a data set is of one; fits take a list of data sets.
+        receivers: Positions [m], shape ``(R, 3)``, or ``(3,)`` for a set of one.
         frequency_hz: Carrier frequency [Hz].
         shape: Rows and columns of a spectrum.
         engine: "exact": line of sight, one mirror reflection and single-bounce scattering, without noise; ``depth``,
@@ -102,7 +102,7 @@ def simulate(
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
-    points = check_receivers("receivers", check_array("receivers", receivers, (None, 3)))
+    points = np.atleast_2d(check_receivers("receivers", receivers))
     source = check_array("transmitter", transmitter, (3,))
     frequency = check_frequency(frequency_hz)
     table = surface_table(scene.materials, frequency)

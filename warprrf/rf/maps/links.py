@@ -32,7 +32,7 @@ from warprrf.rf.spectra.spectrum import (
 
 @dataclass(frozen=True)
 class Links:
-    """Links of several receivers to one transmitter, arrays ``(R,)``.
+    """Links of several receivers, arrays ``(R,)``; or one, numbers.
 
     Attributes:
         total_path_gain: sum over all paths [linear]; the sum of the spectrum.
@@ -48,6 +48,10 @@ class Links:
     best_path_gain: np.ndarray
     delay_spread_s: np.ndarray
     best_beam_gain: np.ndarray
+
+    def __getitem__(self, chosen: Any) -> Links:
+        """Those of some receivers, or of one."""
+        return Links(*(array[chosen] for array in vars(self).values()))
 
     @classmethod
     def joined(cls, parts: Sequence[Links]) -> Links:

@@ -38,13 +38,15 @@ class Lookup:
     train: SpectrumDataset = field(repr=False)
     _predict: Callable[[np.ndarray], Spectrum] = field(repr=False)
 
-    def __call__(self, receiver: ArrayLike) -> Spectrum:
-        """The predicted spectrum at ``receiver`` (3,) [m].
+    def __call__(self, receivers: ArrayLike) -> Spectrum:
+        """The predicted spectrum at ``receivers`` (3,) or (R, 3) [m].
 
         Raises:
-            ValueError: if the position is not three finite numbers.
+            ValueError: if a position is not three finite numbers.
         """
-        return self._predict(check_array("receiver", receiver, (3,)))
+        places = check_array("receivers", receivers, (..., 3))
+        found = [self._predict(place) for place in places.reshape(-1, 3)]
+        return found[0] if places.ndim == 1 else Spectrum.stack(found)
 
     spectrum = __call__
 
