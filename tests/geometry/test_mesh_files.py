@@ -13,7 +13,7 @@ from model_files import BLUE, RED, changed_glb, obj_with_materials, room_glb, ro
 from places import ROOT
 
 import warprrf as wr
-from warprrf.geometry import gltf_files
+from warprrf.geometry import gltf_files, mesh_content, obj_files
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh, write_mesh
 
 BLUE_SRGB = np.array(BLUE) / 255.0
@@ -130,6 +130,31 @@ def test_numbered_pages_of_a_scan_are_no_materials(tmp_path: Path) -> None:
     mesh = wr.Mesh.load(path)
     assert mesh.labels == ("Paint",)
     np.testing.assert_array_equal(mesh.face_label, [-1, -1, 0])
+
+
+def one_texture_glb(folder: Path) -> Path:
+    def share(header):
+        textured = [m for m in header["materials"] if "baseColorTexture" in m["pbrMetallicRoughness"]]
+        header["materials"] = textured * len(header["materials"])
+
+    return changed_glb(room_glb(folder), share)
+
+
+def one_texture_obj(folder: Path) -> Path:
+    path = obj_with_materials(folder)
+    (folder / "square.mtl").write_text(
+        "".join(f"newmtl {n}\nmap_Kd pages/wood.png\n" for n in ("Wood_01", "Paint"))
+    )
+    return path
+
+
+@pytest.mark.parametrize("make", [one_texture_glb, one_texture_obj])
+def test_a_picture_that_materials_share_is_decoded_once(make, tmp_path: Path, monkeypatch) -> None:
+    path, read, decoded = make(tmp_path), mesh_content.read_picture, []
+    for module in gltf_files, obj_files:
+        monkeypatch.setattr(module, "read_picture", lambda *a: decoded.append(a) or read(*a))
+    assert wr.Mesh.load(path).face_colours is not None
+    assert len(decoded) == 1
 
 
 def outside_obj(folder: Path) -> Path:

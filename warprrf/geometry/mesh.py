@@ -68,7 +68,7 @@ class Mesh:
 
     Raises:
         TypeError: if the arguments don't read as arrays, or faces are not whole numbers.
-        ValueError: on a wrong shape, no faces, an index out of range, or vertices that are not finite.
+        ValueError: on a wrong shape, no face that has an area, an index out of range, or vertices that are not finite.
     """
 
     def __init__(
@@ -94,6 +94,8 @@ class Mesh:
                 f"faces: got indices from {low} to {high}, expected 0 to {len(self.vertices) - 1} "
                 f"for {len(self.vertices)} vertices"
             )
+        if not np.cross(*np.diff(self.vertices[self.faces], axis=1).swapaxes(0, 1)).any():
+            raise ValueError("faces: got none that has an area, expected at least one")
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
         self.face_colours = self._checked_colours(face_colours)

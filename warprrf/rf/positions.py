@@ -17,6 +17,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -67,6 +68,43 @@ def check_receivers(name: str, value: ArrayLike) -> np.ndarray:
     if array.ndim not in (1, 2) or array.shape[-1] != 3 or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}, expected (3,) or (R, 3) with R at least 1")
     return array
+
+
+class Ends(NamedTuple):
+    """Both ends of links, row by row.
+
+    Attributes:
+        receivers, transmitters: positions [m], shape ``(R, 3)`` each.
+        single: whether one link was asked for: then results have no receiver axis.
+    """
+
+    receivers: np.ndarray
+    transmitters: np.ndarray
+    single: bool
+
+    @classmethod
+    def of(cls, receivers: ArrayLike, transmitter: ArrayLike, name: str = "receivers") -> Ends:
+        """``receivers`` and ``transmitter`` [m], each ``(3,)`` or ``(R, 3)``: one of either goes with all of the other.
+
+        Raises:
+            ValueError: naming the argument, on other shapes, numbers of rows that differ, or numbers not finite.
+        """
+        to, source = check_receivers(name, receivers), check_receivers("transmitter", transmitter)
+        if to.ndim == source.ndim == 2 and len(to) != len(source):
+            raise ValueError(
+                f"transmitter: got shape {source.shape}, expected (3,) or one for each receiver, {to.shape}"
+            )
+        rows = np.atleast_2d(*map(np.ascontiguousarray, np.broadcast_arrays(to, source)))
+        return cls(rows[0], rows[1], to.ndim == source.ndim == 1)
+
+    def groups(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Each transmitter (3,) and the rows under it."""
+        sources, under = np.unique(self.transmitters, axis=0, return_inverse=True)
+        return [(source, np.flatnonzero(under.ravel() == k)) for k, source in enumerate(sources)]
+
+    def shaped(self, results: Any) -> Any:
+        """``results`` of all rows as they are handed out: a single one by itself."""
+        return results[0] if self.single else results
 
 
 def check_positions(
