@@ -14,6 +14,7 @@ import pytest
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
 import warprrf as wr
+from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.fields import batches
 from warprrf.rf.spectra.spectrum import pixel_solid_angles
 
@@ -242,6 +243,7 @@ def test_what_was_begun_is_continued_and_never_taken_for_whole(
 
 KILLED = """
 import sys, numpy as np, warprrf as wr
+from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.fields import batches
 batches.AT_ONCE = 2
 field, places = wr.RadioField.load(sys.argv[1]), np.load(sys.argv[2])
@@ -269,3 +271,77 @@ def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_pa
     found = field.spectra(PLACES, store=names[2], progress=lambda _, done, __: told.append(done))
     np.testing.assert_array_equal(found.path_gain, field.spectra(PLACES).path_gain)
     assert told == [4, 6]
+
+
+GAIN = np.arange(30.0).reshape(6, 5)
+
+
+def fill(file: Path, rows: int = 6) -> np.ndarray:
+    """What a store of :data:`GAIN` holds, its first ``rows`` written at most."""
+    variables = {
+        "receiver_position": Variable(("receiver", "xyz")),
+        "gain": Variable(("receiver", "zenith")),
+    }
+    with Store(file, {"receiver_position": PLACES}, variables, {"key": "k"}, 6) as store:
+        for row in np.flatnonzero(store.missing[:rows]):
+            store.put(np.array([row]), {"gain": GAIN[[row]]})
+    return store.arrays()["gain"] if file.exists() else GAIN[:0]
+
+
+def test_damage_of_an_unfinished_store_is_mended_or_refused_and_never_sealed(tmp_path: Path) -> None:
+    file, unfinished = tmp_path / "gain.nc", tmp_path / "gain.nc.unfinished"
+    fill(file, 4)
+    begun = unfinished.read_bytes()
+    fill(file)
+    whole, ends = file.read_bytes(), set()
+    row = begun.index(GAIN[2].tobytes())
+    for bit in [8 * row + 13, *np.random.default_rng(0).integers(8 * len(begun), size=60).tolist()]:
+        file.unlink(missing_ok=True)
+        spoilt = bytearray(begun)
+        spoilt[bit // 8] ^= 1 << bit % 8
+        unfinished.write_bytes(spoilt)
+        try:
+            fill(file)
+        except ValueError as error:
+            ends.add("refused")
+            assert "gain.nc.unfinished" in str(error) and not file.exists()
+        else:
+            ends.add("mended")
+            assert file.read_bytes() == whole
+    assert ends == {"refused", "mended"}
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_a_store_that_another_process_finishes_meanwhile_is_read(
+    opened: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, unfinished, open_ = tmp_path / "gain.nc", tmp_path / "gain.nc.unfinished", Store._open
+    fill(file)
+    os.rename(file, unfinished)  # as it is just before its last step
+
+    def late(self: Store, path: Path) -> None:
+        if opened:
+            open_(self, path)
+        os.rename(unfinished, file)
+        if not opened:
+            open_(self, path)
+
+    monkeypatch.setattr(Store, "_open", late)
+    np.testing.assert_array_equal(fill(file), GAIN)
+
+
+def test_a_limit_of_the_size_of_files_is_an_error_that_names_the_store(tmp_path: Path) -> None:
+    """In a process of its own: HDF5 crashed at its first failure."""
+    fill(tmp_path / "whole.nc")
+    assert (tmp_path / "whole.nc").stat().st_size > 7000
+    script = (
+        f"import sys; sys.path[:0] = {[os.path.dirname(__file__), *sys.path]!r}\n"
+        "import resource; from test_batches import *\n"
+        "for limit in (0, 2000, 5000, 7000):\n"
+        "    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))\n"
+        "    with pytest.raises(OSError, match='small.nc'): fill(Path(sys.argv[1]))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", script, tmp_path / "small.nc"], capture_output=True, text=True
+    )
+    assert found.returncode == 0, found.stderr
