@@ -18,7 +18,7 @@ from warprrf.checks import check_array, check_number, check_type, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
-from warprrf.rf.em.materials import Material, load_materials
+from warprrf.rf.em.materials import Material
 from warprrf.rf.positions import in_the_air
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
 from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
@@ -100,9 +100,9 @@ class Scene:
         (``concrete``, ``itu_glass``, ``Wood_01``); the others are names alone until ``materials`` says more: they tell a
         radio field which surfaces are alike, but nothing can be simulated with them.
 
-        Materials named after those of ITU-R P.2040 are known; a table ``materials.json`` beside the file goes before
-        what the file says, and ``materials`` goes before both. What scatters nothing in the file has a scattering
-        coefficient of 0, as in Sionna.
+        Materials named after those of ITU-R P.2040 are known. ``materials`` goes first, then a table ``materials.json`` beside
+        the file, which is read where ``materials`` has not every name, then what the file says. What scatters nothing in
+        the file has a scattering coefficient of 0, as in Sionna.
 
         Args:
             path: the scene file (Mitsuba's XML), or a mesh file.
@@ -126,9 +126,7 @@ class Scene:
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"path: there is no scene file {path}")
-        beside = path.parent / "materials.json"
-        table = load_materials(beside) if beside.is_file() else None
-        choice = MaterialChoice(materials, table, extrapolate)
+        choice = MaterialChoice(materials, path.parent / "materials.json", extrapolate)
         if is_mesh_file(path):
             found = read_mesh_scene(path, choice, MeshOptions(unit, up, simplify, allow_outside))
             choice.check_used()
