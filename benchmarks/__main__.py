@@ -31,7 +31,6 @@ NAMES = {
     ),
     "beams": ("benchmarks.beams.run", "beams chosen from the field, beside pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
-    "fuzz": ("benchmarks.fuzz.command", "hostile arguments and damaged files, for as long as it is told to"),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
     "channel": ("benchmarks.channel", "channels: closed forms, Sionna RT, wide responses, the near field"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
@@ -39,7 +38,6 @@ NAMES = {
     "newrf": ("benchmarks.newrf", "rays and channels of NeWRF's conference room"),
     "city-paths": ("benchmarks.city_paths", "mirror paths of Sionna RT's own scenes beside its solver's"),
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
-    "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
     "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
     "measurements": (

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from damage import survey
 from model_files import BLUE, RED, changed_glb, obj_with_materials, room_glb, room_gltf
 from places import ROOT
 
@@ -220,15 +219,6 @@ def test_a_small_file_that_makes_many_triangles_is_refused(most: int, tmp_path: 
     monkeypatch.setattr(gltf_files, "LARGEST_FACES", most)  # 12 and 2 are made, 2 of them stand there twice
     with pytest.raises(ValueError, match=rf"room\.glb.*more than {most} triangles"):
         wr.Mesh.load(room_glb(tmp_path))
-
-
-@pytest.mark.parametrize("make", [room_glb, room_gltf, obj_with_materials])
-def test_damage_is_refused_by_the_file_s_name_or_gives_numbers(make, tmp_path: Path) -> None:
-    found = survey(make(tmp_path), "file_formats:read_mesh_file", flips=60, cuts=20)
-    # a name that is damaged is that of no material, whose colour is unknown
-    assert [outcome for _, outcome in found.wrong if outcome != "NaN in face_colours"] == []
-    if make is room_glb:  # text may end early and be whole; a binary file states its length
-        assert not any(damage.startswith("cut") for damage, _ in found.changed)
 
 
 def test_a_binary_stl_that_is_cut_short_is_refused(tmp_path: Path) -> None:
