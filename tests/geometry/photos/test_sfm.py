@@ -279,6 +279,11 @@ def test_photos_without_anything_in_common_are_refused(tmp_path):
         sfm.structure_from_motion(noise, workspace=tmp_path / "w2")
 
 
+def test_unknown_lenses_are_refused(tmp_path, lobby):
+    with pytest.raises(ValueError, match="lens: got 'MAGIC', expected one of auto, SIMPLE_PINHOLE"):
+        sfm.structure_from_motion(lobby[0], workspace=tmp_path, config=ReconstructionConfig(lens="MAGIC"))
+
+
 def test_short_names_serve_where_they_are_unique():
     names = ["left/a.jpg", "left/b.jpg", "right/b.jpg"]
     assert match_names("held_out", ["a.jpg", "right/b.jpg"], names) == ["left/a.jpg", "right/b.jpg"]
