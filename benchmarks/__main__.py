@@ -18,12 +18,8 @@ NAMES = {
     "lobby-seeds": ("benchmarks.lobby.seeds", "the main job's figures over several seeds: mean and spread"),
     "data": ("benchmarks.lobby.make_data", "regenerate data/lobby/ from nothing (hours; resumable)"),
     "paper": (
-        "benchmarks.evaluation.command",
-        "the paper's evaluation at its own size: every method, row by row",
-    ),
-    "gap": (
-        "benchmarks.evaluation.gap",
-        "RF-3DGS+ less RF-3DGS, with one of the paper's open choices changed",
+        "benchmarks.evaluation",
+        "the paper's evaluation on any data set and room: fields, networks, a ray tracer",
     ),
     "bistatic": (
         "benchmarks.bistatic.table",
@@ -35,7 +31,7 @@ NAMES = {
     "channel": ("benchmarks.channel", "channels: closed forms, Sionna RT, wide responses, the near field"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
     "relevance": ("benchmarks.relevance", "what each effect is worth, at two bands and roughnesses"),
-    "newrf": ("benchmarks.newrf", "rays and channels of NeWRF's conference room"),
+    "newrf": ("benchmarks.newrf", "data of the second room: NeWRF's conference room"),
     "city-paths": ("benchmarks.city_paths", "mirror paths of Sionna RT's own scenes beside its solver's"),
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
@@ -58,7 +54,6 @@ NAMES = {
         "benchmarks.outside",
         "measurements by others: an array's pictures, received power in a furnished flat",
     ),
-    "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""
 

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.targets import compared
 from warprrf.files import plain, write_atomically, write_json, write_text
 
 Row = dict[str, Any]
@@ -34,14 +33,6 @@ class Report:
     html: Callable[[dict[str, Any]], str] | None = None
     dpi: int = 100
 
-    @property
-    def summary(self) -> str:
-        """The tables, and beneath them what was asked of these figures, where something was."""
-        asked = compared(self.name, self.figures)
-        if not asked:
-            return self.text
-        return f"{self.text}\n\n### Asked and measured\n\n{table(('figure', 'asked', 'measured', ''), asked)}"
-
     def page(self, folder: Path) -> Path:
         """Where the page of a report in ``folder`` lies."""
         return folder / f"{self.name}.{'html' if self.html else 'md'}"
@@ -57,7 +48,7 @@ class Report:
         if self.html is not None:
             write_text(self.page(folder), self.html(figures))
             return figures
-        parts = [self.summary]
+        parts = [self.text]
         for name, (draw, caption) in self.pictures.items():
             write_atomically(folder / name, partial(draw().savefig, dpi=self.dpi))
             parts.append(f"![{caption}]({name})\n\n{caption}")

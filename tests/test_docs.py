@@ -42,7 +42,7 @@ def test_where_the_field_is_behind_is_a_line_a_figure_with_the_worst_margin(monk
     # ahead in PSNR at 10 and in RMSE at 100, behind in RMSE at 10 and in PSNR at 100 and 20
     at = {10: (1.0, 0.5), 100: (-3.0, -0.5), 20: (-2.0, 0.0)}
     rows = [{**place, **even, "count": n, "psnr_db": p, "rmse_db": e} for n, (p, e) in at.items()]
-    monkeypatch.setattr(tables.paper, "read", lambda name: {"margins": rows})
+    monkeypatch.setattr(tables.paper, "margins", lambda runs: rows)
     text = tables.paper._paper_behind()
     assert "Of 30 comparisons the bistatic field is behind in 3:" in text
     assert "| PSNR [dB] | 20, 100 | -3 |" in text and "| RMSE [dB] | 10 | +0.5 |" in text

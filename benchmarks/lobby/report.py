@@ -1,4 +1,4 @@
-"""The lobby run as one HTML page: every figure beside what was asked of it, and the pictures that explain them.
+"""The lobby run as one HTML page: every figure, and the pictures that explain them.
 
 The page needs nothing but itself: pictures are embedded. It is drawn from what the run left in its folder
 (``report.json`` and ``pictures.npz``).
@@ -16,7 +16,6 @@ import numpy as np
 
 from benchmarks.pictures import METHODS, figure_of, spectrum_rows
 from benchmarks.report import columns_table
-from benchmarks.targets import TARGETS, compared
 from warprrf.device import require
 
 FIGURES: tuple[tuple[str, str, str], ...] = (
@@ -52,7 +51,7 @@ h1 { font-size: 1.7rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-t
 p.note, figcaption { color: #555; font-size: .92rem; } figure { margin: 1rem 0; } img { max-width: 100%; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: bottom; }
-th:first-child, td:first-child { text-align: left; } .met { color: #1b6e35; } .missed { color: #a8200d; }
+th:first-child, td:first-child { text-align: left; }
 """
 
 
@@ -179,16 +178,12 @@ def method_table(methods: dict[str, dict[str, Any]]) -> str:
 
 
 def _figure_table(figures: dict[str, Any]) -> str:
-    asked = {line[0]: line[1:] for line in compared("report", figures)}
-    by_key = {target.path: target.name for target in TARGETS["report"]}
     rows = []
     for key, name, unit in FIGURES:
         value = figures.get(key)
         shown = "-" if value is None else f"{value:.4g} {unit}"
-        bound, _, verdict = asked.get(by_key.get(key, ""), ("", "", ""))
-        mark = {"met": "met", "NOT met": "missed"}.get(verdict, "")
-        rows.append(f"<tr><td>{name}</td><td>{shown}</td><td>{bound}</td><td class='{mark}'>{mark}</td></tr>")
-    head = "<tr><th>figure</th><th>measured</th><th>asked</th><th></th></tr>"
+        rows.append(f"<tr><td>{name}</td><td>{shown}</td></tr>")
+    head = "<tr><th>figure</th><th>measured</th></tr>"
     return f"<div class='wide'><table>{head}{''.join(rows)}</table></div>"
 
 
