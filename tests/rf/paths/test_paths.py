@@ -1,10 +1,13 @@
 """Line of sight and mirror paths against float64 geometry and the Fresnel limits."""
 
 import itertools
+import os
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from places import ROOT
 from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
 
 from warprrf.geometry.mesh import Mesh
