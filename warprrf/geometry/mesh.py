@@ -434,6 +434,10 @@ class Mesh:
 
         return self._boxed.get(str(where), build)
 
+    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Mesh:
+        """The mesh at ``scale rotation x + shift``, with what is known of its faces."""
+        return Mesh(**self.__getstate__() | {"vertices": scale * self.vertices @ rotation.T + shift})
+
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""
         above = self.triangles[:, :, 2] > check_number("height", height)

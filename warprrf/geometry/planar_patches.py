@@ -9,7 +9,7 @@ surface is not flat at any such error: its facets stay patches of their own. Len
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,6 +89,18 @@ class PlanarPatches:
         area = np.bincount(label[own], mesh.areas[own], minlength=len(planes[1]))
         group = np.full(len(planes[1]), -1, np.int32)
         return cls(mesh, label, *planes, area, group, np.arange(len(label)), tolerance_m, two_sided)
+
+    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> PlanarPatches:
+        """The patches of the mesh at ``scale rotation x + shift``."""
+        normal = self.normal @ rotation.T
+        return replace(
+            self,
+            mesh=self.mesh.moved(scale, rotation, shift),
+            normal=normal,
+            offset=scale * self.offset + normal @ shift,
+            area=scale**2 * self.area,
+            tolerance_m=scale * self.tolerance_m,
+        )
 
     @property
     def once(self) -> np.ndarray:
