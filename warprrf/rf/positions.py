@@ -14,7 +14,6 @@ the same number of solids; in a court, under a bridge or below a canopy some of 
 
 from __future__ import annotations
 
-import inspect
 import warnings
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array
+from warprrf.checks import check_array, users_level
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -345,7 +344,7 @@ def warn_of_unmodelled(
         f"{frequency_hz / 1e9:g} GHz: {what} not modelled, which matters {' and '.join(reasons)}: receivers without line "
         "of sight may get more power than is found here; warprrf.relevance estimates how much",
         UserWarning,
-        stacklevel=_users_level(),
+        stacklevel=users_level(),
     )
 
 
@@ -439,14 +438,6 @@ def _spread(mesh: Mesh) -> np.ndarray:
     share = (np.arange(_PLACES) + 0.5) / _PLACES
     grid = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
     return mesh.bounds[0] + grid * np.ptp(mesh.bounds, axis=0)
-
-
-def _users_level() -> int:
-    """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
-    frame, level = inspect.currentframe(), 0
-    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
-        frame, level = frame.f_back, level + 1
-    return level
 
 
 def _sky_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
