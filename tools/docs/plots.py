@@ -116,7 +116,7 @@ def _learning() -> Any:
 
 @entry("knobs", "Error and time of each setting of the renderer")
 def _knobs() -> Any:
-    engine, growth = read("settled/engine"), read("engine")["growth"]
+    engine, growth = read("settled/renderer"), read("engine")["growth"]
     words = {"alpha_min": "least alpha that counts", "top_k": "Gaussians kept a pixel"}
     figure, axes = plt.subplots(1, 3, figsize=(9, 3.2))
     for ax, (knob, title) in zip(axes, words.items(), strict=False):
