@@ -5,9 +5,8 @@ import pytest
 from places import LOBBY
 
 import warprrf as wr
-from benchmarks.beams import OFFSETS_HZ, Links, gains, straight
+from benchmarks.beams import OFFSETS_HZ, Links
 from warprrf.rf.channel.arrays import PlanarArray, orientation_towards
-from warprrf.rf.channel.beams import dft_codebook, select_beams
 
 PLACES = np.array([[10.0, 9.0, 1.5], [7.0, 8.5, 1.2]])
 
@@ -40,13 +39,3 @@ def test_channel_is_the_sum_over_its_paths(lobby):
     waves = turned * np.exp(-2j * np.pi * OFFSETS_HZ[:, None] * everything.tau)
     found = link.channel(array)
     np.testing.assert_allclose(found, waves @ steering, atol=2e-3 * np.abs(found).max())
-
-
-def test_a_lone_path_is_met_by_the_beam_along_it(lobby):
-    ds, links = lobby
-    toward = ds.transmitter - PLACES[0]
-    array = PlanarArray(8, 8, orientation=orientation_towards(toward * [1.0, 1.0, 0.0]))
-    book, path = dft_codebook(array, 2), straight(ds, PLACES[0])
-    worth = gains(book, array.response(path.arrival, 1.0))
-    chosen = int(select_beams(path, PlanarArray(1, 1), book).rx[0])
-    assert worth[chosen] == pytest.approx(worth.max(), rel=1e-6)

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
-from small_room import SHAPE, small_room
+from small_room import small_room
 
-import warprrf as wr
 from benchmarks import bistatic, fits
-from benchmarks.methods import point_at_transmitter
 from benchmarks.runner import Job, execute
-from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.spectra.metrics import angle_deg, strongest_direction
 
 LEFT_OUT = ("no mirrors", "no scattering")
 
@@ -81,32 +74,6 @@ def test_finished_rows_are_not_made_again_and_a_killed_run_loses_one(
     assert [row["psnr_db"] for row in again["ablation"]] == [
         row["psnr_db"] for row in finished[1]["ablation"]
     ]
-
-
-def test_calibration_of_errors_that_are_as_large_as_stated(room: Path) -> None:
-    ds = wr.SpectrumDataset.load(room / "spectra.nc")
-    test = replace(ds, path_gain=np.full_like(ds.path_gain, 1e3 * ds.floor))
-    rng = np.random.default_rng(0)
-
-    def spectrum(receiver: np.ndarray, uncertainty: bool) -> Any:
-        sigma = np.exp(rng.normal(0.0, 0.8, SHAPE))
-        gain = (1e3 + 1) * test.floor * 10 ** (rng.normal(0.0, sigma) / 10) - test.floor
-        return SimpleNamespace(path_gain=gain, std_db=sigma)
-
-    row = bistatic.calibration(SimpleNamespace(spectrum=spectrum), test)
-    # 14 x 288 independent pixels: the standard deviation of a share is at most 0.8 %
-    assert row["within_1_sigma"] == pytest.approx(0.683, abs=0.03)
-    assert row["within_2_sigma"] == pytest.approx(0.954, abs=0.02)
-    assert row["rms_error_db"] == pytest.approx(np.exp(0.8**2), rel=0.1)  # root mean square of the deviations
-
-
-def test_point_at_the_transmitter_is_a_beam_of_friis_gain(room: Path) -> None:
-    ds = wr.SpectrumDataset.load(room / "spectra.nc")
-    toward = ds.transmitter - ds.receivers[0]
-    distance = np.linalg.norm(toward)
-    gain = point_at_transmitter(ds)(ds.receivers[0]).path_gain
-    assert gain.sum() == pytest.approx((SPEED_OF_LIGHT / 300e9 / (4 * np.pi * distance)) ** 2, rel=1e-5)
-    assert angle_deg(strongest_direction(gain), toward / distance) < 180 / SHAPE[0]
 
 
 def test_bad_options_are_named(room: Path, tmp_path: Path) -> None:

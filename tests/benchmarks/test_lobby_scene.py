@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from radio_scenes import enclosed_volume, is_wound_alike
 
 from benchmarks.lobby.photos import read_poses
 from benchmarks.lobby.scene import ROOM, SOLIDS, build
-from benchmarks.lobby.textures import PAINTED, STYLES, paint
 from warprrf.geometry.mesh_files import read_mesh
 from warprrf.geometry.splats.camera import Camera
 from warprrf.rf.scene import Scene
@@ -50,28 +48,6 @@ def test_the_committed_files_are_what_the_script_builds(tmp_path: Path) -> None:
         ours, theirs = (np.asarray(images.open(f / f"textures/{material}.jpg")) for f in (tmp_path, LOBBY))
         # Transforms round differently from one machine to the next: a texel in a thousand may differ, by little.
         assert np.mean(np.abs(ours.astype(int) - theirs) > 2) < 1e-3
-
-
-@pytest.mark.parametrize("style", sorted([*STYLES, *PAINTED]))
-def test_textures_never_repeat(style: str) -> None:
-    image = paint(style, 2.4, 2.4, 0.02, np.random.default_rng(0)).mean(axis=2)
-    image = image - image.mean()
-    spectrum = np.abs(np.fft.fft2(image, s=(240, 240))) ** 2
-    correlation = np.fft.ifft2(spectrum).real[:100, :100] / np.sum(image**2)
-    # Normalised autocorrelation at shifts of half a metre and more: a repeated pattern would come near one.
-    correlation[:25, :25] = 0
-    assert correlation.max() < 0.5 and image.std() > 0.05
-
-
-def test_photos_have_roles_and_stand_in_the_air(scene: Scene) -> None:
-    cameras = read_poses(LOBBY / "poses_true.json")
-    roles = json.loads((LOBBY / "photos.json").read_text())
-    surveyed = json.loads((LOBBY / "surveyed.json").read_text())
-    assert len(cameras) == 120 and len(roles["held_out"]) == 12 and not set(roles["held_out"]) & set(surveyed)
-    for name, position in surveyed.items():
-        np.testing.assert_allclose(cameras[name].position, position, atol=1e-4)
-    positions = np.array([camera.position for camera in cameras.values()])
-    assert scene.is_free(positions, clearance_m=0.5, device="cpu").all()
 
 
 def test_mitsuba_sees_what_the_mesh_says_at_every_pixel(scene: Scene) -> None:

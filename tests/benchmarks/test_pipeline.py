@@ -78,7 +78,9 @@ def finished(
     return out, whole(out, data)
 
 
-def test_report_holds_every_figure(finished: tuple[Path, dict[str, Any]]) -> None:
+def test_report_holds_every_figure_and_its_page_needs_no_other_file(
+    finished: tuple[Path, dict[str, Any]],
+) -> None:
     out, found = finished
     assert json.loads((out / "report.json").read_text()) == found
     assert [key for key, *_ in pipeline.page.FIGURES if not isinstance(found[key], float)] == []
@@ -88,10 +90,7 @@ def test_report_holds_every_figure(finished: tuple[Path, dict[str, Any]]) -> Non
     assert found["mesh_distance_p90_m"] < 1e-4 and found["camera_rms_m"] == 0.0  # the mesh is the true one
     assert found["pipeline_time_s"] == pytest.approx(sum(s["seconds"] for s in found["stages"].values()))
     assert (out / "field.safetensors").is_file()
-
-
-def test_page_needs_no_other_file(finished: tuple[Path, dict[str, Any]]) -> None:
-    text = (finished[0] / "report.html").read_text()
+    text = (out / "report.html").read_text()
     sources = re.findall(r"(?:src|href)='([^']{0,30})", text)
     assert len(sources) >= 8 and all(source.startswith("data:image/") for source in sources)
     assert "v9.jpg: shows 3 features" in text and "<td>bistatic (ours), 2 spectra</td>" in text
@@ -109,9 +108,8 @@ def test_second_run_computes_nothing_and_a_killed_one_ends_with_the_same_figures
     with pytest.raises(KeyboardInterrupt):
         whole(tmp_path, data, progress=kill)
     again = whole(tmp_path, data)
-    assert (
-        again["stages"]["bistatic 2, exact"]["attempts"] == 2 and again["stages"]["geometry"]["attempts"] == 1
-    )
+    attempts = {name: stage["attempts"] for name, stage in again["stages"].items()}
+    assert max(attempts.values()) == 2 and attempts["geometry"] == 1
     for name, figures in first["methods"].items():
         assert again["methods"][name]["psnr_db"] == figures["psnr_db"], name
     for name in ("geometry", "geometry_error", "method", "pictures"):

@@ -61,20 +61,8 @@ def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_options_of_the_command_reach_the_benchmark_and_its_figures_the_files(
     nothing: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [
-        "nothing",
-        "--out",
-        str(tmp_path),
-        "--count",
-        "2",
-        "--names",
-        "x",
-        "--quick",
-        "--seed",
-        "7",
-        "--quiet",
-    ]
-    assert command.main([*words, "--every", "5"]) == 0
+    words = f"nothing --out {tmp_path} --count 2 --names x --quick --seed 7 --quiet --every 5"
+    assert command.main(words.split()) == 0
     kept = json.loads((tmp_path / "nothing.json").read_text())
     assert kept["options"] == {"count": 2, "names": ["x"], "every": 5, "quick": True, "hidden": 0.5}
     assert (kept["seed"], kept["value"]) == (7, None)
@@ -87,13 +75,6 @@ def test_bad_input_is_one_line_and_status_two(nothing: None, tmp_path: Path, cap
     assert capsys.readouterr().err == (
         "python -m benchmarks: error: count: got a negative number, expected one of at least 0\n"
     )
-
-
-def test_with_json_a_benchmark_prints_its_figures(nothing: None, tmp_path: Path, capsys: Any) -> None:
-    assert command.main(["nothing", "--out", str(tmp_path), "--json"]) == 0
-    (said,) = map(json.loads, capsys.readouterr().out.splitlines())
-    assert said["figures"]["value"] is None and said["figures"]["count"] == 3
-    assert said["files"] == [str(tmp_path / "nothing.md"), str(tmp_path / "nothing.json")]
 
 
 def test_columns_that_no_row_fills_are_left_out() -> None:

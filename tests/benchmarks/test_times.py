@@ -15,11 +15,6 @@ def test_a_verb_is_told_with_its_seconds_and_memory(tmp_path: Path) -> None:
     assert row["wall_s"] > 0 and row["core_s"] > 0 and 0.1 < row["peak_gb"] < 16
 
 
-def test_a_second_call_is_told_apart(tmp_path: Path) -> None:
-    row = times.measured("trace", times.Room(times.Options(), tmp_path))
-    assert 0 < row["again_wall_s"] and row["place"] == "lobby"
-
-
 def test_unknown_verbs_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="verbs: got sing, expected some of load"):
         times.run(times.Options(verbs=("sing",)), Job(tmp_path))
