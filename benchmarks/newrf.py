@@ -1,11 +1,13 @@
 """The second room of the paper's evaluation: NeWRF's conference room, with materials of ITU-R P.2040 and Sionna RT's spectra.
 
-The mesh says nothing of materials: floor, ceiling, walls and the things in the room get one each, by their place and
+NeWRF (Lu, Vattheuer, Mirzasoleiman, Abari, ICML 2024; github.com/LuHaofan/NeWRF, MIT licence) gives mesh and receivers. The
+mesh says nothing of materials: floor, ceiling, walls and the things in the room get one each, by their place and
 size. P.2040's rows end below 300 GHz for some of them and are continued.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,11 +15,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 import warprrf as wr
-from benchmarks.bare_mesh import named_by_part
 from benchmarks.lobby.spectra import FREQUENCY_HZ, FULL_SHAPE, SEED
-from benchmarks.newrf_rays import load_newrf
 from benchmarks.runner import Benchmark, Job, option
-from warprrf.files import write_atomically, write_json
+from warprrf.files import read_arrays, write_atomically, write_json
+from warprrf.geometry.mesh import components, edge_pairs
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.materials import itu_material, table_entry
 from warprrf.rf.spectra.dataset import assign_roles
@@ -29,6 +30,7 @@ takes minutes, and goes on where it was stopped.
 examples:
   python -m benchmarks newrf --source external/newrf
 """
+RECEIVERS_FILE, MESH_FILE = "newrf_conference.npz", "conferenceroom.stl"
 SCATTERING = {"floorboard": 0.5, "ceiling_board": 0.7, "plasterboard": 0.4, "wood": 0.6, "metal": 0.3}
 """Floor, ceiling, walls and two kinds of things; scattering coefficients are assumed."""
 
@@ -38,7 +40,7 @@ class Options:
     """Options of the second room.
 
     Attributes:
-        source: folder of NeWRF's files; see :mod:`benchmarks.newrf_rays`.
+        source: folder of ``newrf_conference.npz``, which holds ``receivers`` (R, 3), and ``conferenceroom.stl``.
         receivers: as many for training as for testing.
         engine: of the spectra.
         shape: rows and columns of the spectra.
@@ -54,17 +56,24 @@ def run(options: Options, job: Job) -> None:
     """Make scene and spectra.
 
     Raises:
-        FileNotFoundError, ValueError: as :func:`load_newrf` does.
+        FileNotFoundError: if one of NeWRF's files is missing.
+        ValueError: if one does not read.
     """
-    room = load_newrf(options.source)
+    source = Path(options.source)
+    for name in (RECEIVERS_FILE, MESH_FILE):
+        if not (source / name).is_file():
+            raise FileNotFoundError(
+                f"source: there is no {source / name}, expected {RECEIVERS_FILE} and {MESH_FILE}"
+            )
+    mesh, receivers = wr.Mesh.load(source / MESH_FILE), read_arrays(source / RECEIVERS_FILE)["receivers"]
     materials = [replace(itu_material(n, scattering=s).extrapolated(), name=n) for n, s in SCATTERING.items()]
-    scene, count = named_by_part(room.mesh, materials), 2 * options.receivers
+    scene, count = named_by_part(mesh, materials), 2 * options.receivers
     write_scene(scene, job.out)
     low, high = scene.mesh.bounds
     spectra = wr.simulate(
         scene,
         transmitter=low + [0.9, 0.9, 0.9] * (high - low),
-        receivers=np.random.default_rng(SEED).permutation(room.receivers)[:count],
+        receivers=np.random.default_rng(SEED).permutation(receivers)[:count],
         frequency_hz=FREQUENCY_HZ,
         shape=options.shape,
         engine=options.engine,
@@ -74,6 +83,17 @@ def run(options: Options, job: Job) -> None:
         device=job.device,
     )
     write_atomically(job.out / "spectra.nc", spectra.save)
+
+
+def named_by_part(mesh: wr.Mesh, materials: Sequence[wr.Material]) -> wr.Scene:
+    """``mesh`` with a material for its floor, ceiling and walls, and one for each size of the things in it."""
+    part = components(len(mesh.faces), edge_pairs(mesh.welded_faces))
+    area = np.bincount(part, mesh.areas)
+    things = 3 + np.unique(np.round(area, 2), return_inverse=True)[1].reshape(-1) % (len(materials) - 3)
+    upward = mesh.face_normals[:, 2]
+    low = mesh.triangles[:, :, 2].max(axis=1) < mesh.center[2]
+    side = np.where(np.abs(upward) < 0.5, 2, np.where(low, 0, 1))
+    return wr.Scene(mesh, materials, np.where(part == area.argmax(), side, things[part]))
 
 
 def write_scene(scene: wr.Scene, folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -207,12 +208,13 @@ def test_the_second_rooms_scene_and_spectra_are_read_back_as_they_were(tmp_path:
     source = tmp_path / "source"
     source.mkdir()
     trimesh.Trimesh(*box_mesh([0, 0, 0], [5, 4, 3], inward=True)).export(source / "conferenceroom.stl")
+    options = newrf.Options(source=str(source), receivers=2, engine="exact", shape=(6, 12))
+    make = partial(execute, newrf.BENCHMARKS["newrf"], options, Job(tmp_path / "out", device="cpu"))
     with pytest.raises(FileNotFoundError, match=r"newrf_conference\.npz"):
-        newrf.load_newrf(source)
+        make()
     receivers = np.random.default_rng(1).uniform(1, 2, (6, 3))
     np.savez(source / "newrf_conference.npz", receivers=receivers)
-    options = newrf.Options(source=str(source), receivers=2, engine="exact", shape=(6, 12))
-    execute(newrf.BENCHMARKS["newrf"], options, Job(tmp_path / "out", device="cpu"))
+    make()
     ds = wr.SpectrumDataset.load(tmp_path / "out" / "spectra.nc")
     assert sorted(ds.role) == ["test"] * 2 + ["train"] * 2
     assert all(np.isclose(receivers, at).all(axis=1).any() for at in ds.receivers)

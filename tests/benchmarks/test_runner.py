@@ -61,27 +61,13 @@ def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_options_of_the_command_reach_the_benchmark_and_its_figures_the_files(
     nothing: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [
-        "nothing",
-        "--out",
-        str(tmp_path),
-        "--count",
-        "2",
-        "--names",
-        "x",
-        "--quick",
-        "--seed",
-        "7",
-        "--quiet",
-    ]
-    assert command.main([*words, "--every", "5"]) == 0
+    words = f"nothing --out {tmp_path} --count 2 --names x --quick --seed 7 --quiet --every 5"
+    assert command.main(words.split()) == 0
     kept = json.loads((tmp_path / "nothing.json").read_text())
     assert kept["options"] == {"count": 2, "names": ["x"], "every": 5, "quick": True, "hidden": 0.5}
     assert (kept["seed"], kept["value"]) == (7, None)
     assert (tmp_path / "nothing.md").read_text() == "some text\n"
     assert "nothing.md" in capsys.readouterr().out
-    assert command.main(["nothing", "--out", str(tmp_path), "--quiet"]) == 0  # defaults
-    assert json.loads((tmp_path / "nothing.json").read_text())["count"] == 3
 
 
 def test_bad_input_is_one_line_and_status_two(nothing: None, tmp_path: Path, capsys: Any) -> None:
@@ -91,14 +77,14 @@ def test_bad_input_is_one_line_and_status_two(nothing: None, tmp_path: Path, cap
     )
 
 
-def test_with_json_a_benchmark_prints_its_figures(nothing: None, tmp_path: Path, capsys: Any) -> None:
-    assert command.main(["nothing", "--out", str(tmp_path), "--json"]) == 0
-    (said,) = map(json.loads, capsys.readouterr().out.splitlines())
-    assert said["figures"]["value"] is None and said["figures"]["count"] == 3
-    assert said["files"] == [str(tmp_path / "nothing.md"), str(tmp_path / "nothing.json")]
-
-
 def test_columns_that_no_row_fills_are_left_out() -> None:
     columns = (("a", "A", "{:.1f}"), ("b", "B", "{}"), ("c", "C", "{}"))
     text = columns_table(columns, [{"a": 1.0, "b": None}, {"c": "x"}])
     assert text.splitlines() == ["| A | C |", "| --- | --- |", "| 1.0 | - |", "| - | x |"]
+
+
+def test_a_page_with_a_title_is_html_with_its_tables(tmp_path: Path) -> None:
+    Report("page", {}, "## A & B\n\nwords\n\n| a | b |\n| --- | --- |\n| 1 | <2 |", title="T").write(tmp_path)
+    text = (tmp_path / "page.html").read_text()
+    assert "<h1>T</h1>" in text and "<h2>A &amp; B</h2>" in text and "<p>words</p>" in text
+    assert "<tr><th>a</th><th>b</th></tr><tr><td>1</td><td>&lt;2</td></tr>" in text

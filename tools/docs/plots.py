@@ -96,7 +96,7 @@ def _speed() -> Any:
 
 @entry("learning", "Loss of the networks over their training time")
 def _learning() -> Any:
-    rows = read("settled/networks")["rows"]
+    rows = read("networks")["rows"]
     truths = {truth: f"C{k}" for k, truth in enumerate(TRUTHS)}
     figure, axes = plt.subplots(1, 2, figsize=(11.0, 4.0))
     for ax, method in zip(axes, ("nerf2", "cgan"), strict=True):
@@ -116,7 +116,7 @@ def _learning() -> Any:
 
 @entry("knobs", "Error and time of each setting of the renderer")
 def _knobs() -> Any:
-    engine, growth = read("settled/engine"), read("engine")["growth"]
+    engine, growth = read("renderer"), read("engine")["growth"]
     words = {"alpha_min": "least alpha that counts", "top_k": "Gaussians kept a pixel"}
     figure, axes = plt.subplots(1, 3, figsize=(9, 3.2))
     for ax, (knob, title) in zip(axes, words.items(), strict=False):

@@ -16,7 +16,7 @@ def _engine_responses() -> str:
             r["regime"], r["form"], show(r["error_mean"], "{:.1e}"), show(r["error_max"], "{:.1e}"),
             show(r["negative"], "{:.1%}"), show(r["ns_per_pair"]),
         ]
-        for r in read("settled/engine")["responses"]
+        for r in read("renderer")["responses"]
     ]  # fmt: skip
     head = ("Gaussians", "form", "mean error", "largest", "negative squared distances", "ns a pair")
     return markdown(head, lines)
@@ -30,7 +30,7 @@ def _engine_points() -> str:
             show(1e3 * r["length_error_p90_m"], "{:.3g}"), show(r["delay_error_median_ns"], "{:.2g}"),
             show(r["milliseconds_per_receiver"]),
         ]
-        for r in read("settled/engine")["points"]
+        for r in read("renderer")["points"]
     ]  # fmt: skip
     head = (
         "`interaction_point=`", "length error, median [mm]", "90th percentile [mm]", "delay [ns]", "ms a receiver",
@@ -46,7 +46,7 @@ def _engine_knobs() -> str:
     }  # fmt: skip
     lines = []
     for knob, name in words.items():
-        for r in read("settled/engine")[knob]:
+        for r in read("renderer")[knob]:
             value = " x ".join(map(str, r["value"])) if isinstance(r["value"], list) else _short(r["value"])
             lines.append([
                 name, value, show(r["error_rms_db"], "{:.2g}"), show(r["error_worst_db"], "{:.2g}"),
@@ -62,7 +62,7 @@ def _short(value: Any) -> str:
 
 @entry("engine-times")
 def _engine_times() -> str:
-    e, b = read("engine"), read("settled/engine")["blend"]
+    e, b = read("engine"), read("renderer")["blend"]
     size = f"{b['gaussians']} Gaussians, {b['shape'][1]} x {b['shape'][0]}"
     lines = []
     for run in b["runs"]:

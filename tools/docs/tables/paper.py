@@ -27,7 +27,7 @@ def runs() -> list[Row]:
 @cache
 def summary() -> list[Row]:
     """Means of the runs of a kind, with LPIPS where it was measured."""
-    known = read("settled/lpips")["rows"]
+    known = read("lpips")["rows"]
     place = ("truth", "split", "count", "method")
     found = [(row, find(known, **{k: row[k] for k in place})) for row in summarise(runs())]
     return [{**row, "lpips": seen and seen["lpips"]} for row, seen in found]
@@ -160,14 +160,14 @@ def _paper_statement() -> str:
     published = {r["method"]: r["psnr_db"] for r in read("published")["rows"]}
     parts = [f"The paper reports RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:.1f} dB above RF-3DGS."]
     for truth, name in PAPER_TRUTHS.items():
-        own = [r["psnr_db"]["difference"] for r in read("settled/law")["sizes"] if r["truth"] == truth]
+        own = [r["psnr_db"]["difference"] for r in read("law")["sizes"] if r["truth"] == truth]
         parts.append(f"{name[0].upper()}{name[1:]}: {sum(own) / len(own):+.1f} dB over {len(own)} sizes.")
     return " ".join(parts)
 
 
 @entry("paper-runs")
 def _paper_runs() -> str:
-    hashes = {r["truth"]: r["data"] for r in runs()} | {"paper-law": read("settled/law")["data"]}
+    hashes = {r["truth"]: r["data"] for r in runs()} | {"paper-law": read("law")["data"]}
     data = "; ".join(f"{name} {hashes[truth]}" for truth, name in PAPER_TRUTHS.items())
     missing_runs = read("paper")["missing"]
     left = f" Missing runs: {len(missing_runs)}." if missing_runs else ""
@@ -178,7 +178,7 @@ def _paper_runs() -> str:
 
 @entry("paper-networks")
 def _paper_networks() -> str:
-    found = read("settled/networks")
+    found = read("networks")
     effort = found["effort"]
     lines = [
         [
@@ -246,7 +246,7 @@ def _law() -> str:
             words.get(r["truth"], PLACES.get((r["truth"], "random"), r["truth"])), str(r["count"]),
             show(r["psnr_db"]["rf3dgs+"]), show(r["psnr_db"]["rf3dgs"]), show(r["psnr_db"]["difference"], "{:+.1f}"),
         ]
-        for r in read("settled/law")["sizes"]
+        for r in read("law")["sizes"]
     ]  # fmt: skip
     return markdown(("truth", "spectra", "RF-3DGS+ [dB]", "RF-3DGS [dB]", "difference [dB]"), lines)
 
@@ -254,7 +254,7 @@ def _law() -> str:
 @entry("gap")
 def _gap() -> str:
     lines = []
-    for r in read("settled/gap")["differences"]:
+    for r in read("gap")["differences"]:
         cells = [r["what"], str(r["train"])]
         for key in ("psnr_db", "own_psnr_db"):
             cells += [show(r[key][m], "{:.1f}") for m in ("rf3dgs+", "rf3dgs")]
