@@ -21,9 +21,7 @@ from warprrf.files import plain, write_text
 from warprrf.steps import Attempt, Steps, digest
 
 
-def _ask(
-    folder: Path, made: list[int], value: int = 1, *, given: object = 0, version: int = 1, fresh: bool = False
-) -> int:
+def _ask(folder, made, value=1, *, given=0, version=1, fresh=False):
     """The step's value; ``made`` gets it where it is made."""
 
     def make(attempt: Attempt) -> dict[str, float]:
