@@ -391,11 +391,11 @@ def _as_object(kind: type, value: object) -> object:
 
 
 def one_line(self: Any) -> str:
-    """The ``__repr__`` of a dataclass of arrays: their shapes, other values as they are, None left out."""
+    """The ``__repr__`` of a dataclass of arrays: shapes of all but short ones, other values as they are, None left out."""
     parts = []
     for field in fields(self):
         value = getattr(self, field.name)
-        if hasattr(value, "shape") and np.prod(value.shape) > 3:
+        if hasattr(value, "shape") and (np.size(value) > 3 or np.ndim(value) > 1 or len(repr(value)) > 40):
             parts.append(f"{field.name} {tuple(value.shape)}")
         elif value is not None and len(text := repr(value)) <= 60:
             parts.append(f"{field.name}={text}")

@@ -23,7 +23,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked, index_to
+from warprrf.checks import (
+    Expected,
+    check_array,
+    check_arrays,
+    check_count,
+    check_number,
+    checked,
+    index_to,
+    one_line,
+)
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
@@ -77,6 +86,8 @@ class BistaticField(RadioField):
         report: how the fit went.
         device: where it computes.
     """
+
+    __repr__ = one_line
 
     surface: Surface = field(repr=False)
     transmitter: np.ndarray

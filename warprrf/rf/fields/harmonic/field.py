@@ -34,6 +34,7 @@ from warprrf.checks import (
     check_number,
     check_positive,
     checked,
+    one_line,
 )
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -83,6 +84,8 @@ class HarmonicField(RadioField):
         fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
         report: how the fit went: seconds, pairs, losses, Gaussians seen.
     """
+
+    __repr__ = one_line
 
     gaussians: Gaussians = field(repr=False)
     mesh: Mesh | None = field(repr=False)
