@@ -39,7 +39,7 @@ from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import assumed_permittivity
-from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
@@ -286,7 +286,7 @@ class BistaticField(RadioField):
 
             field_140 = field_300.at_frequency(140e9)
         """
-        ratio = check_number("frequency_hz", frequency_hz, *CARRIERS_HZ) / self.frequency_hz
+        ratio = check_frequency(frequency_hz) / self.frequency_hz
         fall = 20.0 * float(np.log10(ratio))
         return replace(
             self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,
