@@ -425,51 +425,37 @@ def test_help_of_fit_names_every_option_of_its_models(capsys: pytest.CaptureFixt
     assert set(re.findall(r"[a-z_]+", text)) >= known - inner - {"seed", "model", "relevance"}
 
 
-def test_simulate_fit_evaluate_and_render_round_trip(
+def test_the_walk_through_is_what_the_library_gives_for_the_same_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """On the true mesh; what the commands write and print is what the library gives for the same files."""
+    """Of the default model, on the true mesh."""
     import warprrf as wr
 
-    rng = np.random.default_rng(3)
-    scene = wr.Scene.load(SCENE)
-    places = rng.uniform([1.0, 1.0, 1.0], [14.0, 11.0, 2.0], (400, 3))
-    places = places[scene.is_free(places, clearance_m=0.3)][:16]
-    np.savetxt(tmp_path / "receivers.csv", places, delimiter=",")
-    spectra, field = tmp_path / "spectra.nc", tmp_path / "field.safetensors"
-    common = ["--quiet", "--device", "cpu"]
-    simulate = ["simulate", SCENE, "-o", spectra, "--receivers", tmp_path / "receivers.csv"]
-    simulate += ["--transmitter", 3.2, 2.6, 3.2, "--shape", 16, 32]
-    assert cli.main([str(word) for word in [*simulate, *common]]) == 0
-    fit = ["fit", SCENE, spectra, "-o", field, "--train", 10, "--iterations", 60, "--model", "rf3dgs+"]
-    assert cli.main([str(word) for word in [*fit, *common]]) == 0
-    evaluate = ["evaluate", field, spectra, "--train", 10, "-o", tmp_path / "figures.json"]
-    assert cli.main([str(word) for word in [*evaluate, *common]]) == 0
-    assert "rf3dgs+" in capsys.readouterr().out
+    def run(words: str) -> str:
+        words = words.format(tmp=tmp_path, scene=SCENE)
+        assert cli.main([*words.split(), "--quiet", "--device", "cpu"]) == 0
+        return capsys.readouterr().out
+
+    run("sample {scene} -o {tmp}/receivers.csv -n 16 --height 1 2")
+    run(
+        "simulate {scene} -o {tmp}/s.nc --receivers {tmp}/receivers.csv --transmitter 3.2 2.6 3.2 --shape 16 32"
+    )
+    assert "bistatic fitted on 10 receivers" in run(
+        "fit {scene} {tmp}/s.nc -o {tmp}/f.safetensors --train 10 --quick"
+    )
+    assert "bistatic" in run("evaluate {tmp}/f.safetensors {tmp}/s.nc -o {tmp}/figures.json")
     figures = json.loads((tmp_path / "figures.json").read_text())
-    assert set(figures) == {"rf3dgs+", "nearest", "idw", "constant", "mean"}
-    train, test = wr.SpectrumDataset.load(spectra).split(10)
-    stored_field = wr.RadioField.load(field)
-    assert stored_field.report["receivers"] == len(train) == 10
-    assert stored_field.report["losses"]["gain"][-1] < 0.8 * stored_field.report["losses"]["gain"][0]
-    again = wr.evaluate(test, stored_field.spectrum)
+    assert set(figures) == {"bistatic", "nearest", "idw", "constant", "mean"}
+    test = wr.SpectrumDataset.load(tmp_path / "s.nc").split(10)[1]
+    field = wr.RadioField.load(tmp_path / "f.safetensors")
+    again = wr.evaluate(test, field.spectrum)
     for name in ("psnr_db", "rmse_db", "tof_error_median_ns"):
-        assert figures["rf3dgs+"][name] == pytest.approx(again[name], rel=1e-6)
-    assert figures["nearest"]["psnr_db"] > figures["constant"]["psnr_db"]
-    position = [f"{x:.3f}" for x in places[0]]
-    for name in ("s.png", "s.npz"):
-        assert (
-            cli.main(["render", str(field), "-o", str(tmp_path / name), "--receiver", *position, *common])
-            == 0
-        )
-    stored = np.load(tmp_path / "s.npz")
-    rounded = [float(word) for word in position]
-    np.testing.assert_allclose(stored["path_gain"], stored_field.spectrum(rounded).path_gain, rtol=1e-6)
-    assert (tmp_path / "s.png").read_bytes()[:4] == b"\x89PNG"
-    plan = ["map", field, "-o", tmp_path / "m.nc", "--cell", 4, "--bounds", 1, 1, 13, 9, "--power-dbm", 7]
-    assert cli.main([str(word) for word in [*plan, *common]]) == 0
-    found, expected = RadioMap.load(tmp_path / "m.nc"), stored_field.radio_map(1.5, 4, bounds=[1, 1, 13, 9])
+        assert figures["bistatic"][name] == pytest.approx(again[name], rel=1e-6)
+    assert figures["bistatic"]["psnr_db"] > figures["nearest"]["psnr_db"] > figures["constant"]["psnr_db"]
+    run("render {tmp}/f.safetensors -o {tmp}/s.png --receiver 7 4 1.5")
+    text = run("map {tmp}/f.safetensors -o {tmp}/m.nc --cell 4 --bounds 1 1 13 9 --power-dbm 7")
+    found, expected = RadioMap.load(tmp_path / "m.nc"), field.radio_map(1.5, 4, bounds=[1, 1, 13, 9])
     np.testing.assert_allclose(found.total_path_gain, expected.total_path_gain, rtol=1e-6)
     np.testing.assert_allclose(found.best_beam_snr_db, expected.best_beam_snr_db - 13.0, atol=1e-6)
-    assert f"{found.free.sum()} cells in the air" in capsys.readouterr().out
-    assert (tmp_path / "m.png").read_bytes()[:4] == b"\x89PNG"
+    assert f"{found.free.sum()} cells in the air" in text
+    assert {(tmp_path / name).read_bytes()[:4] for name in ("s.png", "m.png")} == {b"\x89PNG"}

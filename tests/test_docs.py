@@ -3,13 +3,18 @@
 import ast
 import re
 import sys
+from functools import reduce
 
 import pytest
 from places import ROOT
 
 sys.path.append(str(ROOT / "tools" / "docs"))
+import reference  # noqa: E402
 import results  # noqa: E402
 import tables  # noqa: E402
+
+import warprrf as wr  # noqa: E402
+from warprrf import cli  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 GENERATED = ("docs/reference", "docs/figures", "docs/build")
@@ -50,6 +55,54 @@ def test_files_that_a_page_links_exist(page):
             assert (page.parent / target).exists() or "reference/" in target, target
     for target in re.findall(r"`((?:tests|warprrf|benchmarks|data|tools|docs|notebooks)/[\w./]+)`", text):
         assert (ROOT / target).exists(), f"{target} is named and not there"
+
+
+def test_names_of_the_reference_are_reached_as_it_prints_them():
+    listed = set(re.findall(r" as (\w+)$", (ROOT / "warprrf/__init__.pyi").read_text(), re.MULTILINE))
+    found = [
+        n
+        for page in reference.pages().values()
+        for n in re.findall(r"^\.\. auto\w+:: (\S+)", page, re.MULTILINE)
+    ]
+    assert len(found) > 80
+    for name in found:
+        _, first, *rest = name.split(".")
+        assert first in listed and reduce(getattr, rest, getattr(wr, first)), name
+
+
+def test_commands_on_pages_are_taken_by_the_parser():
+    seen = set()
+    for page in (ROOT / "README.md", *PAGES):
+        for block in re.findall(r"```.*?```", page.read_text(), re.DOTALL):
+            for line in re.findall(r"^(?:\$ )?warprrf (\w.*)", block, re.MULTILINE):
+                words = re.split(r"  |#", line)[0].split()
+                seen.add(words[0])
+                args = cli._parser().parse_args(words)
+                if words[0] == "fit":
+                    pairs = [f"--{word}" for word in args.measurements if "=" in word]
+                    cli._parser().parse_args([*words, *pairs])
+    assert seen > {"fit", "sample", "suggest", "render", "simulate", "view", "evaluate", "reconstruct"} - {
+        "twin"
+    }
+
+
+def test_a_store_of_answers_has_a_name_that_no_page_gives_to_anything_else():
+    code = {
+        p: "".join(re.findall(r"```.*?```", p.read_text(), re.DOTALL)) for p in (ROOT / "README.md", *PAGES)
+    }
+    for page, block in code.items():
+        for name in re.findall(r"store=(\"\S+?\")", block):
+            assert [p for p, other in code.items() if name in other and f"store={name}" not in other] == [], (
+                name
+            )
+            calls = {
+                call
+                for other in code.values()
+                for call in re.findall(rf"field\.(\w+)\(.*store={name}", other)
+            }
+            assert len(calls) == 1, (page.name, name, calls)
+    places = [w for block in code.values() for w in re.findall(r"workspace=(\"\S+?\")", block)]
+    assert len(places) == len(set(places)), "two reconstructions in one workspace"
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda p: p.name)
