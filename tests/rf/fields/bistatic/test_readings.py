@@ -266,31 +266,6 @@ def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
         Readings.load(tmp_path / "nothing.csv", frequency_hz=F, floor=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("changed", "told"),
-    [
-        ({"power": [1e-9, -1e-9]}, "power"),
-        ({"power": [1e-16, 1e-16]}, "power: got no value above the floor"),
-        ({"floor": 0.0}, "floor"),
-        ({"receivers": np.zeros((3, 3))}, "receivers"),
-        ({"receive_pattern": None}, "receive_pattern"),
-        ({"bandwidth_hz": 2e9}, "bandwidth_hz"),
-        ({"chain": ["a"]}, "chain"),
-        ({"std_db": -1.0}, "std_db"),
-        ({"window": "triangle"}, "window"),
-        ({"samples": 0}, "samples"),
-    ],
-)
-def test_bad_readings_are_named(changed: dict, told: str) -> None:
-    good = {
-        "transmitters": TX, "receivers": RECEIVERS[0], "power": [1e-9, 1e-9], "frequency_hz": F, "floor": 1e-15,
-        "arrival": [[1.0, 0.0], [1.0, 1.0]], "receive_pattern": horn(0.2),
-    }  # fmt: skip
-    Readings(**good)
-    with pytest.raises(ValueError, match=told):
-        Readings(**{**good, **changed})
-
-
 def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
     table = pd.DataFrame({name: [1.0, 2.0] for end in ("transmitter", "receiver") for name in COLUMNS[end]})
     table["power_db"] = -80.0
