@@ -15,12 +15,14 @@ import warprrf as wr
 from benchmarks.lobby.spectra import FILES
 from benchmarks.runner import option
 from warprrf.device import Progress
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.steps import digest
 
 DATA = "data/lobby"
 GEOMETRY = "runs/lobby/reconstruction"
+GAUSSIANS = 40_000  # that stand for a mesh
 TRUTHS = tuple(FILES)
 
 VERSIONS = {
@@ -138,22 +140,27 @@ class Truth:
 
 
 class Geometry:
-    """The frozen reconstruction, the true scene, and the blending weights of receivers, kept for the next method.
+    """What methods know of the room, the true scene, and the blending weights of receivers, kept for the next method.
 
     Args:
-        folder: of a saved :class:`Reconstruction`.
+        room: folder of a saved :class:`Reconstruction`; or a mesh or a scene, of which only the mesh is known: it is covered
+            with flat Gaussians.
         xml: true scene.
         device: where to compute.
     """
 
-    def __init__(self, folder: Path, xml: Path, device: Any = None) -> None:
-        self.folder, self.xml, self.device = folder, xml, device
+    def __init__(self, room: Path, xml: Path, device: Any = None) -> None:
+        self.room, self.xml, self.device = room, xml, device
         self._weights: dict[str, tuple[str, Transport, float]] = {}
 
     @cached_property
     def reconstruction(self) -> wr.Reconstruction:
-        """The reconstruction."""
-        return wr.Reconstruction.load(self.folder)
+        """The reconstruction, or what stands for one."""
+        if self.room.is_dir():
+            return wr.Reconstruction.load(self.room)
+        mesh = wr.Scene.load(self.room).mesh if self.room.suffix == ".xml" else wr.Mesh.load(self.room)
+        bare = wr.Mesh(mesh.vertices, mesh.faces)
+        return wr.Reconstruction(discs_on_mesh(bare, GAUSSIANS), bare)
 
     @cached_property
     def scene(self) -> wr.Scene:
@@ -162,8 +169,8 @@ class Geometry:
 
     @cached_property
     def key(self) -> str:
-        """Digest of the reconstruction."""
-        return digest(self.folder)
+        """Digest of what is known of the room."""
+        return digest(self.room) if self.room.is_dir() else digest(self.reconstruction.mesh.triangles)
 
     @cached_property
     def scene_key(self) -> str:

@@ -6,10 +6,13 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from golden import make
 from places import ROOT
 from radio_scenes import box_mesh
 
@@ -17,12 +20,16 @@ from warprrf import cli
 from warprrf.cli.inputs import read_positions, read_receivers
 from warprrf.cli.views import _look_at
 from warprrf.geometry.mesh_files import write_mesh
+from warprrf.rf.fields.bistatic.training import FitOptions
+from warprrf.rf.fields.harmonic.options import FieldOptions
 from warprrf.rf.maps.radio_map import RadioMap
 from warprrf.rf.positions import check_positions
+from warprrf.rf.spectra.spectrum import pixel_directions
 
 SCENE = ROOT / "data" / "lobby" / "scene.xml"
+SPECTRA = ROOT / "data" / "lobby" / "spectra.nc"
 COMMANDS = (
-    "reconstruct", "simulate", "fit", "suggest", "relevance", "render", "evaluate", "map", "twin", "view",
+    "reconstruct", "sample", "simulate", "fit", "suggest", "relevance", "render", "evaluate", "map", "twin", "view",
 )  # fmt: skip
 
 
@@ -83,18 +90,7 @@ def test_examples_that_need_the_repository_alone_run(
 
 
 def test_numbers_below_zero_are_no_options() -> None:
-    words = [
-        "simulate",
-        "s.xml",
-        "-o",
-        "x.nc",
-        "--transmitter",
-        "-1e-3",
-        "-2",
-        "-.5",
-        "--receivers",
-        "-1,4,-1.5",
-    ]
+    words = "simulate s.xml -o x.nc --transmitter -1e-3 -2 -.5 --receivers -1,4,-1.5".split()
     seen: list[object] = []
     parser = cli._parser()
     for action in parser._subparsers._group_actions[0].choices.values():  # type: ignore[union-attr]
@@ -110,7 +106,7 @@ def test_what_went_wrong_is_one_line_and_a_bug_is_a_traceback(
     kind: type[Exception], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(error: type[Exception]) -> object:
-        def load(path: object) -> None:
+        def load(path: object, device: object = None) -> None:
             raise error("first line\nsecond")
 
         return load
@@ -146,159 +142,60 @@ def test_runs_as_a_module() -> None:
     assert done.stderr == "warprrf: error: none: no such file or folder\n"
 
 
-SIMULATE = ["simulate", "{scene}", "-o", "{tmp}/x.nc", "--transmitter", "2", "3", "3", "--receivers"]
-RENDER = ["render", "-o", "{tmp}/x.png"]
-CARRIER = ["--carrier", "300e9"]
+SIMULATE = "simulate {scene} -o {tmp}/x.nc --transmitter 2 3 3 --receivers"
+RENDER = "render -o {tmp}/x.png"
+FIT = "fit {scene} -o {tmp}/f.safetensors"
+HORN = f"{FIT} --frequency 300e9 --noise-floor-db -120 {{tmp}}/horn.csv"
+SUGGEST = "suggest {scene} 2,2,1 --transmitter 13.6 11.2 2.5"
 BAD = {
-    "no photos": (["reconstruct", "{tmp}/none", "-o", "{tmp}/out"], "none"),
-    "no scene": ([word.replace("{scene}", "none.xml") for word in SIMULATE] + ["2,2,1"], "none.xml"),
-    "receiver of two numbers": ([*SIMULATE, "2,2"], "x,y,z"),
-    "receiver that is no number": ([*SIMULATE, "2,2,up"], "numbers"),
-    "NaN receiver": ([*SIMULATE, "2,2,nan"], "receivers"),
-    "receiver outside": ([*SIMULATE, "2,2,40"], "receivers"),
-    "frequency outside the materials": ([*SIMULATE, "2,2,1", "--frequency", "5e12"], "frequency"),
-    "materials of a list": (["simulate", "{tmp}/scene.xml", *SIMULATE[2:], "2,2,1"], "materials.json"),
-    "seed below zero": ([*SIMULATE, "7,4,1.5", "--seed", "-1"], "seed"),
-    "receivers of complex numbers": ([*SIMULATE, "{tmp}/c.npy"], "c.npy"),
-    "too wide a view": (
-        [
-            *RENDER,
-            "{tmp}/one.ply",
-            "--position",
-            "0",
-            "0",
-            "1",
-            "--look-at",
-            "1",
-            "0",
-            "1",
-            "--field-of-view",
-            "180",
-        ],
-        "--field-of-view",
-    ),
-    "no receivers at all": (["relevance", "{scene}", "--receivers", "2,2,1", "--most", "0"], "--most"),
-    "relevance that nests too deep": (
-        [
-            "fit",
-            "{scene}",
-            str(SCENE.parent / "spectra.nc"),
-            "-o",
-            "{tmp}/f.safetensors",
-            "--relevance",
-            "{tmp}/deep.json",
-        ],
-        "deep.json",
-    ),
-    "positions that nest too deep": (
-        ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/deep.json"],
-        "deep.json",
-    ),
-    "scale that is no number": (
-        ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--scale", "a.jpg", "b.jpg", "far"],
-        "--scale",
-    ),
-    "geometry of unknown kind": (
-        ["fit", "{tmp}/words.txt", "{tmp}/x.nc", "-o", "{tmp}/f.safetensors"],
-        ".ply",
-    ),
-    "horn of no table": (
-        ["fit", "{scene}", "{tmp}/bad.nc", "-o", "{tmp}/f.safetensors", "--horn-deg", "10"],
-        "--horn-deg",
-    ),
-    "part of a table": (
-        ["fit", "{scene}", "{tmp}/horn.csv", "-o", "{tmp}/f.safetensors", "--train", "3"],
-        "--train",
-    ),
-    "floor that is no number": (
-        [
-            "fit",
-            "{scene}",
-            "{tmp}/horn.csv",
-            "-o",
-            "{tmp}/f.safetensors",
-            *CARRIER,
-            "--noise-floor-db",
-            "4000",
-        ],
-        "--noise-floor-db",
-    ),
-    "horn that looks through its own foot": (
-        [
-            "fit",
-            "{scene}",
-            "{tmp}/horn.csv",
-            "-o",
-            "{tmp}/f.safetensors",
-            *CARRIER,
-            "--noise-floor-db",
-            "-120",
-            "--horn-deg",
-            "10",
-        ],
-        "zenith of -1.91986",
-    ),
-    "carrier of a field": (["suggest", "{tmp}/bad.safetensors", "2,2,1", *CARRIER], "--carrier"),
-    "candidates that are no numbers": (["suggest", "{scene}", "2,2,up"], "candidates"),
-    "suggest without a carrier": (
-        ["suggest", "{scene}", "2,2,1", "--transmitter", "13.6", "11.2", "2.5"],
-        "--carrier",
-    ),
-    "more suggested than there are": (
-        [
-            "suggest",
-            "{scene}",
-            "2,2,1",
-            "-n",
-            "2",
-            "--transmitter",
-            "13.6",
-            "11.2",
-            "2.5",
-            "--carrier",
-            "300e9",
-        ],
-        "n: got 2",
-    ),
-    "nowhere to look": (["relevance", "{scene}"], "--receivers"),
-    "relevance of nothing": (["relevance", "{tmp}/none.xml", "--receivers", "2,2,1"], "none.xml"),
-    "carrier of no material": (
-        [
-            "relevance",
-            "{scene}",
-            "--receivers",
-            "2,2,1",
-            "--transmitter",
-            "3",
-            "2",
-            "3",
-            "--frequency",
-            "5e9",
-        ],
-        "frequency",
-    ),
-    "corrupt spectra": (["fit", "{scene}", "{tmp}/bad.nc", "-o", "{tmp}/f.safetensors"], "bad.nc"),
-    "corrupt field": ([*RENDER, "{tmp}/bad.safetensors", "--receiver", "1", "1", "1"], "bad.safetensors"),
-    "corrupt splats": (
-        [*RENDER, "{tmp}/bad.ply", "--position", "0", "0", "1", "--look-at", "1", "0", "1"],
-        "bad.ply",
-    ),
-    "camera looks straight up": (
-        [*RENDER, "{tmp}/one.ply", "--position", "0", "0", "1", "--look-at", "0", "0", "2"],
-        "--look-at",
-    ),
-    "map of no kind": (["map", "{tmp}/bad.safetensors", "-o", "{tmp}/m.tif"], "m.tif"),
-    "map of a corrupt field": (["map", "{tmp}/bad.safetensors", "-o", "{tmp}/m.nc"], "bad.safetensors"),
-    "field without receiver": ([*RENDER, "{tmp}/bad.safetensors"], "--receiver"),
-    "positions that are no positions": (
-        ["reconstruct", "{tmp}", "-o", "{tmp}/out", "--known-positions", "{tmp}/words.txt"],
-        "words.txt",
-    ),
-}
+    "no photos": ("reconstruct {tmp}/none -o {tmp}/out", "none"),
+    "no scene": (SIMULATE.replace("{scene}", "none.xml") + " 2,2,1", "none.xml"),
+    "receiver of two numbers": (f"{SIMULATE} 2,2", "x,y,z"),
+    "receiver that is no number": (f"{SIMULATE} 2,2,up", "numbers"),
+    "NaN receiver": (f"{SIMULATE} 2,2,nan", "receivers"),
+    "receiver outside": (f"{SIMULATE} 2,2,40", "receivers"),
+    "frequency outside the materials": (f"{SIMULATE} 2,2,1 --frequency 5e12", "frequency"),
+    "materials of a list": (f"{SIMULATE} 2,2,1 --materials {{tmp}}/materials.json", "materials.json"),
+    "seed below zero": (f"{SIMULATE} 7,4,1.5 --seed -1", "seed"),
+    "receivers of complex numbers": (f"{SIMULATE} {{tmp}}/c.npy", "c.npy"),
+    "nowhere to sample": ("sample {scene} -o {tmp}/r.csv -n 3 --height 20 30", "z: got"),
+    "too wide a view": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 1 0 1 --field-of-view 180", "--field-of-view"),
+    "no receivers at all": ("relevance {scene} --receivers 2,2,1 --most 0", "--most"),
+    "materials of a reconstruction": ("relevance {tmp} --receivers 2,2,1 --materials {tmp}/materials.json", "--materials"),
+    "relevance that nests too deep": (f"{FIT} {{spectra}} --relevance {{tmp}}/deep.json", "deep.json"),
+    "positions that nest too deep": ("reconstruct {tmp} -o {tmp}/out --known-positions {tmp}/deep.json", "deep.json"),
+    "scale that is no number": ("reconstruct {tmp} -o {tmp}/out --scale a.jpg b.jpg far", "--scale"),
+    "geometry of unknown kind": ("fit {tmp}/words.txt {tmp}/x.nc -o {tmp}/f.safetensors", ".ply"),
+    "horn of no table": (f"{FIT} {{tmp}}/bad.nc --receive-pattern 10", "--receive-pattern"),
+    "fading of spectra, behind their file": (f"{FIT} {{tmp}}/bad.nc samples=1", "--samples"),
+    "part of a table": (f"{HORN} --train 3", "--train"),
+    "setting of no name": (f"{HORN} {{tmp}}/horn.csv colour=red", "colour"),
+    "floor that is no number": (f"{HORN} noise-floor-db=4000", "--noise-floor-db"),
+    "horn that looks through its own foot": (f"{HORN} receive-pattern=10", "zenith of -1.91986"),
+    "pattern of words": (f"{HORN} receive-pattern={{tmp}}/words.txt", "words.txt"),
+    "pattern of three numbers": (f"{HORN} --receive-pattern 10,-25,3", "'10,-25,3'"),
+    "option of no model": (f"{FIT} {{spectra}} --option colour=red", "colour"),
+    "arrays that are no spectra": (f"{FIT} {{tmp}}/bad.npz", "bad.npz"),
+    "candidates that are no numbers": ("suggest {scene} 2,2,up", "candidates"),
+    "pointings without a direction": (f"{SUGGEST} --frequency 3e11 --receive-pattern 10", "azimuth"),
+    "suggest without a carrier": (SUGGEST, "--frequency"),
+    "more suggested than there are": (f"{SUGGEST} -n 2 --frequency 300e9", "n: got 2"),
+    "nowhere to look": ("relevance {scene}", "--receivers"),
+    "relevance of nothing": ("relevance {tmp}/none.xml --receivers 2,2,1", "none.xml"),
+    "carrier of no material": ("relevance {scene} --receivers 2,2,1 --transmitter 3 2 3 --frequency 5e9", "frequency"),
+    "corrupt spectra": (f"{FIT} {{tmp}}/bad.nc", "bad.nc"),
+    "corrupt field": (f"{RENDER} {{tmp}}/bad.safetensors --receiver 1 1 1", "bad.safetensors"),
+    "corrupt splats": (f"{RENDER} {{tmp}}/bad.ply --position 0 0 1 --look-at 1 0 1", "bad.ply"),
+    "camera looks straight up": (f"{RENDER} {{tmp}}/one.ply --position 0 0 1 --look-at 0 0 2", "--look-at"),
+    "map of no kind": ("map {tmp}/bad.safetensors -o {tmp}/m.tif", "m.tif"),
+    "map of a corrupt field": ("map {tmp}/bad.safetensors -o {tmp}/m.nc", "bad.safetensors"),
+    "field without receiver": (f"{RENDER} {{tmp}}/bad.safetensors", "--receiver"),
+    "positions that are no positions": ("reconstruct {tmp} -o {tmp}/out --known-positions {tmp}/words.txt", "words.txt"),
+}  # fmt: skip
 
 
 def test_an_empty_name_of_the_result_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
-    words = [word.format(tmp="", scene=SCENE) for word in SIMULATE]
+    words = SIMULATE.format(tmp="", scene=SCENE).split()
     words[words.index("-o") + 1] = ""
     assert cli.main([*words, "7,4,1.5"]) == 2
     assert "-o/--out: got ''" in capsys.readouterr().err
@@ -310,10 +207,10 @@ def test_bad_input_is_one_line_and_status_2(
 ) -> None:
     import warprrf as wr
 
-    (tmp_path / "scene.xml").write_text("<scene/>")
     (tmp_path / "materials.json").write_text("[5]")
     (tmp_path / "deep.json").write_text("[" * 100_000)
     np.save(tmp_path / "c.npy", np.ones((2, 3), complex))
+    np.savez(tmp_path / "bad.npz", receivers=np.ones((1, 3)))
     (tmp_path / "words.txt").write_text("these are, words\n")
     (tmp_path / "horn.csv").write_text(
         "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db\n13,11,2.5,7,4,1.5,0,200,-90\n"
@@ -328,32 +225,16 @@ def test_bad_input_is_one_line_and_status_2(
     )
     words, expected = BAD[case]
     before = sorted(path.name for path in tmp_path.iterdir())
-    status = cli.main([word.format(tmp=tmp_path, scene=SCENE) for word in words] + ["--quiet"])
+    status = cli.main(f"{words} --quiet".format(tmp=tmp_path, scene=SCENE, spectra=SPECTRA).split())
     said = capsys.readouterr().err.strip()
-    assert status == 2
-    assert said.startswith("warprrf: error: ")
-    assert said.count("\n") == 0
-    assert expected in said
+    assert (status, said.count("\n")) == (2, 0)
+    assert said.startswith("warprrf: error: ") and expected in said
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "run") == before
 
 
-def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+def test_debug_shows_the_traceback() -> None:
     with pytest.raises(ValueError, match="no such file"):
-        cli.main(
-            [
-                "simulate",
-                str(tmp_path / "none.xml"),
-                "-o",
-                "x.nc",
-                "--transmitter",
-                "1",
-                "1",
-                "1",
-                "--receivers",
-                "1,1,1",
-                "--debug",
-            ]
-        )
+        cli.main("simulate none.xml -o x.nc --transmitter 1 1 1 --receivers 1,1,1 --debug".split())
 
 
 @pytest.mark.parametrize("suffix", ["json", "csv"])
@@ -388,7 +269,7 @@ def test_suggest_writes_the_places_that_it_chooses(
     write_mesh(tmp_path / "room.ply", *box_mesh([0, 0, 0], [5, 4, 3], inward=True))
     (tmp_path / "candidates.csv").write_text("x,y,z\n1,1,1.5\n4,3,1.5\n-0.0,9,1\n")
     words = ["suggest", f"{tmp_path}/room.ply", f"{tmp_path}/candidates.csv", "-n", "2", "--quiet"]
-    words += ["--transmitter", "0.8", "0.9", "2.2", "--carrier", "300e9", "-o", f"{tmp_path}/next.csv"]
+    words += ["--transmitter", "0.8", "0.9", "2.2", "--frequency", "300e9", "-o", f"{tmp_path}/next.csv"]
     assert cli.main(words) == 2 and "outside the scene" in capsys.readouterr().err
     (tmp_path / "candidates.csv").write_text("x,y,z\n1,1,1.5\n4,3,1.5\n2.5,3.5,1\n")
     assert cli.main(words) == 0
@@ -417,11 +298,131 @@ def test_fit_takes_receivers_for_training_alone(tmp_path: Path, monkeypatch: pyt
         raise ValueError("enough")
 
     monkeypatch.setattr(wr.RadioField, "fit", fit)
-    spectra = str(ROOT / "data" / "lobby" / "spectra.nc")
-    assert cli.main(["fit", str(SCENE), spectra, "-o", str(tmp_path / "f.safetensors"), "--quiet"]) == 2
-    whole = wr.SpectrumDataset.load(spectra)
+    assert cli.main(f"fit {SCENE} {SPECTRA} -o {tmp_path}/f.safetensors --quiet".split()) == 2
+    whole = wr.SpectrumDataset.load(SPECTRA)
     assert (seen[0].role == "train").all()
     assert 0 < len(seen[0]) == (whole.role == "train").sum() < len(whole)
+
+
+def test_each_file_of_measurements_has_its_own_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import warprrf as wr
+
+    head, row = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,", "13,11,2.5,7,4,1.5,"
+    (tmp_path / "horn.csv").write_text(f"{head}azimuth_deg,power_db\n{row}20,-90\n")
+    (tmp_path / "taps.csv").write_text(
+        f"{head}azimuth_deg,tx_azimuth_deg,delay_ns,power_db\n{row}0,5,9,-90\n"
+    )
+    (tmp_path / "power.csv").write_text(f"{head}power_db\n{row}-90\n")
+    (tmp_path / "gains.csv").write_text("1\n0.5\n0\n")
+    given = {
+        "receivers": np.ones((1, 3)),
+        "transmitter": np.zeros(3),
+        "frequency_hz": 3e11,
+        "beam_sigma_rad": 0.03,
+    }
+    np.savez(tmp_path / "s.npz", path_gain=np.full((1, 4, 8), 1e-9), **given)
+    seen: dict[str, Any] = {}
+
+    def fit(geometry: object, data: list[Any], **options: object) -> None:
+        seen.update({getattr(one, "name", "spectra"): one for one in data}, **options)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(wr.RadioField, "fit", fit)
+    monkeypatch.chdir(tmp_path)
+    words = "s.npz horn.csv receive-pattern=10,-25 azimuth=unknown name=corner position-std=0.03 power.csv samples=1 "
+    words += (
+        "noise-floor-db=-140 taps.csv window=hann receive-pattern=gains.csv transmit-pattern=20 bandwidth=2e9"
+    )
+    shared = "--frequency 300e9 --noise-floor-db -120 --option mirror_order=2 --option lobes=[0,12] --quiet"
+    assert cli.main(f"fit {SCENE} {words} -o f.safetensors {shared}".split()) == 2
+    horn, power, taps = (seen[name] for name in ("corner", "power", "taps"))
+    angle = np.linspace(0.0, np.pi, 9)
+    np.testing.assert_allclose(horn.receive_pattern(angle), wr.horn(np.radians(10), -25.0)(angle))
+    assert (horn.azimuth_known, horn.position_std_m, horn.samples, horn.floor[0]) == (
+        False,
+        0.03,
+        None,
+        1e-12,
+    )
+    assert (power.samples, power.azimuth_known, power.frequency_hz) == (1, True, 300e9)
+    assert power.floor[0] == pytest.approx(1e-14)
+    assert (taps.window, taps.bandwidth_hz, horn.bandwidth_hz) == ("hann", 2e9, None)
+    np.testing.assert_array_equal(taps.receive_pattern, [1.0, 0.5, 0.0])
+    np.testing.assert_allclose(taps.transmit_pattern(angle), wr.horn(np.radians(20))(angle))
+    assert seen["spectra"].shape == (4, 8) and (seen["mirror_order"], seen["lobes"]) == (2, (0, 12))
+
+
+def test_materials_that_are_given_are_those_of_a_mesh_whatever_lies_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import warprrf as wr
+
+    seen: list[wr.Scene] = []
+    monkeypatch.setattr(wr, "relevance", lambda scene, **_: seen.append(scene) or {}[0])
+    (tmp_path / "room.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl pane\nf 1 2 3\n")
+    (tmp_path / "mine.json").write_text('{"pane": {"itu": "glass", "thickness": 0.01}}')
+    (tmp_path / "materials.json").write_text('{"metadata": 4}')
+    words = f"relevance {tmp_path}/room.obj --receivers 2,2,1 --transmitter 1 1 1 --frequency 3e11 --quiet"
+    with pytest.raises(KeyError):
+        cli.main([*words.split(), "--materials", f"{tmp_path}/mine.json"])
+    pane, glass = seen[0].materials[0], wr.em.itu_material("glass", thickness_m=0.01)
+    assert pane.name == "pane" and pane.thickness_m == 0.01
+    assert pane.permittivity(3e11) == glass.permittivity(3e11)
+    (tmp_path / "mine.json").write_text('{"pane": {"thicknes": 0.01}}')
+    assert cli.main([*words.split(), "--materials", f"{tmp_path}/mine.json"]) == 2
+    assert "got thicknes, expected among itu, thickness" in capsys.readouterr().err
+
+
+def test_the_carrier_has_one_name() -> None:
+    commands = cli._parser()._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    named = {
+        word
+        for command in commands.values()
+        for action in command._actions
+        for word in action.option_strings
+        if re.search("carrier|freq|hertz|ghz", word)
+    }
+    assert named == {"--frequency"}
+
+
+def test_sample_render_and_suggest_say_what_the_library_says(tmp_path: Path) -> None:
+    import warprrf as wr
+
+    def run(words: str) -> None:
+        assert cli.main([*words.format(tmp=tmp_path, scene=SCENE).split(), "--quiet", "--device", "cpu"]) == 0
+
+    run("sample {scene} -o {tmp}/r.csv -n 5 --height 1 1.5 --clearance 0.5 --seed 3")
+    expected = wr.sample_receivers(wr.Scene.load(SCENE), 5, z=(1, 1.5), clearance=0.5, seed=3)
+    np.testing.assert_allclose(read_receivers([f"{tmp_path}/r.csv"]), expected, rtol=1e-11)
+    field = make.bistatic()
+    field.save(tmp_path / "f.safetensors")
+    place, sender = field.transmitter + [2.0, 0.3, -1.0], field.transmitter + [0.5, 0.5, -0.2]
+    asked = "render {tmp}/f.safetensors -o {tmp}/s.npz --receiver " + " ".join(map(repr, map(float, place)))
+    run(f"{asked} --transmitter {' '.join(map(repr, map(float, sender)))} --frequency 140e9")
+    other = field.at_frequency(140e9).spectrum(place, sender)
+    np.testing.assert_allclose(np.load(tmp_path / "s.npz")["path_gain"], other.path_gain, rtol=1e-5)
+    run(f"{asked} --array 4 2 --facing 30 60")
+    array = wr.PlanarArray(4, 2, orientation=(np.pi / 6, -np.pi / 3, 0.0))
+    heard = field.array_spectrum(place, array, pixel_directions(field.shape))
+    np.testing.assert_allclose(np.load(tmp_path / "s.npz")["path_gain"], heard, rtol=1e-5)
+    turned = np.array([[90.0, 0.0], [-90.0, 0.0], [180.0, 20.0]])
+    np.savetxt(tmp_path / "c.csv", np.column_stack([np.tile(place, (3, 1)), turned]), delimiter=",")
+    run("suggest {tmp}/f.safetensors {tmp}/c.csv -n 2 --receive-pattern 10 -o {tmp}/next.csv")
+    arrival = np.radians(np.column_stack([90.0 - turned[:, 1], turned[:, 0]]))
+    best = field.suggest(np.tile(place, (3, 1)), 2, arrival=arrival, receive_pattern=wr.horn(np.radians(10)))
+    chosen = np.loadtxt((tmp_path / "next.csv").read_text().splitlines()[1:], delimiter=",")
+    np.testing.assert_allclose(chosen[:, 3:], turned[best])
+
+
+def test_help_of_fit_names_every_option_of_its_models(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "--help"])
+    text = capsys.readouterr().out.partition("options of a model")[2]
+    known = {f.name for kind in (FitOptions, FieldOptions) for f in fields(kind)}
+    inner = {"selection", "groups", "residuals", "rates"}  # dataclasses of their own
+    assert set(re.findall(r"[a-z_]+", text)) >= known - inner - {"seed", "model", "relevance"}
 
 
 def test_simulate_fit_evaluate_and_render_round_trip(

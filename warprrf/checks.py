@@ -400,3 +400,11 @@ def one_line(self: Any) -> str:
         elif value is not None and len(text := repr(value)) <= 60:
             parts.append(f"{field.name}={text}")
     return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def users_level() -> int:
+    """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
+        frame, level = frame.f_back, level + 1
+    return level

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from damage import survey
 from model_files import BLUE, RED, changed_glb, obj_with_materials, room_glb, room_gltf
 
 import warprrf as wr
-from warprrf.geometry import gltf_files
+from warprrf.geometry import gltf_files, mesh_content, obj_files
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh, read_mesh, write_mesh
 
 BLUE_SRGB = np.array(BLUE) / 255.0
@@ -126,6 +125,31 @@ def test_numbered_pages_of_a_scan_are_no_materials(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.face_label, [-1, -1, 0])
 
 
+def one_texture_glb(folder: Path) -> Path:
+    def share(header):
+        textured = [m for m in header["materials"] if "baseColorTexture" in m["pbrMetallicRoughness"]]
+        header["materials"] = textured * len(header["materials"])
+
+    return changed_glb(room_glb(folder), share)
+
+
+def one_texture_obj(folder: Path) -> Path:
+    path = obj_with_materials(folder)
+    (folder / "square.mtl").write_text(
+        "".join(f"newmtl {n}\nmap_Kd pages/wood.png\n" for n in ("Wood_01", "Paint"))
+    )
+    return path
+
+
+@pytest.mark.parametrize("make", [one_texture_glb, one_texture_obj])
+def test_a_picture_that_materials_share_is_decoded_once(make, tmp_path: Path, monkeypatch) -> None:
+    path, read, decoded = make(tmp_path), mesh_content.read_picture, []
+    for module in gltf_files, obj_files:
+        monkeypatch.setattr(module, "read_picture", lambda *a: decoded.append(a) or read(*a))
+    assert wr.Mesh.load(path).face_colours is not None
+    assert len(decoded) == 1
+
+
 def outside_obj(folder: Path) -> Path:
     path = obj_with_materials(folder)
     path.write_text(path.read_text().replace("square.mtl", "../square.mtl"))
@@ -189,15 +213,6 @@ def test_a_small_file_that_makes_many_triangles_is_refused(most: int, tmp_path: 
     monkeypatch.setattr(gltf_files, "LARGEST_FACES", most)  # 12 and 2 are made, 2 of them stand there twice
     with pytest.raises(ValueError, match=rf"room\.glb.*more than {most} triangles"):
         wr.Mesh.load(room_glb(tmp_path))
-
-
-@pytest.mark.parametrize("make", [room_glb, room_gltf, obj_with_materials])
-def test_damage_is_refused_by_the_file_s_name_or_gives_numbers(make, tmp_path: Path) -> None:
-    found = survey(make(tmp_path), "file_formats:read_mesh_file", flips=60, cuts=20)
-    # a name that is damaged is that of no material, whose colour is unknown
-    assert [outcome for _, outcome in found.wrong if outcome != "NaN in face_colours"] == []
-    if make is room_glb:  # text may end early and be whole; a binary file states its length
-        assert not any(damage.startswith("cut") for damage, _ in found.changed)
 
 
 def test_a_binary_stl_that_is_cut_short_is_refused(tmp_path: Path) -> None:

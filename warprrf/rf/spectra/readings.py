@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -317,13 +318,14 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
         floor_db: of the side lobes below the peak [dB].
     """
     width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
-
-    def shape(angle: np.ndarray) -> np.ndarray:
-        return np.maximum(np.exp(-4.0 * np.log(2.0) * (angle / width) ** 2), 10.0 ** (low / 10.0))
-
     angle = np.linspace(0.0, np.pi, 20_001)
-    mean = 0.5 * np.trapezoid(shape(angle) * np.sin(angle), angle)
-    return lambda off: shape(np.asarray(off)) / mean
+    mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
+    return partial(_horn_gain, width, low, mean)
+
+
+def _horn_gain(width: float, floor_db: float, mean: float, angle: ArrayLike) -> np.ndarray:
+    lobe = np.exp(-4.0 * np.log(2.0) * (np.asarray(angle) / width) ** 2)
+    return np.maximum(lobe, 10.0 ** (floor_db / 10.0)) / mean
 
 
 def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:
