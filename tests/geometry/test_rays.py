@@ -10,6 +10,7 @@ from threading import Barrier
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
+from trimesh.creation import icosphere
 
 from warprrf.device import resolve
 from warprrf.geometry import rays as raysearch
@@ -29,27 +30,12 @@ def where(request):
     return {"backend": request.param, "device": "cpu"}
 
 
-def sphere(rings=40, around=80, radius=5.0, bumps=0.3):
+def sphere(radius=5.0, bumps=0.3):
     """A closed bumpy sphere about the origin: every vertex is seen from the middle."""
-    theta = np.linspace(0, np.pi, rings + 1)[1:-1]
-    phi = np.arange(around) * 2 * np.pi / around
-    th, ph = np.meshgrid(theta, phi, indexing="ij")
-    r = radius + bumps * np.sin(5 * th) * np.cos(7 * ph)
-    v = r[..., None] * np.stack([np.sin(th) * np.cos(ph), np.sin(th) * np.sin(ph), np.cos(th)], axis=-1)
-    vertices = np.concatenate([v.reshape(-1, 3), [[0, 0, radius], [0, 0, -radius]]])
-    j, k = np.arange(around), (np.arange(around) + 1) % around
-    north, south, last = len(vertices) - 2, len(vertices) - 1, (rings - 2) * around
-    faces = [
-        np.stack([np.full(around, north), j, k], 1),
-        np.stack([np.full(around, south), last + k, last + j], 1),
-    ]
-    for row in range(rings - 2):
-        a = row * around
-        faces += [
-            np.stack([a + j, a + around + j, a + around + k], 1),
-            np.stack([a + j, a + around + k, a + k], 1),
-        ]
-    return Mesh(vertices, np.concatenate(faces))
+    ball = icosphere(subdivisions=4)
+    x, y, z = ball.vertices.T
+    r = radius + bumps * np.sin(5 * np.arccos(z)) * np.cos(7 * np.arctan2(y, x))
+    return Mesh(r[:, None] * ball.vertices, ball.faces)
 
 
 def directions(n, seed=0):

@@ -68,12 +68,6 @@ def engine(scene: RadioScene, gas: object) -> ExactEngine:
 # ------------------------------------------------------------------------------------------------ simulate
 
 
-def test_transmittance_is_attenuation_over_a_length() -> None:
-    assert 0.29 < LOSS < 0.31
-    assert AIR.transmittance(F, 3.0) == pytest.approx(10.0 ** (-0.3 * LOSS), rel=1e-12)
-    assert np.exp(-AIR.loss_per_m(F) * 3.0) == pytest.approx(10.0 ** (-0.3 * LOSS), rel=1e-12)
-
-
 def test_line_of_sight_is_friis_times_gas_and_mirrors_have_their_images_length(scene: RadioScene) -> None:
     distance = np.linalg.norm(SEEN - TX)
     totals, without = engine(scene, True).receive(SEEN).totals, engine(scene, False)
@@ -110,13 +104,6 @@ def test_off_is_off_and_files_say_which(
     np.testing.assert_array_equal(spectra(scene, gas=thick, **some).path_gain, on.path_gain)
     on.save(tmp_path / "on.nc")
     assert SpectrumDataset.load(tmp_path / "on.nc").air == thick == on.subset([1, 0]).air
-
-
-def test_a_carrier_that_the_recommendation_does_not_know_is_refused(scene: RadioScene) -> None:
-    with pytest.raises(ValueError, match="frequency_hz: got 2000000000000"):
-        simulate(scene, transmitter=TX, receivers=[SEEN], frequency_hz=2e12, shape=SHAPE, gas=True)
-    with pytest.raises(TypeError, match="gas: got str"):
-        spectra(scene, gas="standard")
 
 
 def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:

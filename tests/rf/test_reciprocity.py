@@ -135,30 +135,6 @@ def test_the_exact_engines_diffuse_power_is_the_same_both_ways():
     assert abs(there / back - 1.0) > 0.03
 
 
-def test_every_path_of_the_exact_engine_follows_the_reciprocal_formula():
-    found = engine(TX, reciprocal=True).diffuse(RX)
-    mesh, scene = room(reciprocal=True).mesh, room(reciprocal=True)
-    face = mesh.cast(np.tile(RX, (len(found.index), 1)), found.direction).face
-    normal, point = mesh.face_normals[face], RX + found.range_m[:, None] * found.direction
-    d1 = np.linalg.norm(TX - point, axis=1)
-    toward = (TX - point) / d1[:, None]
-    cos_i, cos_s = (normal * toward).sum(axis=1), -(normal * found.direction).sum(axis=1)
-    cos_mirror = 2.0 * cos_i * cos_s + (toward * found.direction).sum(axis=1)
-    omega = exact._sub_pixel_grid((60, 120), exact.SUB_PIXELS, "cpu").solid_angles[found.index]
-    expected = (WAVELENGTH / (4.0 * np.pi * d1)) ** 2 * omega * cos_i
-    for k, m in enumerate(scene.materials):
-        own = scene.face_material[face] == k
-        gamma = 0.25 * sum(
-            np.abs(r) ** 2
-            for cosine in (cos_i[own], cos_s[own])
-            for r in slab_reflection(cosine, m.permittivity(F), m.thickness_m, WAVELENGTH)
-        )
-        alpha = m.alpha_r if m.pattern == "directive" else 0
-        f_s = lobe(alpha, cos_i[own], cos_s[own], cos_mirror[own], reciprocal=True)
-        expected[own] *= m.scattering**2 * gamma * f_s / cos_s[own]
-    np.testing.assert_allclose(found.power, expected, rtol=1e-5)
-
-
 # ---------------------------------------------------------------------------------------------------------- fields
 
 LOBES = Terms(lobes=(0, 4, 30), reciprocal=True)

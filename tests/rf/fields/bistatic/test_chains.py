@@ -69,17 +69,6 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     assert min(means) < -0.5
 
 
-def test_a_chain_reflects_as_much_backwards() -> None:
-    stops, normal, cosine = reflected_ways(40, 3, seed=0)
-    log_excess = np.random.default_rng(1).uniform(-1.0, 4.0, cosine.shape)
-    met = np.ones(cosine.shape, bool)
-    there = chain_reflection(log_excess, cosine, turns(stops, normal), met)[0]
-    back = chain_reflection(
-        log_excess[:, ::-1], cosine[:, ::-1], turns(stops[:, ::-1], normal[:, ::-1]), met
-    )[0]
-    np.testing.assert_allclose(there, back, rtol=1e-12)
-
-
 def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_nothing() -> None:
     log_excess, cosine = np.linspace(-2.0, 4.0, 20), np.linspace(0.05, 1.0, 20)
     rest = np.zeros((20, 2))

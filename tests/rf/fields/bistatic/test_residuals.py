@@ -10,7 +10,6 @@ from radio_scenes import RadioScene, SlabMaterial
 from scipy import sparse
 from trimesh.remesh import subdivide_to_size
 
-from warprrf import tensor_files as files
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -156,7 +155,7 @@ def test_links_have_the_same_gains(field: BistaticField) -> None:
         np.testing.assert_allclose(textured[0] - bare[0], textured[1] - bare[1], rtol=0.1)
 
 
-def test_the_file_keeps_them_and_refuses_others(field: BistaticField, tmp_path: Path) -> None:
+def test_the_file_keeps_them(field: BistaticField, tmp_path: Path) -> None:
     textured = replace(field, residual=np.random.default_rng(7).normal(size=field.residual.shape))
     textured.save(tmp_path / "field.safetensors")
     back = RadioField.load(tmp_path / "field.safetensors")
@@ -165,12 +164,6 @@ def test_the_file_keeps_them_and_refuses_others(field: BistaticField, tmp_path: 
     np.testing.assert_array_equal(
         back.spectrum(RECEIVERS[1]).path_gain, textured.spectrum(RECEIVERS[1]).path_gain
     )
-    tensors, header = files.read(tmp_path / "field.safetensors")
-    files.write(tmp_path / "wrong.safetensors", tensors | {"residual": textured.residual[:, :-1]}, header)
-    with pytest.raises(ValueError, match="wrong.safetensors: .*residual: got shape"):
-        RadioField.load(tmp_path / "wrong.safetensors")
-    with pytest.raises(ValueError, match="residual: got shape"):
-        replace(textured, residual=np.zeros(len(field.surface.element_area)))
 
 
 def test_a_surface_of_faces_larger_than_cells(field: BistaticField) -> None:
