@@ -32,6 +32,7 @@ PAGES = sorted(p for p in (ROOT / "docs").rglob("*.md") if not str(p.relative_to
 
 def test_the_readme_is_short_and_its_table_is_current():
     assert len(README.splitlines()) <= 150 and not re.search(r"\basked\b", README)
+    assert all(len(b.split("\n")) <= 11 for b in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
     assert results.readme() in README, "run: python tools/docs/results.py readme"
 
 
@@ -113,7 +114,3 @@ def test_documented_calls_go_with_the_signatures(source):
                 except TypeError as error:
                     wrong.append(error)
             assert not wrong or not all(wrong), f"{ast.unparse(call)}: {wrong}"
-
-
-def test_python_in_the_readme_is_short():
-    assert all(len(b.split("\n")) <= 11 for b in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
