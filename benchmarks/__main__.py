@@ -26,13 +26,11 @@ NAMES = {
     ),
     "beams": ("benchmarks.beams", "beams chosen from the field without pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
-    "fuzz": ("benchmarks.fuzz.command", "hostile arguments and damaged files, for as long as it is told to"),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
     "relevance": ("benchmarks.relevance", "what each effect is worth, at two carriers and three roughnesses"),
     "newrf": ("benchmarks.newrf", "data of the second room: NeWRF's conference room"),
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
-    "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
     "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
     "measurements": (

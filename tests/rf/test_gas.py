@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
+from furnished import RECEIVERS, SHAPE, TX
+from radio_scenes import RadioScene, SlabMaterial, joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air
@@ -33,24 +34,10 @@ from warprrf.rf.spectra.spectrum import to_db
 
 F = 380.2e9
 WAVELENGTH = SPEED_OF_LIGHT / F
-SHAPE = (24, 48)
-TX = np.array([0.8, 0.9, 2.2])
 AIR = Air()
 LOSS = AIR.attenuation_db_per_m(F)  # dB a metre
-RECEIVERS = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
-     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0]]
-)  # fmt: skip
+RECEIVERS = RECEIVERS[:8]
 BLOCKED, SEEN = RECEIVERS[0], RECEIVERS[4]
-
-
-@pytest.fixture(scope="module")
-def scene() -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4)
-    return RadioScene(mesh, part, [walls, SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)])
 
 
 def spectra(scene: RadioScene, **options: object) -> SpectrumDataset:

@@ -60,14 +60,6 @@ def test_the_lobby_stands_upright_on_its_floor_in_metres_without_survey(lobby, l
     assert np.abs(mine[:, :2].mean(axis=0)).max() < 1e-9
 
 
-def test_vertical_edges_say_where_up_is(lost, lobby):
-    up, proven = vertical_of_edges(lost.cameras, read)
-    scale, rotation, _ = sparse.fit_similarity(*(
-        np.array([c.position for c in m.cameras.values()]) for m in (lobby, lost)
-    ))  # fmt: skip
-    assert proven and np.degrees(np.arccos(up @ rotation[:, 2])) < 1.0
-
-
 def test_what_photos_do_not_show_is_said_to_be_guessed(lost):
     bare = replace(lost, points=np.zeros((0, 3)), colors=np.zeros((0, 3)), reprojection_error=np.zeros(0),
                    track_length=EMPTY, track_start=np.zeros(1, dtype=np.int64), track_camera=EMPTY)  # fmt: skip

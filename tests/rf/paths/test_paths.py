@@ -11,7 +11,6 @@ from places import ROOT
 from radio_scenes import METAL, RadioScene, SlabMaterial, box_mesh, joined, square
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.planar_patches import planar_patches
 from warprrf.rf.em.fresnel import lobe, slab_reflection
 from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -42,16 +41,6 @@ def box_images(order):
             local = np.where(even, TX - LOW, HIGH - TX)
             images.append(LOW + np.array(n) * size + local)
     return np.array(images)
-
-
-def test_friis():
-    p = trace_paths(room(), transmitter=TX, receivers=[1.0, -2, 1.5], frequency_hz=F, mirror_order=0)
-    d = np.linalg.norm(TX - [1.0, -2, 1.5])
-    assert p.kind.tolist() == ["los"]
-    np.testing.assert_allclose(p.power, (WAVELENGTH / (4 * np.pi * d)) ** 2, rtol=1e-13)
-    np.testing.assert_allclose(
-        np.angle(p.gain), np.angle(np.exp(-2j * np.pi * F * d / SPEED_OF_LIGHT)), atol=1e-9
-    )
 
 
 def test_anything_with_a_mesh_is_traced_as_that_mesh():
@@ -180,14 +169,6 @@ def test_lobes_integrate_to_one_over_the_hemisphere(alpha_r, cos_incidence):
     assert (value.mean(axis=1) * 2 * np.pi) @ weight == pytest.approx(1.0, rel=1e-6)
 
 
-def test_patches_of_a_box_are_its_six_sides():
-    patches = planar_patches(room())
-    assert len(patches) == 6
-    np.testing.assert_allclose(np.sort(patches.area), np.sort([180, 180, 60, 60, 48, 48]))
-    split = planar_patches(room(), np.arange(12) % 2)
-    assert len(split) == 12
-
-
 def test_padding_is_marked():
     mesh, _ = joined(square(1.0))
     p = trace_paths(
@@ -195,17 +176,6 @@ def test_padding_is_marked():
     )
     assert p.valid.tolist() == [[True, True], [True, False]]
     assert p.gain[1, 1] == 0 and np.isnan(p.tau[1, 1]) and p.kind[1, 1] == ""
-
-
-def test_bad_input_is_refused():
-    with pytest.raises(ValueError, match="receivers.*NaN"):
-        trace_paths(room(), transmitter=TX, receivers=[np.nan, 0, 0], frequency_hz=F)
-    with pytest.raises(ValueError, match="mirror_order"):
-        trace_paths(room(), transmitter=TX, receivers=[0, 0, 1], frequency_hz=F, mirror_order=-1)
-    with pytest.raises(ValueError, match="frequency_hz"):
-        trace_paths(room(), transmitter=TX, receivers=[0, 0, 1], frequency_hz=-1)
-    with pytest.raises(TypeError, match="mesh_or_scene"):
-        trace_paths("room", transmitter=TX, receivers=[0, 0, 1], frequency_hz=F)
 
 
 def external(name):

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from damage import survey
 
 from warprrf.rf.spectra.dataset import SpectrumDataset, assign_roles
 from warprrf.rf.spectra.dataset_files import (
@@ -223,20 +222,6 @@ def test_a_file_that_states_more_than_it_can_hold_is_refused(tmp_path):
         file.create_variable("path_gain", ("receiver", "zenith", "azimuth"), "f4", chunks=(1, 100, 100))
     with pytest.raises(ValueError, match=r"a\.nc: damaged.* it states 4\d+ bytes"):
         SpectrumDataset.load(tmp_path / "a.nc")
-
-
-def test_damaged_files_are_refused(tmp_path):
-    for compact in (False, True):
-        dataset(8, (6, 12)).save(tmp_path / "a.nc", compact=compact)
-        found = survey(tmp_path / "a.nc", "file_formats:read_dataset")
-        assert found.copies == 260 and not found.changed and not found.wrong, found
-
-
-def test_damaged_exr_files_are_refused(tmp_path):
-    pytest.importorskip("OpenEXR")
-    dataset(4, (6, 12)).export_exr(tmp_path / "a.exr", 1)
-    found = survey(tmp_path / "a.exr", "file_formats:read_exr")
-    assert found.copies == 260 and not found.changed and not found.wrong, found
 
 
 def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path):

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
+from furnished import RECEIVERS, TX, furnished
+from radio_scenes import RadioScene, SlabMaterial
 
 from warprrf.rf.channel.array_spectra import UP, ArraySpectra, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
@@ -22,11 +23,7 @@ from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 F = 28e9  # of whose zones mirrors hold the whole, so that exact paths are the truth
-TX = np.array([0.8, 0.9, 2.2])
-RECEIVERS = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
-     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0]]
-)  # fmt: skip
+RECEIVERS = RECEIVERS[:8]
 ARRAY = PlanarArray(4, 4, orientation=UP)
 DIRECTIONS = hemisphere((18, 36))
 STEERED = ARRAY.response(DIRECTIONS, 1.0).conj() / ARRAY.elements
@@ -36,10 +33,7 @@ BOX = SlabMaterial("box", 12.0, 0.0, np.inf, 0.6)
 
 @pytest.fixture(scope="module")
 def scene() -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    return RadioScene(mesh, part, [WALLS, BOX])
+    return furnished(WALLS, BOX)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
+from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
+from radio_scenes import RadioScene, box_mesh, joined, mirror_paths
 from told import check_told
 
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -29,36 +30,12 @@ from warprrf.rf.spectra.lookups import nearest
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
 
-F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F
-SHAPE = (24, 48)
-SIGMA = np.radians(5.0)
-TX = np.array([0.8, 0.9, 2.2])
-MATERIALS = [
-    SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4),
-    SlabMaterial("box", 6.0, 0.5, np.inf, 0.8),
-]
-RECEIVERS = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
-     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0], [1.8, 1.1, 1.1], [2.6, 3.5, 1.4]]
-)  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def scene() -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    return RadioScene(mesh, part, MATERIALS)
-
-
-def spectra(scene: RadioScene, receivers: np.ndarray, transmitter: np.ndarray = TX) -> SpectrumDataset:
-    return exact_spectra(scene, receivers, transmitter=transmitter, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
 
 
 @pytest.fixture(scope="module")
 def data(scene: RadioScene) -> SpectrumDataset:
-    return spectra(scene, RECEIVERS)
+    return spectra(scene)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +77,7 @@ def test_a_transmitter_never_seen_is_as_good(
     scene: RadioScene, field: BistaticField, data: SpectrumDataset
 ) -> None:
     other = np.array([4.3, 3.2, 2.4])
-    moved = spectra(scene, RECEIVERS[[2, 4, 6, 8]], other)
+    moved = spectra(scene, RECEIVERS[[2, 4, 6, 8]], transmitter=other)
     assert psnr(field, moved, other) > psnr(field, data.subset(np.arange(6, 10))) - 4
     assert psnr(field, moved, other) > psnr(field, moved) + 8  # and it does depend on the transmitter
 
@@ -268,7 +245,7 @@ def test_a_receiver_one_millimetre_from_a_wall(scene: RadioScene, field: Bistati
 def test_a_receiver_in_full_shadow_gets_nothing_but_what_bounces(scene: RadioScene) -> None:
     # A closed shell around the receiver: nothing arrives.
     mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True),
+        ROOM,
         box_mesh([2.9, 1.9, 0.9], [4.1, 3.1, 2.1]),
         box_mesh([3.0, 2.0, 1.0], [4.0, 3.0, 2.0], inward=True),
     )

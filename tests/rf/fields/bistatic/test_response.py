@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from furnished import RECEIVERS, TX, spectra
+from radio_scenes import RadioScene
 
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -19,8 +20,7 @@ from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 
-F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
-TX, RX = np.array([0.8, 0.9, 2.2]), np.array([4.2, 3.1, 1.2])
+RX = RECEIVERS[0]
 
 
 def delay_profile(view: ReceiverView) -> WeighedPaths:
@@ -34,13 +34,8 @@ def delay_profile(view: ReceiverView) -> WeighedPaths:
 
 
 @pytest.fixture(scope="module")
-def field() -> BistaticField:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    scene = RadioScene(mesh, part, [SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box")])
-    ds = exact_spectra(scene, RX[None], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
-    return BistaticField.prior(scene, ds, terms=Terms(mirror_order=1))
+def field(scene: RadioScene) -> BistaticField:
+    return BistaticField.prior(scene, spectra(scene, RX[None]), terms=Terms(mirror_order=1))
 
 
 def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:

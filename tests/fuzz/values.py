@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from decimal import Decimal
 from fractions import Fraction
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -29,47 +30,18 @@ def _with(value: Any, one: float) -> np.ndarray:
     return array
 
 
-def _strided(value: Any) -> np.ndarray:
-    array = np.asarray(value)
-    return np.repeat(array[..., None], 2, axis=-1)[..., 0]
-
-
 def _locked(value: Any) -> np.ndarray:
     array = np.array(value)
     array.setflags(write=False)
     return array
 
 
-def _torch(value: Any) -> Any:
-    import torch
-
-    return torch.from_numpy(np.array(value))
-
-
-PLAIN: dict[str, Callable[[Any], Any]] = {
-    "none": lambda v: None,
-    "true": lambda v: True,
-    "zero": lambda v: 0,
-    "minus one": lambda v: -1,
-    "a half": lambda v: 0.5,
-    "nan": lambda v: float("nan"),
-    "inf": lambda v: float("inf"),
-    "huge": lambda v: 1e300,
-    "tiny": lambda v: 5e-324,
-    "2^31": lambda v: 2**31,
-    "2^63": lambda v: 2**63,
-    "10^40": lambda v: 10**40,
-    "no text": lambda v: "",
-    "text": lambda v: "nonsense",
-    "long text": lambda v: "x" * 5000,
-    "number as text": lambda v: "1.0",
-    "no list": lambda v: [],
-    "list": lambda v: [1, 2],
-    "ragged": lambda v: [[1.0], [1.0, 2.0]],
-    "nested": lambda v: [[[[0.0]]]],
-    "texts": lambda v: ["a", "b", "c"],
-    "dictionary": lambda v: {"a": 1},
-}
+PLAIN: dict[str, Any] = {
+    "none": None, "true": True, "zero": 0, "minus one": -1, "a half": 0.5, "nan": float("nan"), "inf": float("inf"),
+    "huge": 1e300, "tiny": 5e-324, "2^31": 2**31, "2^63": 2**63, "10^40": 10**40, "no text": "", "text": "nonsense",
+    "long text": "x" * 5000, "number as text": "1.0", "no list": [], "list": [1, 2], "ragged": [[1.0], [1.0, 2.0]],
+    "nested": [[[[0.0]]]], "texts": ["a", "b", "c"], "dictionary": {"a": 1},
+}  # fmt: skip
 """Values that JSON holds, more or less; what stood there before does not matter."""
 
 OBJECTS: dict[str, Callable[[Any], Any]] = {
@@ -101,41 +73,35 @@ ARRAYS: dict[str, Callable[[Any], Any]] = {
     "transposed": lambda v: np.asarray(v).T,
     "flat": lambda v: np.ravel(v),
     "deeper": lambda v: np.asarray(v)[None],
-    "with nan": lambda v: _with(v, np.nan),
-    "with inf": lambda v: _with(v, -np.inf),
-    "with huge": lambda v: _with(v, 1e300),
-    "with 1e20": lambda v: _with(v, 1e20),
-    "with 1e9": lambda v: _with(v, 1e9),
-    "with -1": lambda v: _with(v, -1.0),
+    **{f"with {x:g}": lambda v, x=x: _with(v, x) for x in (np.nan, -np.inf, 1e300, 1e20, 1e9, -1.0)},
     "zeros": lambda v: np.zeros_like(np.asarray(v)),
     "negated": lambda v: -np.asarray(v),
     "all alike": lambda v: np.broadcast_to(np.asarray(v)[:1], np.shape(v)),
     "as complex": lambda v: np.asarray(v) * (1 + 1j),
-    "as text": lambda v: np.asarray(v).astype(str),
-    "as bool": lambda v: np.asarray(v).astype(bool),
-    "as int8": lambda v: np.asarray(v).astype(np.int8),
-    "as uint64": lambda v: np.asarray(v).astype(np.uint64),
-    "as float16": lambda v: np.asarray(v).astype(np.float16),
+    **{
+        f"as {t.__name__}": lambda v, t=t: np.asarray(v).astype(t)
+        for t in (str, bool, np.int8, np.uint64, np.float16)
+    },
 }
 """Arrays made of the one that stood there."""
 
 SAME: dict[str, Callable[[Any], Any]] = {
     "as list": lambda v: np.asarray(v).tolist(),
     "as objects": lambda v: np.asarray(v).astype(object),
-    "strided": _strided,
+    "strided": lambda v: np.repeat(np.asarray(v)[..., None], 2, axis=-1)[..., 0],
     "column-major": lambda v: np.asfortranarray(v),
     "read-only": _locked,
     "byte-swapped": lambda v: np.asarray(v).astype(np.asarray(v).dtype.newbyteorder()),
     "subclass": lambda v: np.asarray(v).view(Array),
     "masked": lambda v: np.ma.masked_array(v),
-    "torch": _torch,
+    "torch": lambda v: import_module("torch").from_numpy(np.array(v)),
 }
 """The same array: the same answer is expected, or none."""
 
-NOT_FINITE = {"nan", "inf", "with nan", "with inf"}
+NOT_FINITE = {"nan", "inf", "with nan", "with -inf"}
 """What is given with these may come back."""
 
-VALUES = PLAIN | OBJECTS | ARRAYS | SAME
+VALUES = {name: lambda v, x=x: x for name, x in PLAIN.items()} | OBJECTS | ARRAYS | SAME
 
 
 def is_numbers(value: Any) -> bool:

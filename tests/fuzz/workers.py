@@ -20,6 +20,7 @@ LIMIT_S = 30.0
 START_S = 180.0
 MEMORY = 12 << 30
 """Bytes of address space of a worker: more is refused by the system, which the worker survives."""
+SPAWN = multiprocessing.get_context("spawn")
 
 
 @dataclass
@@ -27,8 +28,13 @@ class _Worker:
     process: BaseProcess
     pipe: Connection
     log: Path
+    until: float
     case: Any = None
-    until: float = 0.0
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
 
 
 class Workers:
@@ -36,38 +42,35 @@ class Workers:
 
     Args:
         make: called in each process with a scratch folder; returns what tries a case.
+        ended: what came of a case that killed its process or was stopped, from the words for it.
         count: how many.
         limit_s: a case that takes longer is a hang.
-        outcome: what came of a case that killed its process or was stopped, from the words for it.
     """
 
     def __init__(
-        self, make: Callable[[Path], Callable[[Any], Any]], outcome: Callable[[str], Any], count: int = 2,
+        self, make: Callable[[Path], Callable[[Any], Any]], ended: Callable[[str], Any], count: int = 2,
         limit_s: float = LIMIT_S,
     ) -> None:  # fmt: skip
-        self._make, self._outcome, self._count, self._limit_s = make, outcome, count, limit_s
-        self._all: list[_Worker] = []
-        self._folder = tempfile.TemporaryDirectory(prefix="fuzz-")
+        self._make, self._ended, self._count, self._limit_s = make, ended, count, limit_s
 
     def __enter__(self) -> Workers:
+        self._folder = tempfile.TemporaryDirectory(prefix="fuzz-")
         self._all = [self._start(k) for k in range(self._count)]
         return self
 
     def __exit__(self, *error: object) -> None:
         for worker in self._all:
-            _stop(worker)
+            worker.stop()
         self._folder.cleanup()
 
     def run(self, cases: Iterable[Any], until: float = float("inf")) -> Iterator[tuple[Any, Any]]:
         """Cases with what came of them, as they are done; none is begun after ``until`` (of ``time.monotonic``)."""
         waiting = iter(cases)
-        more = True
         while True:
             for worker in self._all:
-                if worker.case is None and more and time.monotonic() < until:
+                if worker.case is None and time.monotonic() < until:
                     worker.case = next(waiting, None)
-                    more = worker.case is not None
-                    if more:
+                    if worker.case is not None:
                         worker.pipe.send(worker.case)
                         worker.until = max(worker.until, time.monotonic()) + self._limit_s
             busy = [worker for worker in self._all if worker.case is not None]
@@ -83,33 +86,28 @@ class Workers:
     def _received(self, worker: _Worker) -> Any:
         try:
             if worker.pipe.poll():
-                answer = worker.pipe.recv()
-                worker.until = 0.0
+                answer, worker.until = worker.pipe.recv(), 0.0
                 return answer
             words = f"took more than {self._limit_s:g} s"
         except EOFError:
             worker.process.join()
             words = f"the process died: exit code {worker.process.exitcode}"
-        _stop(worker)
-        place = self._all.index(worker)
+        worker.stop()
+        number = self._all.index(worker)
         words += "\n" + worker.log.read_text(errors="replace")[-2000:]
-        self._all[place] = self._start(place)
-        return self._outcome(words)
+        self._all[number] = self._start(number)
+        return self._ended(words)
 
     def _start(self, number: int) -> _Worker:
-        here, there = multiprocessing.get_context("spawn").Pipe()
-        log = Path(self._folder.name) / f"{number}.log"
-        arguments = (there, self._make, Path(self._folder.name) / str(number), log, self._limit_s)
-        process = multiprocessing.get_context("spawn").Process(target=_work, args=arguments, daemon=True)
+        here, there = SPAWN.Pipe()
+        scratch = Path(self._folder.name) / str(number)
+        log = scratch.with_suffix(".log")
+        process = SPAWN.Process(
+            target=_work, args=(there, self._make, scratch, log, self._limit_s), daemon=True
+        )
         process.start()
         there.close()
-        return _Worker(process, here, log, until=time.monotonic() + START_S)
-
-
-def _stop(worker: _Worker) -> None:
-    worker.process.kill()
-    worker.process.join()
-    worker.pipe.close()
+        return _Worker(process, here, log, time.monotonic() + START_S)
 
 
 def _work(
