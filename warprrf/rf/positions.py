@@ -25,7 +25,7 @@ from warprrf.checks import check_array, users_level
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
-from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.dataset import SpectrumDataset, question_spectra
 
 WALL_CLEARANCE_M = 1e-4
 """Positions nearer to a surface than this count as on it [m]."""
@@ -166,13 +166,15 @@ def check_dataset(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Receivers (R, 3) and transmitter (3,) of ``ds`` [m], if a field of this mesh can be fitted to what they measured.
 
-    Raises, warns: as :func:`check_positions` and :func:`question_unit`; and of what fields do not model.
+    Raises, warns: as :func:`check_positions`, :func:`question_unit` and
+    :func:`~warprrf.rf.spectra.dataset.question_spectra`; and of what fields do not model.
     """
     receivers = check_array("ds.receivers", ds.receivers, (None, 3))
     transmitter, wavelength_m = (
         check_array("ds.transmitter", ds.transmitter, (3,)),
         SPEED_OF_LIGHT / ds.frequency_hz,
     )
+    question_spectra(ds)
     if mesh is not None:
         question_unit(mesh, wavelength_m)
     check_positions(

@@ -28,11 +28,13 @@ from warprrf.checks import (
     check_positive,
     check_type,
     checked,
+    some_of,
     users_level,
 )
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 NEPER = 10.0 / np.log(10.0)
@@ -250,10 +252,11 @@ class Readings:
             settings: other arguments of :class:`Readings`.
 
         Raises:
-            ValueError: naming columns that are missing, misspelt or repeated.
+            ValueError: naming columns that are missing, misspelt or repeated, or calibrated readings of as much as was
+                sent.
 
         Warns:
-            UserWarning: naming columns that are none of these.
+            UserWarning: naming columns that are none of these, or readings far above line of sight.
         """
         names = list(map(str, table))
         _check_columns(names)
@@ -281,7 +284,9 @@ class Readings:
             cells = np.ravel(np.asarray(table["chain"], dtype=object))
             none = [c is None or (isinstance(c, float) and np.isnan(c)) for c in cells]  # as pandas has it
             found["chain"] = np.where(none, "", cells.astype(str))
-        return cls(**found, **settings)
+        readings = cls(**found, **settings)
+        question_readings(readings)
+        return readings
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **settings: Any) -> Readings:
@@ -327,6 +332,30 @@ def _check_columns(names: Sequence[str]) -> None:
     if unknown:
         warnings.warn(
             f"table: columns {', '.join(unknown)} are not read; those that are: {', '.join(known)}",
+            UserWarning,
+            stacklevel=users_level(),
+        )
+
+
+def question_readings(readings: Readings) -> None:
+    """Question readings of too much power; see :func:`~warprrf.rf.spectra.levels.question_levels`.
+
+    Of chains whose gain is not known only readings above what was sent can be told.
+    """
+    r, gain_db, known = readings, 0.0, readings.chain == ""
+    for pattern in (r.receive_pattern, r.transmit_pattern):
+        if pattern is not None:
+            gain_db += 10.0 * np.log10(sample_pattern(pattern, np.linspace(0.0, np.pi, 721)).max())
+    free_space = np.minimum(
+        free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
+    )
+    margin_db = MARGIN_DB + FADING_DB * (r.samples is not None)
+    question_levels("power", np.where(known, r.power, np.nan), free_space, margin_db=margin_db)
+    above = np.flatnonzero(~known & (r.power > 1.0))
+    if len(above):
+        warnings.warn(
+            f"power: {len(above)} readings (rows {some_of(above)}) of chains of unknown gain are above 0 dB, more than was "
+            "sent: were minus signs lost, or are they linear?",
             UserWarning,
             stacklevel=users_level(),
         )

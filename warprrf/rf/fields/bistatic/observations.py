@@ -22,7 +22,7 @@ from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Readings, path_weights
+from warprrf.rf.spectra.readings import Readings, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 
 READINGS_SHAPE = (60, 120)
@@ -147,6 +147,8 @@ def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -
 
 def _check_readings(mesh: Mesh | None, one: Readings | ArraySpectra, device: DeviceLike) -> None:
     wavelength_m = SPEED_OF_LIGHT / one.frequency_hz
+    if isinstance(one, Readings):
+        question_readings(one)
     if mesh is not None:
         question_unit(mesh, wavelength_m)
     transmitters, under = np.unique(one.transmitters, axis=0, return_inverse=True)
