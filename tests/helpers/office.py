@@ -31,7 +31,7 @@ def office(folder: Path) -> Path:
         ("plasterboard", np.concatenate([floor, ceiling]), walls[:, ::-1]),
         ("glass", pane, np.array([[0, 1, 2], [0, 2, 3]])),
         ("wood", *box_mesh([1.5, 3.5, 0.7], [3.0, 4.3, 0.75])),
-        ("metal", *box_mesh([0.05, 2.0, 0.0], [0.5, 3.0, 1.9])),
+        ("chipboard", *box_mesh([0.05, 2.0, 0.0], [0.5, 3.0, 1.9])),
     ]
     lines, first = [], 1
     for name, vertices, faces in parts:
