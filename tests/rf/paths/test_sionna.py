@@ -11,6 +11,7 @@ from warprrf.rf.interop.sionna_engine import load_sionna_scene
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.dataset import SpectrumDataset
 
 TX = np.array([13.6, 11.2, 2.5])
 RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
@@ -24,16 +25,15 @@ def rt():
     return sionna_rt()
 
 
-def solve(rt, scene, tx_array, rx_array, depth=2, diffuse=False):
+def solve(rt, scene, tx_array, rx_array, depth=2):
     loaded = load_sionna_scene(scene, frequency_hz=CARRIER)
     loaded.tx_array, loaded.rx_array = tx_array, rx_array
     loaded.add(rt.Transmitter("tx", position=TX.tolist()))
     for k, point in enumerate(RECEIVERS):
         loaded.add(rt.Receiver(f"rx{k}", position=point.tolist()))
     return rt.PathSolver(deterministic=True)(
-        loaded, max_depth=depth, samples_per_src=200_000, synthetic_array=True, diffuse_reflection=diffuse,
-        refraction=False, seed=1,
-    )  # fmt: skip
+        loaded, max_depth=depth, samples_per_src=200_000, synthetic_array=True, refraction=False, seed=1
+    )
 
 
 def element(rt, polarisation="VH"):
@@ -89,6 +89,32 @@ def test_arrays_and_patterns_are_theirs(rt, traced, pattern, polarisation):
             # Angles near an element's null or 2.8 rad off boresight: float32 errs by 1e-3 of the strongest.
             b = theirs.a[0].numpy()[r, :, 0, :, seen[0]] + 1j * theirs.a[1].numpy()[r, :, 0, :, seen[0]]
             np.testing.assert_allclose(ours.a[r, :, 0, :, direct[0]], b, atol=2e-3 * np.abs(b).max())
+
+
+def test_paths_through_walls_and_round_edges_are_taken_too(rt):
+    """Refraction is on by default: every path's power is half that of its four coefficients, and spectra hold them all."""
+    room = rt.load_scene(rt.scene.box_one_screen)
+    room.tx_array = room.rx_array = element(rt)
+    low, high = (np.ravel(corner) for corner in (room.mi_scene.bbox().min, room.mi_scene.bbox().max))
+    places = low + (high - low) * [[0.2, 0.3, 0.6], [0.8, 0.7, 0.3], [0.3, 0.6, 0.5]]
+    room.add(rt.Transmitter("tx", position=places[0].tolist()))
+    for k in (1, 2):
+        room.add(rt.Receiver(f"rx{k}", position=places[k].tolist()))
+    theirs = rt.PathSolver()(room, max_depth=2, diffraction=True, edge_diffraction=True)
+    valid, bounces = theirs.valid.numpy()[:, 0], theirs.interactions.numpy()[:, :, 0]
+    assert {4, 8} <= set(np.unique(bounces[:, valid]))
+    ours = Paths.from_sionna(theirs, frequency_hz=3.5e9)
+    a = theirs.a[0].numpy()[:, :, 0] + 1j * theirs.a[1].numpy()[:, :, 0]
+    total = 0.5 * np.where(valid, (np.abs(a) ** 2).sum(axis=(1, 2)), 0.0).sum(axis=-1)
+    np.testing.assert_allclose(ours.power.sum(axis=1), total, rtol=1e-5)
+    assert (ours.kind == "los").any(axis=1).tolist() == [False, True]
+    ds = SpectrumDataset.from_paths(ours, shape=(30, 60), beam_sigma_rad=0.1)
+    np.testing.assert_allclose(ds.path_gain.sum(axis=(1, 2)), total, rtol=1e-5)
+    np.testing.assert_allclose(ds.receivers, places[1:], atol=1e-5)
+    assert ds.line_of_sight.tolist() == [False, True]
+    room.tx_array = element(rt, "V")
+    with pytest.raises(ValueError, match=r"scene.tx_array .* PlanarArray\(num_rows=1"):
+        Paths.from_sionna(rt.PathSolver()(room, max_depth=1), frequency_hz=3.5e9)
 
 
 def test_round_trip_changes_nothing(solved):

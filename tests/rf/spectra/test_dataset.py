@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
+from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset, assign_roles
 from warprrf.rf.spectra.dataset_files import (
     COMPACT_AOD_STEP_RAD,
@@ -406,6 +408,25 @@ def test_bad_choices_are_refused():
             receivers=np.zeros((0, 3)), transmitter=[0, 0, 0], frequency_hz=1e9, path_gain=np.zeros((0, 4, 8)),
             delay_s=np.zeros((0, 4, 8)), aod=np.zeros((0, 4, 8, 2)), line_of_sight=[], beam_sigma_rad=0.1, engine="x",
         )  # fmt: skip
+
+
+def test_spectra_of_paths_are_those_of_the_engine_that_finds_the_same_paths():
+    """A box of walls that scatter nothing: line of sight and single mirrors, each in the receiver's beam."""
+    mesh, part = joined(box_mesh([0, 0, 0], [5, 4, 3], inward=True))
+    scene = RadioScene(mesh, part, [SlabMaterial()])
+    ends = {"transmitter": np.array([0.8, 0.9, 2.2]), "frequency_hz": 28e9}
+    receivers = np.array([[4.2, 3.1, 1.2], [1.4, 3.4, 1.7]])
+    paths = trace_paths(scene, receivers=receivers, mirror_order=1, **ends)
+    ds = SpectrumDataset.from_paths(paths, shape=(18, 36), beam_sigma_rad=0.1)
+    wanted = exact_spectra(scene, receivers, shape=(18, 36), sigma=0.1, **ends)
+    for name in ("receivers", "transmitter", "path_gain", "delay_s", "aod", "line_of_sight", "floor"):
+        np.testing.assert_allclose(getattr(ds, name), getattr(wanted, name), rtol=1e-5, err_msg=name)
+    one = SpectrumDataset.from_paths(paths[1], shape=(18, 36), beam_sigma_rad=0.1)
+    np.testing.assert_array_equal(one.path_gain[0], ds.path_gain[1])
+    with pytest.raises(ValueError, match="paths: got ones without receiver"):
+        SpectrumDataset.from_paths(replace(paths, receiver=None))
+    with pytest.raises(ValueError, match="several transmitters"):
+        SpectrumDataset.from_paths(replace(paths, transmitter=receivers + 0.1))
 
 
 def test_a_data_set_of_no_receivers_comes_back(tmp_path):

@@ -182,7 +182,9 @@ def from_sionna(
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
     if not paths.synthetic_array or real.shape[1] != 2 or real.shape[3] != 2:
         raise ValueError(
-            f"paths: got coefficients of shape {real.shape}, expected synthetic arrays of one 'VH' element each"
+            f"paths: got coefficients of shape {real.shape}, expected those of one isotropic element of both polarisations "
+            'at either end: set scene.tx_array and scene.rx_array to PlanarArray(num_rows=1, num_cols=1, pattern="iso", '
+            'polarization="VH") and solve with synthetic_array=True'
         )
     a = (real + 1j * imag)[:, :, transmitter]  # (R, 2, 2, L)
 
@@ -191,12 +193,6 @@ def from_sionna(
 
     valid = np.asarray(paths.valid.numpy())[:, transmitter]
     kinds = np.asarray(paths.interactions.numpy())[:, :, transmitter]
-    others = set(np.unique(kinds[:, valid]).tolist()) - {0, SPECULAR, DIFFUSE}
-    if others:
-        raise ValueError(
-            f"paths: got interactions of types {sorted(others)}, expected specular and diffuse ones alone; solve with "
-            "refraction=False and diffraction=False"
-        )
     points = np.moveaxis(np.asarray(paths.vertices.numpy(), dtype=np.float64)[:, :, transmitter], 0, -2)
     sources, targets = (np.asarray(p.numpy(), dtype=np.float64).T for p in (paths.sources, paths.targets))
     tau, angles = (

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Unpack
+from typing import Any, Protocol, Unpack, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.checks import check_array, check_count, check_positive, check_seed, checked
+from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files
@@ -20,6 +21,7 @@ from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
 from warprrf.rf.spectra.levels import free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
+    DEFAULT_SHAPE,
     Spectrum,
     check_pixels,
     check_range_db,
@@ -27,6 +29,7 @@ from warprrf.rf.spectra.spectrum import (
     check_whole,
     default_floor,
     pixel_directions,
+    spread_paths,
     to_db,
 )
 
@@ -36,6 +39,25 @@ _ROLES = ("train", "test")
 USUAL_M = 10.0  # between a transmitter and a receiver in a room
 SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
 _MOST_ATTRIBUTE_BYTES = 60_000  # HDF5 takes 64 kB
+
+
+@runtime_checkable
+class PathsLike(Protocol):
+    """Paths of one receiver, arrays ``(L,)``, or of several, ``(R, L)``: :class:`warprrf.Paths`."""
+
+    power: np.ndarray
+    arrival: np.ndarray
+    tau: np.ndarray
+    theta_t: np.ndarray
+    phi_t: np.ndarray
+    kind: np.ndarray
+    transmitter: np.ndarray | None
+    receiver: np.ndarray | None
+    frequency_hz: float | None
+    air: Air | None
+
+    def each(self) -> Iterator[PathsLike]:
+        """The paths of one receiver after another."""
 
 
 @checked
@@ -186,12 +208,70 @@ class SpectrumDataset:
         return found
 
     @classmethod
+    def from_paths(
+        cls,
+        paths: PathsLike,
+        *,
+        shape: tuple[int, int] = DEFAULT_SHAPE,
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        floor: float | None = None,
+        role: Sequence[str] | NDArray[np.str_] | None = None,
+        seed: int = 0,
+        device: DeviceLike = None,
+    ) -> SpectrumDataset:
+        """Spectra of paths: each path's gain spread by the receiver's beam; delay and departure of each pixel's strongest.
+
+        Args:
+            paths: :class:`warprrf.Paths` of one transmitter at one receiver or several, with their positions and carrier:
+                of :func:`trace_paths`, a field, or Sionna RT (:meth:`Paths.from_sionna`).
+            shape: rows and columns of a spectrum.
+            beam_sigma_rad: width of the receiver's beam.
+            floor, role, seed: as for :meth:`from_spectra`.
+            device: where paths are spread.
+
+        Raises:
+            ValueError: for paths without positions or carrier, or of several transmitters.
+
+        Example::
+
+            paths = wr.trace_paths(scene, transmitter=tx, receivers=places, frequency_hz=28e9, mirror_order=2)
+            ds = wr.SpectrumDataset.from_paths(paths)
+        """
+        if paths.receiver is None or paths.transmitter is None or paths.frequency_hz is None:
+            raise ValueError(
+                "paths: got ones without receiver, transmitter or frequency_hz, expected all three "
+                "(dataclasses.replace(paths, receiver=...) adds one)"
+            )
+        if np.ndim(paths.transmitter) != 1:
+            raise ValueError(
+                "paths: got ones of several transmitters, expected those of one; a set holds one"
+            )
+        several = list(paths.each())
+        spread = [spread_paths(p.arrival, p.power, shape, beam_sigma_rad, device=device) for p in several]
+        aod = [np.column_stack([p.theta_t, p.phi_t]) for p in several]
+        return cls.from_spectra(
+            receivers=np.atleast_2d(paths.receiver),
+            transmitter=paths.transmitter,
+            frequency_hz=paths.frequency_hz,
+            path_gain=np.stack([s.path_gain for s in spread]),
+            delay_s=np.stack([s.of_strongest(p.tau) for s, p in zip(spread, several, strict=True)]),
+            aod=np.stack([s.of_strongest(angles) for s, angles in zip(spread, aod, strict=True)]),
+            line_of_sight=np.array([(p.kind == "los").any() for p in several]),
+            beam_sigma_rad=beam_sigma_rad,
+            engine="paths",
+            seed=seed,
+            role=role,
+            floor=floor,
+            attributes=None if paths.air is None else paths.air.attributes,
+        )
+
+    @classmethod
     def empty(
         cls,
         *,
         transmitter: ArrayLike,
         frequency_hz: float,
-        shape: tuple[int, int] = (90, 180),
+        shape: tuple[int, int] = DEFAULT_SHAPE,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         floor: float | None = None,
     ) -> SpectrumDataset:
@@ -434,7 +514,7 @@ def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.nd
 
 def question_spectra(ds: SpectrumDataset) -> None:
     """Question spectra that hold too much power; see :func:`~warprrf.rf.spectra.levels.question_levels`."""
-    total = np.nansum(ds.path_gain, axis=(1, 2), dtype=np.float64)
+    total = np.asarray(np.nansum(ds.path_gain, axis=(1, 2), dtype=np.float64))
     free_space = free_space_gain(ds.transmitter, ds.receivers, ds.frequency_hz)
     hint = "; or the gain of an antenna is in them (SpectrumDataset.deembed takes it out)"
     question_levels("path_gain", total, free_space, hint=hint)

@@ -222,6 +222,13 @@ class SpreadPaths(NamedTuple):
     path_gain: np.ndarray
     strongest: np.ndarray
 
+    def of_strongest(self, values: np.ndarray) -> np.ndarray:
+        """Values ``(L, ...)`` of paths as those of each pixel's strongest, shape ``(H, W, ...)``; NaN where empty."""
+        found = np.full((*self.strongest.shape, *values.shape[1:]), np.nan)
+        filled = self.strongest >= 0
+        found[filled] = values[self.strongest[filled]]
+        return found
+
 
 def spread(
     directions: ArrayLike,
