@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,6 @@ TRUTHS = tuple(FILES)
 VERSIONS = {
     "geometry": 1,
     "metrics": 1,
-    "exact": 1,
     "sionna": 1,
     "bistatic": 2,
     "harmonic": 1,
@@ -82,7 +81,6 @@ class Truth:
         key: digest of the file's content.
         data: all receivers.
         counts: numbers of training receivers that it can give.
-        left_out: asked numbers that it cannot.
         every: each how-manieth test receiver counts.
     """
 
@@ -90,7 +88,6 @@ class Truth:
     key: str
     data: SpectrumDataset
     counts: tuple[int, ...]
-    left_out: tuple[int, ...]
     every: int
 
     @classmethod
@@ -108,7 +105,7 @@ class Truth:
                 f"counts: got {', '.join(map(str, counts))}, expected a number of training receivers that {file} "
                 f"holds, 1 to {held}"
             )
-        return cls(data.engine, digest(Path(file)), data, kept, tuple(sorted(set(counts) - set(kept))), every)
+        return cls(data.engine, digest(Path(file)), data, kept, every)
 
     def train(self, count: int, seed: int = 0) -> SpectrumDataset:
         """The first ``count`` training receivers, in the order that ``seed`` gives them."""
@@ -124,19 +121,6 @@ class Truth:
     def few(self) -> int:
         """The smallest number of training receivers: that of the checks besides the main table."""
         return self.counts[0]
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """What its test receivers are, for a report."""
-        test = self.test
-        return {
-            "test": len(test),
-            "blocked": int(np.count_nonzero(~np.asarray(test.line_of_sight))),
-            "shape": list(test.shape),
-            "frequency_hz": float(test.frequency_hz),
-            "range_db": list(test.range_db),
-            "settings": dict(test.attributes),
-        }
 
 
 class Geometry:
@@ -172,13 +156,6 @@ class Geometry:
         """Digest of what is known of the room."""
         return digest(self.room) if self.room.is_dir() else digest(self.reconstruction.mesh.triangles)
 
-    @cached_property
-    def scene_key(self) -> str:
-        """Digest of the true scene."""
-        s = self.scene
-        materials = [[str(getattr(m, f.name)) for f in fields(m)] for m in s.materials]
-        return digest(s.mesh.vertices, s.mesh.faces, s.face_material, materials)
-
     def weights(
         self, ds: SpectrumDataset, *, slot: str = "train", progress: Progress | None = None
     ) -> tuple[Transport, float]:
@@ -206,10 +183,6 @@ class Geometry:
         )
         self._weights[slot] = key, seen, time.perf_counter() - start
         return self._weights[slot][1:]
-
-    def forget(self) -> None:
-        """Drop the weights of training receivers: hundreds of them fill gigabytes. Those of test receivers are small."""
-        self._weights.pop("train", None)
 
 
 def checked(name: str, value: int, least: int) -> int:

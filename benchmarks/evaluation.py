@@ -53,6 +53,7 @@ MEASURED = (*COMPARED, "tof_error_median_ns", "transport_s", "fit_s", "seconds_p
 COLUMNS = (
     *ABOUT,
     "variant",
+    "version",
     "steps",
     "data",
     "room",
@@ -145,11 +146,7 @@ def run(options: Options, job: Job) -> Report:
             "another --name"
         )
     planned = {key_of(about): about for about in lab.planned()}
-    asked = [
-        key
-        for key, about in planned.items()
-        if rows.get(key, {}).get("steps", 0) != lab.steps(about["method"])
-    ]
+    asked = [key for key, about in planned.items() if not lab.holds(rows.get(key), about["method"])]
     for done, key in enumerate(asked):
         job.progress("runs", done, len(asked))
         about = planned[key]
@@ -222,9 +219,14 @@ class _Lab:
                         count_seen = 0 if method.untaught else count
                         yield dict(zip(ABOUT, (self.name, split, count_seen, seed, name), strict=True))
 
-    def steps(self, method: str) -> int | None:
-        """Steps of a network; None for other methods."""
-        return self.options.steps if METHODS[method].network else None
+    def made(self, method: str) -> Row:
+        """What its figures depend on besides: what it computes, and a network's steps."""
+        steps = self.options.steps if METHODS[method].network else None
+        return {"version": METHODS[method].version, "steps": steps}
+
+    def holds(self, row: Row | None, method: str) -> bool:
+        """Whether ``row`` is a run as it would be done now."""
+        return row is not None and all(row[name] == value for name, value in self.made(method).items())
 
     def one(self, about: Row, ours: Row | None) -> Row:
         """A run with each variant of the method, of which the better one counts; ``ours``: the bistatic field's run on the
@@ -252,7 +254,7 @@ class _Lab:
             row = {
                 **about,
                 "variant": variant,
-                "steps": self.steps(name),
+                **self.made(name),
                 "data": self.key,
                 "room": self.geometry.key[:12],
                 "on": f"{resolve(self.job.device)}, {threads()} cores, {processor_name()}",

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -99,8 +100,6 @@ class Fitted:
         before_s: seconds that each prediction took beforehand, for all test receivers together.
         field: what can be saved (anything with ``.save(path)``), or None.
         size_bytes: what a prediction needs, where there is nothing to save.
-        losses: loss by step, where there is one.
-        details: whatever else belongs into the row.
     """
 
     predict: Callable[[Any], Spectrum] = field(repr=False)
@@ -109,8 +108,6 @@ class Fitted:
     before_s: float = 0.0
     field: Any = None
     size_bytes: int | None = None
-    losses: list[float] | None = None
-    details: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -155,91 +152,47 @@ def score(method: str, task: Task, keep: Path | None = None) -> tuple[Fitted, Ro
     return fitted, row
 
 
-def fit_bistatic(
-    geometry: Geometry, train: SpectrumDataset, *, progress: Progress | None = None, **options: Any
-) -> Fitted:
-    """The bistatic field on the reconstruction; ``options`` are those of :meth:`wr.RadioField.fit`."""
+def _bistatic(task: Task, quick: bool = False) -> Fitted:
     found = wr.RadioField.fit(
-        geometry.reconstruction, train, model="bistatic", device=geometry.device, progress=progress, **options
-    )
+        task.geometry.reconstruction, task.train, model="bistatic", quick=quick, device=task.geometry.device,
+        progress=task.progress,
+    )  # fmt: skip
     spent = found.report
-    details = {name: spent[name] for name in ("choices", "materials")}
     return Fitted(
-        found.spectrum,
-        transport_s=spent["transport_time_s"],
-        fit_s=spent["fit_time_s"],
-        field=found,
-        details=details,
+        found.spectrum, transport_s=spent["transport_time_s"], fit_s=spent["fit_time_s"], field=found
     )
 
 
-def fit_harmonic(
-    geometry: Geometry,
-    train: SpectrumDataset,
-    test: SpectrumDataset,
-    model: str,
-    *,
-    slot: str = "test",
-    progress: Progress | None = None,
-    **options: Any,
-) -> Fitted:
+def _harmonic(task: Task, model: str, **options: Any) -> Fitted:
     """RF-3DGS+ or RF-3DGS on the reconstruction.
 
     Blending weights of the test receivers are computed beforehand for all variants; the time of a spectrum from nothing
     includes them. Where opacity was trained they are the field's own, computed as it is asked.
-
-    Args:
-        test: receivers that will be asked for.
-        slot: where the geometry keeps their weights.
-        options: of :meth:`wr.RadioField.fit`.
     """
-    weights, seconds = geometry.weights(train, progress=progress)
+    place, told = task.geometry, task.progress
+    if task.effort.harmonic_iterations is not None:
+        options["iterations"] = task.effort.harmonic_iterations
+    weights, seconds = place.weights(task.train, progress=told)
     learned: Any = wr.RadioField.fit(
-        geometry.reconstruction, train, model=model, transport=weights, device=geometry.device,
-        progress=progress, **options,
+        place.reconstruction, task.train, model=model, transport=weights, gain=task.variant, seed=task.seed,
+        device=place.device, progress=told, **options,
     )  # fmt: skip
-    losses = learned.report["losses"]["gain"]
-    timed = {
-        "transport_s": seconds,
-        "fit_s": learned.report["fit_time_s"],
-        "field": learned,
-        "losses": losses,
-    }
+    fitted = Fitted(learned.spectrum, transport_s=seconds, fit_s=learned.report["fit_time_s"], field=learned)
     if learned.report["train_opacity"]:
-        return Fitted(learned.spectrum, **timed)
-    seen, seconds = geometry.weights(test, slot=slot, progress=progress)
-    return Fitted(
-        lambda rx: learned.spectrum(rx, transport=seen.at(rx)), before_s=seconds / len(test), **timed
+        return fitted
+    seen, seconds = place.weights(task.test, slot=task.slot, progress=told)
+    return replace(
+        fitted,
+        predict=lambda rx: learned.spectrum(rx, transport=seen.at(rx)),
+        before_s=seconds / len(task.test),
     )
 
 
-def fit_lookup(name: str, variant: str, train: SpectrumDataset) -> Fitted:
-    """A lookup of :mod:`warprrf.rf.spectra.lookups`; ``variant`` is what inverse-distance weighting averages."""
-    options = {"domain": variant} if variant else {}
-    size = {"constant": 4, "mean": train.path_gain[0].nbytes if len(train) else 0}
-    return Fitted(
-        getattr(lookups, name)(train, **options), size_bytes=size.get(name, int(train.path_gain.nbytes))
-    )
-
-
-def _bistatic(quick: bool = False) -> Callable[[Task], Fitted]:
-    return lambda task: fit_bistatic(task.geometry, task.train, quick=quick, progress=task.progress)
-
-
-def _harmonic(model: str, **options: Any) -> Callable[[Task], Fitted]:
-    def fit(task: Task) -> Fitted:
-        given: dict[str, Any] = {"gain": task.variant, "seed": task.seed, **options}
-        if task.effort.harmonic_iterations is not None:
-            given["iterations"] = task.effort.harmonic_iterations
-        return fit_harmonic(
-            task.geometry, task.train, task.test, model, slot=task.slot, progress=task.progress, **given
-        )
-
-    return fit
-
-
-def _lookup(name: str) -> Callable[[Task], Fitted]:
-    return lambda task: fit_lookup(name, task.variant, task.train)
+def _lookup(task: Task, name: str) -> Fitted:
+    """A lookup of :mod:`warprrf.rf.spectra.lookups`; the variant is what inverse-distance weighting averages."""
+    options = {"domain": task.variant} if task.variant else {}
+    size = {"constant": 4, "mean": task.train.path_gain[0].nbytes}.get(name, task.train.path_gain.nbytes)
+    return Fitted(getattr(lookups, name)(task.train, **options), size_bytes=int(size))
 
 
 def _zero(task: Task) -> Fitted:
@@ -248,17 +201,16 @@ def _zero(task: Task) -> Fitted:
 
 
 def _transmitter(task: Task) -> Fitted:
-    return Fitted(point_at_transmitter(task.test, task.geometry.device), size_bytes=24)
-
-
-def point_at_transmitter(ds: SpectrumDataset, device: Any = None) -> Callable[[Any], Spectrum]:
-    """A predictor that knows where the transmitter is and nothing of the room: its beam, with Friis' gain."""
+    """What knows where the transmitter is and nothing of the room: its beam, with Friis' gain."""
+    ds = task.test
 
     def predict(receiver: Any) -> Spectrum:
         toward = ds.transmitter - np.asarray(receiver, np.float64)
         distance = float(np.linalg.norm(toward))
         friis = (SPEED_OF_LIGHT / ds.frequency_hz / (4.0 * np.pi * distance)) ** 2
-        gain = spread(toward[None], np.array([friis]), ds.shape, ds.beam_sigma_rad, device=device)
+        gain = spread(
+            toward[None], np.array([friis]), ds.shape, ds.beam_sigma_rad, device=task.geometry.device
+        )
         departure = np.stack(angles_from_directions(-toward)).astype(np.float32)
         lit = gain > 0
         return Spectrum(
@@ -269,7 +221,7 @@ def point_at_transmitter(ds: SpectrumDataset, device: Any = None) -> Callable[[A
             range_db=ds.range_db,
         )
 
-    return predict
+    return Fitted(predict, size_bytes=24)
 
 
 def _nerf2(task: Task) -> Fitted:
@@ -295,7 +247,7 @@ def _network(fit: Callable[..., Any], options: Any, task: Task) -> Fitted:
 
     device = None if task.geometry.device is None else str(task.geometry.device)
     found = fit(task.train, options, Training(task.effort.network_steps, task.seed, device, task.progress))
-    return Fitted(found.spectrum, fit_s=found.seconds, size_bytes=found.size_bytes, losses=found.losses)
+    return Fitted(found.spectrum, fit_s=found.seconds, size_bytes=found.size_bytes)
 
 
 def _assumed(task: Task) -> Fitted:
@@ -328,10 +280,7 @@ def _calibrated(task: Task) -> Fitted:
         Scene.load(twin.xml), task.train, how, device=task.geometry.device, progress=task.progress
     )
     fitted = _sionna(found.scene, task)
-    return replace(
-        fitted, transport_s=found.start_s, fit_s=found.seconds, losses=found.losses,
-        details={"budget_s": seconds, "steps": len(found.losses)},
-    )  # fmt: skip
+    return replace(fitted, transport_s=found.start_s, fit_s=found.seconds)
 
 
 def _sionna(scene: Scene, task: Task) -> Fitted:
@@ -354,24 +303,24 @@ def _sionna(scene: Scene, task: Task) -> Fitted:
 
     mesh = scene.mesh
     size = 4 * (mesh.vertices.size + mesh.faces.size) + 24 * len(scene.materials)
-    return Fitted(predict, size_bytes=size, details={"depth": task.depth})
+    return Fitted(predict, size_bytes=size)
 
 
 METHODS: dict[str, Method] = {
-    "bistatic": Method(_bistatic(), "bistatic"),
-    "bistatic-quick": Method(_bistatic(quick=True), "bistatic"),
-    "rf3dgs+": Method(_harmonic("rf3dgs+"), "harmonic", GAINS),
-    "rf3dgs+los": Method(_harmonic("rf3dgs+", line_of_sight="explicit"), "harmonic", GAINS),
-    "rf3dgs": Method(_harmonic("rf3dgs"), "harmonic", GAINS),
-    "rf3dgs+alpha": Method(_harmonic("rf3dgs+", train_opacity=True), "harmonic", ("exp",)),
-    "rf3dgs-alpha": Method(_harmonic("rf3dgs", train_opacity=True), "harmonic", ("exp",)),
+    "bistatic": Method(_bistatic, "bistatic"),
+    "bistatic-quick": Method(partial(_bistatic, quick=True), "bistatic"),
+    "rf3dgs+": Method(partial(_harmonic, model="rf3dgs+"), "harmonic", GAINS),
+    "rf3dgs+los": Method(partial(_harmonic, model="rf3dgs+", line_of_sight="explicit"), "harmonic", GAINS),
+    "rf3dgs": Method(partial(_harmonic, model="rf3dgs"), "harmonic", GAINS),
+    "rf3dgs+alpha": Method(partial(_harmonic, model="rf3dgs+", train_opacity=True), "harmonic", ("exp",)),
+    "rf3dgs-alpha": Method(partial(_harmonic, model="rf3dgs", train_opacity=True), "harmonic", ("exp",)),
     "nerf2": Method(_nerf2, "networks", network=True),
     "cgan": Method(_cgan, "networks", network=True),
     "sionna-calibrated": Method(_calibrated, "sionna"),
-    "nearest": Method(_lookup("nearest"), "lookups"),
-    "idw": Method(_lookup("idw"), "lookups", ("db", "linear")),
-    "constant": Method(_lookup("constant"), "lookups"),
-    "mean": Method(_lookup("mean"), "lookups"),
+    "nearest": Method(partial(_lookup, name="nearest"), "lookups"),
+    "idw": Method(partial(_lookup, name="idw"), "lookups", ("db", "linear")),
+    "constant": Method(partial(_lookup, name="constant"), "lookups"),
+    "mean": Method(partial(_lookup, name="mean"), "lookups"),
     "sionna": Method(_assumed, "sionna", untaught=True),
     "sionna-again": Method(lambda task: _sionna(task.geometry.scene, task), "sionna", untaught=True),
     "transmitter": Method(_transmitter, "metrics", untaught=True),

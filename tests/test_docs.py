@@ -1,12 +1,12 @@
 """README and documentation say what is so: current tables, links that lead somewhere, code that parses."""
 
 import ast
-import functools
 import inspect
 import re
 import sys
 import textwrap
 import typing
+from functools import reduce
 from pathlib import Path
 
 import pytest
@@ -22,16 +22,21 @@ from warprrf.rf.maps.radio_map import MapOptions
 from warprrf.rf.relevance.search import Setting
 
 sys.path.append(str(ROOT / "tools" / "docs"))
+import reference  # noqa: E402
 import results  # noqa: E402
 import tables  # noqa: E402
+
+from warprrf import cli  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 GENERATED = ("docs/reference", "docs/figures", "docs/build")
 PAGES = sorted(p for p in (ROOT / "docs").rglob("*.md") if not str(p.relative_to(ROOT)).startswith(GENERATED))
+CODE = {p: "".join(re.findall(r"```.*?```", p.read_text(), re.DOTALL)) for p in (ROOT / "README.md", *PAGES)}
 
 
 def test_the_readme_is_short_and_its_table_is_current():
     assert len(README.splitlines()) <= 150 and not re.search(r"\basked\b", README)
+    assert all(len(b.split("\n")) <= 11 for b in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
     assert results.readme() in README, "run: python tools/docs/results.py readme"
 
 
@@ -85,7 +90,7 @@ def called(call: ast.Call) -> list[inspect.Signature]:
         return []
     root, name = ast.unparse(call.func.value), call.func.attr
     if re.fullmatch(r"wr(\.\w+)*", root):
-        return [inspect.signature(functools.reduce(getattr, [*root.split(".")[1:], name], wr))]
+        return [inspect.signature(reduce(getattr, [*root.split(".")[1:], name], wr))]
     if root in ("np", "ax", "axes", "plt", "plan"):
         return []
     kinds = [BistaticField] if root == "field" else [wr.viewer.Viewer, *(getattr(wr, n) for n in dir(wr))]
@@ -117,3 +122,36 @@ def test_documented_calls_go_with_the_signatures(source):
 
 def test_python_in_the_readme_is_short():
     assert all(len(b.split("\n")) <= 11 for b in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
+
+
+def test_names_of_the_reference_are_reached_as_it_prints_them():
+    listed = set(re.findall(r" as (\w+)$", (ROOT / "warprrf/__init__.pyi").read_text(), re.MULTILINE))
+    found = re.findall(r"^\.\. auto\w+:: \w+\.(\S+)", "\n".join(reference.pages().values()), re.MULTILINE)
+    assert len(found) > 80
+    for first, *rest in (name.split(".") for name in found):
+        assert first in listed and reduce(getattr, rest, getattr(wr, first)), (first, *rest)
+
+
+def test_commands_on_pages_are_taken_by_the_parser():
+    seen = set()
+    for line in re.findall(r"^(?:\$ )?warprrf (\w.*)", "\n".join(CODE.values()), re.MULTILINE):
+        words = re.split(r"  |#", line)[0].split()
+        seen.add(words[0])
+        args = cli._parser().parse_args(words)
+        own = [f"--{word}" for word in getattr(args, "measurements", ()) if "=" in word]
+        cli._parser().parse_args([*words, *own])
+    assert seen >= {"fit", "sample", "suggest", "render", "simulate", "view", "evaluate", "reconstruct"}
+
+
+def test_what_a_page_writes_has_a_name_that_no_other_page_gives_to_something_else():
+    stores = {name for code in CODE.values() for name in re.findall(r"store=(\"\S+?\")", code)}
+    for name in stores:
+        lines = [
+            line
+            for code in CODE.values()
+            for line in code.splitlines()
+            if f"{name}" in line and "open" not in line
+        ]
+        assert len({"".join(re.findall(r"field\.(\w+)\(.*store=", line)) for line in lines}) == 1, lines
+    places = [w for code in CODE.values() for w in re.findall(r"workspace=(\"\S+?\")", code)]
+    assert stores and len(places) == len(set(places)), "two reconstructions in one workspace"

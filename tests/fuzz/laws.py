@@ -20,10 +20,12 @@ class Law:
     Attributes:
         edits: names that edits may have; each has two numbers too.
         wrong: what is wrong where edits were made; empty if nothing is.
+        most: how many edits.
     """
 
     edits: Sequence[str]
     wrong: Callable[[Place, tuple[Edit, ...]], str]
+    most: int = 3
 
 
 @cache

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from fuzz import calls, trial
+from fuzz.answers import complaint, differs, leaves, wrong
 from fuzz.files import CODECS, FORMATS
-from fuzz.trial import FILE, Case, Trial, complaint, differs, ended, leaves, wrong
+from fuzz.trial import FILE, Case, Trial, ended
 from fuzz.values import VALUES
 from fuzz.workers import Workers
 

@@ -334,7 +334,7 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
         lines.append(f"{name}: azimuths count from {zero:.2f} degrees")
     for name, moved in field.report.get("position_offset_m", {}).items():
         lines += [
-            f"{name}: receiver {_rows([place])} stood {_rows([offset])} m from there"
+            f"{name}: receiver {_rows(np.array([place]))} stood {_rows(np.array([offset]))} m from there"
             for place, offset in moved
         ]
     found = {

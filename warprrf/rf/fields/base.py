@@ -102,8 +102,10 @@ class RadioField(ABC):
             geometry: a Reconstruction (anything with ``.gaussians`` and ``.mesh``), a Scene or a Mesh.
             ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, or a list of both.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
-            options: keyword arguments of :meth:`BistaticField.fit` or :meth:`HarmonicField.fit`, which name and check
-                them.
+            options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
+                :class:`warprrf.FitOptions`: ``quick=True``, ``relevance``, ``mirror_order``, ``diffuse_order``, ``lobes``,
+                ``reciprocal``, ``residual``, ``gain_offset``, ``iterations``, ``seed``, ... The others take those of
+                :class:`warprrf.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``, ``checkpoint``, ``seed``, ...
 
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_number, check_positive, check_seed, checked
+from warprrf.checks import check_array, check_count, check_positive, check_seed, checked
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.spectra import dataset_files
 from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
 from warprrf.rf.spectra.spectrum import (
@@ -201,7 +201,7 @@ class SpectrumDataset:
             TypeError, ValueError: naming the argument.
         """
         rows, columns = check_shape(shape)
-        wavelength = SPEED_OF_LIGHT / check_number("frequency_hz", frequency_hz, *CARRIERS_HZ)
+        wavelength = SPEED_OF_LIGHT / check_frequency(frequency_hz)
         strongest = (wavelength / (4.0 * np.pi * USUAL_M)) ** 2
         noise = 1e-6 * strongest if floor is None else check_positive("floor", floor, "linear noise floor")
         return cls(

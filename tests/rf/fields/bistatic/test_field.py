@@ -93,21 +93,6 @@ def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field: BistaticFiel
     assert several.gain.shape == (2, 5)
 
 
-def test_spectra_of_many_receivers_are_those_of_each(field: BistaticField) -> None:
-    told: list[tuple[str, int, int]] = []
-    found = field.spectra(RECEIVERS, progress=lambda *step: told.append(step)).path_gain
-    for image, receiver in zip(found, RECEIVERS, strict=True):
-        np.testing.assert_allclose(
-            image, field.spectrum(receiver).path_gain, rtol=1e-6, atol=1e-6 * image.max()
-        )
-    other = TX + [0.3, 0.2, -0.1]
-    elsewhere = field.spectrum(RECEIVERS[1], other).path_gain
-    np.testing.assert_allclose(
-        field.spectra(RECEIVERS[:3], other).path_gain[1], elsewhere, rtol=1e-6, atol=1e-6 * elsewhere.max()
-    )
-    assert told[-1] == ("spectra", len(RECEIVERS), len(RECEIVERS))
-
-
 def test_a_saved_field_answers_the_same(field: BistaticField, tmp_path: Path) -> None:
     file = tmp_path / "field.safetensors"
     field.save(file)

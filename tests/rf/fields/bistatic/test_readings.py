@@ -1,5 +1,6 @@
 """Tables of received power: what a reading is, and fits to horns, powers and delays whose chain's gain is not known."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,11 +77,22 @@ def test_wrong_readings_are_named_and_hardly_count(
     wrong = np.sort(rng.choice(above, len(above) // 10, replace=False))
     power = turned.power.copy()
     power[wrong] *= 100.0
-    clean, spoilt = (RadioField.fit(scene, r, quick=True) for r in (turned, replace(turned, power=power)))
+    clean = RadioField.fit(scene, turned, quick=True)
+    with pytest.warns(UserWarning, match=rf"of {len(turned)} readings .* left out .*rows {wrong[0]}, "):
+        spoilt = RadioField.fit(scene, replace(turned, power=power), quick=True)
     named = spoilt.report["unexplained"]["readings"]
     assert np.isin(wrong, named).mean() >= 0.9
     assert len(named) < 2 * len(wrong) + 3
     assert score(spoilt, test) > score(clean, test) - 1.0
+
+
+def test_data_sets_of_one_name_are_told_apart_in_a_report(scene: RadioScene, turned: Readings) -> None:
+    power = turned.power.copy()
+    power[[0, len(power) // 2]] *= 1e3  # a row of each half
+    halves = [replace(turned, power=power).subset(part) for part in np.split(np.arange(len(turned)), 2)]
+    report = RadioField.fit(scene, halves, quick=True).report
+    assert report["noise_db"].keys() == {"readings 1", "readings 2"}
+    assert all(0 in report["unexplained"][name] for name in ("readings 1", "readings 2"))
 
 
 def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings) -> None:
@@ -239,12 +251,14 @@ def test_a_horn_of_a_width_is_lossless() -> None:
         gain = horn(width)(angle)
         assert 0.5 * np.trapezoid(gain * np.sin(angle), angle) == pytest.approx(1.0, rel=1e-3)
         assert horn(width)(np.array([width / 2]))[0] == pytest.approx(0.5 * gain[0], rel=1e-3)
+    with pytest.raises(ValueError, match=r"width_rad: got 10, expected radians.*np\.radians"):
+        horn(10)
 
 
 def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
     path = tmp_path / "horn.csv"
     zenith, azimuth = np.degrees(turned.arrival).T
-    rows = ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain,note"]
+    rows = ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain"]
     for k in range(len(turned)):
         cells = [
             *turned.transmitters[k],
@@ -253,7 +267,7 @@ def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
             90 - zenith[k],
             10 * np.log10(turned.power[k]),
         ]
-        rows.append(",".join(map(repr, map(float, cells))) + ",horn,any")
+        rows.append(",".join(map(repr, map(float, cells))) + ",horn")
     path.write_text("\n".join(rows))
     read = Readings.load(path, frequency_hz=F, floor=turned.floor, receive_pattern=horn(WIDTH))
     np.testing.assert_allclose(read.power, turned.power, rtol=1e-9)
@@ -264,6 +278,71 @@ def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
         Readings.load(path, frequency_hz=F, floor=1e-12)
     with pytest.raises(FileNotFoundError, match="nothing.csv"):
         Readings.load(tmp_path / "nothing.csv", frequency_hz=F, floor=1e-12)
+
+
+HEADER = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain"
+ROW = "0.8,0.9,2.2,4.2,3.1,1.2,-180,0,-93.1,horn"
+
+
+def of_csv(text: str, path: Path) -> Readings:
+    path.write_text(text, encoding="utf-8")
+    turned = HEADER.split(",")[6] in text
+    return Readings.load(
+        path, frequency_hz=F, floor=1e-12, receive_pattern=horn(np.radians(10)) if turned else None
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (f"{HEADER}\n{ROW}\n\n{ROW},7", "line 4: got 11 values, expected 10"),
+        (f"{HEADER}\n{ROW[:-5]}", "line 2: got 9 values"),
+        (f"{HEADER}\n{ROW.replace('4.2', 'four')}", "line 2: rx_x: got 'four'"),
+        (f"{HEADER}\n{ROW.replace('4.2', '')}", "line 2: rx_x: got ''"),
+        (f"{HEADER.replace('_deg', '')}\n{ROW}", "'azimuth' for azimuth_deg, 'elevation' for elevation_deg"),
+        (
+            f"{HEADER.replace('power_db', 'Power_dB')}\n{ROW}",
+            "lacks the columns power_db.*'Power_dB' for power_db",
+        ),
+        (f"{HEADER.replace('azimuth_deg', 'x')}\n{ROW}", "elevation_deg without azimuth_deg"),
+        (f"{HEADER},power_db\n{ROW},-60", "several columns power_db"),
+        ("", "line 1: got nothing"),
+    ],
+)
+def test_what_a_table_s_file_does_not_say_clearly_is_refused(text: str, told: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"horn\.csv: .*{told}"):
+        of_csv(text, tmp_path / "horn.csv")
+
+
+def test_a_table_s_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
+    """Spaces, empty lines, a byte-order mark, a chain called NA, a power that was not measured; other columns are named."""
+    lines = [HEADER, ROW.replace("horn", "NA"), "", ROW.replace("-93.1", "n/a").replace("horn", "")]
+    spaced = "\ufeff" + "\n".join(line.replace(",", " , ") for line in lines)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read = of_csv(spaced, tmp_path / "horn.csv")
+    assert read.chain.tolist() == ["NA", ""]
+    np.testing.assert_allclose(read.power, [10**-9.31, np.nan])
+    np.testing.assert_allclose(read.arrival, [[np.pi / 2, -np.pi]] * 2)
+    with pytest.warns(UserWarning, match="columns note are not read") as told:
+        of_csv(f"{HEADER},note\n{ROW},any", tmp_path / "horn.csv")
+    assert told[0].filename == __file__
+
+
+def test_a_carrier_in_gigahertz_and_powers_all_at_the_floor_are_questioned() -> None:
+    good = {
+        "transmitters": TX,
+        "receivers": RECEIVERS[:2],
+        "power": [1e-9, 1e-9],
+        "frequency_hz": F,
+        "floor": 1e-15,
+    }
+    for changed, told in (
+        ({"frequency_hz": 28}, "carrier in hertz"),
+        ({"floor": 1e-9}, "no value above the floor"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            Readings(**{**good, **changed})
 
 
 def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:

@@ -23,14 +23,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked, index_to
+from warprrf.checks import (
+    Expected,
+    check_array,
+    check_arrays,
+    check_count,
+    check_number,
+    checked,
+    index_to,
+    one_line,
+)
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.materials import assumed_permittivity
-from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT
+from warprrf.rf.em.waves import SPEED_OF_LIGHT, check_frequency
 from warprrf.rf.fields.base import Data, Measured, RadioField
 from warprrf.rf.fields.bistatic import files, uncertainty
 from warprrf.rf.fields.bistatic.links import RAYS_AT_A_TIME, LinkTracer
@@ -77,6 +86,8 @@ class BistaticField(RadioField):
         report: how the fit went.
         device: where it computes.
     """
+
+    __repr__ = one_line
 
     surface: Surface = field(repr=False)
     transmitter: np.ndarray
@@ -165,7 +176,7 @@ class BistaticField(RadioField):
             client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`warprrf.rf.fields.bistatic.training.FitOptions`, in place of those of
+            settings: attributes of :class:`warprrf.FitOptions`, in place of those of
                 ``options``: ``quick=True``, ``mirror_order=2``, ``relevance=found``, ...
 
         Raises:
@@ -275,7 +286,7 @@ class BistaticField(RadioField):
 
             field_140 = field_300.at_frequency(140e9)
         """
-        ratio = check_number("frequency_hz", frequency_hz, *CARRIERS_HZ) / self.frequency_hz
+        ratio = check_frequency(frequency_hz) / self.frequency_hz
         fall = 20.0 * float(np.log10(ratio))
         return replace(
             self, frequency_hz=float(frequency_hz), parameters=self.parameters.at_ratio(ratio), errors=None,

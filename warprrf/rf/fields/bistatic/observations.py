@@ -69,7 +69,7 @@ class Place:
 
 
 def as_list(data: Data) -> list[Measured]:
-    """Data sets as a list.
+    """Data sets as a list; of several that have one name each gets a number after it.
 
     Raises:
         TypeError: for anything else.
@@ -84,6 +84,10 @@ def as_list(data: Data) -> list[Measured]:
         several.append(one)
     if not several:
         raise ValueError("ds: got an empty list, expected a SpectrumDataset, Readings, or several of them")
+    names = [None if isinstance(one, SpectrumDataset) else one.name for one in several]
+    for k, one in enumerate(several):
+        if not isinstance(one, SpectrumDataset) and names.count(one.name) > 1:
+            several[k] = replace(one, name=f"{one.name} {names[: k + 1].count(one.name)}")
     return several
 
 

@@ -34,6 +34,7 @@ from warprrf.checks import (
     check_number,
     check_positive,
     checked,
+    one_line,
 )
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -83,6 +84,8 @@ class HarmonicField(RadioField):
         fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
         report: how the fit went: seconds, pairs, losses, Gaussians seen.
     """
+
+    __repr__ = one_line
 
     gaussians: Gaussians = field(repr=False)
     mesh: Mesh | None = field(repr=False)
@@ -148,7 +151,7 @@ class HarmonicField(RadioField):
             transport: blending weights of ``ds.receivers``, if they were computed before.
             device: where to compute.
             progress: called with the stages ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`, in place of those of
+            settings: attributes of :class:`warprrf.FieldOptions`, in place of those of
                 ``options``: ``gain="linear"``, ``iterations=600``, ``seed=1``, ...
 
         Raises:
