@@ -204,6 +204,14 @@ def test_a_map_that_other_tools_turned_is_read_by_its_coordinates(found, tmp_pat
         np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("total_path_gain", -1.0), ("best_beam_gain", np.inf), ("cell_m", 0.0)]
+)
+def test_fields_that_no_map_has_are_refused(found: RadioMap, name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        replace(found, **{name: np.full_like(getattr(found, name), value)})
+
+
 def test_pictures_show_every_quantity(found: RadioMap, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     found.picture(tmp_path / "map.png")

@@ -101,6 +101,8 @@ def test_a_horn_is_not_pointed_twice_at_one_place(unmeasured) -> None:
     place = np.tile(WEST[0], (6, 1))
     chosen = unmeasured.suggest(place, 3, arrival=angles, receive_pattern=wr.horn(np.radians(10.0)))
     assert len({(0, 0, 0, 1, 1, 2)[k] for k in chosen}) == 3
+    with pytest.raises(ValueError, match="receive_pattern: it goes with arrival"):
+        unmeasured.suggest(place, 3, arrival=angles)
 
 
 def test_variances_are_those_of_the_joint_posterior() -> None:
