@@ -231,9 +231,10 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         for name in ("receivers", "path_gain", "delay_s", "aod", "beam_sigma_rad", "line_of_sight", "engine", "floor")
     },
     "SpectrumDataset.load": lambda p: {"path": p.folder / "spectra.nc"},
+    "Spectrum.stack": lambda p: {"spectra": [p.spectra[0], p.spectra[1]]},
     "SpectrumDataset.split": lambda p: {"self": p.spectra},
     # fields
-    "RadioField.array_spectrum": lambda p: {"transmitter": p.transmitter + 0.1},
+    "RadioField.array_spectrum": lambda p: {"receivers": POINTS[0], "transmitter": p.transmitter + 0.1},
     "RadioField.at_frequency": lambda p: {"frequency_hz": 140e9},
     "RadioField.fit": lambda p: {
         "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False, "residual": False, "sub_pixels": 1,
@@ -243,11 +244,12 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
         "frequencies_hz": [300e9], "diffuse": "power", "max_paths": 20, "client": None,
     },
     "RadioField.spectra": lambda p: {"client": None},
-    "RadioField.links": lambda p: {"rx": POINTS, "shape": (8, 16), "client": None},
+    "RadioField.links": lambda p: {"shape": (8, 16), "client": None},
     "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": "cpu"},
+    "RadioField.on_grid": lambda p: {"shape": (8, 16)},
     "RadioField.paths": lambda p: {"max_paths": 20, "client": None},
     "RadioField.radio_map": lambda p: {"cell": 1.0},
-    "RadioField.spectrum": lambda p: {"transmitter": p.transmitter + 0.1},
+    "RadioField.spectrum": lambda p: {"transmitter": p.transmitter + 0.1, "shape": (8, 16)},
     "RadioField.suggest": lambda p: {
         "n": 1, "arrival": np.full((len(POINTS), 2), 1.5), "receive_pattern": np.linspace(1.0, 0.1, 19),
     },

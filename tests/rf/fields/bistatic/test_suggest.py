@@ -116,22 +116,6 @@ def test_variances_are_those_of_the_joint_posterior() -> None:
     assert (unknowns.variance(precision + rng.random(5)) < unknowns.variance(precision)).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        ({"n": 7}, "n: got 7"),
-        ({"n": 0}, "n: got 0"),
-        ({"candidates": np.array([[9.0, 9.0, 1.0]])}, "outside the scene"),
-        ({"arrival": np.zeros((6, 2))}, "receive_pattern: it goes with arrival"),
-        ({"arrival": np.zeros((5, 2)), "receive_pattern": wr.horn(0.2)}, "arrival"),
-        ({"arrival": np.zeros((6, 2)), "receive_pattern": np.zeros(9)}, "receive_pattern: got"),
-    ],
-)
-def test_bad_arguments_are_named(unmeasured, arguments, named) -> None:
-    with pytest.raises(ValueError, match=named):
-        unmeasured.suggest(**({"candidates": CANDIDATES} | arguments))
-
-
 def test_a_part_of_what_was_traced_reads_its_own_spectra(scene) -> None:
     ds = spectra(scene, CANDIDATES)
     seen, chosen = trace(scene, ds, sub_pixels=1, mirror_order=1), [4, 1]
