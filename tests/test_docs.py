@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import json
 import re
 import sys
 import textwrap
@@ -59,6 +60,17 @@ def test_every_table_that_a_page_names_can_be_made():
     assert named >= set(tables.TABLES), "a table that no page shows"
     for name in named:
         assert tables.table(name)
+
+
+def test_figures_of_a_settled_question_say_when_of_what_and_what_they_answer():
+    files = list((ROOT / "benchmarks" / "results" / "settled").glob("*.json"))
+    for file in files:
+        found = json.loads(file.read_text())
+        assert re.fullmatch(r"20\d\d-\d\d-\d\d", found["date"]) and re.fullmatch(
+            r"[0-9a-f]{7,40}", found["commit"]
+        )
+        assert found["question"].endswith("?") and found["answer"], file.name
+    assert len(files) > 5
 
 
 @pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CHANGELOG.md", *PAGES], ids=lambda p: p.name)

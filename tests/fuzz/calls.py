@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -119,13 +120,6 @@ def call(name: str, arguments: Mapping[str, Any]) -> Any:
     return target(**given)
 
 
-def _with_nan(values: np.ndarray) -> np.ndarray:
-    """``values``, one of which is not known."""
-    found = values.copy()
-    found.flat[0] = np.nan
-    return found
-
-
 ALIASES = {
     "mesh_or_scene": "scene", "rt_scene": "scene", "geometry": "scene", "g": "gaussians", "cam": "camera", "ds": "train",
     "source": "paths", "tx_array": "codebook", "rx_array": "array", "transmitters": "transmitter", "folder": "home",
@@ -142,26 +136,17 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 BAND = wr.em.Band(1e9, 1e12, 5.0, 0.0, 0.01, 0.9)
 CLASSES: dict[str, Callable[[Place], Any]] = {
-    "Camera": lambda p: p.camera,
-    "Gaussians": lambda p: p.gaussians,
-    "Mesh": lambda p: p.mesh,
-    "Reconstruction": lambda p: p.reconstruction,
-    "Scene": lambda p: p.scene,
     "Material": lambda p: p.scene.materials[0],
     "Air": lambda p: wr.Air(),
     "Spectrum": lambda p: p.spectra[0],
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
-    "Readings": lambda p: p.readings,
     "RadioField": lambda p: p.field,
-    "Paths": lambda p: p.paths,
     "PlanarArray": lambda p: wr.PlanarArray(2, 3, polarisation="VH"),
     "RadioMap": lambda p: p.map,
-    "Relevance": lambda p: p.relevance,
     "channel.ArraySpectra": lambda p: wr.channel.ArraySpectra(
         p.transmitter, POINTS, np.full((3, 2), 0.5), 300e9, p.array, TOWARDS
     ),
     "channel.BeamChoice": lambda p: wr.select_beams(p.paths, p.codebook, p.array),
-    "channel.Codebook": lambda p: p.codebook,
     "channel.Dispersion": lambda p: p.paths.dispersion(),
     "channel.MultiUserChoice": lambda p: wr.channel.select_beams_multiuser(
         p.sources, p.codebook, p.array, noise=1e-12
@@ -176,6 +161,10 @@ CLASSES: dict[str, Callable[[Place], Any]] = {
     "splats.GaussianRays": lambda p: wr.GaussianRays(p.gaussians, device="cpu"),
     "splats.Rasterizer": lambda p: p.raster,
     "lookups.Lookup": lambda p: wr.lookups.nearest(p.train),
+}
+CLASSES |= {
+    name: attrgetter(name.rpartition(".")[2].lower())
+    for name in "Camera Gaussians Mesh Reconstruction Scene Readings Relevance Paths channel.Codebook".split()
 }
 """An object of every public class."""
 
@@ -238,7 +227,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "SpectrumDataset.empty": lambda p: {"shape": (12, 24), "beam_sigma_rad": 0.1, "floor": 1e-15},
     "SpectrumDataset.export_exr": lambda p: {"path": "one.exr"},
     "SpectrumDataset.from_spectra": lambda p: {
-        name: _with_nan(getattr(p.train, name)) if name in ("delay_s", "aod") else getattr(p.train, name)
+        name: getattr(p.train, name)
         for name in ("receivers", "path_gain", "delay_s", "aod", "beam_sigma_rad", "line_of_sight", "engine", "floor")
     },
     "SpectrumDataset.load": lambda p: {"path": p.folder / "spectra.nc"},
@@ -247,21 +236,20 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     # fields
     "RadioField.array_spectrum": lambda p: {"receivers": POINTS[0], "transmitter": p.transmitter + 0.1},
     "RadioField.at_frequency": lambda p: {"frequency_hz": 140e9},
-    "RadioField.check_positions": lambda p: {"receivers": POINTS},
     "RadioField.fit": lambda p: {
         "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False, "residual": False, "sub_pixels": 1,
         "device": "cpu", "relevance": p.relevance,
     },
     "RadioField.cfr": lambda p: {
-        "receivers": POINTS, "frequencies_hz": [300e9], "diffuse": "power", "max_paths": 20, "client": None,
+        "frequencies_hz": [300e9], "diffuse": "power", "max_paths": 20, "client": None,
     },
-    "RadioField.spectra": lambda p: {"receivers": POINTS, "client": None},
-    "RadioField.links": lambda p: {"receivers": POINTS, "shape": (8, 16), "client": None},
+    "RadioField.spectra": lambda p: {"client": None},
+    "RadioField.links": lambda p: {"shape": (8, 16), "client": None},
     "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": "cpu"},
     "RadioField.on_grid": lambda p: {"shape": (8, 16)},
-    "RadioField.paths": lambda p: {"receivers": POINTS, "max_paths": 20, "client": None},
+    "RadioField.paths": lambda p: {"max_paths": 20, "client": None},
     "RadioField.radio_map": lambda p: {"cell": 1.0},
-    "RadioField.spectrum": lambda p: {"receivers": POINTS, "transmitter": p.transmitter + 0.1, "shape": (8, 16)},
+    "RadioField.spectrum": lambda p: {"transmitter": p.transmitter + 0.1, "shape": (8, 16)},
     "RadioField.suggest": lambda p: {
         "n": 1, "arrival": np.full((len(POINTS), 2), 1.5), "receive_pattern": np.linspace(1.0, 0.1, 19),
     },

@@ -38,56 +38,41 @@ from warprrf.steps import Steps
 # ------------------------------------------------------------------------------------------------------------ edits
 
 Edit = tuple[str, int, int]
-_SIZES = [
-    n.to_bytes(w, order, signed=True) for n in (-1, 0, 2**31 - 1, 10**9, 10**6) for w in (4, 8) for order in ("little", "big")
+INSERTED = [
+    *(n.to_bytes(w, order, signed=True) for n in (-1, 0, 2**31 - 1, 10**9, 10**6) for w in (4, 8) for order in ("little", "big")),
+    *(bytes([n]) for n in (0, 255, 127, 128, 10, 32, 45, 57)), b"",
 ]  # fmt: skip
+"""What stands for sizes, letters and ends in files, and nothing."""
 
 
 def _flip(data: bytearray, a: int, b: int) -> None:
     data[a % len(data)] ^= 1 << b % 8
 
 
-def _set(data: bytearray, a: int, b: int) -> None:
-    data[a % len(data)] = (0, 255, 127, 128, 10, 32, 45, 57)[b % 8]
-
-
 def _cut(data: bytearray, a: int, b: int) -> None:
     del data[a % len(data) :]
 
 
-def _insert(data: bytearray, a: int, b: int) -> None:
-    at = a % len(data)
-    data[at:at] = bytes((b + k) % 256 for k in range(1 + b % 9))
+def _put(data: bytearray, a: int, b: int) -> None:
+    """Something in the place of as many bytes, of none, or of some."""
+    at, new = a % len(data) // (1 + 3 * (b % 2)) * (1 + 3 * (b % 2)), INSERTED[b % len(INSERTED)]
+    data[at : at + (len(new), 0, a % 64)[b // 64 % 3]] = new
 
 
-def _remove(data: bytearray, a: int, b: int) -> None:
-    at = a % len(data)
-    del data[at : at + 1 + b % 64]
-
-
-def _swap(data: bytearray, a: int, b: int) -> None:
-    one, other, size = a % len(data), b % len(data), 16
-    first, second = bytes(data[one : one + size]), bytes(data[other : other + size])
-    data[one : one + size], data[other : other + size] = second, first
-
-
-def _size(data: bytearray, a: int, b: int) -> None:
-    value, at = _SIZES[b % len(_SIZES)], a % len(data) // 4 * 4
-    data[at : at + len(value)] = value
-
-
-def _append(data: bytearray, a: int, b: int) -> None:
-    data += bytes(data[: 1 + a % len(data)])
+def _copy_part(data: bytearray, a: int, b: int) -> None:
+    """A part, or all from the beginning, once more, in the place of another part, or between."""
+    part = data[: 1 + a % len(data)] if b % 4 == 0 else data[a % len(data) :][:16]
+    at = len(data) if b % 4 == 0 else b % len(data)
+    data[at : at + 16 * (b % 2)] = part
 
 
 BYTES: dict[str, Callable[[bytearray, int, int], None]] = {
-    "flip": _flip, "set": _set, "cut": _cut, "insert": _insert, "remove": _remove, "swap": _swap, "size": _size,
-    "append": _append,
+    "flip": _flip, "cut": _cut, "put": _put, "copy": _copy_part,
 }  # fmt: skip
 BYTES |= {
     # the first bytes say how to read the others
     f"{name} early": lambda data, a, b, edit=BYTES[name]: edit(data, a % min(len(data), 512), b)
-    for name in ("flip", "set", "cut", "size", "remove")
+    for name in ("flip", "cut", "put")
 }
 """Edits of bytes: what they do at ``a`` with ``b``."""
 

@@ -20,7 +20,7 @@ POINTS = np.array([[1.0, 1.0, 1.5], [4.0, 3.0, 1.0], [1.0, 3.0, 2.0]])
 ANGLES = np.linspace(0.3, 2.5, 5)
 TOWARDS = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
 GIVEN: dict[str, Any] = {
-    "frequency_hz": 300e9, "wavelength_m": 1e-3, "transmitter": np.array(TRANSMITTER), "rx": POINTS[0],
+    "frequency_hz": 300e9, "wavelength_m": 1e-3, "transmitter": np.array(TRANSMITTER),
     "receiver": POINTS[0], "position": POINTS[0], "points": POINTS, "candidates": POINTS, "directions": TOWARDS,
     "direction": TOWARDS[1], "a": POINTS[:2], "b": POINTS[1:].copy(), "origins": POINTS[:2], "n": 1, "seed": 0, "k": 4,
     "top_k": 4, "index": 1, "count": 8, "number": 1, "n_train": 4, "height": 1.2, "width_rad": 0.2, "noise": 0.1,

@@ -187,15 +187,10 @@ def in_another_order(room: Room) -> Room:
     return replace(room, faces=np.roll(room.faces[order], 1, axis=1), part=room.part[order], gaussians=g)
 
 
-def reversed_winding(room: Room) -> Room:
-    """Every face wound the other way."""
-    return replace(room, faces=room.faces[:, ::-1])
-
-
-def mixed_winding(room: Room) -> Room:
-    """Every other face, by chance, wound the other way."""
-    some = np.random.default_rng(3).random(len(room.faces)) < 0.5
-    return replace(room, faces=np.where(some[:, None], room.faces[:, ::-1], room.faces))
+def reversed_winding(room: Room, share: float = 1.0) -> Room:
+    """Every face, or a share by chance, wound the other way."""
+    some = np.random.default_rng(3).random((len(room.faces), 1)) < share
+    return replace(room, faces=np.where(some, room.faces[:, ::-1], room.faces))
 
 
 def unwelded(room: Room) -> Room:
@@ -205,34 +200,19 @@ def unwelded(room: Room) -> Room:
 
 
 def _with(room: Room, copy: Room) -> Room:
-    """Both rooms' faces in one mesh."""
-    mesh, _ = joined((room.vertices, room.faces), (copy.vertices, copy.faces))
+    """Both rooms' faces in one mesh, the copy's wound the other way, as exporters do."""
+    mesh, _ = joined((room.vertices, room.faces), (copy.vertices, copy.faces[:, ::-1]))
     return replace(
         room, vertices=mesh.vertices, faces=mesh.faces, part=np.concatenate([room.part, copy.part])
     )
-
-
-def doubled(room: Room) -> Room:
-    """Every face with both windings, a common export."""
-    return _with(room, reversed_winding(room))
-
-
-def doubled_of_another_material(room: Room) -> Room:
-    """Every face again, of another material: the first counts."""
-    return _with(room, replace(reversed_winding(room), part=(room.part + 1) % len(room.materials)))
-
-
-def covered(room: Room) -> Room:
-    """Every face again, cut into four: coplanar faces that overlap."""
-    return _with(room, reversed_winding(subdivided(room)))
 
 
 def in_two_sheets(metres: float) -> Change:
     """Every face again, so far before or behind it."""
 
     def change(room: Room) -> Room:
+        sheet = unwelded(room)
         normal = np.repeat(room.mesh.face_normals, 3, axis=0)
-        sheet = reversed_winding(unwelded(room))
         return _with(room, replace(sheet, vertices=sheet.vertices + metres * normal))
 
     return change
@@ -255,16 +235,9 @@ def with_faces_without_area(room: Room) -> Room:
     middle = room.vertices[face[:, :2]].mean(axis=1)
     points = np.column_stack([face[:, 0], face[:, 1], face[:, 0]])
     lines = np.column_stack([face[:, 0], len(room.vertices) + np.arange(10), face[:, 1]])
-    nothing = np.zeros(10, room.part.dtype)
-    return replace(
-        room, vertices=np.concatenate([room.vertices, middle]), faces=np.concatenate([points, room.faces, lines]),
-        part=np.concatenate([nothing, room.part, nothing]),
-    )  # fmt: skip
-
-
-def in_float32(room: Room) -> Room:
-    """Vertices rounded to single precision."""
-    return replace(room, vertices=room.vertices.astype(np.float32).astype(float))
+    vertices, nothing = np.concatenate([room.vertices, middle]), np.zeros(10, room.part.dtype)
+    faces, part = np.concatenate([points, room.faces, lines]), np.concatenate([nothing, room.part, nothing])
+    return replace(room, vertices=vertices, faces=faces, part=part)
 
 
 def turned_four_times_in_float32(room: Room) -> Room:
@@ -299,17 +272,19 @@ EXACT: dict[str, Change] = {
     "scaled by 0.1": scaled(0.1),
     "in another order": in_another_order,
     "reversed winding": reversed_winding,
-    "mixed winding": mixed_winding,
+    "mixed winding": lambda room: reversed_winding(room, 0.5),
     "unwelded": unwelded,
-    "doubled": doubled,
-    "doubled, of another material": doubled_of_another_material,
-    "covered by finer faces": covered,
+    "doubled": lambda room: _with(room, room),
+    "doubled, of another material": lambda room: _with(
+        room, replace(room, part=(room.part + 1) % len(room.materials))
+    ),  # the first counts
+    "covered by finer faces": lambda room: _with(room, subdivided(room)),
     "subdivided": subdivided,
     "with faces without area": with_faces_without_area,
 }
 """What must not change a room at all."""
 ROUNDED: dict[str, Change] = {
-    "in float32": in_float32,
+    "in float32": lambda room: replace(room, vertices=room.vertices.astype(np.float32).astype(float)),
     "turned four times in float32": turned_four_times_in_float32,
     **{f"in two sheets 1e{k} m apart": in_two_sheets(10.0**k) for k in (-6, -5, -4)},
     **{f"noise of 1e{k} m": noisy(10.0**k) for k in range(-8, -2)},
