@@ -205,7 +205,7 @@ def test_an_error_in_a_thread_reaches_who_waits_for_it(field_file):
     with ThreadPoolExecutor(4) as pool:
         waiting = [pool.submit(wrong if k % 2 else lambda: asked(field)) for k in range(8)]
         errors = [w.exception() for w in waiting]
-    assert all(isinstance(e, ValueError) and "rx" in str(e) if k % 2 else e is None for k, e in enumerate(errors))
+    assert all(isinstance(e, ValueError) and "receivers" in str(e) if k % 2 else e is None for k, e in enumerate(errors))
     same(asked(field), asked(wr.RadioField.load(sys.argv[1])))
     """,
         field_file,
