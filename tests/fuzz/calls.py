@@ -25,8 +25,8 @@ UNCHECKED = ("RadioField.trace_links",)
 """What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
 BISTATIC = ("array_spectrum", "at_frequency")
 """Methods that a bistatic field has beside those of every ``RadioField``."""
-SERVERS = ("view",)
-"""What starts a server for each call: tests/viewer has its refusals."""
+ELSEWHERE = ("view", "Viewer", "BistaticField", "HarmonicField")
+"""What starts a server for each call (tests/viewer has its refusals), and what ``RadioField`` is fuzzed as."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
 ABSTRACT = ("RadioField",)
@@ -40,7 +40,7 @@ def public() -> dict[str, Callable[..., Any]]:
     found: dict[str, Callable[..., Any]] = {}
     homes: set[Any] = set()
     for name, value in _names(wr, ""):
-        if not callable(value) or value in homes or name in SERVERS:
+        if not callable(value) or value in homes or name in ELSEWHERE:
             continue
         homes.add(value)
         if name not in ABSTRACT:
