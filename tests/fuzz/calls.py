@@ -138,6 +138,8 @@ BAND = wr.em.Band(1e9, 1e12, 5.0, 0.0, 0.01, 0.9)
 CLASSES: dict[str, Callable[[Place], Any]] = {
     "Material": lambda p: p.scene.materials[0],
     "Air": lambda p: wr.Air(),
+    "FitOptions": lambda p: wr.FitOptions(),
+    "FieldOptions": lambda p: wr.FieldOptions(),
     "Spectrum": lambda p: p.spectra[0],
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
     "RadioField": lambda p: p.field,
