@@ -25,8 +25,8 @@ UNCHECKED = ("RadioField.trace_links",)
 """What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
 BISTATIC = ("array_spectrum", "at_frequency")
 """Methods that a bistatic field has beside those of every ``RadioField``."""
-ELSEWHERE = ("view", "Viewer", "BistaticField", "HarmonicField")
-"""What starts a server for each call (tests/viewer has its refusals), and what ``RadioField`` is fuzzed as."""
+ELSEWHERE = ("view", "Viewer", "BistaticField", "HarmonicField", "FitOptions", "FieldOptions")
+"""What starts a server for each call (tests/viewer has its refusals), and what ``RadioField`` and its fit are fuzzed as."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
 ABSTRACT = ("RadioField",)
@@ -138,8 +138,6 @@ BAND = wr.em.Band(1e9, 1e12, 5.0, 0.0, 0.01, 0.9)
 CLASSES: dict[str, Callable[[Place], Any]] = {
     "Material": lambda p: p.scene.materials[0],
     "Air": lambda p: wr.Air(),
-    "FitOptions": lambda p: wr.FitOptions(),
-    "FieldOptions": lambda p: wr.FieldOptions(),
     "Spectrum": lambda p: p.spectra[0],
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
     "RadioField": lambda p: p.field,
