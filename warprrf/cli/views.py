@@ -101,7 +101,8 @@ def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> 
     from warprrf.rf.spectra.spectrum import pixel_directions
 
     azimuth, elevation = np.radians(args.facing)
-    array = wr.PlanarArray(*args.array, orientation=(azimuth, -elevation, 0.0))
+    rows, columns = args.array
+    array = wr.PlanarArray(rows, columns, orientation=(azimuth, -elevation, 0.0))
     heard = field.array_spectrum(place, array, pixel_directions(field.shape), args.transmitter)
     return wr.Spectrum(heard, floor=field.floor, range_db=field.range_db)
 
