@@ -7,7 +7,7 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
@@ -151,6 +151,20 @@ def _number(value: object) -> float:
         return float(value) if array.ndim == 0 and array.dtype.kind in "iufO" else np.nan  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return np.nan
+
+
+def users_level() -> int:
+    """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def some_of(rows: Sequence[int] | np.ndarray, most: int = 8) -> str:
+    """Rows of a table, for a message: the first ones and how many more."""
+    told = ", ".join(str(int(row)) for row in rows[:most])
+    return told + f" and {len(rows) - most} more" * (len(rows) > most)
 
 
 LARGEST_M = 1e8
@@ -391,11 +405,11 @@ def _as_object(kind: type, value: object) -> object:
 
 
 def one_line(self: Any) -> str:
-    """The ``__repr__`` of a dataclass of arrays: their shapes, other values as they are, None left out."""
+    """The ``__repr__`` of a dataclass of arrays: shapes of all but short ones, other values as they are, None left out."""
     parts = []
     for field in fields(self):
         value = getattr(self, field.name)
-        if hasattr(value, "shape") and np.prod(value.shape) > 3:
+        if hasattr(value, "shape") and (np.size(value) > 3 or np.ndim(value) > 1 or len(repr(value)) > 40):
             parts.append(f"{field.name} {tuple(value.shape)}")
         elif value is not None and len(text := repr(value)) <= 60:
             parts.append(f"{field.name}={text}")

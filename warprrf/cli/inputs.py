@@ -55,7 +55,7 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
         if path.suffix == ".json":
             rows = [(name, *position) for name, position in read_json(path).items()]
         else:
-            with path.open(newline="") as lines:
+            with path.open(newline="", encoding="utf-8-sig") as lines:
                 rows = [tuple(row) for row in csv.reader(lines) if row and not row[0].startswith("#")]
             if rows and rows[0][0] == "file":
                 rows = rows[1:]
@@ -259,7 +259,7 @@ def read_rows(path: Path, what: str, columns: int) -> np.ndarray:
         if path.suffix == ".npy":
             found = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
-            lines = [re.split("[#x]", line)[0] for line in path.read_text().splitlines()]
+            lines = [re.split("[#x]", line)[0] for line in path.read_text("utf-8-sig").splitlines()]
             lines = [line for line in lines if line.strip()]
             found = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, columns))
         return check_array(what, found, (None, columns))

@@ -250,6 +250,10 @@ def add_twin(add: Add) -> None:
     """Define `twin`."""
     twin = add("twin", _twin)
     twin.add_argument("field", help="field file (.safetensors) of model bistatic")
+    twin.add_argument(
+        "--thickness", nargs="+", default=[], metavar="M",
+        help="thickness of all surfaces, or NAME=M of some [m]; by default that of the scene that the field was fitted on",
+    )  # fmt: skip
     add_out(twin, "folder of the twin: new, empty or an earlier twin's")
     add_frequency(twin, "another carrier than the field's own")
 
@@ -263,15 +267,17 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
 
     examples:
       warprrf twin field.safetensors -o twin
+      warprrf twin field.safetensors -o twin --thickness glass=0.01 walls=0.1
       warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
     """
-    twin = wr.write_twin(load_field(args.field, args), args.out)
-    rows = [["surface", "area m2", "permittivity", "S", "lobe", "lobe error dB"]]
+    twin = wr.write_twin(load_field(args.field, args), args.out, thickness_m=_thickness(args.thickness))
+    rows = [["surface", "area m2", "thickness m", "permittivity", "S", "lobe", "lobe error dB"]]
     for group in twin.groups:
         rows.append(
             [
                 group.name,
                 f"{group.area_m2:.1f}",
+                f"{group.thickness_m:.3g}",
                 f"{group.permittivity.real:.3g}",
                 f"{group.scattering:.3f}",
                 f"{group.alpha_r}" if group.alpha_r else "Lambertian",
@@ -289,3 +295,16 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
     out.result(
         "\n".join(lines), files=[args.out], materials=len(twin.groups), **figures, left_out=twin.left_out
     )
+
+
+def _thickness(words: list[str]) -> float | dict[str, float] | None:
+    """``["0.1"]`` as one number, ``["glass=0.01", ...]`` by name; None for no words."""
+    try:
+        if len(words) == 1 and "=" not in words[0]:
+            return float(words[0])
+        named = [word.rpartition("=") for word in words]
+        return {name: float(value) for name, _, value in named} or None
+    except ValueError as error:
+        raise ValueError(
+            f"--thickness: got {' '.join(words)}, expected a number, or NAME=NUMBER of each [m]"
+        ) from error

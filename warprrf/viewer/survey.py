@@ -10,7 +10,8 @@ import numpy as np
 from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.maps.radio_map import QUANTITIES, in_the_air
+from warprrf.rf.maps.radio_map import QUANTITIES
+from warprrf.rf.positions import in_the_air
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import Readings
@@ -169,7 +170,8 @@ class Survey:
         if truth is None:
             return
         _check_carrier(field, truth)
-        found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
+        shape = truth.path_gain.shape[1:]  # fitted ones are marked, so that nobody need be warned
+        found = evaluate(truth, lambda at: field.spectrum(at, shape=shape), progress=progress)
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
         worst = np.argsort(psnr)[:WORST]
         labels = [f"{psnr[k]:.1f} dB{' (fitted)' if fitted[k] else ''}" for k in worst]

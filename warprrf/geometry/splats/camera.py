@@ -7,7 +7,7 @@ centres lie at +0.5. A spherical image has zenith ``(i + 0.5) pi / H`` in row i 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -125,6 +125,17 @@ class Camera:
             self.cx * sx,
             self.cy * sy,
         )
+
+    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Camera:
+        """The camera that sees points at ``scale rotation x + shift`` where this one sees ``x``.
+
+        Raises:
+            ValueError: for a spherical camera that would be turned.
+        """
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation @ rotation.T
+        pose[:3, 3] = -pose[:3, :3] @ (scale * rotation @ self.position + shift)
+        return replace(self, world_to_camera=pose)
 
     def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates ``(N, 2)`` of world points ``(N, 3)``, and their depth along the optical axis ``(N,)`` [m]
