@@ -153,6 +153,23 @@ def _number(value: object) -> float:
         return np.nan
 
 
+def check_similarity(scale: object, rotation: object, shift: object) -> tuple[float, np.ndarray, np.ndarray]:
+    """What moves points ``x`` to ``scale rotation x + shift``.
+
+    Args:
+        scale: positive number.
+        rotation: shape ``(3, 3)``; None for none.
+        shift: shape ``(3,)`` [m].
+
+    Raises:
+        TypeError, ValueError: for a scale that is not positive, or a matrix that is no rotation.
+    """
+    turn = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
+        raise ValueError(f"rotation: got {turn.tolist()}, expected a rotation: orthonormal, not mirrored")
+    return check_positive("scale", scale), turn, check_array("shift", shift, (3,))
+
+
 def users_level() -> int:
     """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
     frame, level = inspect.currentframe(), 0

@@ -190,6 +190,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Camera.spherical": lambda p: {"width": 8, "height": 4},
     "Gaussians.load_ply": lambda p: {"path": p.folder / "splats.ply"},
     "Mesh.load": lambda p: {"path": p.folder / "walls.ply", "unit": "m", "up": "z", "simplify": 20},
+    "Reconstruction.aligned": lambda p: {"known_positions": {f"{k}.png": POINTS[k] for k in range(3)}},
     "Reconstruction.from_files": lambda p: {"ply": p.folder / "splats.ply", "mesh": p.mesh},
     "Reconstruction.load": lambda p: {"folder": p.folder / "reconstruction"},
     "Reconstruction.report": lambda p: {"path": "report.html"},

@@ -23,7 +23,15 @@ from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import LARGEST_M, check_array, check_count, check_number, checked, one_line
+from warprrf.checks import (
+    LARGEST_M,
+    check_array,
+    check_count,
+    check_number,
+    check_similarity,
+    checked,
+    one_line,
+)
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
@@ -434,9 +442,15 @@ class Mesh:
 
         return self._boxed.get(str(where), build)
 
-    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Mesh:
-        """The mesh at ``scale rotation x + shift``, with what is known of its faces."""
-        return Mesh(**self.__getstate__() | {"vertices": scale * self.vertices @ rotation.T + shift})
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Mesh:
+        """The mesh at ``scale rotation x + shift``, with what is known of its faces.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        return Mesh(**self.__getstate__() | {"vertices": scale * self.vertices @ turn.T + moved})
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""

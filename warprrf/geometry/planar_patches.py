@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
+from warprrf.checks import check_similarity
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 
 FLAT_M = 1e-5
@@ -93,14 +94,20 @@ class PlanarPatches:
         group = np.full(len(planes[1]), -1, np.int32)
         return cls(mesh, label, *planes, area, group, np.arange(len(label)), tolerance_m, two_sided)
 
-    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> PlanarPatches:
-        """The patches of the mesh at ``scale rotation x + shift``."""
-        normal = self.normal @ rotation.T
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> PlanarPatches:
+        """The patches of the mesh at ``scale rotation x + shift``.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        normal = self.normal @ turn.T
         return replace(
             self,
-            mesh=self.mesh.moved(scale, rotation, shift),
+            mesh=self.mesh.transformed(scale=scale, rotation=turn, shift=moved),
             normal=normal,
-            offset=scale * self.offset + normal @ shift,
+            offset=scale * self.offset + normal @ moved,
             area=scale**2 * self.area,
             tolerance_m=scale * self.tolerance_m,
         )

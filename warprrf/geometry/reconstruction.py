@@ -15,10 +15,9 @@ from warprrf import tensor_files
 from warprrf.checks import (
     LARGEST_M,
     Expected,
-    check_array,
     check_arrays,
     check_number,
-    check_positive,
+    check_similarity,
     check_type,
     checked,
     index_to,
@@ -175,17 +174,15 @@ class Reconstruction:
         Example:
             >>> turned = rec.transformed(rotation=[[0, -1, 0], [1, 0, 0], [0, 0, 1]])  # doctest: +SKIP
         """
-        turn = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
-        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
-            raise ValueError(f"rotation: got {turn.tolist()}, expected a rotation: orthonormal, not mirrored")
-        how = check_positive("scale", scale), turn, check_array("shift", shift, (3,))
-        patches = None if self.patches is None else self.patches.moved(*how)
-        mesh = None if self._mesh is None else self._mesh.moved(*how)
+        number, turn, moved = check_similarity(scale, rotation, shift)
+        how: dict[str, Any] = {"scale": number, "rotation": turn, "shift": moved}
+        patches = None if self.patches is None else self.patches.transformed(**how)
+        mesh = None if self._mesh is None else self._mesh.transformed(**how)
         return Reconstruction(
-            None if self._gaussians is None else self._gaussians.moved(*how),
+            None if self._gaussians is None else self._gaussians.transformed(**how),
             mesh if patches is None else patches.mesh,
-            {name: camera.moved(*how) for name, camera in self.cameras.items()},
-            patches=patches, scale_rms_m=how[0] * self.scale_rms_m, metric=self.metric, unposed=self.unposed,
+            {name: camera.transformed(**how) for name, camera in self.cameras.items()},
+            patches=patches, scale_rms_m=number * self.scale_rms_m, metric=self.metric, unposed=self.unposed,
             held_out=self.held_out, guessed=self.guessed, lenses=self.lenses, causes=self.causes, photos=self.photos,
         )  # fmt: skip
 

@@ -221,5 +221,8 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndar
 
 def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
     """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
-    cameras = {name: camera.moved(scale, rotation, shift) for name, camera in sparse.cameras.items()}
+    cameras = {
+        name: camera.transformed(scale=scale, rotation=rotation, shift=shift)
+        for name, camera in sparse.cameras.items()
+    }
     return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)

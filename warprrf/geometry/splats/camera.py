@@ -12,7 +12,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_number, check_positive, check_type, checked
+from warprrf.checks import (
+    check_array,
+    check_count,
+    check_number,
+    check_positive,
+    check_similarity,
+    check_type,
+    checked,
+)
 
 KINDS = ("pinhole", "spherical")
 
@@ -126,15 +134,17 @@ class Camera:
             self.cy * sy,
         )
 
-    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Camera:
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Camera:
         """The camera that sees points at ``scale rotation x + shift`` where this one sees ``x``.
 
-        Raises:
-            ValueError: for a spherical camera that would be turned.
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`. ValueError too for a spherical one that would be turned.
         """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
         pose = np.eye(4)
-        pose[:3, :3] = self.rotation @ rotation.T
-        pose[:3, 3] = -pose[:3, :3] @ (scale * rotation @ self.position + shift)
+        pose[:3, :3] = self.rotation @ turn.T
+        pose[:3, 3] = -pose[:3, :3] @ (scale * turn @ self.position + moved)
         return replace(self, world_to_camera=pose)
 
     def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import LARGEST_M, check_array, check_count, checked, one_line
+from warprrf.checks import LARGEST_M, check_array, check_count, check_similarity, checked, one_line
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.ply_files import read_ply, write_ply
 from warprrf.kernels.raster import sh as _sh
@@ -120,14 +121,20 @@ class Gaussians:
         """Axis of the smallest scale, up to sign, shape ``(N, 3)`` float64."""
         return self.rotations[np.arange(len(self)), :, np.argmin(self.scales, axis=1)]
 
-    def moved(self, scale: float, rotation: np.ndarray, shift: np.ndarray) -> Gaussians:
-        """The Gaussians at ``scale rotation x + shift``; their colours turn along."""
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Gaussians:
+        """The Gaussians at ``scale rotation x + shift``; their colours turn along.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
         return replace(
             self,
-            means=scale * self.means @ rotation.T + shift,
-            quaternions=quaternions_of(rotation @ self.rotations),
+            means=scale * self.means @ turn.T + moved,
+            quaternions=quaternions_of(turn @ self.rotations),
             scales=scale * self.scales,
-            sh=np.einsum("jk,nkc->njc", _turned_harmonics(rotation, self.sh.shape[1]), self.sh),
+            sh=np.einsum("jk,nkc->njc", _turned_harmonics(turn, self.sh.shape[1]), self.sh),
         )
 
     def save_ply(self, path: str | os.PathLike[str]) -> None:
