@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -253,25 +254,22 @@ def test_look_at_puts_the_target_in_the_middle_with_z_up():
     assert camera.fx == pytest.approx(320.0)  # half the width over tan(45 degrees)
 
 
-def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch):
+def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch, capsys):
     head, row = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,", "13,11,2.5,7,4,1.5,"
     for name, columns, values in (
         ("horn", "azimuth_deg", "20"), ("taps", "azimuth_deg,tx_azimuth_deg,delay_ns", "0,5,9"), ("power", "std_db", "1"),
     ):  # fmt: skip
         (tmp_path / f"{name}.csv").write_text(f"{head}{columns},power_db\n{row}{values},-90\n")
     (tmp_path / "gains.csv").write_text("1\n0.5\n0\n")
-    given = {
-        "receivers": np.ones((1, 3)),
-        "transmitter": np.zeros(3),
-        "frequency_hz": 3e11,
-        "beam_sigma_rad": 0.1,
-    }
-    np.savez(tmp_path / "s.npz", path_gain=np.full((1, 4, 8), 1e-9), **given)
+    given = {"receivers": np.ones((1, 3)), "transmitter": np.zeros(3), "frequency_hz": 3e11}
+    np.savez(tmp_path / "s.npz", path_gain=np.full((1, 4, 8), 1e-9), beam_sigma_rad=0.1, **given)
     seen = {}
+    report = {"azimuth_zero_deg": {"corner": 7.5}, "noise_db": {"power": 1.5}, "unexplained": {"corner": [0]}}
+    report |= {"chains": {}, "position_offset_m": {"corner": [([7, 4, 1.5], [0.02, 0, -0.01])]}}
 
     def fit(geometry, data, **options):
         seen.update({getattr(one, "name", len(one)): one for one in data}, **options)
-        raise ValueError("enough")
+        return SimpleNamespace(report=report, save=lambda path: None)
 
     monkeypatch.setattr(wr.RadioField, "fit", fit)
     monkeypatch.chdir(tmp_path)
@@ -279,8 +277,11 @@ def test_each_file_of_measurements_has_its_own_settings(tmp_path, monkeypatch):
         "fit {scene} {spectra} s.npz horn.csv receive-pattern=10,-25 azimuth=unknown name=corner position-std=0.03 "
         "power.csv samples=1 noise-floor-db=-140 taps.csv window=hann receive-pattern=gains.csv transmit-pattern=20 "
         "bandwidth=2e9 -o f.safetensors --frequency 300e9 --noise-floor-db -120 --option mirror_order=2 --option lobes=[0,12]",
-        tmp_path, status=2,
+        tmp_path,
     )  # fmt: skip
+    said = capsys.readouterr().out
+    told = ("corner: add 7.50 degrees", "off by 0.02,0,-0.01 m", "power: readings are 1.50 dB", "from 0: 0")
+    assert [line for line in told if line not in said] == []
     horn, power, taps, angle = seen["corner"], seen["power"], seen["taps"], np.linspace(0.0, np.pi, 9)
     np.testing.assert_allclose(horn.receive_pattern(angle), wr.horn(np.radians(10), -25.0)(angle))
     assert (horn.azimuth_known, horn.position_std_m, horn.samples) == (False, 0.03, None)

@@ -6,6 +6,7 @@ import argparse
 import json
 import shutil
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +162,7 @@ def _sample(args: argparse.Namespace, out: Output) -> None:
     out.result(f"{args.out}: {len(places)} places", files=[args.out], places=places)
 
 
-def _rows(places: np.ndarray) -> str:
+def _rows(places: Iterable[np.ndarray]) -> str:
     return "\n".join(",".join(f"{x:.12g}" for x in place) for place in places)
 
 
@@ -330,21 +331,15 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
         lines.append(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
     for name, rows in wrong.items():
         lines.append(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
-    for name, zero in field.report.get("azimuth_zero_deg", {}).items():
-        lines.append(f"{name}: azimuths count from {zero:.2f} degrees")
-    for name, moved in field.report.get("position_offset_m", {}).items():
-        lines += [
-            f"{name}: receiver {_rows(np.array([place]))} stood {_rows(np.array([offset]))} m from there"
-            for place, offset in moved
-        ]
-    found = {
-        name: field.report.get(name) for name in ("noise_db", "azimuth_zero_deg", "position_offset_m")
-    } | {
-        "model": args.model,
-        "receivers": places,
-        "chains": chains,
-        "unexplained": wrong,
-    }
+    told = {name: field.report.get(name) for name in ("noise_db", "azimuth_zero_deg", "position_offset_m")}
+    for name, zero in (told["azimuth_zero_deg"] or {}).items():
+        lines.append(f"{name}: add {zero:.2f} degrees to its azimuths")
+    for name, moved in (told["position_offset_m"] or {}).items():
+        for place, offset in np.round(moved, 4):
+            lines.append(f"{name}: the receiver at {_rows([place])} stood off by {_rows([offset])} m")
+    for name, noise in (told["noise_db"] or {}).items():
+        lines.append(f"{name}: readings are {noise:.2f} dB from the field (standard deviation)")
+    found = {"model": args.model, "receivers": places, "chains": chains, "unexplained": wrong, **told}
     out.result("\n".join(lines), files=[args.out], **found)
 
 
