@@ -17,12 +17,8 @@ NAMES = {
     "lobby-seeds": ("benchmarks.lobby.seeds", "the main job's figures over several seeds: mean and spread"),
     "data": ("benchmarks.lobby.make_data", "regenerate data/lobby/ from nothing (hours; resumable)"),
     "paper": (
-        "benchmarks.evaluation.command",
-        "the paper's evaluation at its own size: every method, row by row",
-    ),
-    "gap": (
-        "benchmarks.evaluation.gap",
-        "RF-3DGS+ less RF-3DGS, with one of the paper's open choices changed",
+        "benchmarks.evaluation",
+        "the paper's evaluation on any data set and room: fields, networks, a ray tracer",
     ),
     "bistatic": (
         "benchmarks.bistatic",
@@ -30,13 +26,11 @@ NAMES = {
     ),
     "beams": ("benchmarks.beams", "beams chosen from the field without pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
-    "fuzz": ("benchmarks.fuzz.command", "hostile arguments and damaged files, for as long as it is told to"),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
     "relevance": ("benchmarks.relevance", "what each effect is worth, at two carriers and three roughnesses"),
-    "newrf": ("benchmarks.newrf", "rays and channels of NeWRF's conference room"),
+    "newrf": ("benchmarks.newrf", "data of the second room: NeWRF's conference room"),
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
-    "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
     "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
     "measurements": (
@@ -53,7 +47,6 @@ NAMES = {
         "benchmarks.outside",
         "measurements by others: an array's pictures, received power in a furnished flat",
     ),
-    "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""
 

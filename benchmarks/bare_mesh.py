@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,7 +14,6 @@ from benchmarks.fits import FitOptions, Fits, experiment
 from benchmarks.report import Row
 from benchmarks.runner import option
 from warprrf.device import require
-from warprrf.geometry.mesh import components, edge_pairs
 
 HELP = """\
 Fits the bistatic field on the true mesh with the names of its materials, on the same mesh without them, and on a scan
@@ -68,17 +67,6 @@ def scanned(mesh: wr.Mesh, places: np.ndarray, options: Options, seed: int) -> w
     used, faces = np.unique(fine.faces[seen], return_inverse=True)
     noise = options.error_m / np.sqrt(3.0) * r.normal(size=(len(used), 3))
     return wr.Mesh(fine.vertices[used] + noise, faces.reshape(-1, 3))
-
-
-def named_by_part(mesh: wr.Mesh, materials: Sequence[wr.Material]) -> wr.Scene:
-    """``mesh`` with a material for its floor, ceiling and walls, and one for each size of the things in it."""
-    part = components(len(mesh.faces), edge_pairs(mesh.welded_faces))
-    area = np.bincount(part, mesh.areas)
-    things = 3 + np.unique(np.round(area, 2), return_inverse=True)[1].reshape(-1) % (len(materials) - 3)
-    upward = mesh.face_normals[:, 2]
-    low = mesh.triangles[:, :, 2].max(axis=1) < mesh.center[2]
-    side = np.where(np.abs(upward) < 0.5, 2, np.where(low, 0, 1))
-    return wr.Scene(mesh, materials, np.where(part == area.argmax(), side, things[part]))
 
 
 def rows(options: Options, fits: Fits) -> Iterator[Row]:

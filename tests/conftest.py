@@ -30,3 +30,11 @@ def each_form(request, monkeypatch):
 
     made = partialmethod(Rasterizer.__init__, per_pixel=request.param == "reference")
     monkeypatch.setattr(Rasterizer, "__init__", made)
+
+
+@pytest.fixture(scope="session")
+def place(tmp_path_factory):
+    """A small room, and files of all kinds that the library makes of it."""
+    from fuzz.place import Place
+
+    return Place(tmp_path_factory.mktemp("fuzz") / "place").make()

@@ -7,7 +7,7 @@ import inspect
 import numbers
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from types import EllipsisType
 from typing import Any, TypeVar
@@ -151,6 +151,37 @@ def _number(value: object) -> float:
         return float(value) if array.ndim == 0 and array.dtype.kind in "iufO" else np.nan  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
         return np.nan
+
+
+def check_similarity(scale: object, rotation: object, shift: object) -> tuple[float, np.ndarray, np.ndarray]:
+    """What moves points ``x`` to ``scale rotation x + shift``.
+
+    Args:
+        scale: positive number.
+        rotation: shape ``(3, 3)``; None for none.
+        shift: shape ``(3,)`` [m].
+
+    Raises:
+        TypeError, ValueError: for a scale that is not positive, or a matrix that is no rotation.
+    """
+    turn = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
+        raise ValueError(f"rotation: got {turn.tolist()}, expected a rotation: orthonormal, not mirrored")
+    return check_positive("scale", scale), turn, check_array("shift", shift, (3,))
+
+
+def users_level() -> int:
+    """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
+    frame, level = inspect.currentframe(), 0
+    while frame is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "warprrf":
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def some_of(rows: Sequence[int] | np.ndarray, most: int = 8) -> str:
+    """Rows of a table, for a message: the first ones and how many more."""
+    told = ", ".join(str(int(row)) for row in rows[:most])
+    return told + f" and {len(rows) - most} more" * (len(rows) > most)
 
 
 LARGEST_M = 1e8
@@ -391,11 +422,11 @@ def _as_object(kind: type, value: object) -> object:
 
 
 def one_line(self: Any) -> str:
-    """The ``__repr__`` of a dataclass of arrays: their shapes, other values as they are, None left out."""
+    """The ``__repr__`` of a dataclass of arrays: shapes of all but short ones, other values as they are, None left out."""
     parts = []
     for field in fields(self):
         value = getattr(self, field.name)
-        if hasattr(value, "shape") and np.prod(value.shape) > 3:
+        if hasattr(value, "shape") and (np.size(value) > 3 or np.ndim(value) > 1 or len(repr(value)) > 40):
             parts.append(f"{field.name} {tuple(value.shape)}")
         elif value is not None and len(text := repr(value)) <= 60:
             parts.append(f"{field.name}={text}")

@@ -20,8 +20,8 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -53,16 +53,25 @@ def write_atomically(
     """
     partial = partial_path(path)
     try:
-        write(partial)
-        if seal:
-            end_with_seal(partial)
-        os.replace(partial, path)
-    except OSError as error:
-        if error.errno is not None and error.filename in (None, str(partial)):
-            error.filename, error.filename2 = os.fspath(path), None
-        raise
+        with naming(path, partial):
+            write(partial)
+            if seal:
+                end_with_seal(partial)
+            os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: str | os.PathLike[str], partial: Path) -> Iterator[None]:
+    """What the system refuses of ``partial`` is said of ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename in (None, str(partial)):
+            error.filename = os.fspath(path)
+            del error.filename2
+        raise
 
 
 def end_with_seal(path: Path) -> None:

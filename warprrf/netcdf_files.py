@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import fcntl
 import io
+import json
 import math
 import os
-from collections.abc import Callable, Mapping
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -19,10 +22,12 @@ from typing import IO, Any
 import numpy as np
 
 from warprrf.device import require
-from warprrf.files import MOST_INFLATED, check_seal, end_with_seal, partial_path, write_bytes
+from warprrf.files import MOST_INFLATED, check_seal, end_with_seal, naming, partial_path, write_bytes
 
 _CHUNK_BYTES = 2_000_000  # of packed variables, several rows to a chunk
-_FINISHED = "finished"  # variable of a store: which rows are there
+# A store's rows are followed by the CRC-32 of each, 0 where it is not there, and a line that says where they are.
+_SUMS = "checksums"
+_LINE, _MOST_LINE = b"\nwarprrf rows ", 1 << 16
 _SAME_PLACE = 1e-6  # of coordinates, in their unit
 
 
@@ -134,8 +139,8 @@ class Store:
     """A NetCDF-4 file whose arrays are filled row by row, as a context manager: whole or not there.
 
     HDF5 lays it out with the first rows, as ``NAME.unfinished``; rows are then written past it into their places, so that a
-    kill leaves the file sound and a full disk is an error of the system's. Who comes again goes on; with the last row it
-    is sealed and gets its name. One process at a time works on it.
+    kill leaves the file sound and a full disk is an error of the system's. Who comes again goes on: rows whose checksums do
+    not fit are missing. With the last row it is sealed and gets its name. One process at a time works on it.
 
     Args:
         path: of the file.
@@ -148,6 +153,7 @@ class Store:
         missing: which rows are not there yet, shape ``(count,)``.
 
     Raises:
+        OSError: naming the file, if the system does not take it.
         ValueError: naming ``path``, on entering: for a file of another key, none of these, a damaged one, or one that
             another process is at work on.
     """
@@ -164,24 +170,36 @@ class Store:
         self._known, self._variables, self._attributes = known, variables, attributes
         self.missing = np.ones(count, bool)
         self._places: dict[str, tuple[int, Room]] = {}
+        self._rest = 0
         self._file: IO[bytes] | None = None
 
     def __enter__(self) -> Store:
-        if self.path.exists():
-            if not check_seal(self.path):
-                raise ValueError(f"store: {self.path} is no finished store; name another file, or remove it")
-            self._find(self.path)
-            self.missing[:] = False
-        elif self._unfinished.exists():
-            self._find(self._unfinished)
-            self._open(self._unfinished)
-            self.missing = self._mapped(self._unfinished, _FINISHED) == 0
+        while not self.path.exists():
+            try:
+                self._open(self._unfinished)
+            except FileNotFoundError:
+                if not self.path.exists():
+                    return self
+                continue
+            with ExitStack() as opened:
+                opened.enter_context(self._stream)
+                # Another process may have finished it since: then it is no longer what the name stands for.
+                if self._is_named(self._unfinished):
+                    self._find(self._unfinished)
+                    self.missing = ~self._sound_rows()
+                    opened.pop_all()
+                    return self
+            self._file = None
+        if not check_seal(self.path):
+            raise ValueError(f"store: {self.path} is no finished store; name another file, or remove it")
+        self._find(self.path)
+        self.missing[:] = False
         return self
 
     def __exit__(self, kind: object, *error: object) -> None:
         if self._file is None:
             return
-        with self._file:
+        with naming(self.path, self._unfinished), self._file:
             if kind is None and not self.missing.any():
                 end_with_seal(self._unfinished)
                 os.replace(self._unfinished, self.path)
@@ -190,26 +208,31 @@ class Store:
         """Write ``rows`` (K,) of every array, ``(K, ...)`` each; they count once they are on the disk."""
         if self._file is None:
             self._lay_out(arrays)
-        for held in arrays, {_FINISHED: np.ones(len(rows), np.int8)}:
-            for name, array in held.items():
-                place, room = self._places[name]
-                values = np.ascontiguousarray(array, room.dtype)
-                for row, value in zip(rows.tolist(), values, strict=True):
-                    self._stream.seek(place + row * value.nbytes)
+        values = {n: np.ascontiguousarray(arrays[n], self._places[n][1].dtype) for n in self._row_names}
+        values[_SUMS] = np.array([_row_sum(row) for row in zip(*values.values(), strict=True)], np.uint32)
+        with naming(self.path, self._unfinished):
+            for name, array in values.items():
+                for row, value in zip(rows.tolist(), array, strict=True):
+                    self._stream.seek(self._places[name][0] + row * value.nbytes)
                     self._stream.write(value.tobytes())
             self._stream.flush()
             os.fsync(self._stream.fileno())
         self.missing[rows] = False
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of the finished file, which stay on the disk."""
-        return {name: self._mapped(self.path, name) for name in self._places}
+        """The arrays of the finished file that rows were written of, which stay on the disk."""
+        return {name: self._mapped(self.path, name) for name in self._row_names}
 
     @property
     def _stream(self) -> IO[bytes]:
         if self._file is None:
             raise RuntimeError("a store is written within its with statement")
         return self._file
+
+    @property
+    def _row_names(self) -> list[str]:
+        """Names of the arrays that rows are written of."""
+        return sorted(self._places.keys() - {_SUMS})
 
     def _mapped(self, path: Path, name: str) -> np.ndarray:
         place, room = self._places[name]
@@ -218,18 +241,29 @@ class Store:
     def _lay_out(self, arrays: Mapping[str, np.ndarray]) -> None:
         count = len(self.missing)
         rooms: dict[str, Any] = {n: Room((count, *a.shape[1:]), a.dtype) for n, a in arrays.items()}
-        rooms |= {**self._known, _FINISHED: Room((count,), np.dtype(np.int8))}
-        variables = {
-            **self._variables,
-            _FINISHED: Variable((self._variables[next(iter(arrays))].dimensions[0],)),
-        }
         partial = partial_path(self._unfinished)
         try:
-            with require("h5netcdf", extra="all").File(partial, "w") as file:
-                _fill(file, rooms, variables, {}, self._attributes)
-            self._find(partial)
-            self._open(partial)  # and lock it, before anybody sees it
-            os.link(partial, self._unfinished)
+            with naming(self.path, partial):
+                with _FirstFailure(partial, "w+") as stream:
+                    with require("h5netcdf", extra="all").File(stream, "w") as file:
+                        _fill(file, rooms | dict(self._known), self._variables, {}, self._attributes)
+                    if stream.failure is not None:
+                        raise stream.failure
+                with require("h5py", extra="all").File(partial, "r", locking=False) as file:
+                    self._places = {n: (file[n].id.get_offset(), room) for n, room in rooms.items()}
+                self._open(partial)  # and lock it, before anybody sees it
+                end = self._stream.seek(0, os.SEEK_END)
+                self._places[_SUMS] = end, Room((count,), np.dtype(np.uint32))
+                held = {
+                    n: (place, room.shape, np.dtype(room.dtype).str)
+                    for n, (place, room) in self._places.items()
+                }
+                told = {"key": self._attributes["key"], "places": held, "rest": self._sum_of_rest()}
+                line = json.dumps(told).encode()
+                self._stream.seek(end)
+                self._stream.write(bytes(4 * count) + _LINE + line + b" %08x\n" % zlib.crc32(line))
+                self._stream.flush()
+                os.link(partial, self._unfinished)
         except FileExistsError as error:
             raise ValueError(f"store: another process is at work on {self.path}; wait for it") from error
         finally:
@@ -240,28 +274,88 @@ class Store:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
+            self._file.close()
             raise ValueError(f"store: another process is at work on {self.path}; wait for it") from error
 
+    def _is_named(self, path: Path) -> bool:
+        """Whether ``path`` is the name of the file that is open."""
+        return path.exists() and os.path.samestat(os.fstat(self._stream.fileno()), path.stat())
+
     def _find(self, path: Path) -> None:
-        """Where rows are in a file that was laid out."""
-        h5py = require("h5py", extra="all")
-        try:
-            with h5py.File(path, "r", locking=False) as file:
-                same = (
-                    file.attrs.get("key") == self._attributes["key"]
-                    and file[_FINISHED].shape == self.missing.shape
-                )
-                for name, held in file.items():
-                    place = held.id.get_offset() if isinstance(held, h5py.Dataset) else None
-                    if place is not None:
-                        self._places[name] = place, Room(held.shape, held.dtype)
-        except (OSError, KeyError) as error:
-            raise ValueError(f"store: {path} is no store of ours: {error}; name another file") from error
-        if not same:
+        """Where rows are in a file that was laid out, by the line behind what is HDF5's, which no damage gets past."""
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - _MOST_LINE, 0))
+            line, _, digest = file.read().rpartition(_LINE)[2].partition(b"\n")[0].rpartition(b" ")
+        if digest != b"%08x" % zlib.crc32(line):
+            raise ValueError(
+                f"store: {path} is damaged, or no store of ours; name another file, or remove it"
+            )
+        told = json.loads(line)
+        if told["key"] != self._attributes["key"]:
             raise ValueError(
                 f"store: {path} holds answers of another field, other places or other options; name another file, or "
                 "remove it"
             )
+        self._places = {
+            n: (at, Room(tuple(s), np.dtype(kind))) for n, (at, s, kind) in told["places"].items()
+        }
+        self._rest = told["rest"]
+
+    def _sound_rows(self) -> np.ndarray:
+        """Which rows of the open file are there as they were written, shape ``(count,)`` bool.
+
+        Raises:
+            ValueError: if the rest of the file is not as it was laid out.
+        """
+        if self._rest != self._sum_of_rest():
+            raise ValueError(f"store: {self._unfinished} was damaged; remove it, and begin anew")
+        rows = zip(*(self._mapped(self._unfinished, n) for n in (_SUMS, *self._row_names)), strict=True)
+        return np.array([known > 0 and known == _row_sum(values) for known, *values in rows])
+
+    def _sum_of_rest(self) -> int:
+        """Checksum of what is HDF5's in the open file but for the places of rows."""
+        total, at = 0, 0
+        for place, room in sorted(self._places.values(), key=lambda one: one[0]):
+            self._stream.seek(at)
+            total = zlib.crc32(self._stream.read(place - at), total)
+            at = place + math.prod(room.shape) * np.dtype(room.dtype).itemsize
+        return total
+
+
+def _row_sum(values: Iterable[np.ndarray]) -> int:
+    """Checksum of one row of every array; never 0, which stands for none."""
+    total = 0
+    for value in values:
+        total = zlib.crc32(value.tobytes(), total)
+    return total or 1
+
+
+class _FirstFailure(io.FileIO):
+    """A file that keeps what the system first refused for later: HDF5 does not survive it.
+
+    Attributes:
+        failure: that, or None.
+    """
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        """As much as the system takes; all is said to be written."""
+        left = memoryview(data).cast("B")
+        try:
+            while len(left) and self.failure is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.failure = error
+        return memoryview(data).nbytes
+
+    def truncate(self, size: int | None = None) -> int:
+        """The size asked for, if the system takes it."""
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+        return self.tell() if size is None else size
 
 
 def read(

@@ -7,12 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from places import LOBBY
+from radio_scenes import box_mesh
+from scipy.spatial.transform import Rotation
 from told import check_told
 from views import look
 
 import warprrf as wr
 from warprrf import tensor_files
 from warprrf.geometry import pipeline as from_photos
+from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos import sparse
 from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
 from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
@@ -359,6 +362,50 @@ def test_splats_alone_say_what_they_lack_when_it_is_needed(splats):
         _ = rec.mesh
     with pytest.raises(FileNotFoundError):
         Reconstruction.from_files(splats / "none.ply")
+
+
+@pytest.fixture
+def seen():
+    """Gaussians of every degree on a box, its patches, and three cameras."""
+    rng = np.random.default_rng(0)
+    box = planar_patches(Mesh(*box_mesh([0, 0, 0], [2, 3, 1])))
+    splats = discs_on_mesh(box.mesh, 300)
+    splats = replace(
+        splats,
+        sh=0.2 * rng.standard_normal((len(splats), 16, 3)),
+        scales=[0.09, 0.05, 0.02] + 0 * splats.scales,
+    )
+    cameras = {f"{k}.jpg": look([4 + k, 3 - 2 * k, 1 + k * k], [1, 1.5, 0.5]) for k in range(3)}
+    return Reconstruction(
+        splats, box.mesh, cameras, patches=box, guessed=("scale: nobody measured one", "plain")
+    )
+
+
+def test_a_moved_reconstruction_looks_the_same_from_its_moved_cameras(seen):
+    turn = Rotation.from_rotvec([0.3, -0.8, 1.9]).as_matrix()
+    moved = seen.transformed(scale=2.5, rotation=turn, shift=[3.0, -1.0, 0.5])
+    for name, camera in seen.cameras.items():
+        before, after = wr.render(seen.gaussians, camera), wr.render(moved.gaussians, moved.cameras[name])
+        assert before.alpha.max() > 0.9
+        np.testing.assert_allclose(after.features, before.features, atol=2e-4)
+        np.testing.assert_allclose(after.depth, 2.5 * before.depth, rtol=1e-4)
+    for normal, offset, patch in zip(moved.patches.normal, moved.patches.offset, range(6), strict=True):
+        corners = moved.mesh.triangles[moved.patches.face_patch == patch]
+        np.testing.assert_allclose(corners @ normal, offset, atol=1e-9)
+    np.testing.assert_allclose(moved.patches.area.sum(), moved.mesh.areas.sum())
+    with pytest.raises(ValueError, match=r"rotation.*mirrored"):
+        seen.transformed(rotation=np.diag([1, 1, -1]))
+
+
+def test_surveyed_cameras_bring_a_reconstruction_into_their_frame(seen):
+    turn = Rotation.from_rotvec([0.0, 0.0, 1.1]).as_matrix()
+    back = seen.transformed(scale=0.4, rotation=turn, shift=[9, 9, 9]).aligned(
+        {name: camera.position for name, camera in seen.cameras.items()}
+    )
+    np.testing.assert_allclose(back.mesh.vertices, seen.mesh.vertices, atol=1e-9)
+    assert back.metric and back.scale_rms_m < 1e-9 and back.guessed == ("plain",)
+    with pytest.raises(ValueError, match=r"known_positions: got 2"):
+        seen.aligned({"0.jpg": (0, 0, 0), "1.jpg": (1, 0, 0)})
 
 
 def test_plane_axes_are_a_right_handed_frame():

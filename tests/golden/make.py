@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 
 import warprrf as wr
-from benchmarks.reflections import fit_reflections
 
 HERE = Path(__file__).parent
 LOBBY = HERE.parent.parent / "data" / "lobby"
@@ -462,21 +461,6 @@ def band_plan() -> Values:
     return {
         "numbers": (numbers, BITS),
         "values": ([[v for v in vars(c).values() if isinstance(v, float)] for c in plan], FLOAT64),
-    }
-
-
-@case
-def reflections() -> Values:
-    mesh = room_mesh()[0]
-    receivers = places(6)
-    paths = wr.trace_paths(
-        room(), transmitter=TRANSMITTER, receivers=receivers, frequency_hz=3e9, mirror_order=1
-    )
-    csi = np.where(paths.valid, paths.gain, 0).sum(axis=1)
-    fitted = fit_reflections(mesh, TRANSMITTER, receivers, csi, 3e9, order=1)
-    return {
-        "csi": (csi, Check(rtol=1e-6)),
-        "predicted": (fitted.predict(receivers), Check(rtol=1e-4, atol=1e-7)),
     }
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from rays_by_definition import met
 from scipy.special import spence
 
 from warprrf.geometry.splats.camera import Camera
@@ -38,26 +39,11 @@ def pinhole(width=33, height=33, *, focal=30.0, position=ORIGIN):
     )
 
 
-def alpha_of_one(g, cam, blending, dtype=np.longdouble):
-    """Alpha of a single Gaussian on every ray, by its definition: the response at the ray's closest approach."""
-    d = cam.directions().astype(dtype)
-    d /= np.sqrt(np.sum(d * d, axis=-1, keepdims=True))
-    q = g.quaternions[0].astype(dtype)
-    w, x, y, z = q / np.sqrt(np.sum(q * q))
-    r = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    whiten = r.T / g.scales[0].astype(dtype)[:, None]
-    m = g.means[0].astype(dtype) - cam.position.astype(dtype)
-    a, b = d @ whiten.T, whiten @ m
-    t = a @ b / np.sum(a * a, axis=-1)
-    distance2 = np.sum((a * t[..., None] - b) ** 2, axis=-1)
-    raw = dtype(g.opacities[0]) * np.exp(-distance2 / 2)
-    return np.where((raw > blending.alpha_min) & (t > 0), np.minimum(raw, blending.alpha_max), 0).astype(
-        float
-    )
+def alpha_of_one(g, cam, blending):
+    """Alpha of a single Gaussian on every ray, by its definition."""
+    t, raw, _ = met(g, cam.position, cam.directions(), np.longdouble)
+    seen = (raw > blending.alpha_min) & (t > 0)
+    return np.where(seen, np.minimum(raw, blending.alpha_max), 0).astype(float)[..., 0]
 
 
 def ours64(g, cam, blending=SMOOTH):
@@ -71,10 +57,15 @@ def ours32(g, cam, blending=SMOOTH):
     return render(g, cam, np.ones((len(g), 1)), device="cpu", blending=blending).alpha
 
 
-@pytest.mark.parametrize("scale", [0.0, -0.1, 1e-40, np.inf, np.nan], ids=str)
-def test_zero_negative_denormal_infinite_and_nan_scales_are_refused(scale):
-    with pytest.raises(ValueError, match="^scales:"):
-        gaussians([0, 0, 5.0], [0.1, scale, 0.1])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("scales", [0.1, s, 0.1]) for s in (0.0, -0.1, 1e-40, np.inf, np.nan)]
+    + [("quaternions", (0, 0, 0, 0)), ("opacities", 1.5), ("opacities", -0.1)],
+    ids=str,
+)
+def test_what_is_no_gaussian_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"^{name}:"):
+        gaussians([0, 0, 5.0], **({"scales": [0.1] * 3} | {name: value}))
 
 
 def test_the_smallest_scales_accepted_are_seen_by_the_ray_through_them_alone():
@@ -87,12 +78,7 @@ def test_the_smallest_scales_accepted_are_seen_by_the_ray_through_them_alone():
             assert np.allclose(seen, expected, atol=1e-6), (scale, alpha)
 
 
-def test_a_zero_quaternion_is_refused():
-    with pytest.raises(ValueError, match="^quaternions:"):
-        gaussians([0, 0, 5.0], [0.1] * 3, quaternions=(0, 0, 0, 0))
-
-
-@pytest.mark.parametrize("length", [1e-6, 0.5, 3.0, 1e6])
+@pytest.mark.parametrize("length", [1e-6, 1e6])
 def test_the_length_of_a_quaternion_changes_no_pixel(length):
     q = np.array([0.4, -0.2, 0.7, 0.3])
     q /= np.linalg.norm(q)
@@ -113,7 +99,7 @@ def test_the_length_of_a_quaternion_changes_no_pixel(length):
 
 
 @pytest.mark.usefixtures("device")
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_needles_of_one_to_ten_thousand(seed):
     rng = np.random.default_rng(seed)
     g = gaussians(
@@ -294,15 +280,9 @@ def test_gradients_at_opacity_zero_and_one_are_those_of_the_blend(rule):
 @pytest.mark.parametrize("count", [0, 3])
 def test_none_visible_is_the_background_and_has_no_gradient_but_the_backgrounds(count):
     raster = Rasterizer(device="cpu", real=wp.float64)
-    g = gaussians(np.full((count, 3), -50.0).reshape(count, 3), [0.1] * 3) if count else None
-    shapes = {"means": (wp.vec3d, 3), "quaternions": (wp.vec4d, 4), "scales": (wp.vec3d, 3)}
-    if g is None:
-        inputs = [wp.zeros(0, dtype=d, device="cpu", requires_grad=True) for d, _ in shapes.values()]
-        inputs.append(wp.zeros(0, dtype=wp.float64, device="cpu", requires_grad=True))
-    else:
-        inputs = list(raster.upload(g))
-        for array in inputs:
-            array.requires_grad = True
+    inputs = raster.upload(gaussians(np.full((count, 3), -50.0), [0.1] * 3))
+    for array in inputs:
+        array.requires_grad = True
     features = wp.ones((count, 2), dtype=wp.float64, device="cpu", requires_grad=True)
     background = wp.array([0.25, 0.5], dtype=wp.float64, device="cpu", requires_grad=True)
     with wp.Tape() as tape:
@@ -313,12 +293,6 @@ def test_none_visible_is_the_background_and_has_no_gradient_but_the_backgrounds(
     assert background.grad.numpy() == pytest.approx([200.0, 200.0])
     for array in (*inputs, features):
         assert (array.grad.numpy() == 0).all()
-
-
-def test_no_gaussians_at_all_render_the_background():
-    g = Gaussians(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 1, 3)))
-    out = render(g, pinhole(), background=0.5, device="cpu")
-    assert (out.features == 0.5).all() and np.isinf(out.depth).all() and (out.dominant == -1).all()
 
 
 def test_one_million_gaussians_in_a_plane_let_through_what_the_dilogarithm_says():

@@ -74,6 +74,15 @@ def square(half, z=0.0):
     return np.array(v, float), np.array([[0, 1, 2], [0, 2, 3]])
 
 
+def tube(sides, radius, height):
+    """Vertices and faces of a pillar's outside, open at its ends."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(sides)])
+    a, b = np.arange(sides), (np.arange(sides) + 1) % sides
+    faces = np.concatenate([np.column_stack([a, b, b + sides]), np.column_stack([a, b + sides, a + sides])])
+    return np.concatenate([ring, ring + [0, 0, height]]), faces
+
+
 def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, sub_pixels=6):
     """Spectra of ``receivers`` by the exact engine, as a data set."""
     engine = ExactEngine(

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
+from furnished import RECEIVERS, SHAPE, TX
+from radio_scenes import RadioScene, SlabMaterial, joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import Air
@@ -33,24 +34,10 @@ from warprrf.rf.spectra.spectrum import to_db
 
 F = 380.2e9
 WAVELENGTH = SPEED_OF_LIGHT / F
-SHAPE = (24, 48)
-TX = np.array([0.8, 0.9, 2.2])
 AIR = Air()
 LOSS = AIR.attenuation_db_per_m(F)  # dB a metre
-RECEIVERS = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
-     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0]]
-)  # fmt: skip
+RECEIVERS = RECEIVERS[:8]
 BLOCKED, SEEN = RECEIVERS[0], RECEIVERS[4]
-
-
-@pytest.fixture(scope="module")
-def scene() -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4)
-    return RadioScene(mesh, part, [walls, SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)])
 
 
 def spectra(scene: RadioScene, **options: object) -> SpectrumDataset:
@@ -79,12 +66,6 @@ def engine(scene: RadioScene, gas: object) -> ExactEngine:
 
 
 # ------------------------------------------------------------------------------------------------ simulate
-
-
-def test_transmittance_is_attenuation_over_a_length() -> None:
-    assert 0.29 < LOSS < 0.31
-    assert AIR.transmittance(F, 3.0) == pytest.approx(10.0 ** (-0.3 * LOSS), rel=1e-12)
-    assert np.exp(-AIR.loss_per_m(F) * 3.0) == pytest.approx(10.0 ** (-0.3 * LOSS), rel=1e-12)
 
 
 def test_line_of_sight_is_friis_times_gas_and_mirrors_have_their_images_length(scene: RadioScene) -> None:
@@ -123,13 +104,6 @@ def test_off_is_off_and_files_say_which(
     np.testing.assert_array_equal(spectra(scene, gas=thick, **some).path_gain, on.path_gain)
     on.save(tmp_path / "on.nc")
     assert SpectrumDataset.load(tmp_path / "on.nc").air == thick == on.subset([1, 0]).air
-
-
-def test_a_carrier_that_the_recommendation_does_not_know_is_refused(scene: RadioScene) -> None:
-    with pytest.raises(ValueError, match="frequency_hz: got 2000000000000"):
-        simulate(scene, transmitter=TX, receivers=[SEEN], frequency_hz=2e12, shape=SHAPE, gas=True)
-    with pytest.raises(TypeError, match="gas: got str"):
-        spectra(scene, gas="standard")
 
 
 def test_sionnas_paths_lose_by_their_delay(tmp_path: Path) -> None:

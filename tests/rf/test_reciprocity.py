@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from furnished import RECEIVERS, TX, F, furnished, spectra
+from radio_scenes import RadioScene, SlabMaterial
 from twin_fields import known_field
 
 from warprrf.rf import exact
@@ -20,24 +21,20 @@ from warprrf.rf.fields.bistatic.rays import Illumination, RayGrid
 from warprrf.rf.fields.bistatic.scattering import resolve, scatter
 from warprrf.rf.fields.bistatic.surface import Surface
 
-F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F
-TX, RX = np.array([0.8, 0.9, 2.2]), np.array([4.2, 3.1, 1.2])
+RX = RECEIVERS[0]
 MATERIALS = [
     SlabMaterial("walls", 3.0, 0.5, 0.02, 0.5, "directive", 12),
     SlabMaterial("block", 6.0, 0.5, np.inf, 0.8),
 ]
 
 
-def furnished(*, reciprocal: bool) -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    return RadioScene(mesh, part, [replace(m, reciprocal=reciprocal) for m in MATERIALS])
+def room(*, reciprocal: bool) -> RadioScene:
+    return furnished(*(replace(m, reciprocal=reciprocal) for m in MATERIALS))
 
 
 def engine(transmitter: np.ndarray, *, reciprocal: bool) -> ExactEngine:
-    scene = furnished(reciprocal=reciprocal)
+    scene = room(reciprocal=reciprocal)
     return ExactEngine(scene, transmitter=transmitter, frequency_hz=F, shape=(60, 120))
 
 
@@ -138,30 +135,6 @@ def test_the_exact_engines_diffuse_power_is_the_same_both_ways():
     assert abs(there / back - 1.0) > 0.03
 
 
-def test_every_path_of_the_exact_engine_follows_the_reciprocal_formula():
-    found = engine(TX, reciprocal=True).diffuse(RX)
-    mesh, scene = furnished(reciprocal=True).mesh, furnished(reciprocal=True)
-    face = mesh.cast(np.tile(RX, (len(found.index), 1)), found.direction).face
-    normal, point = mesh.face_normals[face], RX + found.range_m[:, None] * found.direction
-    d1 = np.linalg.norm(TX - point, axis=1)
-    toward = (TX - point) / d1[:, None]
-    cos_i, cos_s = (normal * toward).sum(axis=1), -(normal * found.direction).sum(axis=1)
-    cos_mirror = 2.0 * cos_i * cos_s + (toward * found.direction).sum(axis=1)
-    omega = exact._sub_pixel_grid((60, 120), exact.SUB_PIXELS, "cpu").solid_angles[found.index]
-    expected = (WAVELENGTH / (4.0 * np.pi * d1)) ** 2 * omega * cos_i
-    for k, m in enumerate(scene.materials):
-        own = scene.face_material[face] == k
-        gamma = 0.25 * sum(
-            np.abs(r) ** 2
-            for cosine in (cos_i[own], cos_s[own])
-            for r in slab_reflection(cosine, m.permittivity(F), m.thickness_m, WAVELENGTH)
-        )
-        alpha = m.alpha_r if m.pattern == "directive" else 0
-        f_s = lobe(alpha, cos_i[own], cos_s[own], cos_mirror[own], reciprocal=True)
-        expected[own] *= m.scattering**2 * gamma * f_s / cos_s[own]
-    np.testing.assert_allclose(found.power, expected, rtol=1e-5)
-
-
 # ---------------------------------------------------------------------------------------------------------- fields
 
 LOBES = Terms(lobes=(0, 4, 30), reciprocal=True)
@@ -170,7 +143,7 @@ WEIGHT, EXCESS = np.array([[0.1, 0.2, 0.3], [0.3, 0.1, 0.05]]), np.log([2.0, 5.0
 
 def test_scattering_of_a_field_takes_both_ends_alike():
     # Rays with a unit of light, then the same with the two cosines exchanged: equal to the bit.
-    surface = Surface.of(furnished(reciprocal=False))
+    surface = Surface.of(room(reciprocal=False))
     rng = np.random.default_rng(4)
     a, b, mirror = rng.uniform(0.0, 1.0, 4000), rng.uniform(0.0, 1.0, 4000), rng.uniform(-1.0, 1.0, 4000)
     face = wp.array(rng.integers(0, len(surface.group), 4000), dtype=wp.int32)
@@ -186,7 +159,7 @@ def test_scattering_of_a_field_takes_both_ends_alike():
 
 
 def test_a_field_gives_each_element_the_same_both_ways():
-    surface = Surface.of(furnished(reciprocal=False))
+    surface = Surface.of(room(reciprocal=False))
     grid = RayGrid(surface, (24, 48), 1)
     first = grid.hit(RX)
     ray = np.flatnonzero((first.face.numpy() >= 0) & (grid.light(first, TX).strength.numpy() > 0))
@@ -218,7 +191,7 @@ def test_a_fields_scattered_power_is_the_same_both_ways():
 
 
 def test_what_a_fit_sees_is_what_the_field_gives():
-    surface = Surface.of(furnished(reciprocal=False))
+    surface = Surface.of(room(reciprocal=False))
     grid = RayGrid(surface, (24, 48), 2)
     hits = grid.hit(RX)
     light = grid.light(hits, TX)
@@ -235,10 +208,8 @@ def test_what_a_fit_sees_is_what_the_field_gives():
 
 
 def test_a_fit_takes_reciprocal_lobes_and_its_file_says_so(tmp_path):
-    scene, shape, sigma = furnished(reciprocal=True), (20, 40), np.radians(6.0)
-    ds = exact_spectra(
-        scene, np.array([RX, [3.6, 3.3, 2.1]]), transmitter=TX, frequency_hz=F, shape=shape, sigma=sigma, sub_pixels=4
-    )  # fmt: skip
+    scene = room(reciprocal=True)
+    ds = spectra(scene, RECEIVERS[[0, 5]], shape=(20, 40), sub_pixels=4)
     field = RadioField.fit(scene, ds, quick=True, reciprocal=True)
     field.save(tmp_path / "field.safetensors")
     again = RadioField.load(tmp_path / "field.safetensors")

@@ -1,11 +1,10 @@
 """How real photos go in: bent by a lens, turned, of several cameras, masked, larger than needed."""
 
-import json
-
 import numpy as np
 import pytest
 from bent_photos import bent
 from places import LOBBY
+from views import lobby_cameras
 
 from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -26,11 +25,6 @@ pytest.importorskip("pycolmap")
 FOCAL, K1 = 395.0, -0.12
 BENT, TURNED = [f"view_{k:03d}.jpg" for k in range(10)], "view_009.jpg"
 ORIENTATION, MAKER, MODEL = 0x0112, 0x010F, 0x0110
-
-
-def truth(names):
-    views = json.loads((LOBBY / "poses_true.json").read_text())["views"]
-    return {n: np.array(views[n]["world_to_camera"]) for n in names}
 
 
 def save(path, pixels, orientation=1, camera=None):
@@ -62,11 +56,8 @@ def through_a_lens(tmp_path_factory):
     mask[:, : width // 3] = 0
     Image.fromarray(mask).save(folder / "view_005.mask.png")
     work = tmp_path_factory.mktemp("work")
-    return (
-        folder,
-        work,
-        sfm.structure_from_motion(folder, workspace=work, config=ReconstructionConfig(max_features=1500)),
-    )
+    found = sfm.structure_from_motion(folder, workspace=work, config=ReconstructionConfig(max_features=1500))
+    return folder, work, found
 
 
 # ------------------------------------------------------------------------------------------- lens
@@ -80,13 +71,12 @@ def test_the_lens_is_found(through_a_lens):
 
 
 def test_poses_through_a_lens_agree_with_the_truth(through_a_lens):
-    sparse, poses = through_a_lens[2], truth(BENT)
+    sparse, true = through_a_lens[2], lobby_cameras(BENT)
     assert set(sparse.cameras) == set(BENT)
-    known = {n: -p[:3, :3].T @ p[:3, 3] for n, p in poses.items()}
-    aligned = align_to_known(sparse, known)
+    aligned = align_to_known(sparse, {n: camera.position for n, camera in true.items()})
     assert aligned.scale_rms_m < 0.03  # as without a lens
-    for name, pose in poses.items():  # upright all, also the one stored on its side
-        error = aligned.cameras[name].rotation @ pose[:3, :3].T
+    for name, camera in true.items():  # upright all, also the one stored on its side
+        error = aligned.cameras[name].rotation @ camera.rotation.T
         assert np.degrees(np.arccos((np.trace(error) - 1) / 2)) < 1.0
 
 
@@ -107,19 +97,6 @@ def test_undistorted_photos_show_what_the_straight_ones_do(through_a_lens):
         assert apart < 0.03 < np.abs(found - np.roll(other, 8, axis=1)).mean()
 
 
-def test_photos_without_distortion_are_taken_as_they_are(tmp_path):
-    names = BENT[:6]
-    sparse = sfm.structure_from_motion(
-        [LOBBY / "photos" / n for n in names],
-        workspace=tmp_path,
-        config=ReconstructionConfig(max_features=1000),
-    )
-    lens = sparse.lenses[names[0]]
-    assert lens.model == "SIMPLE_PINHOLE" and lens.straight
-    for name in sparse.cameras:
-        assert sparse.photos[name].read_bytes() == (LOBBY / "photos" / name).read_bytes()
-
-
 @pytest.mark.parametrize(
     "model, bends",
     [
@@ -132,12 +109,9 @@ def test_a_pixel_shows_the_direction_that_its_camera_says(model, bends, orientat
     """The undistorted photo of a picture that is a function of direction is this function of its camera's directions."""
     import pycolmap
 
-    lens = Lens(model, 160, 120, 110.0, 112.0, 78.0, 61.0, bends)
-    camera = pycolmap.Camera(model=model, width=160, height=120,
-                             params=[lens.fx] * (model in ("SIMPLE_RADIAL", "RADIAL")) + [110.0, 112.0] * (
-                                 model not in ("SIMPLE_RADIAL", "RADIAL")) + [78.0, 61.0, *bends])  # fmt: skip
-    if model in ("SIMPLE_RADIAL", "RADIAL"):
-        lens = Lens(model, 160, 120, 110.0, 110.0, 78.0, 61.0, bends)
+    focal = [110.0] if model in ("SIMPLE_RADIAL", "RADIAL") else [110.0, 112.0]
+    lens = Lens(model, 160, 120, focal[0], focal[-1], 78.0, 61.0, bends)
+    camera = pycolmap.Camera(model=model, width=160, height=120, params=[*focal, 78.0, 61.0, *bends])
     x, y = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
     direction = np.array(camera.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1)))[:, :2]
 
@@ -281,12 +255,9 @@ def test_a_mask_that_is_gone_is_forgotten(tmp_path):
     grey = np.full((480, 640), 255, np.uint8)
     grey[:20] = 0
     Image.fromarray(grey).save(mask)
-    found = sfm.structure_from_motion(
-        photos, workspace=work, config=ReconstructionConfig(max_features=1000, lens="SIMPLE_PINHOLE")
-    )
+    config = ReconstructionConfig(max_features=1000, lens="SIMPLE_PINHOLE")
+    found = sfm.structure_from_motion(photos, workspace=work, config=config)
     np.testing.assert_array_equal(read_mask(found.photos["view_001.jpg"]), grey == 0)
     mask.unlink()
-    again = sfm.structure_from_motion(
-        photos, workspace=work, config=ReconstructionConfig(max_features=1000, lens="SIMPLE_PINHOLE")
-    )
+    again = sfm.structure_from_motion(photos, workspace=work, config=config)
     assert read_mask(again.photos["view_001.jpg"]) is None

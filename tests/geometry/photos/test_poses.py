@@ -91,20 +91,9 @@ def test_an_angle_of_view_tells_the_focal_length(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"frames": 3}, '"frames"'),
-        ({"frames": [3]}, r"frames\[0\]"),
-        ({"frames": [{"file_path": 7}]}, r"file_path of frames\[0\]"),
         ({"frames": frames()[:1] * 2}, "comes twice"),
-        ({"fl_x": -1.0}, "fl_x"),
-        ({"fl_x": "wide"}, "fl_x"),
-        ({"w": 1e9}, "w: got"),
-        ({"w": 640.5}, "w: got"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model"),
         ({"k4": 0.1}, "k4"),
-        (
-            {"frames": [frames()[0] | {"transform_matrix": [[1, 2], [3, 4]]}]},
-            r"frames\[0\] \(images/view_000.jpg\)",
-        ),
         ({"frames": [frames()[0] | {"transform_matrix": (2 * np.eye(4)).tolist()}]}, "last is 0 0 0 1"),
         ({"frames": [frames()[0] | {"transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}]}, "rigid"),
         ({"frames": [frames()[0] | {"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}]}, "mirrors"),
@@ -117,17 +106,6 @@ def test_bad_transforms_are_named(tmp_path, change, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
         read_poses(written(tmp_path, **change))
     assert "transforms.json" in str(caught.value) or "none.png" in str(caught.value)
-
-
-def test_numbers_that_are_none_and_files_that_are_none_are_named(tmp_path):
-    path = written(tmp_path)
-    path.write_text(path.read_text().replace("395.0", "NaN", 1))
-    with pytest.raises(ValueError, match="finite"):
-        read_poses(path)
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        read_poses(tmp_path / "other.json")
-    with pytest.raises(ValueError, match=r"neither a COLMAP model .* nor NAME\.pose\.txt"):
-        read_poses(tmp_path)
 
 
 def test_frames_are_matched_with_photos_by_as_much_of_their_names_as_it_takes(tmp_path):
@@ -242,31 +220,20 @@ def test_depth_of_frames_that_tell_it_is_found(rgbd, tmp_path):
     np.testing.assert_allclose(read_depth(depth), 2 * read_depth(once), rtol=1e-6)
 
 
-def test_bad_frames_are_named(rgbd, tmp_path):
+def test_frames_where_tracking_was_lost_are_left_out_and_bad_ones_named(rgbd, tmp_path):
     for file in [*rgbd.glob("*.pose.txt")][:3]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
     with pytest.raises(FileNotFoundError, match="camera-intrinsics.txt does not exist"):
         read_poses(tmp_path)
-    lens = tmp_path / "camera-intrinsics.txt"
-    for text, message in (
-        ("1 2 3", "3 rows of 3"),
-        ("a b c\n" * 3, "3 rows of 3"),
-        ("0 0 1\n" * 3, "fx 0 cx"),
-    ):
-        lens.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            read_poses(tmp_path)
-    lens.write_bytes((rgbd / lens.name).read_bytes())
+    (tmp_path / "camera-intrinsics.txt").write_bytes((rgbd / "camera-intrinsics.txt").read_bytes())
     (tmp_path / "lost.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
-    assert len(read_poses(tmp_path)) == 3  # tracking was lost
+    assert len(read_poses(tmp_path)) == 3
     (tmp_path / "bent.pose.txt").write_text("1 2 3 4\n" * 4)
     with pytest.raises(ValueError, match="bent.pose.txt"):
         read_poses(tmp_path)
     colour = [frame | {"depth_file_path": "colour.png"} for frame in frames()[:1]]
     image.new("RGB", (4, 3)).save(tmp_path / "colour.png")
-    with pytest.raises(
-        ValueError, match="colour.png does not read as a depth image: got an image of mode RGB"
-    ):
+    with pytest.raises(ValueError, match="colour.png does not read as a depth image: .* of mode RGB"):
         read_depth(next(iter(read_poses(written(tmp_path, frames=colour)).values())).depth)
 
 

@@ -1,12 +1,12 @@
 """Structure from motion on real image files, and the similarity to metres."""
 
-import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from places import LOBBY
+from views import lobby_cameras
 
 from warprrf.geometry.photos import sfm
 from warprrf.geometry.photos.config import ReconstructionConfig
@@ -44,13 +44,7 @@ def model(rng, names="abcdefgh"):
 @pytest.fixture(scope="module")
 def lobby():
     """Ten photos of the walk, and their true positions."""
-    missing = [n for n in VIEWS if not (LOBBY / "photos" / n).is_file()]
-    assert not missing, f"the committed lobby photos are gone: {missing}"
-    views = json.loads((LOBBY / "poses_true.json").read_text())["views"]
-    truth = {}
-    for name in VIEWS:
-        pose = np.array(views[name]["world_to_camera"])
-        truth[name] = -pose[:3, :3].T @ pose[:3, 3]
+    truth = {name: camera.position for name, camera in lobby_cameras(VIEWS).items()}
     return [LOBBY / "photos" / n for n in VIEWS], truth
 
 
@@ -65,7 +59,7 @@ def posed(lobby, tmp_path_factory):
 # ------------------------------------------------------------------------------------------- similarity
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_similarity_is_recovered(seed):
     rng = np.random.default_rng(seed)
     scale, turn, shift = np.exp(rng.uniform(-3, 3)), rotation(rng), 10 * rng.standard_normal(3)
@@ -99,12 +93,6 @@ def test_no_similarity_nearby_fits_noisy_points_better():
             cost(s * (1 + 1e-2 * rng.standard_normal()), u @ vt @ r, t + 1e-2 * rng.standard_normal(3))
             > least
         )
-
-
-def test_points_on_a_line_fix_no_rotation():
-    line = np.outer(np.arange(5.0), [1, 2, 3])
-    with pytest.raises(ValueError, match="one line"):
-        fit_similarity(line, line)
 
 
 def test_alignment_moves_world_and_cameras_together():
@@ -151,12 +139,17 @@ def test_bad_surveyed_positions_are_refused():
 # ------------------------------------------------------------------------------------------- real photos
 
 
-def test_poses_of_rendered_photos_agree_with_the_truth(posed, lobby):
+def test_poses_of_rendered_photos_agree_with_the_truth_and_straight_photos_are_taken_as_they_are(
+    posed, lobby
+):
     sparse, truth = posed[1], lobby[1]
     assert set(sparse.cameras) == set(VIEWS) and sparse.unposed == ()
     aligned = align_to_known(sparse, truth)
     assert aligned.scale_rms_m < 0.03  # ten neighbouring views; the whole walk does better
     assert sparse.cameras[VIEWS[0]].fx == pytest.approx(395, rel=0.03)  # estimated from the images alone
+    assert sparse.lenses[VIEWS[0]].model == "SIMPLE_PINHOLE" and sparse.lenses[VIEWS[0]].straight
+    for photo in lobby[0]:
+        assert sparse.photos[photo.name].read_bytes() == photo.read_bytes()
 
 
 def test_a_point_projects_to_where_its_photos_saw_it(posed):
@@ -203,13 +196,13 @@ def test_other_photos_do_not_reuse_old_work(posed, lobby, tmp_path):
     shutil.copytree(posed[0], tmp_path / "w", symlinks=True)
     stages = set()
     sparse = sfm.structure_from_motion(
-        lobby[0][:9],
+        lobby[0][:6],
         workspace=tmp_path / "w",
         config=ReconstructionConfig(max_features=1500),
         progress=lambda s, d, n: stages.add(s),
     )
     assert stages == {"features", "matching", "mapping", "undistorting"}
-    assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:9])
+    assert set(sparse.cameras) | set(sparse.unposed) == set(VIEWS[:6])
 
 
 def test_why_a_photo_has_no_pose_is_said(posed):
@@ -239,12 +232,6 @@ def test_colmap_models_are_read_in_both_formats(posed, tmp_path):
     row = next(line for line in whole.splitlines() if not line.startswith("#"))
     points.write_text(whole.replace(row, " ".join(row.split()[:8])))  # a point that no photo shows
     assert len(sfm.read_colmap(tmp_path / "text").points) == len(posed[1].points) - 1
-    points.write_text(whole)
-    (tmp_path / "text" / "images.txt").write_text("1 2 three\n")
-    with pytest.raises(ValueError, match="does not read as a COLMAP model"):
-        sfm.read_colmap(tmp_path / "text")
-    with pytest.raises(ValueError, match="holds no COLMAP model"):
-        sfm.read_colmap(tmp_path)
 
 
 @pytest.mark.parametrize("at", [16, 43])  # x, and the reprojection error
@@ -257,16 +244,6 @@ def test_colmap_points_that_are_nan_are_refused(at, posed, tmp_path):
         sfm.read_colmap(folder)
 
 
-@pytest.mark.parametrize("name", ["rigs", "cameras", "frames", "images", "points3D"])
-def test_colmap_files_that_end_too_early_are_refused(name, posed, tmp_path):
-    folder = shutil.copytree(posed[0] / "sfm" / "model", tmp_path / "model")
-    whole = (folder / f"{name}.bin").read_bytes()
-    for damaged in (whole[:4], whole[: len(whole) // 2], b"\xff" * 5 + whole[5:]):
-        (folder / f"{name}.bin").write_bytes(damaged)
-        with pytest.raises(ValueError, match=rf"{name}\.bin is cut short or damaged"):
-            sfm.read_colmap(folder)
-
-
 # ------------------------------------------------------------------------------------------- bad input
 
 
@@ -275,27 +252,10 @@ def save(path, pixels):
     return path
 
 
-def test_photos_that_are_not_there_are_named(tmp_path):
-    with pytest.raises(ValueError, match="not a folder"):
-        find_photos(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match="got 0 photos"):
-        find_photos(tmp_path)
-    with pytest.raises(ValueError, match=r"2 of 2 files do not exist.*b\.jpg"):
-        find_photos([tmp_path / "a.jpg", tmp_path / "b.jpg"])
-
-
 def test_hidden_files_are_no_photos(tmp_path):
     for name in ("a.jpg", "b.png", "c.JPG", ".d.123.partial.jpg", "notes.txt"):
         (tmp_path / name).write_bytes(b"")
     assert list(find_photos(tmp_path)) == ["a.jpg", "b.png", "c.JPG"]
-
-
-def test_unreadable_photos_are_named(tmp_path, lobby):
-    good = [shutil.copy(p, tmp_path) for p in lobby[0][:3]]
-    broken = tmp_path / "broken.jpg"
-    broken.write_bytes(lobby[0][0].read_bytes()[:2000])
-    with pytest.raises(ValueError, match=r"1 of 4 files do not read as images: broken\.jpg"):
-        sfm.structure_from_motion([*good, broken], workspace=tmp_path / "w")
 
 
 def test_photos_that_unfold_to_too_many_pixels_are_named(tmp_path, lobby, monkeypatch):

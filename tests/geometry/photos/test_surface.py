@@ -13,7 +13,6 @@ from warprrf.geometry.photos.fusion import fuse_depth, range_to_depth
 from warprrf.geometry.photos.planes import Plane, detect_planes, plane_axes
 from warprrf.geometry.photos.points import clean_points, estimate_normals
 from warprrf.geometry.photos.snapping import find_patches, flattened, largest_first, simplified
-from warprrf.geometry.splats.camera import Camera
 
 pytest.importorskip("open3d")
 look = partial(views.look, width=160, height=120, f=100.0, off=(1.5, -2.0))
@@ -229,18 +228,6 @@ def test_fused_sphere():
     error = np.linalg.norm(mesh.vertices, axis=1) - radius
     assert abs(np.median(error)) < 4e-3
     assert np.percentile(np.abs(error), 95) < 0.02
-
-
-def test_bad_depth_maps_are_refused():
-    camera = look([0.0, 0, 1], [1.0, 0, 1])
-    with pytest.raises(ValueError, match="got 0 maps for 1"):
-        fuse_depth([], [camera])
-    with pytest.raises(ValueError, match=r"depths\[0\]: got shape \(3, 3\)"):
-        fuse_depth([np.ones((3, 3))], [camera])
-    with pytest.raises(ValueError, match="spherical"):
-        fuse_depth([np.ones((4, 8))], [Camera.spherical(8, 4, position=[0, 0, 0])])
-    with pytest.raises(ValueError, match="no surface"):
-        fuse_depth([np.full((120, 160), np.inf)], [camera])
 
 
 # ------------------------------------------------------------------------------------------------ patches

@@ -62,10 +62,9 @@ def test_the_lobby_stands_upright_on_its_floor_in_metres_without_survey(lobby, l
 
 def test_vertical_edges_say_where_up_is(lost, lobby):
     up, proven = vertical_of_edges(lost.cameras, read)
-    scale, rotation, _ = sparse.fit_similarity(*(
-        np.array([c.position for c in m.cameras.values()]) for m in (lobby, lost)
-    ))  # fmt: skip
-    assert proven and np.degrees(np.arccos(up @ rotation[:, 2])) < 1.0
+    mine, true = (np.array([c.position for c in model.cameras.values()]) for model in (lost, lobby))
+    turned = sparse.fit_similarity(mine, true)[1] @ up
+    assert proven and np.degrees(np.arccos(turned[2])) < 1.0
 
 
 def test_what_photos_do_not_show_is_said_to_be_guessed(lost):

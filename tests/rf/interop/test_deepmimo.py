@@ -131,10 +131,3 @@ def test_folder_without_the_package(tmp_path):
     assert set(codes[0]) == {1.0, 3.0}
     assert json.loads((folder / "params.json").read_text())["txrx_sets"]["txrx_set_1"]["num_points"] == 2
     assert not [f for f in folder.iterdir() if f.name.startswith(".")]
-
-
-def test_bad_input_is_named(tmp_path):
-    with pytest.raises(ValueError, match="folder"):
-        write_deepmimo(random_paths(2), tmp_path / "Room")
-    with pytest.raises(ValueError, match="max_paths"):
-        write_deepmimo(random_paths(2), tmp_path / "room", max_paths=0)

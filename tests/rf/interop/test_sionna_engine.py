@@ -141,15 +141,7 @@ def test_a_place_that_no_path_reaches_has_an_empty_spectrum(scene):
 
 def test_reciprocal_materials_are_refused(scene):
     sionna = sionna_or_skip()
-    materials = [replace(m, reciprocal=True) for m in scene.materials]
-    other = Scene(
-        scene.mesh,
-        materials,
-        scene.face_material,
-        face_object=scene.face_object,
-        object_names=scene.object_names,
-        xml_path=scene.xml_path,
-    )
+    other = scene.with_materials([replace(m, reciprocal=True) for m in scene.materials])
     with pytest.raises(ValueError, match="reciprocal=False"):
         sionna(other, transmitter=TX, frequency_hz=F, shape=SHAPE)
 

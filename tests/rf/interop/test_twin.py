@@ -207,6 +207,35 @@ def test_the_slab_reflects_like_a_half_space_in_single_precision_too(permittivit
         assert np.abs(np.hypot(a.real.numpy(), a.imag.numpy()) - np.abs(b)).max() < 1e-3
 
 
+@pytest.mark.parametrize("thickness", [0.4, 3.3, 40.0])
+def test_a_slabs_curve_is_the_mean_over_its_fringes(thickness):
+    cosine, _, family = twins._slabs(thickness)
+    share = (np.arange(400)[:, None] + 0.5) / 400 - 0.5
+    for k in np.flatnonzero((twins._EXCESS > 0.5) & (twins._EXCESS < 20))[::40]:
+        eta = (1 + twins._EXCESS[k]) * (1 - 1j * twins.LOSS_TANGENT)
+        fringe = 0.5 / np.sqrt(eta.real - 1 + cosine**2)
+        powers = np.abs(slab_reflection(cosine, eta, thickness + share * fringe, 1.0)) ** 2
+        np.testing.assert_allclose(10 * np.log10(powers.mean(axis=(0, 1))), family[:, k], atol=0.1)
+
+
+def test_slabs_are_as_thick_as_the_scene_or_the_caller_says_and_else_let_nothing_through(field, tmp_path):
+    assert np.isinf(field.surface.thickness_m).all()  # the room's
+    unknown = replace(field, surface=replace(field.surface, thickness_m=np.array([0.02, np.nan, np.nan])))
+    found = wr.write_twin(unknown, tmp_path / "scene")
+    assert [group.thickness_m for group in found.groups] == [0.02, np.inf]
+    assert "block/top <1>" in found.left_out[0] and "walls" not in found.left_out[0]
+    assert wr.Scene.load(found.xml).materials[0].thickness_m == pytest.approx(0.02)
+    given = wr.write_twin(unknown, tmp_path / "given", thickness_m={"block/top <1>": 0.3})
+    assert [group.thickness_m for group in given.groups] == [0.02, 0.3] and given.left_out == ()
+    unknown.save(tmp_path / "field.safetensors")
+    words = ["twin", str(tmp_path / "field.safetensors"), "-o", str(tmp_path / "cli"), "--thickness", "0.3"]
+    assert cli.main(words) == 0
+    assert [m.thickness_m for m in wr.Scene.load(tmp_path / "cli" / "scene.xml").materials] == [0.3, 0.3]
+    for wrong in ({"door": 0.1}, -1.0, {"walls": 0.0}):
+        with pytest.raises(ValueError, match="thickness_m"):
+            wr.write_twin(unknown, tmp_path / "x", thickness_m=wrong)
+
+
 def test_what_no_material_can_hold_is_said(field, tmp_path):
     assert wr.write_twin(field, tmp_path / "plain").left_out == ()
     parameters = replace(

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from path_makers import CARRIER, random_paths
 from places import LOBBY
+from sionna_room import sionna_or_skip
 
-from warprrf.rf import scene_sionna
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.interop.sionna_engine import load_sionna_scene
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.scene import Scene
+from warprrf.rf.spectra.dataset import SpectrumDataset
 
 TX = np.array([13.6, 11.2, 2.5])
 RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
@@ -18,26 +19,21 @@ RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
 
 @pytest.fixture(scope="module")
 def rt():
-    try:
-        scene_sionna.select_llvm()
-    except ImportError as error:
-        pytest.skip(str(error))
-    pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
+    sionna_or_skip()
     from warprrf.rf.scene_sionna import sionna_rt
 
     return sionna_rt()
 
 
-def solve(rt, scene, tx_array, rx_array, depth=2, diffuse=False):
+def solve(rt, scene, tx_array, rx_array, depth=2):
     loaded = load_sionna_scene(scene, frequency_hz=CARRIER)
     loaded.tx_array, loaded.rx_array = tx_array, rx_array
     loaded.add(rt.Transmitter("tx", position=TX.tolist()))
     for k, point in enumerate(RECEIVERS):
         loaded.add(rt.Receiver(f"rx{k}", position=point.tolist()))
     return rt.PathSolver(deterministic=True)(
-        loaded, max_depth=depth, samples_per_src=200_000, synthetic_array=True, diffuse_reflection=diffuse,
-        refraction=False, seed=1,
-    )  # fmt: skip
+        loaded, max_depth=depth, samples_per_src=200_000, synthetic_array=True, refraction=False, seed=1
+    )
 
 
 def element(rt, polarisation="VH"):
@@ -95,6 +91,32 @@ def test_arrays_and_patterns_are_theirs(rt, traced, pattern, polarisation):
             np.testing.assert_allclose(ours.a[r, :, 0, :, direct[0]], b, atol=2e-3 * np.abs(b).max())
 
 
+def test_paths_through_walls_and_round_edges_are_taken_too(rt):
+    """Refraction is on by default: every path's power is half that of its four coefficients, and spectra hold them all."""
+    room = rt.load_scene(rt.scene.box_one_screen)
+    room.tx_array = room.rx_array = element(rt)
+    low, high = (np.ravel(corner) for corner in (room.mi_scene.bbox().min, room.mi_scene.bbox().max))
+    places = low + (high - low) * [[0.2, 0.3, 0.6], [0.8, 0.7, 0.3], [0.3, 0.6, 0.5]]
+    room.add(rt.Transmitter("tx", position=places[0].tolist()))
+    for k in (1, 2):
+        room.add(rt.Receiver(f"rx{k}", position=places[k].tolist()))
+    theirs = rt.PathSolver()(room, max_depth=2, diffraction=True, edge_diffraction=True)
+    valid, bounces = theirs.valid.numpy()[:, 0], theirs.interactions.numpy()[:, :, 0]
+    assert {4, 8} <= set(np.unique(bounces[:, valid]))
+    ours = Paths.from_sionna(theirs, frequency_hz=3.5e9)
+    a = theirs.a[0].numpy()[:, :, 0] + 1j * theirs.a[1].numpy()[:, :, 0]
+    total = 0.5 * np.where(valid, (np.abs(a) ** 2).sum(axis=(1, 2)), 0.0).sum(axis=-1)
+    np.testing.assert_allclose(ours.power.sum(axis=1), total, rtol=1e-5)
+    assert (ours.kind == "los").any(axis=1).tolist() == [False, True]
+    ds = SpectrumDataset.from_paths(ours, shape=(30, 60), beam_sigma_rad=0.1)
+    np.testing.assert_allclose(ds.path_gain.sum(axis=(1, 2)), total, rtol=1e-5)
+    np.testing.assert_allclose(ds.receivers, places[1:], atol=1e-5)
+    assert ds.line_of_sight.tolist() == [False, True]
+    room.tx_array = element(rt, "V")
+    with pytest.raises(ValueError, match=r"scene.tx_array .* PlanarArray\(num_rows=1"):
+        Paths.from_sionna(rt.PathSolver()(room, max_depth=1), frequency_hz=3.5e9)
+
+
 def test_round_trip_changes_nothing(solved):
     both = PlanarArray(1, 1, polarisation="VH")
     back = Paths.from_sionna(solved, frequency_hz=CARRIER)
@@ -144,20 +166,6 @@ def test_channels_are_theirs(rt, solved):
     np.testing.assert_allclose((np.abs(normal) ** 2).mean(axis=(1, 3, 4, 5)), 1.0)
 
 
-def test_link_level_functions_take_them():
-    """Sionna PHY's ``cir_to_ofdm_channel`` on our impulse response."""
-    channel = pytest.importorskip(
-        "sionna.phy.channel", reason="Sionna PHY is a package of its own", exc_type=ImportError
-    )
-    s = Paths.stack([random_paths(5), random_paths(8, seed=1)]).to_sionna(
-        PlanarArray(2, 2), PlanarArray(1, 2)
-    )
-    f = channel.subcarrier_frequencies(32, 1e7)
-    h = channel.cir_to_ofdm_channel(f, *(x[None] for x in s.cir(out_type="torch")))
-    ours = s.cfr(np.asarray(f))
-    np.testing.assert_allclose(h[0].numpy(), ours, atol=1e-4 * np.abs(ours).max())
-
-
 def test_shapes_of_paths_with_and_without_diffuse_power():
     p = Paths.stack(
         [random_paths(3), Paths.concatenate([random_paths(2), random_paths(2, seed=3, kind="diffuse")])]
@@ -167,5 +175,3 @@ def test_shapes_of_paths_with_and_without_diffuse_power():
     s = p.to_sionna(PlanarArray(2, 2), PlanarArray(1, 3), diffuse="power")
     assert s.a.shape == (2, 3, 1, 4, 4) and s.tau.shape == (2, 1, 4) and s.interactions.shape == (1, 2, 1, 4)
     assert s.valid[1, 0].tolist() == [True, True, False, False] and (s.tau[1, 0, 2:] == -1).all()
-    with pytest.raises(ValueError, match="out_type"):
-        s.cir(out_type="jax")

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from damage import survey
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
 
+from warprrf.rf.paths.trace import trace_paths
 from warprrf.rf.spectra.dataset import SpectrumDataset, assign_roles
 from warprrf.rf.spectra.dataset_files import (
     COMPACT_AOD_STEP_RAD,
@@ -225,20 +226,6 @@ def test_a_file_that_states_more_than_it_can_hold_is_refused(tmp_path):
         SpectrumDataset.load(tmp_path / "a.nc")
 
 
-def test_damaged_files_are_refused(tmp_path):
-    for compact in (False, True):
-        dataset(8, (6, 12)).save(tmp_path / "a.nc", compact=compact)
-        found = survey(tmp_path / "a.nc", "file_formats:read_dataset")
-        assert found.copies == 260 and not found.changed and not found.wrong, found
-
-
-def test_damaged_exr_files_are_refused(tmp_path):
-    pytest.importorskip("OpenEXR")
-    dataset(4, (6, 12)).export_exr(tmp_path / "a.exr", 1)
-    found = survey(tmp_path / "a.exr", "file_formats:read_exr")
-    assert found.copies == 260 and not found.changed and not found.wrong, found
-
-
 def test_a_file_that_may_not_be_read_is_not_called_damaged(tmp_path):
     path = tmp_path / "a.nc"
     dataset(8).save(path)
@@ -421,6 +408,25 @@ def test_bad_choices_are_refused():
             receivers=np.zeros((0, 3)), transmitter=[0, 0, 0], frequency_hz=1e9, path_gain=np.zeros((0, 4, 8)),
             delay_s=np.zeros((0, 4, 8)), aod=np.zeros((0, 4, 8, 2)), line_of_sight=[], beam_sigma_rad=0.1, engine="x",
         )  # fmt: skip
+
+
+def test_spectra_of_paths_are_those_of_the_engine_that_finds_the_same_paths():
+    """A box of walls that scatter nothing: line of sight and single mirrors, each in the receiver's beam."""
+    mesh, part = joined(box_mesh([0, 0, 0], [5, 4, 3], inward=True))
+    scene = RadioScene(mesh, part, [SlabMaterial()])
+    ends = {"transmitter": np.array([0.8, 0.9, 2.2]), "frequency_hz": 28e9}
+    receivers = np.array([[4.2, 3.1, 1.2], [1.4, 3.4, 1.7]])
+    paths = trace_paths(scene, receivers=receivers, mirror_order=1, **ends)
+    ds = SpectrumDataset.from_paths(paths, shape=(18, 36), beam_sigma_rad=0.1)
+    wanted = exact_spectra(scene, receivers, shape=(18, 36), sigma=0.1, **ends)
+    for name in ("receivers", "transmitter", "path_gain", "delay_s", "aod", "line_of_sight", "floor"):
+        np.testing.assert_allclose(getattr(ds, name), getattr(wanted, name), rtol=1e-5, err_msg=name)
+    one = SpectrumDataset.from_paths(paths[1], shape=(18, 36), beam_sigma_rad=0.1)
+    np.testing.assert_array_equal(one.path_gain[0], ds.path_gain[1])
+    with pytest.raises(ValueError, match="paths: got ones without receiver"):
+        SpectrumDataset.from_paths(replace(paths, receiver=None))
+    with pytest.raises(ValueError, match="several transmitters"):
+        SpectrumDataset.from_paths(replace(paths, transmitter=receivers + 0.1))
 
 
 def test_a_data_set_of_no_receivers_comes_back(tmp_path):

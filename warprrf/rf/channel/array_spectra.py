@@ -53,7 +53,7 @@ class ArraySpectra:
             them, exp(-(2 pi std / lambda)^2 / 2) of their amplitude, and in power beyond: 0 for a true mesh, a wavelength
             for one that says nothing of phases.
         air: whose absorption is in the powers; None for none.
-        name: by which a report tells these readings from others.
+        name: by which a report tells these readings from others; several of one name are numbered in the order given.
 
     Raises:
         TypeError, ValueError: naming the argument.

@@ -45,7 +45,7 @@ class PathArrays:
         theta_t: Zenith of departure [rad].
         phi_t: Azimuth of departure [rad].
         vertices: Interaction points from the transmitter on [m], shape ``(..., depth, 3)``; NaN past the last.
-        kind: "los", "mirror" or "diffuse"; "" where padded.
+        kind: "los", "mirror" (of Sionna RT's also paths through walls and round edges) or "diffuse"; "" where padded.
         valid: Whether there is a path.
         jones: Polarised complex gain, shape ``(..., 2, 2)``: received over transmitted, both along zenith and azimuth
             unit vectors; NaN for paths without, None if no path has it. 0 where padded.

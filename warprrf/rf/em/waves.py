@@ -8,19 +8,21 @@ from numpy.typing import ArrayLike
 from warprrf.checks import check_alike, check_array, checked
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
-CARRIERS_HZ = (1e3, 1e16)
-"""Carriers that a field may have."""
+CARRIERS_HZ = (1e5, 1e16)
+"""What a carrier may be: a smaller number is one in megahertz or gigahertz."""
 
 
 def check_frequency(frequency_hz: ArrayLike | None) -> float:
-    """``frequency_hz`` as a positive float.
+    """``frequency_hz`` as a float.
 
     Raises:
-        ValueError: if it is not a positive finite number.
+        ValueError: if it is outside :data:`CARRIERS_HZ`.
     """
-    value = float(check_array("frequency_hz", frequency_hz, ()))
-    if value <= 0:
-        raise ValueError(f"frequency_hz: got {value!r}, expected a positive frequency in hertz")
+    value, (low, high) = float(check_array("frequency_hz", frequency_hz, ())), CARRIERS_HZ
+    if not low <= value <= high:
+        raise ValueError(
+            f"frequency_hz: got {value!r}, expected a carrier in hertz, {low:g} to {high:g} (28 GHz is 28e9)"
+        )
     return value
 
 

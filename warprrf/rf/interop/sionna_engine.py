@@ -205,16 +205,12 @@ class SionnaEngine:
         found = self.solve(receiver)
         power = found["power"]
         spread = spread_paths(found["arrival"], power, self.shape, self.beam_sigma_rad, device=self.device)
-        filled = spread.strongest >= 0
-        index = spread.strongest[filled]
-        delay_s, aod = np.full(self.shape, np.nan), np.full((*self.shape, 2), np.nan)
-        delay_s[filled], aod[filled] = found["tau"][index], found["aod"][index]
         direct, diffuse = found["bounces"] == 0, found["diffuse"]
         kinds = {"los": direct, "mirror": ~direct & ~diffuse, "diffuse": diffuse}
         return ReceivedPaths(
             path_gain=spread.path_gain,
-            delay_s=delay_s,
-            aod=aod,
+            delay_s=spread.of_strongest(found["tau"]),
+            aod=spread.of_strongest(found["aod"]),
             line_of_sight=bool(direct.any()),
             totals={kind: float(power[own].sum()) for kind, own in kinds.items()},
         )

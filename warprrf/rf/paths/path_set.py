@@ -104,17 +104,18 @@ class Paths(PathArrays):
         """Paths that Sionna RT solved, with their Jones matrices, arrays ``(R, L)``, strongest path first.
 
         Sionna's arrays must be one isotropic element of polarisation "VH" at either end, unrotated: their four
-        coefficients are the Jones matrix. The phase of ``gain`` is that of the delay alone.
+        coefficients are the Jones matrix. The phase of ``gain`` is that of the delay alone. Paths through walls and round
+        edges are "mirror" paths here: sharp, and not in line of sight.
 
         Args:
-            paths: What a ``PathSolver`` returned, with ``synthetic_array=True``.
+            paths: What a ``PathSolver`` returned, with ``synthetic_array=True`` as by default.
             frequency_hz: The scene's carrier [Hz].
             transmitter: Index of the transmitter.
             drop_repeated: Leave out specular paths that repeat another one: Sionna counts a mirror of many small
                 triangles several times.
 
         Raises:
-            ValueError: for other arrays, or paths through or round obstacles (refraction, diffraction).
+            ValueError: for other arrays.
         """
         found = sionna.from_sionna(paths, frequency_hz, transmitter, drop_repeated)
         return cls.stack([cls(**arrays) for arrays in found])

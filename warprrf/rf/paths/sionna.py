@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, checked
+from warprrf.checks import check_array, check_count, checked, one_line
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
@@ -45,6 +45,8 @@ class SionnaPaths:
         vertices: Interaction points [m], shape ``(depth, R, 1, L, 3)``; 0 where none.
         synthetic_array: True.
     """
+
+    __repr__ = one_line
 
     a: np.ndarray
     tau: np.ndarray
@@ -180,7 +182,9 @@ def from_sionna(
     real, imag = (np.asarray(part.numpy(), dtype=np.float64) for part in paths.a)
     if not paths.synthetic_array or real.shape[1] != 2 or real.shape[3] != 2:
         raise ValueError(
-            f"paths: got coefficients of shape {real.shape}, expected synthetic arrays of one 'VH' element each"
+            f"paths: got coefficients of shape {real.shape}, expected those of one isotropic element of both polarisations "
+            'at either end: set scene.tx_array and scene.rx_array to PlanarArray(num_rows=1, num_cols=1, pattern="iso", '
+            'polarization="VH") and solve with synthetic_array=True'
         )
     a = (real + 1j * imag)[:, :, transmitter]  # (R, 2, 2, L)
 
@@ -189,12 +193,6 @@ def from_sionna(
 
     valid = np.asarray(paths.valid.numpy())[:, transmitter]
     kinds = np.asarray(paths.interactions.numpy())[:, :, transmitter]
-    others = set(np.unique(kinds[:, valid]).tolist()) - {0, SPECULAR, DIFFUSE}
-    if others:
-        raise ValueError(
-            f"paths: got interactions of types {sorted(others)}, expected specular and diffuse ones alone; solve with "
-            "refraction=False and diffraction=False"
-        )
     points = np.moveaxis(np.asarray(paths.vertices.numpy(), dtype=np.float64)[:, :, transmitter], 0, -2)
     sources, targets = (np.asarray(p.numpy(), dtype=np.float64).T for p in (paths.sources, paths.targets))
     tau, angles = (

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Unpack
+from typing import Any, Protocol, Unpack, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, check_number, check_positive, check_seed, checked
+from warprrf.checks import check_array, check_count, check_positive, check_seed, checked
+from warprrf.device import DeviceLike
 from warprrf.rf.em.absorption import Air
-from warprrf.rf.em.waves import CARRIERS_HZ, SPEED_OF_LIGHT, check_frequency
+from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra import dataset_files
 from warprrf.rf.spectra.antenna import DeembedOptions, Pattern, deembed
+from warprrf.rf.spectra.levels import free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
+    DEFAULT_SHAPE,
     Spectrum,
     check_pixels,
     check_range_db,
@@ -26,6 +29,7 @@ from warprrf.rf.spectra.spectrum import (
     check_whole,
     default_floor,
     pixel_directions,
+    spread_paths,
     to_db,
 )
 
@@ -35,6 +39,25 @@ _ROLES = ("train", "test")
 USUAL_M = 10.0  # between a transmitter and a receiver in a room
 SAME_PLACE_M = 1e-3  # a spectrum measured this near is the same one
 _MOST_ATTRIBUTE_BYTES = 60_000  # HDF5 takes 64 kB
+
+
+@runtime_checkable
+class PathsLike(Protocol):
+    """Paths of one receiver, arrays ``(L,)``, or of several, ``(R, L)``: :class:`warprrf.Paths`."""
+
+    power: np.ndarray
+    arrival: np.ndarray
+    tau: np.ndarray
+    theta_t: np.ndarray
+    phi_t: np.ndarray
+    kind: np.ndarray
+    transmitter: np.ndarray | None
+    receiver: np.ndarray | None
+    frequency_hz: float | None
+    air: Air | None
+
+    def each(self) -> Iterator[PathsLike]:
+        """The paths of one receiver after another."""
 
 
 @checked
@@ -145,7 +168,11 @@ class SpectrumDataset:
         The other arguments are the attributes of those names.
 
         Raises:
-            TypeError, ValueError: naming the argument.
+            TypeError, ValueError: naming the argument; spectra that sum to as much as was sent are refused.
+
+        Warns:
+            UserWarning: naming receivers that get far more than line of sight would give; see
+                :data:`~warprrf.rf.spectra.levels.MARGIN_DB`.
         """
         gain = check_array("path_gain", path_gain, (None, None, None), dtype=np.float32, finite=False)
         if len(gain) == 0 or np.isnan(gain).all():
@@ -153,14 +180,14 @@ class SpectrumDataset:
         places = check_array("receivers", receivers, (len(gain), 3))
         source = check_array("transmitter", transmitter, (3,))
         if line_of_sight is None:
-            wavelength = SPEED_OF_LIGHT / check_frequency(frequency_hz)
-            line_of_sight = _sees(
-                places, source, gain, wavelength, check_positive("beam_sigma_rad", beam_sigma_rad)
-            )
+            frequency, beam = check_frequency(frequency_hz), check_positive("beam_sigma_rad", beam_sigma_rad)
+            line_of_sight = _sees(places, source, gain, frequency, beam)
         if (gain < 0).any():
-            raise ValueError(f"path_gain: got {gain.min()}, expected gains of at least 0")
+            raise ValueError(
+                f"path_gain: got {np.nanmin(gain)}, expected linear gains of at least 0 (of decibels, 10 ** (x / 10))"
+            )
         noise = default_floor(gain) if floor is None else check_positive("floor", floor, "linear noise floor")
-        return cls(
+        found = cls(
             receivers=receivers,
             transmitter=transmitter,
             frequency_hz=frequency_hz,
@@ -177,6 +204,66 @@ class SpectrumDataset:
             line_of_sight=line_of_sight,
             attributes={} if attributes is None else attributes,
         )
+        question_spectra(found)
+        return found
+
+    @classmethod
+    def from_paths(
+        cls,
+        paths: PathsLike,
+        *,
+        shape: tuple[int, int] = DEFAULT_SHAPE,
+        beam_sigma_rad: float = BEAM_SIGMA_RAD,
+        floor: float | None = None,
+        role: Sequence[str] | NDArray[np.str_] | None = None,
+        seed: int = 0,
+        device: DeviceLike = None,
+    ) -> SpectrumDataset:
+        """Spectra of paths: each path's gain spread by the receiver's beam; delay and departure of each pixel's strongest.
+
+        Args:
+            paths: :class:`warprrf.Paths` of one transmitter at one receiver or several, with their positions and carrier:
+                of :func:`trace_paths`, a field, or Sionna RT (:meth:`Paths.from_sionna`).
+            shape: rows and columns of a spectrum.
+            beam_sigma_rad: width of the receiver's beam.
+            floor, role, seed: as for :meth:`from_spectra`.
+            device: where paths are spread.
+
+        Raises:
+            ValueError: for paths without positions or carrier, or of several transmitters.
+
+        Example::
+
+            paths = wr.trace_paths(scene, transmitter=tx, receivers=places, frequency_hz=28e9, mirror_order=2)
+            ds = wr.SpectrumDataset.from_paths(paths)
+        """
+        if paths.receiver is None or paths.transmitter is None or paths.frequency_hz is None:
+            raise ValueError(
+                "paths: got ones without receiver, transmitter or frequency_hz, expected all three "
+                "(dataclasses.replace(paths, receiver=...) adds one)"
+            )
+        if np.ndim(paths.transmitter) != 1:
+            raise ValueError(
+                "paths: got ones of several transmitters, expected those of one; a set holds one"
+            )
+        several = list(paths.each())
+        spread = [spread_paths(p.arrival, p.power, shape, beam_sigma_rad, device=device) for p in several]
+        aod = [np.column_stack([p.theta_t, p.phi_t]) for p in several]
+        return cls.from_spectra(
+            receivers=np.atleast_2d(paths.receiver),
+            transmitter=paths.transmitter,
+            frequency_hz=paths.frequency_hz,
+            path_gain=np.stack([s.path_gain for s in spread]),
+            delay_s=np.stack([s.of_strongest(p.tau) for s, p in zip(spread, several, strict=True)]),
+            aod=np.stack([s.of_strongest(angles) for s, angles in zip(spread, aod, strict=True)]),
+            line_of_sight=np.array([(p.kind == "los").any() for p in several]),
+            beam_sigma_rad=beam_sigma_rad,
+            engine="paths",
+            seed=seed,
+            role=role,
+            floor=floor,
+            attributes=None if paths.air is None else paths.air.attributes,
+        )
 
     @classmethod
     def empty(
@@ -184,7 +271,7 @@ class SpectrumDataset:
         *,
         transmitter: ArrayLike,
         frequency_hz: float,
-        shape: tuple[int, int] = (90, 180),
+        shape: tuple[int, int] = DEFAULT_SHAPE,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
         floor: float | None = None,
     ) -> SpectrumDataset:
@@ -201,8 +288,8 @@ class SpectrumDataset:
             TypeError, ValueError: naming the argument.
         """
         rows, columns = check_shape(shape)
-        wavelength = SPEED_OF_LIGHT / check_number("frequency_hz", frequency_hz, *CARRIERS_HZ)
-        strongest = (wavelength / (4.0 * np.pi * USUAL_M)) ** 2
+        away = np.array([USUAL_M, 0.0, 0.0])
+        strongest = float(free_space_gain(away, np.zeros(3), check_frequency(frequency_hz)))
         noise = 1e-6 * strongest if floor is None else check_positive("floor", floor, "linear noise floor")
         return cls(
             receivers=np.zeros((0, 3)), transmitter=check_array("transmitter", transmitter, (3,)),
@@ -390,10 +477,15 @@ class SpectrumDataset:
         Raises:
             OSError: naming the file, if it cannot be read.
             ValueError: naming it, if it is damaged, no NetCDF file of spectra, or holds what no data set may.
+
+        Warns:
+            UserWarning: as :meth:`from_spectra`.
         """
         values = dataset_files.read(path)
         try:
-            return cls(**values)
+            found = cls(**values)
+            question_spectra(found)
+            return found
         except (TypeError, ValueError) as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from error
 
@@ -420,8 +512,16 @@ def assign_roles(count: int, *, test: int | None = None, seed: int = 0) -> np.nd
     return role
 
 
+def question_spectra(ds: SpectrumDataset) -> None:
+    """Question spectra that hold too much power; see :func:`~warprrf.rf.spectra.levels.question_levels`."""
+    total = np.asarray(np.nansum(ds.path_gain, axis=(1, 2), dtype=np.float64))
+    free_space = free_space_gain(ds.transmitter, ds.receivers, ds.frequency_hz)
+    hint = "; or the gain of an antenna is in them (SpectrumDataset.deembed takes it out)"
+    question_levels("path_gain", total, free_space, hint=hint)
+
+
 def _sees(
-    receivers: np.ndarray, transmitter: np.ndarray, gain: np.ndarray, wavelength_m: float, sigma_rad: float
+    receivers: np.ndarray, transmitter: np.ndarray, gain: np.ndarray, frequency_hz: float, sigma_rad: float
 ) -> np.ndarray:
     """Whether half the power of free space or more comes from the transmitter's direction, shape ``(R,)``."""
     way = transmitter - receivers
@@ -429,7 +529,7 @@ def _sees(
     cosine = np.einsum("hwc,rc->rhw", pixel_directions(gain.shape[1:]), way / length[:, None])
     near = cosine > np.cos(max(3.0 * sigma_rad, 2.0 * np.pi / gain.shape[1]))
     received = np.where(near, np.nan_to_num(gain), 0.0).sum(axis=(1, 2))
-    return np.asarray(received >= 0.5 * (wavelength_m / (4.0 * np.pi * length)) ** 2)
+    return np.asarray(received >= 0.5 * free_space_gain(transmitter, receivers, frequency_hz))
 
 
 def measured_at(ds: SpectrumDataset, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:

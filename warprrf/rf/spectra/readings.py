@@ -7,9 +7,13 @@ one row each; what a column is missing does not weigh.
 
 from __future__ import annotations
 
+import csv
 import os
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,10 +21,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import digamma, polygamma
 
-from warprrf.checks import check_array, check_count, check_number, check_positive, check_type, checked
+from warprrf.checks import (
+    check_array,
+    check_count,
+    check_number,
+    check_positive,
+    check_type,
+    checked,
+    some_of,
+    users_level,
+)
 from warprrf.rf.em.absorption import Air
 from warprrf.rf.em.waves import check_frequency
 from warprrf.rf.spectra.antenna import Pattern, sample_pattern
+from warprrf.rf.spectra.levels import FADING_DB, MARGIN_DB, free_space_gain, question_levels
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
 NEPER = 10.0 / np.log(10.0)
@@ -31,6 +45,13 @@ COLUMNS = {
     "departure": ("tx_azimuth_deg", "tx_elevation_deg"),
 }
 """Columns of a table of readings; beside them ``power_db``, ``delay_ns``, ``std_db`` and ``chain``."""
+NEEDED = (*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db")
+NUMBERS = (*NEEDED, *COLUMNS["arrival"], *COLUMNS["departure"], "delay_ns", "std_db")
+NOT_MEASURED = ("", "na", "n/a", "#n/a", "<na>", "nan", "null", "none")
+"""What stands in a file, in small letters, for a power that was not measured."""
+WIDEST_HORN_RAD = 2.0 * np.pi / 3.0
+"""Full width at half maximum of the widest horns; a larger number is one in degrees."""
+ALIKE = 0.7  # of two names' letters: one is misspelt for the other
 WINDOWS = ("rectangular", "hann")
 
 
@@ -67,7 +88,7 @@ class Readings:
         samples: independent samples of fading that each reading is the mean of: 1 for narrowband power at one place,
             None where fading is averaged out. Fading is taken for Rayleigh's.
         air: whose absorption is in the powers; None for none.
-        name: by which a report tells these readings from others.
+        name: by which a report tells these readings from others; several of one name are numbered in the order given.
         azimuth_known: False where azimuths of ``arrival`` count from an unknown zero, one for all: a fit then finds it
             from line of sight and mirrors. Give readings whose zeros differ as several data sets.
         position_std_m: standard deviation of each coordinate of the receivers [m]; above 0 a fit finds where they stood.
@@ -231,14 +252,14 @@ class Readings:
             settings: other arguments of :class:`Readings`.
 
         Raises:
-            ValueError: naming columns that are missing.
+            ValueError: naming columns that are missing, misspelt or repeated, or calibrated readings of as much as was
+                sent.
+
+        Warns:
+            UserWarning: naming columns that are none of these, or readings far above line of sight.
         """
-        names = set(map(str, table))
-        missing = sorted({*COLUMNS["transmitter"], *COLUMNS["receiver"], "power_db"} - names)
-        if missing:
-            raise ValueError(
-                f"table: lacks the columns {', '.join(missing)}; it has {', '.join(sorted(names))}"
-            )
+        names = list(map(str, table))
+        _check_columns(names)
 
         def column(name: str) -> np.ndarray:
             return check_array(
@@ -263,26 +284,128 @@ class Readings:
             cells = np.ravel(np.asarray(table["chain"], dtype=object))
             none = [c is None or (isinstance(c, float) and np.isnan(c)) for c in cells]  # as pandas has it
             found["chain"] = np.where(none, "", cells.astype(str))
-        return cls(**found, **settings)
+        readings = cls(**found, **settings)
+        question_readings(readings)
+        return readings
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **settings: Any) -> Readings:
         """Readings of a CSV file with a header line; see :meth:`from_table`.
 
+        Values are separated by commas; spaces round them and empty lines do not count. ``power_db`` is left empty, or
+        ``nan``, where nothing was measured, ``chain`` where powers are calibrated.
+
         Raises:
             OSError: naming the file, if it cannot be read.
-            ValueError: naming it, if it is no such table.
-        """
-        import pandas
+            ValueError: naming it, the line and the column, if it is no such table.
 
+        Warns:
+            UserWarning: as :meth:`from_table`.
+        """
         file = Path(path)
         if not file.is_file():
             raise FileNotFoundError(f"path: there is no file {file}")
         try:
-            table = pandas.read_csv(file, keep_default_na=True, dtype={"chain": str})
-            return cls.from_table(table, **settings)
-        except (TypeError, ValueError) as error:
+            return cls.from_table(_read_csv(file), **settings)
+        except (TypeError, ValueError, csv.Error) as error:
             raise ValueError(f"path: {file}: {error}") from error
+
+
+def _check_columns(names: Sequence[str]) -> None:
+    """Refuse names of columns that are missing, repeated or misspelt; warn of others that are not read."""
+    _check_once(names)
+    known, unknown = (*NUMBERS, "chain"), [name for name in names if name not in (*NUMBERS, "chain")]
+    alike = {name: get_close_matches(name.lower(), known, 2, ALIKE) for name in unknown}
+    meant = [
+        f"{name!r} for {' or '.join(absent)}"
+        for name, near in alike.items()
+        if (absent := [other for other in near if other not in names]) and near[0] in absent
+    ]
+    missing = [name for name in NEEDED if name not in names]
+    if missing or meant:
+        lacking = f"lacks the columns {', '.join(missing)}; it has {', '.join(names)}" * bool(missing)
+        misspelt = f"seems to have {', '.join(meant)}; correct the header" * bool(meant)
+        raise ValueError(f"table: {'; it '.join(filter(None, (lacking, misspelt)))}")
+    for azimuth, elevation in (COLUMNS["arrival"], COLUMNS["departure"]):
+        if elevation in names and azimuth not in names:
+            raise ValueError(f"table: got {elevation} without {azimuth}, expected both or neither")
+    if unknown:
+        warnings.warn(
+            f"table: columns {', '.join(unknown)} are not read; those that are: {', '.join(known)}",
+            UserWarning,
+            stacklevel=users_level(),
+        )
+
+
+def question_readings(readings: Readings) -> None:
+    """Question readings of too much power; see :func:`~warprrf.rf.spectra.levels.question_levels`.
+
+    Of chains whose gain is not known only readings above what was sent can be told.
+    """
+    r, gain_db, known = readings, 0.0, readings.chain == ""
+    for pattern in (r.receive_pattern, r.transmit_pattern):
+        if pattern is not None:
+            gain_db += 10.0 * np.log10(sample_pattern(pattern, np.linspace(0.0, np.pi, 721)).max())
+    free_space = np.minimum(
+        free_space_gain(r.transmitters, r.receivers, r.frequency_hz) * 10.0 ** (gain_db / 10.0), 1.0
+    )
+    margin_db = MARGIN_DB + FADING_DB * (r.samples is not None)
+    question_levels("power", np.where(known, r.power, np.nan), free_space, margin_db=margin_db)
+    above = np.flatnonzero(~known & (r.power > 1.0))
+    if len(above):
+        warnings.warn(
+            f"power: {len(above)} readings (rows {some_of(above)}) of chains of unknown gain are above 0 dB, more than was "
+            "sent: were minus signs lost, or are they linear?",
+            UserWarning,
+            stacklevel=users_level(),
+        )
+
+
+def _check_once(names: Sequence[str]) -> None:
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"table: got several columns {', '.join(twice)}, expected one of each name")
+
+
+def _read_csv(file: Path) -> dict[str, np.ndarray]:
+    """Columns of a CSV file by name: numbers, and text where they are not known.
+
+    Raises:
+        ValueError: naming line and column.
+    """
+    with file.open(newline="", encoding="utf-8-sig") as text:
+        rows = csv.reader(text, skipinitialspace=True, strict=True)
+        header = [name.strip() or f"(column {k} without a name)" for k, name in enumerate(next(rows, []), 1)]
+        if not header:
+            raise ValueError("line 1: got nothing, expected names of columns")
+        table, lines = [], []
+        for row in rows:
+            cells = [cell.strip() for cell in row]
+            if not any(cells):
+                continue
+            if len(cells) != len(header):
+                raise ValueError(
+                    f"line {rows.line_num}: got {len(cells)} values, expected {len(header)}, one for each column of the "
+                    "header"
+                )
+            table.append(cells)
+            lines.append(rows.line_num)
+    _check_once(header)
+    found = dict(zip(header, np.array(table, dtype=str).reshape(-1, len(header)).T, strict=True))
+    for name in found.keys() & NUMBERS:
+        found[name] = np.array([_number(name, *one) for one in zip(found[name].tolist(), lines, strict=True)])
+    return found
+
+
+def _number(name: str, cell: str, line: int) -> float:
+    if name == "power_db" and cell.lower() in NOT_MEASURED:
+        return np.nan
+    try:
+        number = float(cell)
+    except ValueError:
+        number = np.nan
+    if np.isnan(number) or (np.isinf(number) and name != "power_db"):
+        raise ValueError(f"line {line}: {name}: got {cell!r}, expected a finite number")
+    return number
 
 
 def path_weights(
@@ -313,17 +436,26 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
     """Gain of a horn over the angle off boresight: Gaussian in the angle, lossless.
 
     Args:
-        width_rad: full width at half maximum [rad].
+        width_rad: full width at half maximum [rad], at most :data:`WIDEST_HORN_RAD`.
         floor_db: of the side lobes below the peak [dB].
+
+    Raises:
+        ValueError: for other numbers.
     """
     width, low = check_positive("width_rad", width_rad), check_number("floor_db", floor_db, -200.0, 0.0)
-
-    def shape(angle: np.ndarray) -> np.ndarray:
-        return np.maximum(np.exp(-4.0 * np.log(2.0) * (angle / width) ** 2), 10.0 ** (low / 10.0))
-
+    if width > WIDEST_HORN_RAD:
+        raise ValueError(
+            f"width_rad: got {width:g}, expected radians, at most {WIDEST_HORN_RAD:.3g}: "
+            f"horn(np.radians({width:g})) is {width:g} degrees wide"
+        )
     angle = np.linspace(0.0, np.pi, 20_001)
-    mean = 0.5 * np.trapezoid(shape(angle) * np.sin(angle), angle)
-    return lambda off: shape(np.asarray(off)) / mean
+    mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
+    return partial(_horn_gain, width, low, mean)
+
+
+def _horn_gain(width: float, floor_db: float, mean: float, angle: ArrayLike) -> np.ndarray:
+    lobe = np.exp(-4.0 * np.log(2.0) * (np.asarray(angle) / width) ** 2)
+    return np.maximum(lobe, 10.0 ** (floor_db / 10.0)) / mean
 
 
 def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:

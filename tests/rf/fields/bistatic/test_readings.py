@@ -1,12 +1,14 @@
 """Tables of received power: what a reading is, and fits to horns, powers and delays whose chain's gain is not known."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
+from radio_scenes import RadioScene
 
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
@@ -17,29 +19,14 @@ from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import COLUMNS, Readings, horn, path_weights
 from warprrf.rf.spectra.spectrum import directions_from_angles
 
-F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
-TX = np.array([0.8, 0.9, 2.2])
-RECEIVERS = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
-     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0], [1.8, 1.1, 1.1], [2.6, 3.5, 1.4]]
-)  # fmt: skip
 CHAIN_DB = -23.7
 WIDTH = np.radians(20.0)
 
 
 @pytest.fixture(scope="module")
-def scene() -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4)
-    return RadioScene(mesh, part, [walls, SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)])
-
-
-@pytest.fixture(scope="module")
 def test(scene: RadioScene) -> SpectrumDataset:
     held = RECEIVERS[6:] + np.array([0.1, 0.1, 0.05])
-    return exact_spectra(scene, held, transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    return spectra(scene, held)
 
 
 @pytest.fixture(scope="module")
@@ -90,11 +77,22 @@ def test_wrong_readings_are_named_and_hardly_count(
     wrong = np.sort(rng.choice(above, len(above) // 10, replace=False))
     power = turned.power.copy()
     power[wrong] *= 100.0
-    clean, spoilt = (RadioField.fit(scene, r, quick=True) for r in (turned, replace(turned, power=power)))
+    clean = RadioField.fit(scene, turned, quick=True)
+    with pytest.warns(UserWarning, match=rf"of {len(turned)} readings .* left out .*rows {wrong[0]}, "):
+        spoilt = RadioField.fit(scene, replace(turned, power=power), quick=True)
     named = spoilt.report["unexplained"]["readings"]
     assert np.isin(wrong, named).mean() >= 0.9
     assert len(named) < 2 * len(wrong) + 3
     assert score(spoilt, test) > score(clean, test) - 1.0
+
+
+def test_data_sets_of_one_name_are_told_apart_in_a_report(scene: RadioScene, turned: Readings) -> None:
+    power = turned.power.copy()
+    power[[0, len(power) // 2]] *= 1e3  # a row of each half
+    halves = [replace(turned, power=power).subset(part) for part in np.split(np.arange(len(turned)), 2)]
+    report = RadioField.fit(scene, halves, quick=True).report
+    assert report["noise_db"].keys() == {"readings 1", "readings 2"}
+    assert all(0 in report["unexplained"][name] for name in ("readings 1", "readings 2"))
 
 
 def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings) -> None:
@@ -111,10 +109,7 @@ def test_the_noise_of_readings_is_estimated(scene: RadioScene, turned: Readings)
 
 def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioScene, tmp_path: Path) -> None:
     second, third = np.array([4.3, 0.7, 2.0]), np.array([4.2, 3.4, 2.3])
-    sets = [
-        exact_spectra(scene, RECEIVERS[k : k + 3], transmitter=t, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
-        for k, t in ((0, TX), (3, second))
-    ]
+    sets = [spectra(scene, RECEIVERS[k : k + 3], transmitter=t) for k, t in ((0, TX), (3, second))]
     field = RadioField.fit(scene, sets, quick=True)
     np.testing.assert_array_equal(field.transmitter, TX)
     np.testing.assert_array_equal(field.fitted_on, RECEIVERS[:6])
@@ -123,7 +118,7 @@ def test_several_transmitters_are_fitted_together_and_remembered(scene: RadioSce
     assert not field.was_fitted_on(swapped).any()  # fitted there under another transmitter
     field.save(tmp_path / "field.safetensors")
     assert RadioField.load(tmp_path / "field.safetensors").was_fitted_on(sets[1]).all()
-    truth = exact_spectra(scene, RECEIVERS[6:8], transmitter=third, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    truth = spectra(scene, RECEIVERS[6:8], transmitter=third)
     both = evaluate(truth, lambda r: field.spectrum(r, third))["psnr_db"]
     one = RadioField.fit(scene, sets[0], quick=True)
     assert both > evaluate(truth, lambda r: one.spectrum(r, third))["psnr_db"] - 0.5
@@ -165,7 +160,7 @@ def test_receivers_that_stood_elsewhere_are_found(scene: RadioScene, turned: Rea
 def test_roughness_counts_in_wavelengths_at_another_carrier(scene: RadioScene) -> None:
     """A mirror's share exp(-(4 pi sigma_h / lambda)^2) is found again, the sum of both shares stays, and so does what
     free space gives: the square of the wavelength."""
-    truth = exact_spectra(scene, RECEIVERS[:3], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    truth = spectra(scene, RECEIVERS[:3])
     field = RadioField.fit(scene, truth, quick=True, iterations=3)
     other = field.at_frequency(F / 2)
     share, there = (np.exp(f.parameters.log_mirror) for f in (field, other))
@@ -187,20 +182,20 @@ def test_carriers_are_fitted_together(scene: RadioScene) -> None:
     smoother = [replace(m, scattering=np.sqrt(1 - (1 - m.scattering**2) ** 0.25)) for m in scene.materials]
     rooms = {F: scene, F / 2: replace(scene, materials=smoother)}
     here, there = (
-        exact_spectra(room, RECEIVERS[own], transmitter=TX, frequency_hz=f, shape=SHAPE, sigma=SIGMA)
+        spectra(room, RECEIVERS[own], frequency_hz=f)
         for own, (f, room) in zip((slice(1), slice(1, 6)), rooms.items(), strict=True)
     )
     alone, both = (RadioField.fit(scene, data, quick=True, mirror_order=2) for data in (here, [here, there]))
     assert both.frequency_hz == F
     for f, room in rooms.items():
-        truth = exact_spectra(room, RECEIVERS[6:], transmitter=TX, frequency_hz=f, shape=SHAPE, sigma=SIGMA)
+        truth = spectra(room, RECEIVERS[6:], frequency_hz=f)
         one, two = (evaluate(truth, field.at_frequency(f).spectrum)["psnr_db"] for field in (alone, both))
         assert two > one + 1.0
         assert two > 30.0
 
 
 def test_directions_that_nobody_measured_do_not_count(scene: RadioScene, test: SpectrumDataset) -> None:
-    whole = exact_spectra(scene, RECEIVERS[:5], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    whole = spectra(scene, RECEIVERS[:5])
     gain = whole.path_gain.copy()
     gain[:, :6] = np.nan
     part = SpectrumDataset.from_spectra(
@@ -256,12 +251,14 @@ def test_a_horn_of_a_width_is_lossless() -> None:
         gain = horn(width)(angle)
         assert 0.5 * np.trapezoid(gain * np.sin(angle), angle) == pytest.approx(1.0, rel=1e-3)
         assert horn(width)(np.array([width / 2]))[0] == pytest.approx(0.5 * gain[0], rel=1e-3)
+    with pytest.raises(ValueError, match=r"width_rad: got 10, expected radians.*np\.radians"):
+        horn(10)
 
 
 def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
     path = tmp_path / "horn.csv"
     zenith, azimuth = np.degrees(turned.arrival).T
-    rows = ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain,note"]
+    rows = ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain"]
     for k in range(len(turned)):
         cells = [
             *turned.transmitters[k],
@@ -270,7 +267,7 @@ def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
             90 - zenith[k],
             10 * np.log10(turned.power[k]),
         ]
-        rows.append(",".join(map(repr, map(float, cells))) + ",horn,any")
+        rows.append(",".join(map(repr, map(float, cells))) + ",horn")
     path.write_text("\n".join(rows))
     read = Readings.load(path, frequency_hz=F, floor=turned.floor, receive_pattern=horn(WIDTH))
     np.testing.assert_allclose(read.power, turned.power, rtol=1e-9)
@@ -283,29 +280,69 @@ def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
         Readings.load(tmp_path / "nothing.csv", frequency_hz=F, floor=1e-12)
 
 
+HEADER = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain"
+ROW = "0.8,0.9,2.2,4.2,3.1,1.2,-180,0,-93.1,horn"
+
+
+def of_csv(text: str, path: Path) -> Readings:
+    path.write_text(text, encoding="utf-8")
+    turned = HEADER.split(",")[6] in text
+    return Readings.load(
+        path, frequency_hz=F, floor=1e-12, receive_pattern=horn(np.radians(10)) if turned else None
+    )
+
+
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("text", "told"),
     [
-        ({"power": [1e-9, -1e-9]}, "power"),
-        ({"power": [1e-16, 1e-16]}, "power: got no value above the floor"),
-        ({"floor": 0.0}, "floor"),
-        ({"receivers": np.zeros((3, 3))}, "receivers"),
-        ({"receive_pattern": None}, "receive_pattern"),
-        ({"bandwidth_hz": 2e9}, "bandwidth_hz"),
-        ({"chain": ["a"]}, "chain"),
-        ({"std_db": -1.0}, "std_db"),
-        ({"window": "triangle"}, "window"),
-        ({"samples": 0}, "samples"),
+        (f"{HEADER}\n{ROW}\n\n{ROW},7", "line 4: got 11 values, expected 10"),
+        (f"{HEADER}\n{ROW[:-5]}", "line 2: got 9 values"),
+        (f"{HEADER}\n{ROW.replace('4.2', 'four')}", "line 2: rx_x: got 'four'"),
+        (f"{HEADER}\n{ROW.replace('4.2', '')}", "line 2: rx_x: got ''"),
+        (f"{HEADER.replace('_deg', '')}\n{ROW}", "'azimuth' for azimuth_deg, 'elevation' for elevation_deg"),
+        (
+            f"{HEADER.replace('power_db', 'Power_dB')}\n{ROW}",
+            "lacks the columns power_db.*'Power_dB' for power_db",
+        ),
+        (f"{HEADER.replace('azimuth_deg', 'x')}\n{ROW}", "elevation_deg without azimuth_deg"),
+        (f"{HEADER},power_db\n{ROW},-60", "several columns power_db"),
+        ("", "line 1: got nothing"),
     ],
 )
-def test_bad_readings_are_named(changed: dict, told: str) -> None:
+def test_what_a_table_s_file_does_not_say_clearly_is_refused(text: str, told: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"horn\.csv: .*{told}"):
+        of_csv(text, tmp_path / "horn.csv")
+
+
+def test_a_table_s_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
+    """Spaces, empty lines, a byte-order mark, a chain called NA, a power that was not measured; other columns are named."""
+    lines = [HEADER, ROW.replace("horn", "NA"), "", ROW.replace("-93.1", "n/a").replace("horn", "")]
+    spaced = "\ufeff" + "\n".join(line.replace(",", " , ") for line in lines)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read = of_csv(spaced, tmp_path / "horn.csv")
+    assert read.chain.tolist() == ["NA", ""]
+    np.testing.assert_allclose(read.power, [10**-9.31, np.nan])
+    np.testing.assert_allclose(read.arrival, [[np.pi / 2, -np.pi]] * 2)
+    with pytest.warns(UserWarning, match="columns note are not read") as told:
+        of_csv(f"{HEADER},note\n{ROW},any", tmp_path / "horn.csv")
+    assert told[0].filename == __file__
+
+
+def test_a_carrier_in_gigahertz_and_powers_all_at_the_floor_are_questioned() -> None:
     good = {
-        "transmitters": TX, "receivers": RECEIVERS[0], "power": [1e-9, 1e-9], "frequency_hz": F, "floor": 1e-15,
-        "arrival": [[1.0, 0.0], [1.0, 1.0]], "receive_pattern": horn(0.2),
-    }  # fmt: skip
-    Readings(**good)
-    with pytest.raises(ValueError, match=told):
-        Readings(**{**good, **changed})
+        "transmitters": TX,
+        "receivers": RECEIVERS[:2],
+        "power": [1e-9, 1e-9],
+        "frequency_hz": F,
+        "floor": 1e-15,
+    }
+    for changed, told in (
+        ({"frequency_hz": 28}, "carrier in hertz"),
+        ({"floor": 1e-9}, "no value above the floor"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            Readings(**{**good, **changed})
 
 
 def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
@@ -318,9 +355,9 @@ def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:
 
 def test_the_only_place_of_a_chain_is_not_held_out(scene: RadioScene, turned: Readings) -> None:
     """Its gain would be known from nothing: a horn at one place beside spectra at seven, whichever place it is."""
-    spectra = exact_spectra(scene, RECEIVERS[1:8], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
+    several = spectra(scene, RECEIVERS[1:8])
     alone = turned.subset(np.flatnonzero((turned.receivers == RECEIVERS[0]).all(axis=1)))
-    for data in ([spectra, alone], [alone, spectra]):
+    for data in ([several, alone], [alone, several]):
         for seed in range(2):
             field = RadioField.fit(scene, data, quick=True, seed=seed)
             assert field.report["held_out"] == 2
@@ -328,6 +365,6 @@ def test_the_only_place_of_a_chain_is_not_held_out(scene: RadioScene, turned: Re
     # readings that come after more spectra than terms are chosen by
     few = Selection(most_to_choose=4)
     field = RadioField.fit(
-        scene, [spectra, turned.subset(np.arange(72))], quick=True, indirect=None, selection=few
+        scene, [several, turned.subset(np.arange(72))], quick=True, indirect=None, selection=few
     )
     assert field.report["chains"]["horn"]["gain_db"] == pytest.approx(CHAIN_DB, abs=1.0)

@@ -22,7 +22,7 @@ from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.readings import Readings, path_weights
+from warprrf.rf.spectra.readings import Readings, path_weights, question_readings
 from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, to_db
 
 READINGS_SHAPE = (60, 120)
@@ -69,7 +69,7 @@ class Place:
 
 
 def as_list(data: Data) -> list[Measured]:
-    """Data sets as a list.
+    """Data sets as a list; of several that have one name each gets a number after it.
 
     Raises:
         TypeError: for anything else.
@@ -84,6 +84,10 @@ def as_list(data: Data) -> list[Measured]:
         several.append(one)
     if not several:
         raise ValueError("ds: got an empty list, expected a SpectrumDataset, Readings, or several of them")
+    names = [None if isinstance(one, SpectrumDataset) else one.name for one in several]
+    for k, one in enumerate(several):
+        if not isinstance(one, SpectrumDataset) and names.count(one.name) > 1:
+            several[k] = replace(one, name=f"{one.name} {names[: k + 1].count(one.name)}")
     return several
 
 
@@ -143,6 +147,8 @@ def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -
 
 def _check_readings(mesh: Mesh | None, one: Readings | ArraySpectra, device: DeviceLike) -> None:
     wavelength_m = SPEED_OF_LIGHT / one.frequency_hz
+    if isinstance(one, Readings):
+        question_readings(one)
     if mesh is not None:
         question_unit(mesh, wavelength_m)
     transmitters, under = np.unique(one.transmitters, axis=0, return_inverse=True)

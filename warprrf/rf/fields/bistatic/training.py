@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from warprrf.checks import check_count, check_seed, checked
+from warprrf.checks import check_count, check_seed, checked, some_of, users_level
 from warprrf.cluster import each
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, as_mesh
@@ -413,12 +414,27 @@ def train(
                 progress=progress,
             )  # fmt: skip
             found = _Training(seen, data, o, progress).run()
+    _warn_of_left_out(data, found.report["unexplained"])
     names = training.names
     told = {
         names[k]: [(place.receiver.tolist(), offset.tolist()) for place, offset in own]
         for k, own in offsets.items()
     }
     return replace(found, report=found.report | {"azimuth_zero_deg": zeros, "position_offset_m": told})
+
+
+def _warn_of_left_out(data: Sequence[Measured], unexplained: dict[str, list[int]]) -> None:
+    if unexplained:
+        count = sum(len(one) for one in data if isinstance(one, Readings))
+        told = "; ".join(
+            f"{len(rows)} of {name!r}, rows {some_of(rows)}" for name, rows in unexplained.items()
+        )
+        warnings.warn(
+            f"ds: {sum(map(len, unexplained.values()))} of {count} readings are taken for wrong and left out ({told}): "
+            'report["unexplained"] lists them',
+            UserWarning,
+            stacklevel=users_level(),
+        )
 
 
 def _line_of_sight_share(response: Response, p: Parameters) -> np.ndarray:
