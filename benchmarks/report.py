@@ -91,7 +91,8 @@ def _block(text: str) -> str:
     if text.startswith("#"):
         return f"<h2>{lines[0].lstrip('# ')}</h2>"
     if not text.startswith("|"):
-        return f"<p>{re.sub(r'`([^`]*)`', r'<code>\1</code>', ' '.join(lines))}</p>"
+        code = re.sub(r"`([^`]*)`", r"<code>\1</code>", " ".join(lines))
+        return f"<p>{code}</p>"
     head, _, *rows = ([cell.strip() for cell in line.strip("| ").split("|")] for line in lines)
     marked = [("th", head), *(("td", row) for row in rows)]
     body = "".join(
