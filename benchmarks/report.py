@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,7 +24,7 @@ h1 { font-size: 1.7rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-t
 figcaption { color: #555; font-size: .92rem; } figure { margin: 1rem 0; } img { max-width: 100%; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: bottom; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td:first-child { text-align: left; white-space: nowrap; }
 """
 
 
@@ -90,7 +91,8 @@ def _block(text: str) -> str:
     if text.startswith("#"):
         return f"<h2>{lines[0].lstrip('# ')}</h2>"
     if not text.startswith("|"):
-        return f"<p>{' '.join(lines)}</p>"
+        code = re.sub(r"`([^`]*)`", r"<code>\1</code>", " ".join(lines))
+        return f"<p>{code}</p>"
     head, _, *rows = ([cell.strip() for cell in line.strip("| ").split("|")] for line in lines)
     marked = [("th", head), *(("td", row) for row in rows)]
     body = "".join(

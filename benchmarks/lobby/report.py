@@ -130,13 +130,14 @@ def pictures(figures: dict[str, Any], file: Path) -> dict[str, tuple[Callable[[]
 
 
 def time_bars(stages: dict[str, dict[str, Any]]) -> Any:
-    """Wall time of each stage as bars; a stage that reported several long steps has one bar a step."""
+    """Wall time of each stage as bars; one that takes most of all has a bar for each of its long steps."""
     bars: dict[str, float] = {}
+    total = sum(stage["seconds"] for stage in stages.values())
     for name, stage in stages.items():
-        steps = {step: s for step, s in stage.get("steps", {}).items() if s > 0.02 * stage["seconds"]}
-        if len(steps) < 3:
+        if stage["seconds"] < 0.5 * total:
             bars[name] = stage["seconds"]
             continue
+        steps = {step: s for step, s in stage["steps"].items() if s > 0.02 * total}
         bars |= {f"{name}: {step}": s for step, s in steps.items()}
         bars[f"{name}: rest"] = max(stage["seconds"] - sum(steps.values()), 0.0)
     figure, (ax,) = figure_of(1, size=(9.0, 0.34 * len(bars) + 0.8))
