@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from hypothesis import settings
 
+settings.register_profile("any machine", deadline=None)  # a busy one is no defect
+settings.load_profile("any machine")
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "helpers"), str(HERE), str(HERE.parent)]
 

@@ -230,3 +230,9 @@ def test_wheel_works_in_a_fresh_environment_without_extras(wheel: Path, tmp_path
     }.items():
         assert told in python(f"import warprrf as wr; wr.{call}", fails=True)
     assert run(fresh / "bin" / "warprrf", "--version", cwd=tmp_path) == f"warprrf {PROJECT['version']}"
+
+
+def test_what_make_quick_names_is_there() -> None:
+    for line in (ROOT / "tests" / "quick.txt").read_text().splitlines():
+        path, _, name = line.partition("::")
+        assert (ROOT / path).exists() and (not name or f"def {name}(" in (ROOT / path).read_text()), line

@@ -21,18 +21,25 @@ from fuzz.place import ANGLES, POINTS, READINGS, TOWARDS, Place
 
 IGNORED = ("progress", "ax", "client")
 """Arguments that are not mutated unless an example names them: a caller's own functions, matplotlib's axes."""
-UNCHECKED = ("RadioField.trace_links",)
-"""What ``RadioField.links`` and ``radio_map`` give positions that they checked; these two are fuzzed."""
-BISTATIC = ("array_spectrum", "at_frequency")
-"""Methods that a bistatic field has beside those of every ``RadioField``."""
-ELSEWHERE = ("view", "Viewer", "BistaticField", "HarmonicField", "FitOptions", "FieldOptions")
-"""What starts a server for each call (tests/viewer has its refusals), and what ``RadioField`` and its fit are fuzzed as."""
+UNCHECKED = ("trace_links", "render", "sent_radiance")
+"""Methods that are given what others checked or made: ``links`` and ``radio_map``, ``view`` and ``transport`` are fuzzed."""
+OPTIONS_OF = ("FitOptions", "FieldOptions")
+"""Classes whose options are what is public of them."""
+SERVERS = ("view", "Viewer")
+"""What starts a server for each call: the law of messages, and tests/viewer, have its refusals."""
 SPREADS = ("channel.angular_spread", "channel.coherence_bandwidth", "channel.delay_spread")
 """What is NaN where there is no power, as their documentation says."""
-ABSTRACT = ("RadioField",)
+ABSTRACT = ("RadioField", "BistaticField", "HarmonicField")
 """Classes that nobody makes by calling them."""
-REFUSED = ("Paths.from_sionna", "Scene.from_sionna", "interop.load_sionna_scene", "reconstruct")
-"""What is refused without any change: it asks for objects or files of other programs, or for photos of a place."""
+REFUSED = (
+    "Paths.from_sionna",
+    "Scene.from_sionna",
+    "interop.load_sionna_scene",
+    "reconstruct",
+    "HarmonicField.suggest",
+)
+"""What is refused without any change: it asks for objects or files of other programs, for photos of a place, or a
+bistatic field."""
 
 
 def public() -> dict[str, Callable[..., Any]]:
@@ -45,11 +52,9 @@ def public() -> dict[str, Callable[..., Any]]:
         homes.add(value)
         if name not in ABSTRACT:
             found[name] = value
-        kind = wr.RadioField.models["bistatic"] if value is wr.RadioField else value
-        more = BISTATIC if value is wr.RadioField else ()
-        for method in (*_methods(value), *more) if inspect.isclass(value) else ():
-            if f"{name}.{method}" not in UNCHECKED:
-                found[f"{name}.{method}"] = getattr(kind, method)
+        for method in _methods(value) if inspect.isclass(value) and name not in OPTIONS_OF else ():
+            if method not in UNCHECKED and not (name == "BistaticField" and hasattr(wr.RadioField, method)):
+                found[f"{name}.{method}"] = getattr(value, method)
     return found
 
 
@@ -77,7 +82,12 @@ def _names(module: ModuleType, prefix: str) -> Iterator[tuple[str, Any]]:
 
 
 def _signature(name: str) -> Iterator[inspect.Parameter]:
-    yield from inspect.signature(public()[name]).parameters.values()
+    """Arguments of a public call; a field's methods are those of the bistatic one that is asked."""
+    method = name.removeprefix("RadioField.")
+    call = public()[name]
+    if method != name and inspect.isfunction(call):
+        call = getattr(wr.RadioField.models["bistatic"], method)
+    yield from inspect.signature(call).parameters.values()
 
 
 def example(name: str, place: Place) -> dict[str, Any]:
@@ -85,8 +95,9 @@ def example(name: str, place: Place) -> dict[str, Any]:
 
     A method is called on the object of its class; a class is given what that object holds.
     """
-    given = dict(EXAMPLES.get(name, lambda p: {})(place))
-    owner, known = name.rpartition(".")[0], None
+    owner, _, method = name.rpartition(".")
+    known = f"RadioField.{method}" if name not in EXAMPLES and owner == "HarmonicField" else name
+    given = dict(EXAMPLES.get(known, lambda p: {})(place))
     for one in _signature(name):
         if one.name in given:
             continue
@@ -140,7 +151,10 @@ CLASSES: dict[str, Callable[[Place], Any]] = {
     "Air": lambda p: wr.Air(),
     "Spectrum": lambda p: p.spectra[0],
     "SpectrumDataset": lambda p: p.spectra.subset([0, 1, 2]),
-    "RadioField": lambda p: p.field,
+    **{f"{kind}Field": lambda p: p.field for kind in ("Radio", "Bistatic")},
+    "HarmonicField": lambda p: p.harmonic,
+    "FitOptions": lambda p: wr.FitOptions(),
+    "FieldOptions": lambda p: wr.FieldOptions(),
     "PlanarArray": lambda p: wr.PlanarArray(2, 3, polarisation="VH"),
     "RadioMap": lambda p: p.map,
     "channel.ArraySpectra": lambda p: wr.channel.ArraySpectra(
@@ -190,9 +204,11 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Camera.spherical": lambda p: {"width": 8, "height": 4},
     "Gaussians.load_ply": lambda p: {"path": p.folder / "splats.ply"},
     "Mesh.load": lambda p: {"path": p.folder / "walls.ply", "unit": "m", "up": "z", "simplify": 20},
-    "Reconstruction.aligned": lambda p: {"known_positions": {f"{k}.png": POINTS[k] for k in range(3)}},
     "Reconstruction.from_files": lambda p: {"ply": p.folder / "splats.ply", "mesh": p.mesh},
     "Reconstruction.load": lambda p: {"folder": p.folder / "reconstruction"},
+    "Reconstruction.aligned": lambda p: {
+        "self": p.filmed, "known_positions": {name: c.position for name, c in p.filmed.cameras.items()},
+    },
     "Reconstruction.report": lambda p: {"path": "report.html"},
     "Scene.to_sionna": lambda p: {"frequency_hz": 300e9},
     "Scene.load": lambda p: {"path": p.folder / "scene.xml"},
@@ -235,12 +251,15 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "Spectrum.stack": lambda p: {"spectra": [p.spectra[0], p.spectra[1]]},
     "SpectrumDataset.split": lambda p: {"self": p.spectra},
     # fields
-    "RadioField.array_spectrum": lambda p: {"receivers": POINTS[0], "transmitter": p.transmitter + 0.1},
-    "RadioField.at_frequency": lambda p: {"frequency_hz": 140e9},
+    "BistaticField.array_spectrum": lambda p: {"receivers": POINTS[0], "transmitter": p.transmitter + 0.1},
+    "BistaticField.at_frequency": lambda p: {"frequency_hz": 140e9},
     "RadioField.fit": lambda p: {
         "mirror_order": 1, "lobes": (0, 4), "diffuse": True, "indirect": False, "residual": False, "sub_pixels": 1,
         "device": "cpu", "relevance": p.relevance,
     },
+    "BistaticField.view": lambda p: {"receivers": POINTS[0]},
+    "HarmonicField.load": lambda p: {"path": p.folder / "harmonic.safetensors"},
+    "HarmonicField.fit": lambda p: {"model": "rf3dgs+", "iterations": 2},
     "RadioField.cfr": lambda p: {
         "frequencies_hz": [300e9], "diffuse": "power", "max_paths": 20, "client": None,
     },

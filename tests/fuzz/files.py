@@ -22,7 +22,7 @@ from model_files import obj_with_materials, room_glb, room_gltf
 from twin_fields import known_field
 
 import warprrf as wr
-from fuzz.place import POINTS, Place
+from fuzz.place import MANY, POINTS, Place
 from fuzz.values import ARRAYS, PLAIN
 from warprrf import tensor_files
 from warprrf.cli.inputs import read_positions, read_receivers
@@ -284,6 +284,11 @@ def _field(path: Path) -> Any:
     return field, field.spectrum(POINTS[1]), field.paths(POINTS[1], max_paths=10)
 
 
+def _resumed(path: Path) -> Any:
+    field = wr.RadioField.load(path.with_name("bistatic.safetensors"), device="cpu")
+    return np.array(field.spectra(MANY, store=path.with_name("store.nc")).path_gain)
+
+
 def _splats(path: Path) -> Any:
     g = wr.Gaussians.load_ply(path)
     return g, wr.render(g, wr.Camera.spherical(24, 12, position=POINTS[0]), device="cpu")
@@ -354,6 +359,7 @@ FORMATS: dict[str, Format] = {
         for name in ("bistatic", "harmonic", "rf3dgs")
     },
     "older field": Format(_made("old.safetensors", without_checksum), _field, "", "whole", ("transmitter",)),
+    "unfinished store": Format(_copy("store.nc.unfinished", "bistatic.safetensors"), _resumed, "", "sealed"),
     "paths": Format(_copy("paths.nc"), _paths, "netcdf", "sealed"),
     "reconstruction": Format(
         _copy("reconstruction/reconstruction.safetensors"), lambda p: wr.Reconstruction.load(p.parent), "tensors", "sealed"

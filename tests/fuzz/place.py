@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from warprrf.geometry.splats.gaussians import discs_on_mesh
 POINTS = np.array([[1.0, 1.0, 1.5], [4.0, 3.0, 1.0], [1.0, 3.0, 2.0]])
 ANGLES = np.linspace(0.3, 2.5, 5)
 TOWARDS = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+MANY = POINTS[0] + np.linspace(0.0, 0.5, 30)[:, None] * [1.0, 0.2, 0.1]
+"""Receivers of a store, more than are traced at once."""
 GIVEN: dict[str, Any] = {
     "frequency_hz": 300e9, "wavelength_m": 1e-3, "transmitter": np.array(TRANSMITTER),
     "receiver": POINTS[0], "position": POINTS[0], "points": POINTS, "candidates": POINTS, "directions": TOWARDS,
@@ -62,6 +65,8 @@ class Place:
             field.save(self.folder / f"{name}.safetensors")
         where = {"receivers": self.receivers[:2], "transmitter": TRANSMITTER, "frequency_hz": 300e9}
         wr.relevance(self.field, **where).save(self.folder / "relevance.json")
+        with suppress(InterruptedError):
+            self.field.spectra(MANY, store=self.folder / "store.nc", progress=_stop)
         self.field.radio_map(1.2, 0.8).save(self.folder / "map.nc")
         self.gaussians.save_ply(self.folder / "splats.ply")
         self.paths.save(self.folder / "paths.nc")
@@ -102,6 +107,11 @@ class Place:
             write(str(self.folder / name))
 
 
+def _stop(stage: str, done: int, total: int) -> None:
+    if done:
+        raise InterruptedError
+
+
 def _uploaded(p: Place) -> dict[str, Any]:
     """Parameters of Gaussians on the device, and colours."""
     means, quaternions, scales, opacities = p.raster.upload(p.gaussians)
@@ -136,6 +146,11 @@ MADE: dict[str, Callable[[Place], Any]] = {
     "gaussians": lambda p: discs_on_mesh(p.mesh, 200),
     "camera": lambda p: make.pinhole().resized(16, 12),
     "reconstruction": lambda p: wr.Reconstruction(p.gaussians, p.mesh, {"0.png": p.camera}),
+    "harmonic": lambda p: wr.RadioField.load(p.folder / "harmonic.safetensors"),
+    "filmed": lambda p: wr.Reconstruction(
+        mesh=p.mesh,
+        cameras={str(k): wr.Camera.spherical(8, 4, position=at) for k, at in enumerate([*POINTS, (2, 2, 1)])},
+    ),  # fmt: skip
     "field": lambda p: wr.RadioField.load(p.folder / "bistatic.safetensors"),
     "readings": lambda p: wr.Readings(**READINGS),
     "paths": lambda p: wr.trace_paths(

@@ -13,7 +13,8 @@ import pytest
 from fuzz import calls, trial
 from fuzz.answers import complaint, differs, leaves, wrong
 from fuzz.files import CODECS, FORMATS
-from fuzz.trial import FILE, Case, Trial, ended
+from fuzz.laws import LAWS
+from fuzz.trial import FILE, LAW, Case, Trial, ended
 from fuzz.workers import Workers
 
 CASES = 600
@@ -99,7 +100,7 @@ def test_what_is_no_argument_is_refused_by_its_name(attempt, name):
 
 FOUND = """
 Mesh.look_around: directions=as bool, points=no rows; Paths.taps: center_hz=huge; Paths.select: chosen=2^63
-RadioField.at_frequency: frequency_hz=tiny; RadioField.cfr: client=true; RadioField.fit: relevance=text
+BistaticField.at_frequency: frequency_hz=tiny; RadioField.cfr: client=true; RadioField.fit: relevance=text
 RadioField.links: shape=with -inf; RadioField.load: path=no text; RadioField.suggest: candidates=with 1e+09
 Readings: chain=ragged; Readings.from_table: table=list; SpectrumDataset.empty: frequency_hz=tiny
 Spectrum: range_db=as objects; Reconstruction: photos=dictionary; SpectrumDataset.deembed: pattern=class
@@ -120,6 +121,28 @@ def test_what_was_found_once_is_right_now(attempt, case):
     target, _, edits = case.partition(": ")
     outcome = attempt(Case(target, tuple(tuple(edit.split("=")) for edit in edits.split(", "))))
     assert outcome.kind in ("refused", "answered"), outcome.text
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_law_holds(attempt, law):
+    plain = [Case(LAW + law, ((name, 0, 0),)) for name in dict.fromkeys(LAWS[law].edits)]
+    for case in plain + trial.drawn(LAW + law, [], 6, 0):
+        outcome = attempt(case)
+        assert outcome.kind in ("answered", "unfit"), f"{case}: {outcome.text}"
+
+
+@pytest.mark.parametrize(
+    ("target", "edits"),
+    [
+        ("simulate", {"beam_sigma_rad": "zero"}),
+        ("PlanarArray", {"orientation": "mirror"}),
+        ("Mesh", {"vertices": "all alike"}),
+        ("RadioField.fit", {"ds": "readings", "model": "rf3dgs+"}),
+    ],
+)
+def test_what_no_answer_exists_for_is_refused(attempt, target, edits):
+    outcome = attempt(Case(target, tuple(edits.items())))
+    assert outcome.kind == "refused", outcome
 
 
 def misbehaving(scratch):

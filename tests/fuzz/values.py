@@ -10,6 +10,9 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from radio_scenes import box_mesh, joined, square
+
+import warprrf as wr
 
 
 class Array(np.ndarray):
@@ -61,8 +64,35 @@ OBJECTS: dict[str, Callable[[Any], Any]] = {
     "warp array": lambda v: wp.zeros(3, dtype=wp.vec3, device="cpu"),
     "warp flat": lambda v: wp.zeros(3, dtype=float, device="cpu"),
     "repeated in a list": lambda v: [v, v],
+    "horn": lambda v: wr.horn(0.2),
+    "mirror": lambda v: np.diag([1.0, 1.0, -1.0]),
+    "rf3dgs+": lambda v: "rf3dgs+",
+    "readings": lambda v: wr.Readings([1.0, 1.0, 2.5], [2.0, 2.0, 1.5], [1e-8], 300e9, floor=1e-15),
 }
-"""Python's and other packages' values, for arguments alone."""
+"""Python's, other packages' and our own values, for arguments alone."""
+
+
+def _of(vertices: Any, faces: Any) -> Callable[[Any], Any]:
+    """A mesh, or a scene of it, as the one that stood there."""
+
+    def make(value: Any) -> Any:
+        mesh = wr.Mesh(vertices, faces)
+        held = isinstance(value, wr.Scene)
+        return wr.Scene(mesh, list(value.materials[:1]), np.zeros(len(faces), int)) if held else mesh
+
+    return make
+
+
+_ROOM = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
+_SHEETS = joined(*(square(2.0, z) for z in (0.0, 1.0, 2.5)))[0]
+SCENES: dict[str, Callable[[Any], Any]] = {
+    "one sheet": _of(*square(5.0)),
+    "sheets": _of(_SHEETS.vertices, _SHEETS.faces),
+    "one side open": _of(_ROOM[0], _ROOM[1][2:]),
+    "a closed box": _of(*box_mesh([0, 0, 0], [5, 4, 3])),
+    "no area": _of(np.outer([0.0, 1.0, 2.0], [1.0, 2.0, 3.0]), np.array([[0, 1, 2]])),
+}
+"""Meshes and scenes in the place of one."""
 
 ARRAYS: dict[str, Callable[[Any], Any]] = {
     "empty": lambda v: np.zeros(0),
@@ -101,7 +131,7 @@ SAME: dict[str, Callable[[Any], Any]] = {
 NOT_FINITE = {"nan", "inf", "with nan", "with -inf"}
 """What is given with these may come back."""
 
-VALUES = {name: lambda v, x=x: x for name, x in PLAIN.items()} | OBJECTS | ARRAYS | SAME
+VALUES = {name: lambda v, x=x: x for name, x in PLAIN.items()} | OBJECTS | SCENES | ARRAYS | SAME
 
 
 def is_numbers(value: Any) -> bool:
@@ -117,4 +147,5 @@ def is_numbers(value: Any) -> bool:
 
 def names_for(value: Any) -> list[str]:
     """Names of the values that ``value`` can be replaced with."""
-    return [*PLAIN, *OBJECTS, *((*ARRAYS, *SAME) if is_numbers(value) else ())]
+    more = SCENES if isinstance(value, (wr.Mesh, wr.Scene)) else (*ARRAYS, *SAME) if is_numbers(value) else ()
+    return [*PLAIN, *OBJECTS, *more]
