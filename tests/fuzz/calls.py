@@ -47,7 +47,7 @@ def public() -> dict[str, Callable[..., Any]]:
     found: dict[str, Callable[..., Any]] = {}
     homes: set[Any] = set()
     for name, value in _names(wr, ""):
-        if not callable(value) or value in homes or name in ELSEWHERE:
+        if not callable(value) or value in homes or name in SERVERS:
             continue
         homes.add(value)
         if name not in ABSTRACT:
