@@ -163,6 +163,14 @@ def test_only_what_a_closed_surface_holds_is_no_air_however_surfaces_are_wound(s
         np.testing.assert_array_equal(in_the_air(mesh, places, known)[off], ~solid[off])
 
 
+def test_a_room_is_one_though_crumbs_lie_beside_it():
+    """As in a reconstruction, whose walls have pieces before and behind them."""
+    crumb = sheet([6.1, 2, 1], [6.1, 3, 1], [6.1, 3, 2], [6.1, 2, 2])
+    mesh = joined(box_mesh(LOW, HIGH, inward=True), crumb)[0]
+    check_positions(mesh, TX, np.zeros((0, 3)), WAVELENGTH)
+    assert in_the_air(mesh, np.array([AIR, TX])).all()
+
+
 def test_places_round_open_walls_and_lone_boxes_pass_and_in_a_box_do_not():
     rng = np.random.default_rng(4)
     for side in range(6):  # a room without it

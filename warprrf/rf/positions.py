@@ -51,6 +51,7 @@ _SKY = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
 _PLACES = 5  # along each side of a scene, at which the sky is looked for
 _ROOM = 0.1  # least share of the box around a scene that its room takes
 _WALL = 0.5  # least share of what a room's walls hold that their inner surface does
+_CRUMBS = 0.1  # of a surface's area: what is left beside it is nothing to speak of
 _SAMPLES = 1000  # faces whose places tell what a surface holds
 _LEAK = 0.02  # share of rays that may leave a closed room: its walls need not meet exactly
 _FLOOR = 0.1  # least share of a plan with something below, for a scene with a floor
@@ -395,7 +396,8 @@ def _rooms(mesh: Mesh) -> list[int]:
             rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:_SAMPLES]
         ]
         held = holds(mesh.closed_parts[k], mesh.triangles[rest].mean(axis=1))
-        if not len(rest) or mesh.areas[rest[held]].sum() > 0.5 * mesh.areas[rest].sum():
+        left = mesh.areas[rest].sum()
+        if mesh.areas[rest[held]].sum() > 0.5 * left or left <= _CRUMBS * mesh.closed_parts[k].areas.sum():
             rooms.append(k)
             least = _WALL * volume[k]
     return rooms
