@@ -8,20 +8,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from furnished import RECEIVERS, SHAPE, SIGMA, TX, spectra
+from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene
 
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic import observations
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import OWN_GAIN, Reading, Target
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
+from warprrf.rf.fields.bistatic.observations import observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.readings import Readings, horn
 
 RX = RECEIVERS[0]
 
@@ -57,6 +60,39 @@ def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
     # three components resolve the Fresnel curves to a few parts in a thousand
     np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-3 * expected.max())
     assert found.sum() == pytest.approx(expected.sum(), rel=0.01)
+
+
+def test_places_where_a_horn_is_turned_alike_share_a_table(
+    field: BistaticField, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says what a table of each place's own says, and memory does not grow with the places."""
+    places, azimuth = RX + [[0.0, 0, 0], [0.3, -0.4, 0.2]], np.linspace(-3.0, 3.0, 7)
+    arrival = np.tile(np.column_stack([np.full(7, 1.5), azimuth]), (2, 1))
+    horns = Readings(
+        TX,
+        np.repeat(places, 7, axis=0),
+        np.full(14, 1e-9),
+        F,
+        1e-15,
+        arrival=arrival,
+        receive_pattern=horn(0.3),
+    )
+    views, data = [field.view(place) for place in places], [horns]
+    where = places_of(data, field.mesh, None)
+    shared = [one.measured for one in observe(data, where, views, 1.0)[0]]
+    assert shared[0].of_bin is shared[1].of_bin and shared[0].alike == shared[1].alike
+    monkeypatch.setattr(observations, "MOST_POINTINGS_BYTES", 0)
+    own = [one.measured for one in observe(data, where, views, 1.0)[0]]
+    some = np.array([5, 2])
+    for a, b, view in zip(shared, own, views, strict=True):
+        powers = path_powers(view, field.materials, None)
+        expected = read(view, b, powers)
+        np.testing.assert_allclose(read(view, a, powers), expected, rtol=1e-3)
+        np.testing.assert_allclose(read(view, a.part(some), powers), expected[some], rtol=1e-3)
+        back = [m.to_bins(np.eye(7)[:, some])[m.bins(view)[0]] for m in (a, b)]
+        back += [m.part(some).to_bins(np.eye(2))[m.bins(view)[0]] for m in (a, b)]
+        for found in back[1:]:
+            np.testing.assert_allclose(found, back[0], rtol=0.05, atol=1e-3 * back[0].max())
 
 
 def array_image(view: ReceiverView) -> ArrayImage:
