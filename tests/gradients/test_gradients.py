@@ -1,6 +1,6 @@
 """Gradients of the rasteriser's whole path (parameters, image, loss) and of rays through Gaussians, in float64: Warp's
 tape against finite differences on many random scenes, with the cutoffs of photos; what lies at a cutoff; second backward
-calls, gradients used again, and the same through torch."""
+calls."""
 
 from __future__ import annotations
 
@@ -316,23 +316,6 @@ def test_a_step_over_a_cutoff_moves_a_pixel_by_one_faint_layer_at_most(kind, see
     assert difference.max() < smooth + jump
 
 
-@PICTURES
-def test_gradients_handed_to_the_tape_can_be_used_again(kind):
-    path = kind(4)
-    seed = wp.array(np.random.default_rng(0).normal(size=path.target.shape), dtype=wp.float64)
-    kept, found = seed.numpy().copy(), []
-    for _ in range(2):
-        arrays = path.arrays(path.values)
-        with wp.Tape() as tape:
-            image = path.image(arrays)
-        tape.backward(grads={image.features: seed})
-        found.append([array.grad.numpy().copy() for array in arrays.values()])
-        assert np.array_equal(seed.numpy(), kept)
-    for one, other in zip(*found, strict=True):
-        assert np.abs(one).max() > 0
-        assert np.array_equal(one, other)
-
-
 @pytest.mark.parametrize("layers", [1, 2])
 def test_a_fully_opaque_layer_has_the_derivative_of_the_others_product(layers):
     """With alpha_max of one, T = (1 - a1)(1 - a2)(1 - 0.3): a division by 1 - a would be by zero."""
@@ -354,65 +337,3 @@ def test_a_fully_opaque_layer_has_the_derivative_of_the_others_product(layers):
     tape.backward(grads={passed: wp.ones(1, dtype=wp.float64)})
     expected = [-np.prod(1 - np.delete(opacities, i)) for i in range(3)]
     np.testing.assert_allclose(arrays["opacities"].grad.numpy(), expected, atol=1e-15)
-
-
-# --------------------------------------------------------------------------------------------------------- torch
-
-
-def scene(torch, seed, dtype):
-    rng = np.random.default_rng(seed)
-    values = (
-        rng.uniform(-1, 1, (4, 3)), rng.normal(size=(4, 4)), np.exp(rng.uniform(-1, 0, (4, 3))),
-        rng.uniform(0.2, 0.9, 4),
-    )  # fmt: skip
-    return [torch.tensor(v, dtype=dtype, requires_grad=True) for v in values]
-
-
-def test_torch_gradcheck_passes_and_a_planted_wrong_adjoint_fails(monkeypatch):
-    torch = pytest.importorskip("torch")
-    from warprrf.geometry.splats import torch_functions as interop
-
-    smooth = Blending(alpha_min=1e-12, alpha_max=1.0, transmittance_min=1e-12)
-    values = scene(torch, 0, torch.float64)
-    start, end = np.array([[-4.0, 0.1, 0.2], [0.3, -4.0, 0.1]]), np.array([[4.0, 0, 0], [0.1, 4.0, 0.3]])
-
-    def passed(*v):
-        return interop.ray_transmittance(*v, start, end, blending=smooth)
-
-    def hits(*v):
-        return interop.ray_hits(*v, start, end - start, 4, blending=smooth)[1:]
-
-    assert (hits(*values)[0] < 10).all()  # all places are taken: no infinity meets gradcheck
-    for function in (passed, hits):
-        assert torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-7, rtol=1e-6)
-    right = interop._Rays.backward
-
-    def wrong(ctx, *incoming):
-        out = list(right(ctx, *incoming))
-        out[2] = out[2] * (1 + 1e-4)
-        return tuple(out)
-
-    monkeypatch.setattr(interop._Rays, "backward", staticmethod(wrong))
-    for function in (passed, hits):
-        with pytest.raises(RuntimeError, match="Jacobian mismatch"):
-            torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-7, rtol=1e-6)
-
-
-def test_torch_second_backward_and_reused_gradients_behave():
-    torch = pytest.importorskip("torch")
-    from warprrf.geometry.splats import torch_functions as interop
-
-    values = scene(torch, 1, torch.float32)
-    index, t, alpha, weight, left = interop.ray_hits(*values, [-4, 0, 0], [[1, 0, 0], [1, 0.1, 0]], 3)
-    assert index.dtype == torch.int32 and weight.dtype == torch.float32 and not index.requires_grad
-    incoming = torch.ones_like(weight)
-    torch.autograd.backward(weight, incoming, retain_graph=True)
-    once = [v.grad.clone() for v in values]
-    torch.autograd.backward(weight, incoming)
-    assert torch.equal(incoming, torch.ones_like(weight))
-    for v, first in zip(values, once, strict=True):
-        assert first.abs().max() > 0
-        assert torch.equal(v.grad, 2 * first)
-    for k, value, message in ((2, torch.zeros(4, 3), r"^scales:"), (0, np.nan * values[0], r"^means:.*NaN")):
-        with pytest.raises(ValueError, match=message):
-            interop.ray_transmittance(*values[:k], value, *values[k + 1 :], [0, 0, 0], [1, 0, 0])

@@ -60,9 +60,6 @@ def through_a_lens(tmp_path_factory):
     return folder, work, found
 
 
-# ------------------------------------------------------------------------------------------- lens
-
-
 def test_the_lens_is_found(through_a_lens):
     lens = through_a_lens[2].lenses[BENT[0]]
     assert lens.model == "SIMPLE_RADIAL"
@@ -100,7 +97,7 @@ def test_undistorted_photos_show_what_the_straight_ones_do(through_a_lens):
 @pytest.mark.parametrize(
     "model, bends",
     [
-        ("SIMPLE_RADIAL", (-0.1,)), ("RADIAL", (-0.1, 0.02)), ("OPENCV", (-0.1, 0.02, 0.002, -0.003)),
+        ("PINHOLE", ()), ("SIMPLE_RADIAL", (-0.1,)), ("RADIAL", (-0.1, 0.02)), ("OPENCV", (-0.1, 0.02, 0.002, -0.003)),
         ("OPENCV_FISHEYE", (0.02, -0.01, 0.0, 0.0)), ("FULL_OPENCV", (-0.1, 0.02, 1e-3, 0.0, 0.01, 0.02, 0.0, 0.0)),
     ],
 )  # fmt: skip
@@ -135,19 +132,6 @@ def test_a_pixel_shows_the_direction_that_its_camera_says(model, bends, orientat
         assert np.abs(found - expected)[2:-2, 2:-2].max() < 0.02
 
 
-# ------------------------------------------------------------------------------------------- orientation, size
-
-
-@pytest.mark.parametrize("turns, orientation", [(0, 1), (1, 6), (2, 3), (3, 8)])
-def test_photos_are_written_upright(turns, orientation, tmp_path):
-    upright = smooth(40, 30)
-    save(tmp_path / "a.png", np.rot90(upright, turns), orientation)
-    stored = read_photo(tmp_path / "a.png").shape
-    lens = Lens("PINHOLE", stored[1], stored[0], 50.0, 51.0, 18.0, 17.0)
-    write_undistorted(tmp_path / "a.png", tmp_path / "out.png", lens, 10**6)
-    np.testing.assert_allclose(255 * read_photo(tmp_path / "out.png"), upright, atol=0.01)
-
-
 def test_photos_stored_mirrored_are_refused(tmp_path):
     save(tmp_path / "a.png", smooth(40, 30), 2)
     with pytest.raises(ValueError, match=r"a\.png has EXIF orientation 2, expected 1, 3, 6 or 8"):
@@ -160,9 +144,6 @@ def test_photos_are_reduced_and_never_enlarged():
     assert 0.998e6 < small.width * small.height <= 1e6
     assert small.fx / small.width == pytest.approx(0.75) and small.cx / small.width == pytest.approx(0.5)
     assert pinhole_of(lens, np.eye(4), 0, 10**8).width == 4000
-
-
-# ------------------------------------------------------------------------------------------- cameras
 
 
 def test_photos_of_one_camera_share_a_lens_wherever_they_lie(tmp_path):
@@ -196,9 +177,6 @@ def test_photos_of_two_sizes_are_posed_together(tmp_path):
     large, small = sparse.lenses[names[1]], sparse.lenses[names[0]]
     assert len(lenses_in_use(sparse.lenses)) == 2
     assert large.fx == pytest.approx(FOCAL, rel=0.03) and small.fx == pytest.approx(0.8 * FOCAL, rel=0.03)
-
-
-# ------------------------------------------------------------------------------------------- masks
 
 
 def test_features_are_not_found_where_a_mask_is_black(through_a_lens):
