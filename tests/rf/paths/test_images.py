@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from radio_scenes import box_mesh, joined
+from radio_scenes import box_mesh, joined, tube
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
@@ -174,20 +174,11 @@ def test_no_points_and_no_patches():
     assert exact_paths(MirrorImages(none, TX), np.array([[9.0, 9, 9]]), 3).order.tolist() == [0]
 
 
-def pillar(facets):
-    """A round pillar of 0.3 m in facets, without ends."""
-    azimuth, k = 2 * np.pi * np.arange(facets) / facets, np.arange(facets)
-    ring = 0.3 * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
-    vertices = np.concatenate([np.column_stack([ring, np.full(facets, z)]) for z in (0.0, 3.0)])
-    after = (k + 1) % facets
-    return vertices + [2.0, 2.0, 0.0], np.concatenate(
-        [np.column_stack([k, after, after + facets]), np.column_stack([k, after + facets, k + facets])]
-    )
-
-
 @pytest.mark.parametrize(("facets", "curved"), [(4, False), (8, False), (16, True), (64, True)])
 def test_a_smooth_surface_that_was_cut_into_mirrors_is_told_of(facets, curved):
-    mesh = joined(box_mesh([0, 0, 0], [6, 5, 3], inward=True), pillar(facets))[0]
+    vertices, faces = tube(facets, 0.3, 3.0)
+    pillar = vertices + [2.0, 2.0, 0.0], faces
+    mesh = joined(box_mesh([0, 0, 0], [6, 5, 3], inward=True), pillar)[0]
     assert planar_patches(mesh).curved_m2 == pytest.approx(
         curved * 2 * facets * 0.3 * np.sin(np.pi / facets) * 3.0
     )
