@@ -19,7 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_number, check_positive, checked, one_line
+from warprrf.checks import check_array, check_number, check_positive, check_type, checked, one_line
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -263,7 +263,7 @@ def spread_paths(
     Raises:
         ValueError: on a wrong shape, NaN, a negative gain, a direction of length zero, or a sigma that is not positive.
     """
-    rows, columns = check_shape(shape)
+    shape = rows, columns = check_shape(shape)
     d = check_array("directions", directions, (None, 3))
     power = check_array("powers", powers, (len(d),))
     check_positive("sigma", sigma, "beam width in radians")
@@ -503,10 +503,12 @@ class Spectrum:
         """Spectra of several receivers as one; floor and range are those of the first.
 
         Raises:
-            ValueError: for none.
+            TypeError, ValueError: for none, or what are no spectra.
         """
-        if not spectra:
-            raise ValueError("spectra: got none, expected at least one")
+        if not isinstance(spectra, Sequence) or not len(spectra):
+            raise ValueError(f"spectra: got {spectra!r:.60}, expected a list of at least one")
+        for k, one in enumerate(spectra):
+            check_type(f"spectra[{k}]", one, Spectrum)
         several: dict[str, Any] = {}
         for name, first in spectra[0]._arrays().items():
             several[name] = None if first is None else np.stack([getattr(one, name) for one in spectra])
