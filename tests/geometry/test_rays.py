@@ -91,28 +91,6 @@ def test_grazing_rays_meet_floor_or_wall_where_they_should(where, height):
     assert hit.valid.all()
 
 
-def test_degenerate_and_duplicate_triangles_change_nothing(where):
-    clean = sphere()
-    rng = np.random.default_rng(3)
-    some = rng.permutation(len(clean.faces))[:400]
-    middle = clean.triangles[some].mean(axis=1)
-    count = len(clean.vertices)
-    points = clean.faces[some][:, [0, 0, 1]]
-    collinear = np.column_stack(
-        [clean.faces[some, 0], np.arange(count, count + 400), np.arange(count + 400, count + 800)]
-    )
-    vertices = np.concatenate([clean.vertices, middle, 0.5 * (middle + clean.triangles[some, 0])])
-    dirty = Mesh(vertices, np.concatenate([points, clean.faces[some], clean.faces]))
-    needles = Mesh(vertices, np.concatenate([collinear, points, clean.faces[some], clean.faces]))
-    assert dirty.is_closed
-    aimed = np.concatenate([directions(100_000), clean.vertices, middle])
-    expected = clean.cast([0.01, 0.02, 0.03], aimed, **where)
-    for mesh in (dirty, needles):
-        hit = mesh.cast([0.01, 0.02, 0.03], aimed, **where)
-        np.testing.assert_allclose(hit.t, expected.t, atol=2e-6)
-        np.testing.assert_allclose(hit.t[:100_000], expected.t[:100_000], atol=1e-9)
-
-
 def test_a_receiver_on_a_surface_meets_the_next_surface(where):
     turn, n = rotation(4), 30_000
     vertices, faces = box_mesh(*ROOM)

@@ -15,7 +15,6 @@ import warprrf as wr
 from warprrf import tensor_files
 from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos import sparse
 from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
 from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
 from warprrf.geometry.photos.initialise import initial_gaussians
@@ -105,19 +104,6 @@ def test_a_plane_in_front_hides_the_one_behind():
     cameras = [look([3.0, 0.0, 2.0], [0, 0, 2.0])] * 2
     front, back = seen_cells([near, wall], cameras)
     assert front.occupied.any() and not back.occupied.any()
-
-
-def test_without_a_survey_the_size_is_plausible_and_said_to_be_assumed():
-    cameras = {f"{k}": look([0.1 * k, 0.02 * k**2, 0.0], [1 + k, 2.0, 0.1]) for k in range(4)}
-    rng = np.random.default_rng(0)
-    points = rng.uniform(5, 6, (30, 3))
-    model = sparse.SparseModel(
-        cameras, points, points, np.ones(30), np.full(30, 2), np.arange(0, 61, 2), np.tile([0, 3], 30)
-    )
-    out = sparse.assume_scale(sparse.transformed(model, 0.2, np.eye(3), np.ones(3)))
-    gap = [np.linalg.norm(p - c.position) for c in list(out.cameras.values())[::3] for p in out.points]
-    assert np.median(gap) == pytest.approx(3.0, rel=0.05)
-    assert not out.metric and [text.split(":")[0] for text in out.guessed] == ["scale"]
 
 
 def made(workspace, photos=VIEWS, **options):

@@ -175,11 +175,11 @@ def test_a_thin_screen_does_not_cut_the_floor_it_stands_on():
 
 def test_nearly_level_weak_planes_become_level_and_tilted_ones_stay():
     rng = np.random.default_rng(0)
-    strong = np.concatenate([rng.uniform(-2, 2, (900, 2)), 0.003 * rng.standard_normal((900, 1))], axis=1)[
-        :, [2, 0, 1]
-    ]
-    weak = np.concatenate([rng.uniform(-0.2, 0.2, (40, 2)), 0.004 * rng.standard_normal((40, 1))], axis=1)
-    tilted = np.concatenate([rng.uniform(-1, 1, (60, 2)), 0.001 * rng.standard_normal((60, 1))], axis=1)
+    sizes, noise = np.repeat([2.0, 0.2, 1.0], [900, 40, 60]), np.repeat([0.003, 0.004, 0.001], [900, 40, 60])
+    flat = np.column_stack(
+        [sizes[:, None] * rng.uniform(-1, 1, (1000, 2)), noise * rng.standard_normal(1000)]
+    )
+    strong, weak, tilted = flat[:900, [2, 0, 1]], flat[900:940], flat[940:]
     slope = np.array([np.sin(0.04), 0, np.cos(0.04)])
     tilted[:, 2] -= tilted[:, 0] * np.tan(0.04)
     points = np.concatenate([strong, weak, tilted])
