@@ -201,6 +201,12 @@ def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_pa
     assert not Path(names[2]).exists() and Path(f"{names[2]}.unfinished").exists()
     with pytest.raises(ValueError, match="another field"):
         field.spectra(PLACES, OTHER, store=names[2])
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        field.spectra(PLACES, store=names[2], progress=stop)
     told: list[int] = []
     found = field.spectra(PLACES, store=names[2], progress=lambda _, done, __: told.append(done))
     np.testing.assert_array_equal(found.path_gain, field.spectra(PLACES).path_gain)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from places import ROOT
 from sionna_room import sionna_or_skip
 from twin_fields import BLOCKED, LOBES, MATERIALS, SEES, SHAPE, SIGMA, TX, F, known_field, room
 
@@ -90,20 +89,6 @@ def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patt
         assert getattr(pattern, "alpha_r", None) == alpha_r
     with pytest.raises(ValueError, match="140 GHz"):
         wr.load_sionna_scene(twin.xml, frequency_hz=140e9)
-
-
-def test_our_loader_opens_a_scene_of_itu_materials_with_our_table():
-    sionna_or_skip()
-    import sionna.rt as rt
-
-    lobby = ROOT / "data" / "lobby" / "scene.xml"
-    loaded, ours = wr.load_sionna_scene(str(lobby), frequency_hz=F), wr.Scene.load(lobby)
-    assert len(loaded.objects) == len(ours.object_names)
-    metal = loaded.objects["elevator"].radio_material
-    assert metal.conductivity.numpy()[0] == pytest.approx(1e7)
-    assert isinstance(metal.scattering_pattern, rt.DirectivePattern)
-    assert metal.scattering_pattern.alpha_r == 10
-    assert len(loaded.radio_materials) == len(ours.materials)
 
 
 def test_sionna_scatters_and_mirrors_as_the_field(twin, field):

@@ -1,6 +1,7 @@
 """The grid covers the sphere, and the beam keeps power wherever a path points."""
 
 import numpy as np
+import path_makers
 import pytest
 
 from warprrf.rf.spectra.spectrum import (
@@ -20,8 +21,7 @@ SIGMA = np.deg2rad(2.0)
 
 
 def random_directions(n, seed=0):
-    d = np.random.default_rng(seed).standard_normal((n, 3))
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
+    return path_makers.random_directions(n, np.random.default_rng(seed))
 
 
 def brute_force(d, powers, shape, sigma):
