@@ -29,6 +29,7 @@ from warprrf.checks import (
     check_arrays,
     check_count,
     check_number,
+    check_type,
     checked,
     index_to,
     one_line,
@@ -317,6 +318,7 @@ class BistaticField(RadioField):
         """
         field = self.on_grid(shape)
         if view is not None:
+            check_type("view", view, ReceiverView)
             return field._seen(view, uncertainty)
         return field._looked(
             receivers, transmitter, lambda *link: field._trace_spectrum(*link, uncertainty=uncertainty)
