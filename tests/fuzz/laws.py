@@ -376,7 +376,7 @@ def _messages(place: Place, edits: tuple[Edit, ...]) -> str:
         for message in (wild, drag | {"position": right.tolist()}):
             page.send(msgspec.msgpack.encode(message))
             time.sleep(0.05)
-        end = time.monotonic() + 10.0
+        end = time.monotonic() + 30.0
         while time.monotonic() < end:
             if viewer.last is not None and np.array_equal(viewer.last.receiver, right):
                 return ""

@@ -318,7 +318,6 @@ class BistaticField(RadioField):
         """
         field = self.on_grid(shape)
         if view is not None:
-            check_type("view", view, ReceiverView)
             return field._seen(view, uncertainty)
         return field._looked(
             receivers, transmitter, lambda *link: field._trace_spectrum(*link, uncertainty=uncertainty)
@@ -431,6 +430,7 @@ class BistaticField(RadioField):
 
     def render(self, view: ReceiverView) -> Rendered:
         """The spectrum of what is seen, by its parts."""
+        check_type("view", view, ReceiverView)
         view = view.transport.complete(view, self.terms)
         return render(view, self.materials, self._beam, self.sent_radiance(view.transport))
 
