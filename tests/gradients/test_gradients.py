@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from rays_by_definition import blended, met
+from scipy.spatial.transform import Rotation
 
 from warprrf import device
 from warprrf.geometry.splats.camera import Camera
@@ -208,8 +209,7 @@ def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: boo
     if spherical:
         return Camera.spherical(18, 9, position=rng.uniform(-0.3, 0.3, 3))
     while True:
-        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        rotation *= np.sign(np.linalg.det(rotation))
+        rotation = Rotation.random(rng=rng).as_matrix()
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, rotation @ rng.uniform(-0.3, 0.3, 3)
         camera = Camera.pinhole(17, 11, fx=7.0, fy=8.0, cx=8.0, cy=6.0, world_to_camera=pose)

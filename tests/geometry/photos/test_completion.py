@@ -6,7 +6,6 @@ import pytest
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.photos.completion import complete
-from warprrf.geometry.photos.completion.room_planes import directions
 from warprrf.geometry.photos.config import SurfaceConfig
 from warprrf.geometry.photos.snapping import find_patches, largest_first
 from warprrf.geometry.planar_patches import PlanarPatches
@@ -137,11 +136,6 @@ def test_a_mesh_without_planes_or_views_stays_as_it_is():
     assert complete(none, views, [np.ones((80, 80))] * 6) is none
     patches = find_patches(as_mesh(box(*ROOM, sign=-1)), config=FLAT)
     assert complete(patches, [], []) is patches
-    label = np.where(np.arange(40) < 3, 0, -1)
-    slope = PlanarPatches.from_planes(mesh, label, [[0.6, 0.0, 0.8]], [0.0], tolerance_m=1e-6)
-    assert directions(slope.normal, slope.area, float(mesh.areas.sum())) is None
-    with pytest.raises(ValueError, match="depths: got 0 maps for 6"):
-        complete(patches, views, [])
 
 
 def test_a_place_seen_in_part_only_is_not_guessed():
