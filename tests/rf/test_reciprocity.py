@@ -1,6 +1,5 @@
 """Scattering with transmitter and receiver exchanged: what a surface element passes on, in single paths and in total."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ from twin_fields import known_field
 
 from warprrf.rf import exact
 from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection
-from warprrf.rf.em.materials import Material, load_materials, table_entry
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
@@ -174,18 +172,3 @@ def test_a_fit_takes_reciprocal_lobes_and_its_file_says_so(tmp_path):
     assert again.terms.reciprocal
     assert np.array_equal(again.spectrum(RX).path_gain, field.spectrum(RX).path_gain)
     assert not RadioField.fit(scene, ds, quick=True).terms.reciprocal
-
-
-def test_a_table_of_materials_says_which_are_reciprocal(tmp_path):
-    both = [
-        Material.custom(f"m{r}", relative_permittivity=4.0, scattering=0.5, pattern="directive", reciprocal=r)
-        for r in (False, True)
-    ]
-    table = {"materials": [table_entry(m) for m in both]}
-    file = tmp_path / "materials.json"
-    file.write_text(json.dumps(table))
-    assert [m.reciprocal for m in load_materials(file).values()] == [False, True]
-    table["materials"][1]["pattern"]["reciprocal"] = "yes"
-    file.write_text(json.dumps(table))
-    with pytest.raises(ValueError, match="reciprocal"):
-        load_materials(file)

@@ -305,6 +305,9 @@ def test_gas_is_put_in_and_taken_out():
     db_per_m = gas_attenuation_db_per_m(CARRIER)
     np.testing.assert_allclose(10 * np.log10(p.power / p.with_gas().power), db_per_m * p.length_m, rtol=1e-9)
     assert p.with_gas(False) is p
+    # relevance decides
+    assert p.with_gas(SimpleNamespace(kept=("line_of_sight",))) is p
+    np.testing.assert_array_equal(p.with_gas(SimpleNamespace(kept=("gas",))).gain, p.with_gas(True).gain)
 
 
 def test_channels_need_a_carrier_delays_and_for_spherical_waves_points():
@@ -316,12 +319,6 @@ def test_channels_need_a_carrier_delays_and_for_spherical_waves_points():
     ):
         with pytest.raises(ValueError, match=name):
             replace(p, **changed).cfr([3e11], **asked)
-
-
-def test_relevance_decides_on_gas():
-    p = random_paths(4)
-    assert p.with_gas(SimpleNamespace(kept=("line_of_sight",))) is p
-    np.testing.assert_array_equal(p.with_gas(SimpleNamespace(kept=("gas",))).gain, p.with_gas(True).gain)
 
 
 @pytest.mark.parametrize("wave", ["plane", "spherical"])

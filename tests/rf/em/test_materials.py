@@ -128,7 +128,11 @@ def test_a_table_may_give_the_scattering_coefficient_itself_and_names_a_material
             lambda: content["materials"].pop() and brick["scattering"].update(value=1.43),
             r"brick.*scattering.*1\.43",
         ),
-        (lambda: brick.pop("scattering"), "brick.*neither 'roughness_m' nor 'scattering'"),
+        (lambda: brick["pattern"].update(reciprocal="yes"), "reciprocal"),
+        (
+            lambda: brick["pattern"].pop("reciprocal") and brick.pop("scattering"),
+            "brick.*neither 'roughness_m' nor 'scattering'",
+        ),
     ):
         change()
         file.write_text(json.dumps(content))
@@ -141,6 +145,7 @@ def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], 
         *table.values(),
         Material.custom("own", relative_permittivity=2.5, scattering=0.3, pattern="directive", alpha_r=7),
         replace(table["glass"], name="turning", xpd=0.25),
+        replace(table["glass"], name="both ways", reciprocal=True),
     ]
     file = tmp_path / "materials.json"
     file.write_text(json.dumps({"materials": [table_entry(material) for material in given]}))
@@ -148,7 +153,7 @@ def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], 
     for material in given:
         again = read[material.name]
         assert again.bands == material.bands
-        for name in ("thickness_m", "pattern", "roughness_m", "scattering", "itu", "xpd"):
+        for name in ("thickness_m", "pattern", "roughness_m", "scattering", "itu", "xpd", "reciprocal"):
             assert getattr(again, name) == getattr(material, name)
         if material.pattern == "directive":
             assert again.alpha_r == material.alpha_r

@@ -247,29 +247,19 @@ def test_an_earlier_twin_is_replaced_and_nothing_else(field, tmp_path):
         wr.write_twin(field, folder / "materials.json")
 
 
-def test_a_failed_write_leaves_the_earlier_twin(field, tmp_path, monkeypatch):
-    folder = tmp_path / "twin"
+@pytest.mark.parametrize("what", ["disk full", "stale handle"])
+def test_a_failed_write_leaves_the_earlier_twin(what, field, tmp_path, monkeypatch):
+    folder, rename = tmp_path / "twin", Path.rename
     wr.write_twin(field, folder)
     before = (folder / "scene.xml").read_bytes()
 
-    def full(*_args, **_options):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(twins, "write_mesh", full)
-    with pytest.raises(OSError, match="disk full"):
-        wr.write_twin(field, folder)
-    assert (folder / "scene.xml").read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == ["twin"]
-    monkeypatch.undo()
-    rename = Path.rename
-
-    def stuck(self, target):
-        if Path(target) == folder and "earlier" not in self.name:
-            raise OSError("stale handle")
+    def failing(self, target, *_):
+        if what == "disk full" or (Path(target) == folder and "earlier" not in self.name):
+            raise OSError(what)
         return rename(self, target)
 
-    monkeypatch.setattr(Path, "rename", stuck)
-    with pytest.raises(OSError, match="stale handle"):
+    monkeypatch.setattr(*((twins, "write_mesh") if what == "disk full" else (Path, "rename")), failing)
+    with pytest.raises(OSError, match=what):
         wr.write_twin(field, folder)
     assert (folder / "scene.xml").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["twin"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warprrf as wr
-from warprrf.rf.spectra.antenna import deembed, respond, scanned_kernel
+from warprrf.rf.spectra.antenna import deembed, scanned_kernel
 from warprrf.rf.spectra.spectrum import directions_from_angles, pixel_directions, pixel_solid_angles, spread
 
 SHAPE = (90, 180)
@@ -116,14 +116,6 @@ def test_a_pattern_as_samples_is_the_pattern_as_a_function():
     samples = horn(np.linspace(0, np.pi, 3601))
     one, other = (scanned_kernel(p, (30, 60)) for p in (horn, samples))
     np.testing.assert_allclose(one, other, atol=1e-3 * one.max())
-
-
-def test_the_kernel_is_the_scan_of_pixels():
-    image = np.zeros((30, 60))
-    image[[0, 12, 29], [3, 59, 30]] = 1.0, 2.0, 0.5
-    d = pixel_directions((30, 60))[image > 0]
-    expected = scan(d, image[image > 0], shape=(30, 60))
-    np.testing.assert_allclose(respond(image, scanned_kernel(horn, (30, 60))), expected, atol=1e-10 * PEAK)
 
 
 def test_a_needle_leaves_the_spectrum_as_it_is_but_for_the_beam():

@@ -95,6 +95,19 @@ def test_places_where_a_horn_is_turned_alike_share_a_table(
             np.testing.assert_allclose(found, back[0], rtol=0.05, atol=1e-3 * back[0].max())
 
 
+def differences(ask, x: np.ndarray, step: float) -> np.ndarray:
+    """Slopes of the readings ``ask(x)`` by each parameter, shape (parameters, readings)."""
+    steps = step * np.eye(len(x))
+    return np.stack([(ask(x + s) - ask(x - s)) / (2.0 * step) for s in steps])
+
+
+def dense(table: np.ndarray, index: np.ndarray, layout: Layout) -> np.ndarray:
+    """A Jacobian with the rows of what is not seen: zeros."""
+    whole = np.zeros((layout.size, table.shape[1]))
+    whole[index] = table
+    return whole
+
+
 def array_image(view: ReceiverView) -> ArrayImage:
     """Half a hemisphere as an array of 4 x 4 elements sees it, whose paths' lengths are known to 0.4 mm."""
     array, directions = PlanarArray(4, 4, orientation=UP), hemisphere((18, 36)).reshape(-1, 3)
@@ -122,14 +135,9 @@ def test_its_jacobian_is_that_of_differences(field: BistaticField, measured, lit
     x += rng.normal(0.0, 0.2, layout.size)
     values, table, index = jacobian(response, layout.unpack(x), layout)
     np.testing.assert_allclose(values, predict(response, layout.unpack(x)), rtol=1e-4)
-    whole = np.zeros((layout.size, len(values)))
-    whole[index] = table  # of what is not seen, none
+    slopes = differences(lambda x: predict(response, layout.unpack(x)), x, 0.02)
     caught = []
-    for place, row in enumerate(whole):
-        step = 0.02 * (np.arange(layout.size) == place)
-        slope = (
-            predict(response, layout.unpack(x + step)) - predict(response, layout.unpack(x - step))
-        ) / 0.04
+    for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.02  # that of permittivity is a table's
         bound = allowed * np.abs(slope).max() + 1e-5 * values.max()
         assert np.abs(row - slope).max() <= bound
@@ -153,13 +161,10 @@ def test_errors_at_another_carrier_or_of_unknown_gain_have_the_slopes_of_differe
     x = layout.pack(replace(field.parameters, log_indirect=np.full(groups, -3.0)))
     x += rng.normal(0.0, 0.4, layout.size)
     error, table, index = reading.linearised(layout.unpack(x), layout)
-    whole = np.zeros((layout.size, len(error)))
-    whole[index] = table
-    for place in range(layout.size):
-        step = 0.02 * (np.arange(layout.size) == place)
-        slope = (reading.error_db(layout.unpack(x + step)) - reading.error_db(layout.unpack(x - step))) / 0.04
+    slopes = differences(lambda x: reading.error_db(layout.unpack(x)), x, 0.02)
+    for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.01  # that of permittivity is a table's
-        assert np.abs(whole[place] - slope).max() <= allowed * np.abs(slope).max() + 1e-4
+        assert np.abs(row - slope).max() <= allowed * np.abs(slope).max() + 1e-4
 
 
 def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() -> None:
@@ -176,13 +181,8 @@ def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() 
     layout = Layout(3, 2, indirect=False, gain=False)
     x = layout.pack(Parameters.prior(3, 2)) + rng.normal(0.0, 0.3, layout.size)
     values, table, index = jacobian(response, layout.unpack(x), layout)
-    whole = np.zeros((layout.size, count))
-    whole[index] = table
-    for place in range(layout.size):
-        step = 1e-2 * (np.arange(layout.size) == place)
-        high, low = (predict(response, layout.unpack(x + s * step)) for s in (1.0, -1.0))
-        slope = (high - low) / 2e-2
-        assert (np.abs(whole[place] - slope) <= 1e-3 * np.abs(slope) + 1e-4 * values).all()
+    slopes = differences(lambda x: predict(response, layout.unpack(x)), x, 1e-2)
+    assert (np.abs(dense(table, index, layout) - slopes) <= 1e-3 * np.abs(slopes) + 1e-4 * values).all()
 
 
 def test_a_used_field_is_copied_and_pickled(field: BistaticField) -> None:
