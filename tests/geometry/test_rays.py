@@ -91,7 +91,7 @@ def test_grazing_rays_meet_floor_or_wall_where_they_should(where, height):
 
 
 def test_a_receiver_on_a_surface_meets_the_next_surface(where):
-    turn, n = Rotation.random(rng=4).as_matrix(), 30_000
+    turn, n = Rotation.random(None, 4).as_matrix(), 30_000
     vertices, faces = box_mesh(*ROOM)
     room = Mesh(vertices @ turn.T + [3.0, -2.0, 1.0], faces)
     rng = np.random.default_rng(5)

@@ -15,7 +15,7 @@ import warprrf as wr
 from warprrf import tensor_files
 from warprrf.geometry import pipeline as from_photos
 from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells
+from warprrf.geometry.photos.cells import occupancy, plane_mesh, seen_cells, visible_from
 from warprrf.geometry.photos.config import PlaneConfig, ReconstructionConfig, RefineConfig, SurfaceConfig
 from warprrf.geometry.photos.initialise import initial_gaussians
 from warprrf.geometry.photos.planes import Plane, plane_axes
@@ -94,7 +94,9 @@ def test_cells_that_no_photo_sees_get_no_discs():
     uv, depth = camera.project(seen[0].cells())
     assert 0 < len(uv) < planes[0].occupied.sum()
     assert ((uv >= 0) & (uv < (64, 48))).all()
-    hidden = seen_cells(planes, [look([-2.0, 1.5, 2.0], [0, 1.5, 2.0])] * 2)  # from behind
+    behind = [look([-2.0, 1.5, 2.0], [0, 1.5, 2.0])] * 2
+    assert not visible_from(None, planes[0].cells(), planes[0].normal, behind).any()
+    hidden = seen_cells(planes, behind)
     assert hidden[0].occupied.sum() == 0 and plane_mesh(hidden) is None
 
 

@@ -209,7 +209,7 @@ def random_camera(rng: np.random.Generator, means: np.ndarray, *, spherical: boo
     if spherical:
         return Camera.spherical(18, 9, position=rng.uniform(-0.3, 0.3, 3))
     while True:
-        rotation = Rotation.random(rng=rng).as_matrix()
+        rotation = Rotation.random(None, rng).as_matrix()
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, rotation @ rng.uniform(-0.3, 0.3, 3)
         camera = Camera.pinhole(17, 11, fx=7.0, fy=8.0, cx=8.0, cy=6.0, world_to_camera=pose)
