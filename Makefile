@@ -2,6 +2,8 @@
 #
 #   make lobby      install what is missing, then photos -> geometry -> radio -> evaluation into runs/lobby/ (resumable)
 #   make test       lint, types, import rules, documentation, tests: what CI runs
+#   make quick      every public verb and the main laws once: two minutes on two cores with compiled kernels cached, on a
+#                   fresh clone a few more while they compile (tests/quick.txt)
 #   make lint       the first three alone
 #   make docs       the documentation, into build/site: warnings are errors, links are checked
 #   make gpu        tests and times on a CUDA device, within ten minutes; without one a dry run on the CPU
@@ -28,7 +30,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PYTHONHASHSEED ?= 0
 export PYTHON
 
-.PHONY: help lobby test lint docs gpu data notebooks clean setup setup-test
+.PHONY: help lobby test quick lint docs gpu data notebooks clean setup setup-test
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -75,6 +77,9 @@ docs: $(VENV)/.test
 
 test: lint docs
 	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
+
+quick: $(VENV)/.test
+	$(RUN) -m pytest -n 2 --dist loadfile @tests/quick.txt $(ARGS)
 
 gpu: $(VENV)/.test
 	@$(RUN) -m benchmarks gpu $(ARGS)

@@ -14,32 +14,23 @@ from warprrf.cli.output import Output
 
 NAMES = {
     "lobby": ("benchmarks.lobby.pipeline", "the main job: photos -> geometry -> radio -> evaluation"),
-    "lobby-plain": ("benchmarks.lobby.plain", "the lobby with plain walls: photos -> geometry -> one field"),
     "lobby-seeds": ("benchmarks.lobby.seeds", "the main job's figures over several seeds: mean and spread"),
     "data": ("benchmarks.lobby.make_data", "regenerate data/lobby/ from nothing (hours; resumable)"),
     "paper": (
-        "benchmarks.evaluation.command",
-        "the paper's evaluation at its own size: every method, row by row",
-    ),
-    "gap": (
-        "benchmarks.evaluation.gap",
-        "RF-3DGS+ less RF-3DGS, with one of the paper's open choices changed",
+        "benchmarks.evaluation",
+        "the paper's evaluation on any data set and room: fields, networks, a ray tracer",
     ),
     "bistatic": (
-        "benchmarks.bistatic.table",
-        "what the bistatic field's parts are worth, its uncertainty, delays, another transmitter",
+        "benchmarks.bistatic",
+        "what the bistatic field's parts are worth, its uncertainty and delays",
     ),
-    "beams": ("benchmarks.beams.run", "beams chosen from the field, beside pilots"),
+    "beams": ("benchmarks.beams", "beams chosen from the field without pilots"),
     "engine": ("benchmarks.engine.table", "the engine's speed against error"),
-    "fuzz": ("benchmarks.fuzz.command", "hostile arguments and damaged files, for as long as it is told to"),
     "gpu": ("benchmarks.gpu", "tests and times on a CUDA device; without one a dry run"),
-    "channel": ("benchmarks.channel", "channels: closed forms, Sionna RT, wide responses, the near field"),
     "map": ("benchmarks.radio_map", "the radio map beside Sionna RT's RadioMapSolver"),
-    "relevance": ("benchmarks.relevance", "what each effect is worth, at two bands and roughnesses"),
-    "newrf": ("benchmarks.newrf", "rays and channels of NeWRF's conference room"),
-    "city-paths": ("benchmarks.city_paths", "mirror paths of Sionna RT's own scenes beside its solver's"),
+    "relevance": ("benchmarks.relevance", "what each effect is worth, at two carriers and three roughnesses"),
+    "newrf": ("benchmarks.newrf", "data of the second room: NeWRF's conference room"),
     "photos": ("benchmarks.photos", "photos of any place: every eighth held out, rendered and compared"),
-    "invariances": ("benchmarks.invariances", "what a room's description must not change, law by law"),
     "bare-mesh": ("benchmarks.bare_mesh", "a mesh without names, and a scan, beside the scene with names"),
     "filmed": ("benchmarks.filmed", "a filmed room against an RGB-D camera's depth"),
     "measurements": (
@@ -51,16 +42,11 @@ NAMES = {
         "benchmarks.suggest",
         "receivers that the field suggests beside random ones, from none to ten",
     ),
-    "batches": (
-        "benchmarks.batches",
-        "thousands of receivers at once: time, memory, and workers of a cluster",
-    ),
-    "view": ("benchmarks.viewer", "the viewer: from a drag to its answer, and whether anything grows"),
+    "times": ("benchmarks.times", "what each verb takes in the lobby or in a city: seconds and memory"),
     "outside": (
         "benchmarks.outside",
         "measurements by others: an array's pictures, received power in a furnished flat",
     ),
-    "twin": ("benchmarks.twin", "a field's digital twin in a ray tracer, beside the field and the truth"),
 }
 """Benchmarks: name to the module that has it in ``BENCHMARKS``, and a line about it."""
 

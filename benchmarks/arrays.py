@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 import warprrf as wr
-from benchmarks.data import DATA, Truth
-from benchmarks.machine import machine
-from benchmarks.report import Report, columns_table
-from benchmarks.runner import Benchmark, Job, option
-from warprrf import tensor_files
+from benchmarks.fits import FitOptions, Fits, experiment
+from benchmarks.report import Row
+from benchmarks.runner import option
 from warprrf.rf.channel.array_spectra import UP, hemisphere
-from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
-from warprrf.steps import Attempt, Steps
 
 HELP = """\
 An array of 4 x 4 vertical elements lies flat at receivers of the lobby and hears the complex paths of Sionna RT (three bounces);
@@ -29,35 +26,31 @@ examples:
   python -m benchmarks arrays --every 4 --carriers-ghz 2.4     a first look
 """
 
-KIND = "channels of arrays from Sionna RT's paths 1"
-ELEMENTS, SHAPE = 4, (90, 360)
+SHAPE = (90, 360)
+ARRAY = wr.PlanarArray(4, 4, orientation=UP)
 SCATTERING = 0.3
 """Assumed of every surface: what stands on walls and behind them, of which no mesh knows."""
-COLUMNS = (
-    ("carrier_ghz", "carrier [GHz]", "{:g}"), ("method", "", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
-    ("gained_db", "over the nearest [dB]", "{:+.2f}"), ("psnr_db_blocked", "blocked [dB]", "{:.2f}"),
-    ("fit_s", "fit [s]", "{:.0f}"),
-)  # fmt: skip
+NO_PHASES_M = 1e3  # lengths of paths that are known so badly let mirrors add up in power
+COLUMNS = {
+    "rows": (
+        ("carrier_ghz", "carrier [GHz]", "{:g}"), ("method", "", "{}"), ("psnr_db", "PSNR [dB]", "{:.2f}"),
+        ("gained_db", "over the nearest [dB]", "{:+.2f}"), ("psnr_db_blocked", "blocked [dB]", "{:.2f}"),
+    )
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(FitOptions):
     """Options of the comparison.
 
     Attributes:
-        scene: true scene (XML).
-        spectra: data set whose receivers are used (NetCDF).
         carriers_ghz: carriers.
-        train: training receivers.
-        every: each how-manieth test receiver counts.
         samples: rays of Sionna RT.
     """
 
-    scene: str = option(str(Path(DATA) / "scene.xml"), "true scene (XML)")
-    spectra: str = option(str(Path(DATA) / "spectra_sionna.nc"), "data set whose receivers are used (NetCDF)")
+    truths: tuple[str, ...] = ("sionna",)
+    counts: tuple[int, ...] = option((20,), "training receivers")
     carriers_ghz: tuple[float, ...] = option((2.4, 28.0), "carriers [GHz]")
-    train: int = option(20, "training receivers")
-    every: int = option(1, "each how-manieth test receiver counts")
     samples: int = option(300_000, "rays of Sionna RT")
 
 
@@ -72,40 +65,21 @@ def at_low_carriers(scene: wr.Scene) -> wr.Scene:
     return scene.with_materials([known(material) for material in scene.materials])
 
 
-def array() -> wr.PlanarArray:
-    """The array, flat."""
-    return wr.PlanarArray(ELEMENTS, ELEMENTS, orientation=UP)
-
-
-def channels(
-    scene: wr.Scene,
-    transmitter: np.ndarray,
-    places: np.ndarray,
-    carrier_hz: float,
-    options: Options,
-    attempt: Attempt,
-) -> dict[str, np.ndarray]:
-    """What the array hears at each of ``places`` (R, 3), real and imaginary, shape ``(R, M)``."""
+def heard(
+    scene: wr.Scene, transmitter: Any, places: np.ndarray, carrier_hz: float, samples: int
+) -> np.ndarray:
+    """Spectra of the array at each of ``places`` (R, 3), normalised to their peak, in steps of 8 bits."""
     engine = SionnaEngine(
-        scene, transmitter=transmitter, frequency_hz=carrier_hz, shape=(18, 36), sampling=Sampling(3, options.samples, seed=7)
+        scene, transmitter=transmitter, frequency_hz=carrier_hz, shape=(18, 36), sampling=Sampling(3, samples, seed=7)
     )  # fmt: skip
-    rng, heard = np.random.default_rng(7), []
-    for k, place in enumerate(places):
-        attempt.progress("paths", k, len(places))
+    rng, steering, found = np.random.default_rng(7), ARRAY.response(hemisphere(SHAPE), 1.0).conj(), []
+    for place in places:
         paths = engine.solve(place)
         phase = np.exp(-2j * np.pi * np.mod(carrier_hz * paths["tau"], 1.0))
         random = np.exp(2j * np.pi * rng.random(len(phase)))
         amplitude = paths["jones"][:, 0, 0] * np.where(paths["diffuse"], random, phase)
-        heard.append(array().response(paths["arrival"], 1.0).T @ amplitude)
-    attempt.progress("paths", len(places), len(places))
-    return {"real": np.real(heard), "imag": np.imag(heard)}
-
-
-def pictures(heard: np.ndarray) -> np.ndarray:
-    """Spectra of channels (R, M), normalised to their peak, in steps of 8 bits."""
-    steering = array().response(hemisphere(SHAPE), 1.0).conj()
-    power = np.stack([np.abs(steering @ h) ** 2 for h in heard])
-    return np.asarray(np.round(255.0 * normalised(power)) / 255.0)
+        found.append(np.abs(steering @ (ARRAY.response(paths["arrival"], 1.0).T @ amplitude)) ** 2)
+    return np.asarray(np.round(255.0 * normalised(np.stack(found))), np.uint8)
 
 
 def normalised(power: np.ndarray) -> np.ndarray:
@@ -118,96 +92,55 @@ def psnr(prediction: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.asarray(-10.0 * np.log10(((prediction - truth) ** 2).mean(axis=(1, 2))))
 
 
-def run(options: Options, job: Job) -> Report:
-    """Hear, fit and score.
-
-    Raises:
-        FileNotFoundError, ValueError: as the scene and the data set do.
-    """
-    scene = wr.Scene.load(options.scene)
-    truth = Truth.load(Path(options.spectra), (options.train,), options.every)
-    train, test = truth.train(options.train), truth.test
+def rows(options: Options, fits: Fits) -> Iterator[Row]:
+    """A row for each carrier and way to predict what is heard at the test receivers."""
+    scene = wr.Scene.load(options.xml)
+    (truth,) = options.load()
+    train, test = truth.train(truth.few), truth.test
     places = np.concatenate([train.receivers, test.receivers])
-    rows: list[dict[str, Any]] = []
+    near = np.linalg.norm(test.receivers[:, None] - train.receivers, axis=2).argmin(axis=1)
     for carrier in options.carriers_ghz:
-        file = f"channels_{carrier:g}.safetensors"
 
-        def hear(attempt: Attempt, carrier: float = carrier, file: str = file) -> dict[str, Any]:
+        def hear(hz: float = 1e9 * carrier) -> dict[str, np.ndarray]:
             low = at_low_carriers(scene)
-            found = channels(low, train.transmitter, places, carrier * 1e9, options, attempt)
-            tensor_files.write(job.out / file, found, {}, KIND)
-            return {}
+            return {"spectra": heard(low, train.transmitter, places, hz, options.samples)}
 
-        with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
-            inputs = [
-                truth.key,
-                Path(options.scene).read_text(),
-                options.every,
-                options.train,
-                options.samples,
-            ]
-            steps.run(f"channels at {carrier:g} GHz", hear, version=1, inputs=inputs, outputs=[file])
-        parts = tensor_files.read(job.out / file, KIND)[0]
-        seen = pictures(parts["real"] + 1j * parts["imag"])
-        rows += compare(scene, train, test, seen, carrier, job)
-    text = (
-        f"Normalised spectra of {ELEMENTS} x {ELEMENTS} elements, {len(train)} training and {len(test)} test receivers, true "
-        f"mesh, Sionna RT's complex paths.\n\n{columns_table(COLUMNS, rows)}"
-    )
-    return Report("arrays", {"machine": machine(job.device), "scattering": SCATTERING, "rows": rows}, text)
-
-
-def compare(
-    scene: wr.Scene,
-    train: wr.SpectrumDataset,
-    test: wr.SpectrumDataset,
-    seen: np.ndarray,
-    carrier: float,
-    job: Job,
-) -> list[dict[str, Any]]:
-    """A row for each way to predict the pictures ``seen`` of the test receivers, which follow those of training."""
-    known, asked = seen[: len(train)], seen[len(train) :]
-    blocked = ~np.asarray(test.line_of_sight)
-    measured = wr.channel.ArraySpectra(
-        train.transmitter, train.receivers, known, carrier * 1e9, array(), hemisphere(SHAPE)
-    )
-    nearest = known[np.linalg.norm(test.receivers[:, None] - train.receivers, axis=2).argmin(axis=1)]
-    fitted = BistaticField.fit(scene, measured, device=job.device, progress=job.progress)
-    without = replace(
-        fitted, parameters=type(fitted.parameters).prior(*fitted.parameters.log_weight.shape), residual=0.0 * fitted.residual
-    )  # fmt: skip
-
-    def drawn(field: BistaticField, length_std_m: float = 0.0) -> np.ndarray:
-        return normalised(
-            np.stack(
-                [
-                    field.array_spectrum(
-                        place, array(), hemisphere(SHAPE), train.transmitter, length_std_m=length_std_m
-                    )
-                    for place in test.receivers
-                ]
-            )
+        inputs = [fits.key, truth.few, options.samples]
+        kept = fits.steps.arrays(f"spectra-{carrier:g}", hear, version=1, inputs=inputs)["spectra"] / 255.0
+        known, asked = kept[: len(train)], kept[len(train) :]
+        measured = wr.channel.ArraySpectra(
+            train.transmitter, train.receivers, known, carrier * 1e9, ARRAY, hemisphere(SHAPE)
         )
+        make = partial(_fields, fits, scene, measured, asked, test)
+        found = fits.row(f"{carrier:g} GHz", make, truth.few, options.samples)
+        mean = np.broadcast_to(normalised(known.mean(axis=0)), asked.shape)
+        base = psnr(known[near], asked)
+        each = {"nearest training receiver": base, "mean picture": psnr(mean, asked), **found["psnr_db"]}
+        for method, values in each.items():
+            blocked = float(np.mean(np.asarray(values)[~np.asarray(test.line_of_sight)]))
+            row = {"carrier_ghz": carrier, "method": method, "psnr_db": float(np.mean(values))}
+            yield {**row, "gained_db": row["psnr_db"] - float(base.mean()), "psnr_db_blocked": blocked}
 
-    predictions = {
-        "nearest training receiver": nearest,
-        "mean picture": np.broadcast_to(normalised(known.mean(axis=0)), asked.shape),
-        "field, no readings": drawn(without),
-        "field, powers of mirrors added": drawn(fitted, 1e3),
-        "field": drawn(fitted),
+
+def _fields(fits: Fits, scene: wr.Scene, measured: Any, asked: np.ndarray, test: wr.SpectrumDataset) -> Row:
+    """PSNR [dB] of every test receiver, of a fitted field with and without phases of mirrors, and of its start."""
+    fitted = fits.fit(scene, measured)
+    prior = type(fitted.parameters).prior(*fitted.parameters.log_weight.shape)
+    start = replace(fitted, parameters=prior, residual=0.0 * fitted.residual)
+
+    def scored(field: Any, length_std_m: float = 0.0) -> list[float]:
+        asking = ARRAY, hemisphere(SHAPE), measured.transmitters[0]
+        pictures = [field.array_spectrum(rx, *asking, length_std_m=length_std_m) for rx in test.receivers]
+        return [float(value) for value in psnr(normalised(np.stack(pictures)), asked)]
+
+    return {
+        "psnr_db": {
+            "field, no readings": scored(start),
+            "field, powers of mirrors added": scored(fitted, NO_PHASES_M),
+            "field": scored(fitted),
+        }
     }
-    rows = []
-    base = float(psnr(nearest, asked).mean())
-    for method, prediction in predictions.items():
-        each = psnr(prediction, asked)
-        rows.append(
-            {
-                "carrier_ghz": carrier, "method": method, "psnr_db": float(each.mean()),
-                "gained_db": float(each.mean()) - base, "psnr_db_blocked": float(each[blocked].mean()),
-                "fit_s": fitted.report["fit_time_s"] + fitted.report["transport_time_s"] if method == "field" else None,
-            }
-        )  # fmt: skip
-    return rows
 
 
-BENCHMARKS = {"arrays": Benchmark("arrays", Options, run, HELP)}
+ABOUT = "Normalised spectra of 4 x 4 elements, true mesh, Sionna RT's complex paths."
+BENCHMARKS = {"arrays": experiment("arrays", Options, rows, COLUMNS, ABOUT, HELP)}

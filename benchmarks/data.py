@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,18 +15,19 @@ import warprrf as wr
 from benchmarks.lobby.spectra import FILES
 from benchmarks.runner import option
 from warprrf.device import Progress
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.steps import digest
 
 DATA = "data/lobby"
 GEOMETRY = "runs/lobby/reconstruction"
+GAUSSIANS = 40_000  # that stand for a mesh
 TRUTHS = tuple(FILES)
 
 VERSIONS = {
     "geometry": 1,
     "metrics": 1,
-    "exact": 1,
     "sionna": 1,
     "bistatic": 2,
     "harmonic": 1,
@@ -80,7 +81,6 @@ class Truth:
         key: digest of the file's content.
         data: all receivers.
         counts: numbers of training receivers that it can give.
-        left_out: asked numbers that it cannot.
         every: each how-manieth test receiver counts.
     """
 
@@ -88,7 +88,6 @@ class Truth:
     key: str
     data: SpectrumDataset
     counts: tuple[int, ...]
-    left_out: tuple[int, ...]
     every: int
 
     @classmethod
@@ -106,7 +105,7 @@ class Truth:
                 f"counts: got {', '.join(map(str, counts))}, expected a number of training receivers that {file} "
                 f"holds, 1 to {held}"
             )
-        return cls(data.engine, digest(Path(file)), data, kept, tuple(sorted(set(counts) - set(kept))), every)
+        return cls(data.engine, digest(Path(file)), data, kept, every)
 
     def train(self, count: int, seed: int = 0) -> SpectrumDataset:
         """The first ``count`` training receivers, in the order that ``seed`` gives them."""
@@ -123,37 +122,29 @@ class Truth:
         """The smallest number of training receivers: that of the checks besides the main table."""
         return self.counts[0]
 
-    @property
-    def about(self) -> dict[str, Any]:
-        """What its test receivers are, for a report."""
-        test = self.test
-        return {
-            "test": len(test),
-            "blocked": int(np.count_nonzero(~np.asarray(test.line_of_sight))),
-            "shape": list(test.shape),
-            "frequency_hz": float(test.frequency_hz),
-            "range_db": list(test.range_db),
-            "settings": dict(test.attributes),
-        }
-
 
 class Geometry:
-    """The frozen reconstruction, the true scene, and the blending weights of receivers, kept for the next method.
+    """What methods know of the room, the true scene, and the blending weights of receivers, kept for the next method.
 
     Args:
-        folder: of a saved :class:`Reconstruction`.
+        room: folder of a saved :class:`Reconstruction`; or a mesh or a scene, of which only the mesh is known: it is covered
+            with flat Gaussians.
         xml: true scene.
         device: where to compute.
     """
 
-    def __init__(self, folder: Path, xml: Path, device: Any = None) -> None:
-        self.folder, self.xml, self.device = folder, xml, device
+    def __init__(self, room: Path, xml: Path, device: Any = None) -> None:
+        self.room, self.xml, self.device = room, xml, device
         self._weights: dict[str, tuple[str, Transport, float]] = {}
 
     @cached_property
     def reconstruction(self) -> wr.Reconstruction:
-        """The reconstruction."""
-        return wr.Reconstruction.load(self.folder)
+        """The reconstruction, or what stands for one."""
+        if self.room.is_dir():
+            return wr.Reconstruction.load(self.room)
+        mesh = wr.Scene.load(self.room).mesh if self.room.suffix == ".xml" else wr.Mesh.load(self.room)
+        bare = wr.Mesh(mesh.vertices, mesh.faces)
+        return wr.Reconstruction(discs_on_mesh(bare, GAUSSIANS), bare)
 
     @cached_property
     def scene(self) -> wr.Scene:
@@ -162,15 +153,8 @@ class Geometry:
 
     @cached_property
     def key(self) -> str:
-        """Digest of the reconstruction."""
-        return digest(self.folder)
-
-    @cached_property
-    def scene_key(self) -> str:
-        """Digest of the true scene."""
-        s = self.scene
-        materials = [[str(getattr(m, f.name)) for f in fields(m)] for m in s.materials]
-        return digest(s.mesh.vertices, s.mesh.faces, s.face_material, materials)
+        """Digest of what is known of the room."""
+        return digest(self.room) if self.room.is_dir() else digest(self.reconstruction.mesh.triangles)
 
     def weights(
         self, ds: SpectrumDataset, *, slot: str = "train", progress: Progress | None = None
@@ -199,10 +183,6 @@ class Geometry:
         )
         self._weights[slot] = key, seen, time.perf_counter() - start
         return self._weights[slot][1:]
-
-    def forget(self) -> None:
-        """Drop the weights of training receivers: hundreds of them fill gigabytes. Those of test receivers are small."""
-        self._weights.pop("train", None)
 
 
 def checked(name: str, value: int, least: int) -> int:

@@ -32,6 +32,12 @@ METHODS = {
 """Name and colour of each method."""
 
 
+def name_of(key: str) -> str:
+    """Name of a method, or of ``METHOD-COUNT``: one on another number of spectra."""
+    method, _, count = key.rpartition("-")
+    return METHODS[key][0] if key in METHODS else f"{METHODS[method][0]}, {count} spectra"
+
+
 def figure_of(
     count: int, size: tuple[float, float], widths: Sequence[float] | None = None, sharey: bool = False
 ) -> tuple[Any, Any]:

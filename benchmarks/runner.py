@@ -112,5 +112,5 @@ def run_command(benchmark: Benchmark, args: argparse.Namespace, out: Output) -> 
         return
     figures = report.write(job.out)
     page, data = report.page(job.out), job.out / f"{report.name}.json"
-    text = f"{report.summary}\n\n{page}: tables and pictures; {data.name}: every figure"
+    text = f"{report.text}\n\n{page}: tables and pictures; {data.name}: every figure"
     out.result(text, files=[page, data], figures=figures)

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from hypothesis import settings
 
+settings.register_profile("any machine", deadline=None)  # a busy one is no defect
+settings.load_profile("any machine")
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "helpers"), str(HERE), str(HERE.parent)]
 
@@ -30,3 +33,11 @@ def each_form(request, monkeypatch):
 
     made = partialmethod(Rasterizer.__init__, per_pixel=request.param == "reference")
     monkeypatch.setattr(Rasterizer, "__init__", made)
+
+
+@pytest.fixture(scope="session")
+def place(tmp_path_factory):
+    """A small room, and files of all kinds that the library makes of it."""
+    from fuzz.place import Place
+
+    return Place(tmp_path_factory.mktemp("fuzz") / "place").make()

@@ -24,12 +24,8 @@ def test_a_number_is_finite_real_and_within_its_range(value: object) -> None:
 
 def test_numbers_of_any_kind_are_taken() -> None:
     assert check_count("n", np.uint8(3), 0, 3) == 3
-    assert [check_positive("x", v) for v in (3, 0.5, np.float32(0.25), Fraction(1, 8))] == [
-        3.0,
-        0.5,
-        0.25,
-        0.125,
-    ]
+    kinds = (3, 0.5, np.float32(0.25), Fraction(1, 8))
+    assert [check_positive("x", v) for v in kinds] == [3.0, 0.5, 0.25, 0.125]
     assert check_number("x", -2, -2.0, -2.0) == -2.0
     for wrong in (4, True):
         with pytest.raises(ValueError, match=r"whole number of 0 to 3"):

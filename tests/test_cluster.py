@@ -82,9 +82,7 @@ def test_a_killed_worker_changes_no_bit(client: Any, tmp_path: Path) -> None:
     assert killed[0] not in client.run(os.getpid).values()
 
 
-def test_a_task_takes_one_thread_and_its_error_comes_back(
-    client: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_task_takes_one_thread_and_its_error_comes_back(client, monkeypatch):
     assert dict(each(lambda k: (k, threads()), range(20), client)) == {k: (k, 1) for k in range(20)}
     with pytest.raises(ZeroDivisionError):
         dict(each(partial(divmod, 7), [1, 0, 2], client))

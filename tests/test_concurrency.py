@@ -1,13 +1,12 @@
 """Threads, forks and other processes ask at once: what they get is what one thread alone gets, to the bit.
 
-Each test runs a script in a process of its own, because what is wrong here kills a process or stops it for good.
+Each script runs in a process of its own, because what is wrong here kills a process or stops it for good.
 """
 
 import multiprocessing
 import os
 import subprocess
 import sys
-import textwrap
 import time
 
 import pytest
@@ -22,20 +21,19 @@ sys.path[:0] = {path!r}
 import numpy as np
 import warprrf as wr
 from golden import make
+from rooms import plain, subdivided
+from warprrf.geometry.splats.gaussians import discs_on_mesh
 
 RX = make.TRANSMITTER + [[2.0, 0.3, -1.0], [0.5, 2.0, -0.9], [3.0, 2.5, -1.2]]
 POINTS = np.random.default_rng(0).uniform(0.2, 2.8, (3000, 3))
+FILE, FOLDER = sys.argv[1:]
 
 
 def fine_room(times=5):
-    mesh, _ = make.room_mesh()
-    corners = mesh.triangles
+    room = plain()
     for _ in range(times):
-        middles = (corners + np.roll(corners, -1, axis=1)) / 2
-        (a, b, c), (ab, bc, ca) = np.moveaxis(corners, 1, 0), np.moveaxis(middles, 1, 0)
-        corners = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
-        corners = np.moveaxis(corners, 2, 0).reshape(-1, 3, 3)
-    return corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+        room = subdivided(room)
+    return room.vertices, room.faces
 
 
 def same(found, wanted):
@@ -59,6 +57,10 @@ def at_once(*uses):
 def asked(field):
     paths = field.paths(RX)
     return [*(field.spectrum(rx).path_gain for rx in RX), paths.gain, paths.tau]
+
+
+def near(mesh):
+    return mesh.distance(POINTS), mesh.cast(RX[0], POINTS, backend="warp").t
 
 
 def in_fork(use, wait_s=60):
@@ -90,22 +92,150 @@ def in_fork(use, wait_s=60):
 faulthandler.register(signal.SIGUSR1)
 """
 
+SCRIPTS = {
+    "first uses of a mesh from four threads agree with one": """
+FINE = fine_room()
+def use(mesh):
+    return mesh.distance(POINTS[:200]), mesh.is_closed, mesh.areas, mesh.cast(RX[0], POINTS).t, mesh.bounds
+for _ in range(5):
+    mesh = wr.Mesh(*FINE)
+    found = at_once(*[lambda: use(mesh)] * 4)
+    alone = use(wr.Mesh(*FINE))
+    for one in found:
+        same(one, alone)
+meshes = [wr.Mesh(*FINE) for _ in range(2)]
+alone = wr.Mesh(*FINE).cast(RX[0], POINTS, backend="embree").t
+for mesh in meshes:
+    same(at_once(*[lambda: mesh.cast(RX[0], POINTS, backend="embree").t] * 4), [alone] * 4)
+""",
+    "first uses of a field from four threads agree with one": """
+alone = asked(wr.RadioField.load(FILE))
+for _ in range(5):
+    field = wr.RadioField.load(FILE)
+    for found in at_once(*[lambda: asked(field)] * 4):
+        same(found, alone)
+sources = RX[0], RX[0] + [0.3, 0.1, 0.2], RX[2]
+from_elsewhere = [wr.RadioField.load(FILE).spectrum(RX[1], transmitter=t).path_gain for t in sources]
+for _ in range(3):
+    field = wr.RadioField.load(FILE)
+    same(at_once(*[lambda t=t: field.spectrum(RX[1], transmitter=t).path_gain for t in sources]), from_elsewhere)
+""",
+    # Warp itself, kernels and tables of the process are then first used by several threads.
+    "a process may start with all verbs at once": """
+scene, (mesh, _) = make.room(), make.room_mesh()
+camera = wr.Camera.spherical(36, 18, position=RX[0])
+link = dict(transmitter=make.TRANSMITTER, receivers=RX, frequency_hz=make.CARRIER_HZ)
+grid = dict(shape=make.SHAPE, beam_sigma_rad=make.BEAM_RAD)
 
-def run(script, *arguments, **settings):
-    """Run ``script`` after :data:`HEAD`; a status, an error or a hang fails the test."""
-    text = HEAD.format(path=sys.path) + "\n" + textwrap.dedent(script)
-    done = subprocess.run(
-        [sys.executable, "-c", text, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        env=os.environ | settings,
-    )
-    assert done.returncode == 0, f"exit status {done.returncode}\n{done.stderr[-3000:]}"
-    return done.stdout
+def fitted():
+    ds = wr.simulate(scene, **link, **grid)
+    return wr.RadioField.fit(scene, ds, quick=True).spectrum(RX[0] + 0.1).path_gain
 
+def saved():
+    field = wr.RadioField.load(FILE)
+    for k in range(5):
+        field.save(FOLDER + "/again.safetensors")
+        same(asked(wr.RadioField.load(FOLDER + "/again.safetensors"))[:1], asked(field)[:1])
+    return 1.0
 
-forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+uses = 2 * [
+    lambda: wr.simulate(scene, **link, **grid).path_gain, lambda: wr.trace_paths(scene, **link, mirror_order=2).gain,
+    lambda: wr.RadioField.load(FILE).radio_map(1.0, 1.5).total_path_gain,
+    lambda: wr.render(discs_on_mesh(mesh, 2000), camera).depth, fitted, saved,
+]
+found = at_once(*uses)
+same(found, [use() for use in uses])
+""",
+    "an error in a thread reaches who waits for it": """
+field = wr.RadioField.load(FILE)
+def wrong():
+    return field.spectrum([np.nan, 0.0, 0.0])
+with ThreadPoolExecutor(4) as pool:
+    waiting = [pool.submit(wrong if k % 2 else lambda: asked(field)) for k in range(8)]
+    errors = [w.exception() for w in waiting]
+assert all(isinstance(e, ValueError) if k % 2 else e is None for k, e in enumerate(errors))
+same(asked(field), asked(wr.RadioField.load(FILE)))
+""",
+    "threads go on after the main thread has ended": """
+field = wr.RadioField.load(FILE)
+alone = asked(field)
+def late():
+    threading.main_thread().join()
+    same(asked(field), alone)
+    wr.Mesh(*fine_room()).distance(POINTS)
+    open(FOLDER + "/done", "w").close()
+threading.Thread(target=late).start()
+room = wr.Mesh(*fine_room())
+def for_ever():  # not Embree's rays: Open3D takes tensors that are in use at exit for a leak, and exits with 1
+    while True:
+        room.distance(POINTS)
+threading.Thread(target=for_ever, daemon=True).start()
+time.sleep(0.5)
+""",
+    "a forked child goes on where its parent was": """
+field, mesh = wr.RadioField.load(FILE), wr.Mesh(*fine_room())
+before, near = asked(field), mesh.distance(POINTS)
+t = mesh.cast(RX[0], POINTS, backend="embree").t
+same(in_fork(lambda: asked(field)), before)
+same([in_fork(lambda: mesh.cast(RX[0], POINTS, backend="embree").t), in_fork(lambda: mesh.distance(POINTS))], [t, near])
+same(in_fork(lambda: asked(wr.RadioField.load(FILE))), before)
+same(in_fork(lambda: in_fork(lambda: asked(field))), before)  # and its child's child
+with multiprocessing.get_context("fork").Pool(3) as pool:
+    same(pool.map(mesh.distance, np.split(POINTS, 6)), np.split(near, 6))
+same(asked(field), before)
+""",
+    # Forks while other threads are in launches and in first uses: the children neither hang nor differ.
+    "a fork waits for what other threads make": """
+FINE = fine_room()
+field, mesh = wr.RadioField.load(FILE), wr.Mesh(*FINE)
+before, near, closed = asked(field), mesh.distance(POINTS), mesh.is_closed
+stop = threading.Event()
+
+def busy():
+    while not stop.is_set():
+        asked(wr.RadioField.load(FILE))
+        field.spectrum(RX[0])
+
+def first_uses():
+    while not stop.is_set():
+        assert wr.Mesh(*FINE).is_closed == closed
+        wr.Mesh(*FINE).distance(POINTS[:100])
+
+threads = [threading.Thread(target=f) for f in (busy, first_uses)]
+[t.start() for t in threads]
+try:
+    for _ in range(6):
+        time.sleep(np.random.default_rng().uniform(0, 0.05))
+        fresh = wr.Mesh(*FINE)
+        same(in_fork(lambda: [*asked(field), mesh.distance(POINTS), fresh.is_closed]), [*before, near, closed])
+finally:
+    stop.set()
+    [t.join() for t in threads]
+""",
+    # Pickles of what was used; the first processes all find a kernel cache that is empty and fill it at once.
+    "used objects go to spawned processes": """
+if __name__ == "__main__":
+    mesh, _ = make.room_mesh()
+    rec = wr.Reconstruction(discs_on_mesh(mesh, 400), mesh)
+    harmonic = wr.RadioField.fit(rec, make.spectra().subset([0, 1, 2]), model="rf3dgs+", iterations=2)
+    fields = [wr.RadioField.load(FILE), harmonic]
+    alone, wanted = [asked(f) for f in fields], near(mesh)
+    usual = os.environ.get("WARP_CACHE_PATH")
+    os.environ["WARP_CACHE_PATH"] = FOLDER + "/kernels"
+    with ProcessPoolExecutor(3, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for found in [pool.submit(near, mesh) for _ in range(3)]:
+            same(found.result(), wanted)
+    assert os.listdir(FOLDER + "/kernels")
+    del os.environ["WARP_CACHE_PATH"]
+    if usual:
+        os.environ["WARP_CACHE_PATH"] = usual
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("forkserver")) as pool:
+        for found, expected in zip([pool.submit(asked, f) for f in fields], alone):
+            same(found.result(), expected)
+""",
+}
+"""What must hold, and what fails where it does not: by an error, a status or a hang."""
+THREADED = [name for name in SCRIPTS if "fork" in name or "go on after" in name]
 
 
 @pytest.fixture(scope="module")
@@ -115,218 +245,18 @@ def field_file(tmp_path_factory):
     return path
 
 
-def test_first_uses_of_a_mesh_from_four_threads_agree_with_one():
-    run("""
-    FINE = fine_room()
-    def use(mesh):
-        return mesh.distance(POINTS[:200]), mesh.is_closed, mesh.areas, mesh.cast(RX[0], POINTS).t, mesh.bounds
-    for _ in range(5):
-        mesh = wr.Mesh(*FINE)
-        found = at_once(*[lambda: use(mesh)] * 4)
-        alone = use(wr.Mesh(*FINE))
-        for one in found:
-            same(one, alone)
-    meshes = [wr.Mesh(*FINE) for _ in range(2)]
-    alone = wr.Mesh(*FINE).cast(RX[0], POINTS, backend="embree").t
-    for mesh in meshes:
-        same(at_once(*[lambda: mesh.cast(RX[0], POINTS, backend="embree").t] * 4), [alone] * 4)
-    """)
+forks = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 
 
-def test_first_uses_of_a_field_from_four_threads_agree_with_one(field_file):
-    run(
-        """
-    path = sys.argv[1]
-    alone = asked(wr.RadioField.load(path))
-    for _ in range(5):
-        field = wr.RadioField.load(path)
-        for found in at_once(*[lambda: asked(field)] * 4):
-            same(found, alone)
-    other = RX[0] + [0.3, 0.1, 0.2]
-    from_elsewhere = [wr.RadioField.load(path).spectrum(RX[1], transmitter=t).path_gain for t in (RX[0], other, RX[2])]
-    for _ in range(3):
-        field = wr.RadioField.load(path)
-        uses = [lambda t=t: field.spectrum(RX[1], transmitter=t).path_gain for t in (RX[0], other, RX[2])]
-        same(at_once(*uses), from_elsewhere)
-    """,
-        field_file,
-    )
-
-
-def test_a_process_may_start_with_all_verbs_at_once(field_file, tmp_path):
-    """Warp itself, kernels and tables of the process are then first used by several threads."""
-    run(
-        """
-    from warprrf.geometry.splats.gaussians import discs_on_mesh
-    path, folder = sys.argv[1:]
-    scene, (mesh, _) = make.room(), make.room_mesh()
-    camera = wr.Camera.spherical(36, 18, position=RX[0])
-    link = dict(transmitter=make.TRANSMITTER, receivers=RX, frequency_hz=make.CARRIER_HZ)
-    grid = dict(shape=make.SHAPE, beam_sigma_rad=make.BEAM_RAD)
-
-    def simulated():
-        return wr.simulate(scene, **link, **grid).path_gain
-
-    def traced():
-        return wr.trace_paths(scene, **link, mirror_order=2).gain
-
-    def mapped():
-        return wr.RadioField.load(path).radio_map(1.0, 1.5).total_path_gain
-
-    def rendered():
-        return wr.render(discs_on_mesh(mesh, 2000), camera).depth
-
-    def fitted():
-        ds = wr.simulate(scene, **link, **grid)
-        return wr.RadioField.fit(scene, ds, quick=True).spectrum(RX[0] + 0.1).path_gain
-
-    def saved():
-        field = wr.RadioField.load(path)
-        for k in range(5):
-            field.save(folder + "/again.safetensors")
-            same(asked(wr.RadioField.load(folder + "/again.safetensors"))[:1], asked(field)[:1])
-        return 1.0
-
-    uses = [simulated, traced, mapped, rendered, fitted, saved, simulated, traced, mapped, rendered, fitted, saved]
-    found = at_once(*uses)
-    same(found, [use() for use in uses])
-    """,
-        field_file,
-        tmp_path,
-    )
-
-
-def test_an_error_in_a_thread_reaches_who_waits_for_it(field_file):
-    run(
-        """
-    field = wr.RadioField.load(sys.argv[1])
-    def wrong():
-        return field.spectrum([np.nan, 0.0, 0.0])
-    with ThreadPoolExecutor(4) as pool:
-        waiting = [pool.submit(wrong if k % 2 else lambda: asked(field)) for k in range(8)]
-        errors = [w.exception() for w in waiting]
-    assert all(isinstance(e, ValueError) and "rx" in str(e) if k % 2 else e is None for k, e in enumerate(errors))
-    same(asked(field), asked(wr.RadioField.load(sys.argv[1])))
-    """,
-        field_file,
-    )
-
-
-def test_threads_go_on_after_the_main_thread_has_ended(field_file):
-    out = run(
-        """
-    field = wr.RadioField.load(sys.argv[1])
-    alone = asked(field)
-    def late():
-        threading.main_thread().join()
-        same(asked(field), alone)
-        wr.Mesh(*fine_room()).distance(POINTS)
-        print("done", flush=True)
-    threading.Thread(target=late).start()
-    room = wr.Mesh(*fine_room())
-    def for_ever():  # not Embree's rays: Open3D takes tensors that are in use at exit for a leak, and exits with 1
-        while True:
-            room.distance(POINTS)
-    threading.Thread(target=for_ever, daemon=True).start()
-    time.sleep(0.5)
-    """,
-        field_file,
-        WARPRRF_THREADS="3",
-    )
-    assert out == "done\n"
-
-
-@forks
-def test_a_forked_child_goes_on_where_its_parent_was(field_file):
-    run(
-        """
-    field, mesh = wr.RadioField.load(sys.argv[1]), wr.Mesh(*fine_room())
-    before, near = asked(field), mesh.distance(POINTS)
-    t = mesh.cast(RX[0], POINTS, backend="embree").t
-    same(in_fork(lambda: asked(field)), before)
-    same([in_fork(lambda: mesh.cast(RX[0], POINTS, backend="embree").t), in_fork(lambda: mesh.distance(POINTS))], [t, near])
-    same(in_fork(lambda: asked(wr.RadioField.load(sys.argv[1]))), before)
-    same(in_fork(lambda: in_fork(lambda: asked(field))), before)  # and its child's child
-    with multiprocessing.get_context("fork").Pool(3) as pool:
-        same(pool.map(mesh.distance, np.split(POINTS, 6)), np.split(near, 6))
-    same(asked(field), before)
-    """,
-        field_file,
-        WARPRRF_THREADS="3",
-    )
-
-
-@forks
-def test_a_fork_waits_for_what_other_threads_make(field_file):
-    """Forks while other threads are in launches and in first uses: the children neither hang nor differ."""
-    run(
-        """
-    FINE = fine_room()
-    field, mesh = wr.RadioField.load(sys.argv[1]), wr.Mesh(*FINE)
-    before, near, closed = asked(field), mesh.distance(POINTS), mesh.is_closed
-    stop = threading.Event()
-
-    def busy():
-        while not stop.is_set():
-            asked(wr.RadioField.load(sys.argv[1]))
-            field.spectrum(RX[0])
-
-    def first_uses():
-        while not stop.is_set():
-            assert wr.Mesh(*FINE).is_closed == closed
-            wr.Mesh(*FINE).distance(POINTS[:100])
-
-    threads = [threading.Thread(target=f) for f in (busy, first_uses)]
-    [t.start() for t in threads]
-    try:
-        for _ in range(6):
-            time.sleep(np.random.default_rng().uniform(0, 0.05))
-            fresh = wr.Mesh(*FINE)
-            same(in_fork(lambda: [*asked(field), mesh.distance(POINTS), fresh.is_closed]), [*before, near, closed])
-    finally:
-        stop.set()
-        [t.join() for t in threads]
-    """,
-        field_file,
-        WARPRRF_THREADS="3",
-    )
-
-
-def test_used_objects_go_to_spawned_processes(field_file, tmp_path):
-    """Pickles of what was used; the first processes all find a kernel cache that is empty and fill it at once."""
-    script = tmp_path / "pool.py"
-    body = """
-    def near(mesh):
-        return mesh.distance(POINTS), mesh.cast(RX[0], POINTS, backend="warp").t
-
-    if __name__ == "__main__":
-        from warprrf.geometry.splats.gaussians import discs_on_mesh
-        mesh, _ = make.room_mesh()
-        rec = wr.Reconstruction(discs_on_mesh(mesh, 400), mesh)
-        harmonic = wr.RadioField.fit(rec, make.spectra().subset([0, 1, 2]), model="rf3dgs+", iterations=2)
-        fields = [wr.RadioField.load(sys.argv[1]), harmonic]
-        alone, wanted = [asked(f) for f in fields], near(mesh)
-        usual = os.environ.get("WARP_CACHE_PATH")
-        os.environ["WARP_CACHE_PATH"] = sys.argv[2]
-        with ProcessPoolExecutor(3, mp_context=multiprocessing.get_context("spawn")) as pool:
-            for found in [pool.submit(near, mesh) for _ in range(3)]:
-                same(found.result(), wanted)
-        assert os.listdir(sys.argv[2])
-        del os.environ["WARP_CACHE_PATH"]
-        if usual:
-            os.environ["WARP_CACHE_PATH"] = usual
-        with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("forkserver")) as pool:
-            for found, expected in zip([pool.submit(asked, f) for f in fields], alone):
-                same(found.result(), expected)
-    """
-    script.write_text(HEAD.format(path=sys.path) + textwrap.dedent(body))
-    done = subprocess.run(
-        [sys.executable, script, field_file, tmp_path / "kernels"],
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
+@pytest.mark.parametrize("law", [pytest.param(law, marks=forks if "fork" in law else ()) for law in SCRIPTS])
+def test_it_holds(law, field_file, tmp_path):
+    script = tmp_path / "script.py"  # spawned processes read it again
+    script.write_text(HEAD.format(path=sys.path) + SCRIPTS[law])
+    threads = {"WARPRRF_THREADS": "3"} if law in THREADED else {}
+    command = [sys.executable, script, field_file, tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, env=os.environ | threads)
     assert done.returncode == 0, f"exit status {done.returncode}\n{done.stderr[-3000:]}"
+    assert (tmp_path / "done").exists() or "go on after" not in law
 
 
 @forks

@@ -1,12 +1,8 @@
-"""Launches are cut over threads, also in a forked child."""
+"""Launches are cut over threads; tests/test_concurrency.py has them in forked children."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-
 import numpy as np
-import pytest
 import warp as wp
 
 from warprrf.device import MIN_SPLIT, launch
@@ -37,18 +33,3 @@ def test_given_cuts_hold():
     found, expected = scaled("cpu", cuts=[3, 3, 40, 50])
     index = np.arange(COUNT)
     np.testing.assert_allclose(found, np.where((index >= 3) & (index < 50), expected, 0.0), rtol=1e-6)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_child_has_a_pool_of_its_own():
-    expected = scaled("cpu", grain=1)[0]
-    context = multiprocessing.get_context("fork")
-    ours, theirs = context.Pipe()
-    child = context.Process(target=lambda: theirs.send(scaled("cpu", grain=1)[0]), daemon=True)
-    child.start()
-    try:
-        assert ours.poll(60), "the child hangs"
-        np.testing.assert_array_equal(ours.recv(), expected)
-    finally:
-        child.kill()
-        child.join()

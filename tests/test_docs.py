@@ -1,23 +1,43 @@
 """README and documentation say what is so: current tables, links that lead somewhere, code that parses."""
 
 import ast
+import inspect
+import json
 import re
 import sys
+import textwrap
+import typing
+from functools import reduce
+from pathlib import Path
 
 import pytest
 from places import ROOT
 
+import warprrf as wr
+import warprrf.viewer
+from warprrf.rf.fields.base import ResponseOptions
+from warprrf.rf.fields.bistatic.field import BistaticField
+from warprrf.rf.fields.bistatic.training import FitOptions
+from warprrf.rf.fields.harmonic.options import FieldOptions
+from warprrf.rf.maps.radio_map import MapOptions
+from warprrf.rf.relevance.search import Setting
+
 sys.path.append(str(ROOT / "tools" / "docs"))
+import reference  # noqa: E402
 import results  # noqa: E402
 import tables  # noqa: E402
+
+from warprrf import cli  # noqa: E402
 
 README = (ROOT / "README.md").read_text()
 GENERATED = ("docs/reference", "docs/figures", "docs/build")
 PAGES = sorted(p for p in (ROOT / "docs").rglob("*.md") if not str(p.relative_to(ROOT)).startswith(GENERATED))
+CODE = {p: "".join(re.findall(r"```.*?```", p.read_text(), re.DOTALL)) for p in (ROOT / "README.md", *PAGES)}
 
 
 def test_the_readme_is_short_and_its_table_is_current():
     assert len(README.splitlines()) <= 150 and not re.search(r"\basked\b", README)
+    assert all(len(b.split("\n")) <= 11 for b in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
     assert results.readme() in README, "run: python tools/docs/results.py readme"
 
 
@@ -28,7 +48,7 @@ def test_where_the_field_is_behind_is_a_line_a_figure_with_the_worst_margin(monk
     # ahead in PSNR at 10 and in RMSE at 100, behind in RMSE at 10 and in PSNR at 100 and 20
     at = {10: (1.0, 0.5), 100: (-3.0, -0.5), 20: (-2.0, 0.0)}
     rows = [{**place, **even, "count": n, "psnr_db": p, "rmse_db": e} for n, (p, e) in at.items()]
-    monkeypatch.setattr(tables.paper, "read", lambda name: {"margins": rows})
+    monkeypatch.setattr(tables.paper, "margins", lambda runs: rows)
     text = tables.paper._paper_behind()
     assert "Of 30 comparisons the bistatic field is behind in 3:" in text
     assert "| PSNR [dB] | 20, 100 | -3 |" in text and "| RMSE [dB] | 10 | +0.5 |" in text
@@ -42,6 +62,17 @@ def test_every_table_that_a_page_names_can_be_made():
         assert tables.table(name)
 
 
+def test_figures_of_a_settled_question_say_when_of_what_and_what_they_answer():
+    files = list((ROOT / "benchmarks" / "results" / "settled").glob("*.json"))
+    for file in files:
+        found = json.loads(file.read_text())
+        assert re.fullmatch(r"20\d\d-\d\d-\d\d", found["date"]) and re.fullmatch(
+            r"[0-9a-f]{7,40}", found["commit"]
+        )
+        assert found["question"].endswith("?") and found["answer"], file.name
+    assert len(files) > 5
+
+
 @pytest.mark.parametrize("page", [ROOT / "README.md", ROOT / "CHANGELOG.md", *PAGES], ids=lambda p: p.name)
 def test_files_that_a_page_links_exist(page):
     text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
@@ -52,9 +83,87 @@ def test_files_that_a_page_links_exist(page):
         assert (ROOT / target).exists(), f"{target} is named and not there"
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda p: p.name)
-def test_python_on_a_page_parses(page):
-    for block in re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL):
-        ast.parse(block)
-        if page.name == "README.md":
-            assert len([line for line in block.splitlines() if line.strip()]) <= 10
+def examples(source: Path) -> list[str]:
+    """Python on a page, calls in its lines, or examples in the docstrings of a module."""
+    text, blocks = source.read_text(), r"Example::\n\n((?: +[^\s\"].*\n)+)"
+    if source.suffix == ".md":
+        blocks, text = r"```python\n(.*?)```", re.sub(r"`(\w[^`\n]*[^=]\))`", r"```python\n\1```", text)
+    if source.parent.name == "notebooks":
+        return [text]
+    return [
+        textwrap.dedent(found)
+        for found in re.findall(blocks, text, flags=0 if source.suffix == ".py" else re.DOTALL)
+    ]
+
+
+def called(call: ast.Call) -> list[inspect.Signature]:
+    """Signatures of what a call may mean: ``wr.NAME``, or a method of that name of anything public."""
+    if not isinstance(call.func, ast.Attribute):
+        return []
+    root, name = ast.unparse(call.func.value), call.func.attr
+    if re.fullmatch(r"wr(\.\w+)*", root):
+        return [inspect.signature(reduce(getattr, [*root.split(".")[1:], name], wr))]
+    if root in ("np", "ax", "axes", "plt", "plan"):
+        return []
+    kinds = [BistaticField] if root == "field" else [wr.viewer.Viewer, *(getattr(wr, n) for n in dir(wr))]
+    own = [getattr(kind, name, None) for kind in kinds if isinstance(kind, type)]
+    return [inspect.signature(f.__get__(0) if inspect.isfunction(f) else f) for f in own if callable(f)]
+
+
+OPTIONS = [FitOptions, FieldOptions, MapOptions, Setting, ResponseOptions, wr.Readings]
+"""What ``**options`` are."""
+SOURCES = [ROOT / "README.md", *PAGES, *(ROOT / "notebooks").glob("*.py"), *(ROOT / "warprrf").rglob("*.py")]
+
+
+@pytest.mark.parametrize("source", sorted(s for s in SOURCES if examples(s)), ids=lambda p: p.name)
+def test_documented_calls_go_with_the_signatures(source):
+    known = {name for options in OPTIONS for name in typing.get_type_hints(options)}
+    for block in examples(source):
+        for call in (node for node in ast.walk(ast.parse(block)) if isinstance(node, ast.Call)):
+            given = [a for a in call.args if not isinstance(a, ast.Starred) and ast.unparse(a) != "..."]
+            words, wrong = {word.arg: None for word in call.keywords if word.arg}, []
+            for signature in called(call):
+                wide = [p.name for p in signature.parameters.values() if p.kind is p.VAR_KEYWORD]
+                try:
+                    taken = signature.bind_partial(*given, **words).arguments
+                    wrong.append(set(taken.get(wide[0], ())) - known if wide else None)
+                except TypeError as error:
+                    wrong.append(error)
+            assert not wrong or not all(wrong), f"{ast.unparse(call)}: {wrong}"
+
+
+def test_python_in_the_readme_is_short():
+    assert all(len(b.split("\n")) <= 11 for b in re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL))
+
+
+def test_names_of_the_reference_are_reached_as_it_prints_them():
+    listed = set(re.findall(r" as (\w+)$", (ROOT / "warprrf/__init__.pyi").read_text(), re.MULTILINE))
+    found = re.findall(r"^\.\. auto\w+:: \w+\.(\S+)", "\n".join(reference.pages().values()), re.MULTILINE)
+    assert len(found) > 80
+    for first, *rest in (name.split(".") for name in found):
+        assert first in listed and reduce(getattr, rest, getattr(wr, first)), (first, *rest)
+
+
+def test_commands_on_pages_are_taken_by_the_parser():
+    seen = set()
+    for line in re.findall(r"^(?:\$ )?warprrf (\w.*)", "\n".join(CODE.values()), re.MULTILINE):
+        words = re.split(r"  |#", line)[0].split()
+        seen.add(words[0])
+        args = cli._parser().parse_args(words)
+        own = [f"--{word}" for word in getattr(args, "measurements", ()) if "=" in word]
+        cli._parser().parse_args([*words, *own])
+    assert seen >= {"fit", "sample", "suggest", "render", "simulate", "view", "evaluate", "reconstruct"}
+
+
+def test_what_a_page_writes_has_a_name_that_no_other_page_gives_to_something_else():
+    stores = {name for code in CODE.values() for name in re.findall(r"store=(\"\S+?\")", code)}
+    for name in stores:
+        lines = [
+            line
+            for code in CODE.values()
+            for line in code.splitlines()
+            if f"{name}" in line and "open" not in line
+        ]
+        assert len({"".join(re.findall(r"field\.(\w+)\(.*store=", line)) for line in lines}) == 1, lines
+    places = [w for code in CODE.values() for w in re.findall(r"workspace=(\"\S+?\")", code)]
+    assert stores and len(places) == len(set(places)), "two reconstructions in one workspace"

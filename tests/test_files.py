@@ -1,7 +1,6 @@
 """A file is whole or not there, and not what it was written as is an error."""
 
 import io
-import json
 import os
 import resource
 import signal
@@ -135,32 +134,6 @@ def test_text_and_arrays_come_back(tmp_path: Path) -> None:
         write_arrays(tmp_path / "a.bin", {"x": np.array([None])})
 
 
-def damaged(whole: bytes, seed: int = 0) -> list[bytes]:
-    """200 times one bit flipped, 60 times the end cut off."""
-    rng = np.random.default_rng(seed)
-    out = [whole[:n] for n in rng.integers(0, len(whole), 60)]
-    for place in rng.integers(0, 8 * len(whole), 200):
-        flipped = bytearray(whole)
-        flipped[place // 8] ^= 1 << place % 8
-        out.append(bytes(flipped))
-    return out
-
-
-@pytest.mark.parametrize("compress", [True, False])
-def test_damaged_arrays_are_refused_or_as_they_were(tmp_path: Path, compress: bool) -> None:
-    path = tmp_path / "a.npz"
-    held = {"x": np.linspace(0, 1, 60), "y": np.zeros((9, 9), np.int32)}
-    write_arrays(path, held, compress=compress)
-    for content in damaged(path.read_bytes()):
-        path.write_bytes(content)
-        try:
-            found = read_arrays(path)
-        except ValueError as error:
-            assert str(path) in str(error)
-        else:  # the seal itself was hit
-            assert list(found) == list(held) and all((found[k] == held[k]).all() for k in held)
-
-
 def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     header = io.BytesIO()
@@ -174,42 +147,20 @@ def test_arrays_that_state_more_than_they_hold_are_refused(tmp_path: Path) -> No
             read_arrays(path)
 
 
-def test_sealed_files_tell_damage(tmp_path: Path) -> None:
+def test_a_seal_is_seen(tmp_path: Path) -> None:
+    """What damage does to sealed files, arrays and JSON is in tests/fuzz."""
     path = tmp_path / "a"
     for data in (b"", b"content", bytes(3_000_000)):
         write_bytes(path, data, seal=True)
         assert check_seal(path) and path.read_bytes().startswith(data)
         write_bytes(path, data)
         assert not check_seal(path)
-    write_bytes(path, bytes(range(250)), seal=True)
-    whole = path.read_bytes()
-    for content in damaged(whole):
-        path.write_bytes(content)
-        try:
-            assert not check_seal(path)
-        except ValueError as error:
-            assert "a: the checksum at its end does not fit" in str(error)
-        else:  # of a seal that is no seal any more, the content is the same
-            assert content[:250] == whole[:250] or len(content) < len(whole)
     with pytest.raises(FileNotFoundError, match="missing"):
         check_seal(tmp_path / "missing")
-
-
-def test_sealed_json_tells_damage(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
     value = {"b": [1, 2.5, 1e-30, None, "ö"], "a": {"c": True}}
-    write_json(path, value, seal=True)
-    assert read_json(path) == value
-    for content in damaged(path.read_bytes()):
-        path.write_bytes(content)
-        try:
-            found = read_json(path)
-        except ValueError as error:
-            assert str(path) in str(error)
-        else:  # the name of the checksum was hit
-            assert {name: found[name] for name in value} == value
-    path.write_text(json.dumps(value))
-    assert read_json(path) == value
+    for seal in (True, False):
+        write_json(path, value, seal=seal)
+        assert read_json(path) == value
 
 
 @pytest.mark.parametrize("text", ["[5]", "5", "", "{", "[" * 100_000, '{"a": NaN}', '{"a": 1e999}', "\xff"])

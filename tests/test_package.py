@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import operator
 import pydoc
 import re
 import subprocess
@@ -19,6 +20,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from places import ROOT
 
+import warprrf
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 
@@ -27,36 +30,16 @@ CORE = {canonicalize_name(Requirement(line).name) for line in PROJECT["dependenc
 # Each of these lives inside one module of ours, which imports it when called.
 WRAPPED = ("open3d", "pycolmap", "sionna", "mitsuba")
 HEAVY = (
-    *WRAPPED,
-    "trimesh",
-    "torch",
-    "drjit",
-    "matplotlib",
-    "xarray",
-    "h5py",
-    "scipy",
-    "pandas",
-    "PIL",
-    "skimage",
-    "viser",
-)
+    *WRAPPED, "trimesh", "torch", "drjit", "matplotlib", "xarray", "h5py", "scipy", "pandas", "PIL", "skimage", "viser",
+)  # fmt: skip
 
-# The public names that notebooks and outside checks rely on, and the members that they use.
-PUBLIC = {
-    "Camera": ("pinhole", "spherical"),
-    "Gaussians": ("save_ply", "load_ply"),
-    "Mesh": ("cast", "visible"),
-    "RadioField": ("fit", "save", "load", "spectrum", "paths"),
-    "Reconstruction": ("from_files", "save", "load", "report"),
-    "Scene": ("load",),
-    "SpectrumDataset": ("load", "save", "split", "export_exr"),
-    "Relevance": ("table", "save", "load", "options"),
-    "reconstruct": (),
-    "relevance": (),
-    "render": (),
-    "simulate": (),
-    "trace_paths": (),
-}
+# What notebooks and outside checks rely on.
+PUBLIC = """
+Camera.pinhole Camera.spherical Gaussians.save_ply Gaussians.load_ply Mesh.cast Mesh.visible RadioField.fit RadioField.save
+RadioField.load RadioField.spectrum RadioField.paths Reconstruction.from_files Reconstruction.save Reconstruction.load
+Reconstruction.report Scene.load SpectrumDataset.load SpectrumDataset.save SpectrumDataset.split SpectrumDataset.export_exr
+Relevance.table Relevance.save Relevance.load Relevance.options reconstruct relevance render simulate trace_paths
+""".split()
 
 # From a mesh to a field to a spectrum, with what is in the wheel and its core dependencies alone.
 TEN_LINES = """
@@ -73,37 +56,30 @@ spectrum = field.spectrum((2.5, 2, 1.5))
 """
 
 IMPORT_NAMES = {
-    "sionna": "sionna-rt",
-    "skimage": "scikit-image",
-    "PIL": "pillow",
-    "drjit": "sionna-rt",
-    "mitsuba": "sionna-rt",
+    "sionna": "sionna-rt", "skimage": "scikit-image", "PIL": "pillow", "drjit": "sionna-rt", "mitsuba": "sionna-rt",
     "yaml": "pyyaml",
-}
+}  # fmt: skip
 
 
-def python(
-    code: str, interpreter: str = sys.executable, **options: object
-) -> subprocess.CompletedProcess[str]:
-    """Run ``code``; by another interpreter than this one apart from what the environment adds to its path."""
-    isolated = [] if interpreter == sys.executable else ["-I"]
-    command = [interpreter, *isolated, "-c", code]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, **options)  # type: ignore[call-overload]
+def run(*words: object, cwd: Path | None = None, fails: bool = False) -> str:
+    """What a program writes to standard output; to standard error where it is to fail."""
+    command = list(map(str, words))
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=cwd, check=False)
+    assert (done.returncode != 0) is fails, done.stderr
+    return (done.stderr if fails else done.stdout).strip()
 
 
 def test_import_loads_no_heavy_package() -> None:
-    done = python(f"import sys, warprrf; print([m for m in {HEAVY!r} if m in sys.modules])", cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "[]"
+    code = f"import sys, warprrf; print([m for m in {HEAVY!r} if m in sys.modules])"
+    assert run(sys.executable, "-c", code, cwd=ROOT) == "[]"
 
 
-@pytest.mark.parametrize("name", sorted(PUBLIC))
-def test_public_name_exists_with_its_members(name: str) -> None:
-    import warprrf
-
-    value = getattr(warprrf, name)
-    assert name in dir(warprrf)
-    assert [member for member in PUBLIC[name] if not hasattr(value, member)] == []
+def test_public_names_are_there_and_flat_ones_few() -> None:
+    assert [name for name in PUBLIC if not operator.attrgetter(name)(warprrf)] == []
+    assert {name.split(".")[0] for name in PUBLIC} <= set(dir(warprrf)) and len(dir(warprrf)) <= 30
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        warprrf.no_such_thing  # noqa: B018
+    assert warprrf.__version__ == PROJECT["version"]
 
 
 LAZY = sorted((ROOT / "warprrf").rglob("__init__.pyi"))
@@ -122,74 +98,44 @@ def test_every_name_of_a_stub_is_what_it_says_and_help_lists_it(stub: Path) -> N
     assert [name for name in listed if len(re.findall(rf"^ +{name}  +\S", text, re.MULTILINE)) != 1] == []
 
 
-def test_flat_names_are_few() -> None:
-    import warprrf
-
-    assert len(dir(warprrf)) <= 30
-
-
-def test_unknown_name_is_an_attribute_error() -> None:
-    import warprrf
-
-    with pytest.raises(AttributeError, match="no_such_thing"):
-        warprrf.no_such_thing  # noqa: B018
-
-
-def test_version_is_stated_once() -> None:
-    import warprrf
-
-    assert warprrf.__version__ == PROJECT["version"]
-
-
-def _imports(file: Path) -> set[str]:
-    """Top-level packages that a file imports anywhere, `require("package", ...)` included."""
-    found = set()
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name.split(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            found.add(node.module.split(".")[0])
-        elif (
-            isinstance(node, ast.Call)
-            and getattr(node.func, "id", getattr(node.func, "attr", "")) == "require"
-        ):
-            if node.args and isinstance(node.args[0], ast.Constant):
-                found.add(str(node.args[0].value).split(".")[0])
+def _required(tree: ast.AST) -> list[tuple[int, str, str]]:
+    """Line, package and extra of every ``require("package", extra="name")``."""
+    found = []
+    for call in (node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args):
+        given = [*call.args, *(k.value for k in call.keywords if k.arg == "extra")]
+        words = [str(one.value) for one in given if isinstance(one, ast.Constant)]
+        if getattr(call.func, "id", getattr(call.func, "attr", "")) == "require" and len(words) == 2:
+            found.append((call.lineno, words[0].split(".")[0], words[1]))
     return found
 
 
-def _sources() -> list[Path]:
-    return sorted((ROOT / "warprrf").rglob("*.py"))
+def _imports(tree: ast.AST) -> set[str]:
+    """Top-level packages that a file imports anywhere."""
+    nodes = list(ast.walk(tree))
+    found = {alias.name.split(".")[0] for n in nodes if isinstance(n, ast.Import) for alias in n.names}
+    found |= {
+        n.module.split(".")[0] for n in nodes if isinstance(n, ast.ImportFrom) and n.level == 0 and n.module
+    }
+    return found | {package for _, package, _ in _required(tree)}
+
+
+SOURCES = {file: ast.parse(file.read_text()) for file in sorted((ROOT / "warprrf").rglob("*.py"))}
 
 
 @pytest.mark.parametrize("package", WRAPPED)
-def test_heavy_package_is_wrapped_by_few_modules(package: str) -> None:
-    """One module wraps each; Sionna RT stands on Mitsuba, whose variant its module must choose."""
-    users = [f.relative_to(ROOT / "warprrf").as_posix() for f in _sources() if package in _imports(f)]
-    assert len(set(users) - ({"rf/sionna_engine.py"} if package == "mitsuba" else set())) <= 1, users
+def test_heavy_package_is_wrapped_by_one_module(package: str) -> None:
+    """One module wraps each."""
+    users = [file.name for file, tree in SOURCES.items() if package in _imports(tree)]
+    assert len(users) <= 1, users
 
 
 def test_required_extras_exist_and_bring_the_package() -> None:
-    """Every `require(package, extra=...)` names an extra that lists the distribution of that package."""
     wrong = []
-    for file in _sources():
-        for node in ast.walk(ast.parse(file.read_text())):
-            if not isinstance(node, ast.Call):
-                continue
-            if getattr(node.func, "id", getattr(node.func, "attr", "")) != "require" or not node.args:
-                continue
-            extra = next(
-                (k.value for k in node.keywords if k.arg == "extra"),
-                node.args[1] if len(node.args) > 1 else None,
-            )
-            if not isinstance(node.args[0], ast.Constant) or not isinstance(extra, ast.Constant):
-                continue
-            package = str(node.args[0].value).split(".")[0]
-            if canonicalize_name(package) in CORE:
-                continue
-            listed = {canonicalize_name(Requirement(r).name) for r in EXTRAS.get(str(extra.value), ())}
+    for file, tree in SOURCES.items():
+        for line, package, extra in _required(tree):
+            listed = CORE | {canonicalize_name(Requirement(r).name) for r in EXTRAS.get(extra, ())}
             if canonicalize_name(IMPORT_NAMES.get(package, package)) not in listed:
-                wrong.append(f"{file.name}:{node.lineno}: {package} is not in the extra {extra.value}")
+                wrong.append(f"{file.name}:{line}: {package} is not in the extra {extra}")
     assert wrong == []
 
 
@@ -210,24 +156,8 @@ def test_constraints_pin_every_requirement_exactly() -> None:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("hatchling")
     folder = tmp_path_factory.mktemp("wheel")
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pip",
-            "wheel",
-            "-q",
-            "--no-deps",
-            "--no-build-isolation",
-            "-w",
-            str(folder),
-            str(ROOT),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
+    build = "-m pip wheel -q --no-deps --no-build-isolation -w".split()
+    run(sys.executable, *build, folder, ROOT)
     return next(folder.glob("warprrf-*.whl"))
 
 
@@ -236,13 +166,10 @@ def test_wheel_is_typed_licensed_and_holds_only_the_package(wheel: Path) -> None
     assert "warprrf/py.typed" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"warprrf"}
-    data = {
-        name
-        for name in names
-        if Path(name).suffix not in (".py", ".pyi", ".typed") and ".dist-info/" not in name
-    }
+    code = (".py", ".pyi", ".typed")
+    data = {name for name in names if Path(name).suffix not in code and ".dist-info/" not in name}
     assert data == {"warprrf/rf/em/p676_oxygen.txt", "warprrf/rf/em/p676_water_vapour.txt"}
-    assert wheel.stat().st_size < 670e3  # code alone
+    assert wheel.stat().st_size < 700e3  # code alone
 
 
 def _core_files() -> list[Path]:
@@ -269,62 +196,43 @@ def _core_files() -> list[Path]:
 def test_wheel_works_in_a_fresh_environment_without_extras(wheel: Path, tmp_path: Path) -> None:
     """A new environment gets the wheel and the core dependencies (linked, not downloaded), and no extra."""
     fresh, core = tmp_path / "venv", tmp_path / "core"
-    subprocess.run([sys.executable, "-m", "venv", str(fresh)], check=True, timeout=300)
-    interpreter = str(fresh / "bin" / "python")
-    subprocess.run(
-        [interpreter, "-m", "pip", "install", "-q", "--no-deps", "--no-index", str(wheel)],
-        check=True,
-        timeout=300,
-    )
+    run(sys.executable, "-m", "venv", fresh)
+    alone = (fresh / "bin" / "python", "-I")  # apart from what the environment adds to the path
+    run(*alone, "-m", "pip", "install", "-q", "--no-deps", "--no-index", wheel)
     core.mkdir()
     for source in _core_files():
         (core / source.name).symlink_to(source)
-    purelib = python(
-        "import sysconfig; print(sysconfig.get_path('purelib'))", interpreter, cwd=tmp_path
-    ).stdout.strip()
+    purelib = run(*alone, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))")
     (Path(purelib) / "core.pth").write_text(f"{core}\n")
 
-    hidden = python(
-        f"import importlib.util as u; print([m for m in {WRAPPED!r} if u.find_spec(m)])",
-        interpreter,
-        cwd=tmp_path,
+    def python(code: str, **how: bool) -> str:
+        return run(*alone, "-c", code, cwd=tmp_path, **how)
+
+    assert python(f"import importlib.util as u; print([m for m in {WRAPPED!r} if u.find_spec(m)])") == "[]"
+    names = sorted({name.split(".")[0] for name in PUBLIC})
+    assert str(fresh) in python(
+        f"import warprrf as wr; [getattr(wr, n) for n in {names!r}]; print(wr.__file__)"
     )
-    assert hidden.stdout.strip() == "[]", hidden.stderr
-    done = python(
-        f"import warprrf as wr; [getattr(wr, name) for name in {sorted(PUBLIC)!r}]; print(wr.__file__)",
-        interpreter,
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0, done.stderr
-    assert str(fresh) in done.stdout
     assert len(TEN_LINES.strip().splitlines()) == 10
     score = "print(wr.evaluate(spectra.split(10)[1], field.spectrum)['psnr_db'], spectrum.path_gain.sum())"
-    done = python(TEN_LINES + score, interpreter, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    psnr_db, path_gain = (float(word) for word in done.stdout.split()[-2:])
+    psnr_db, path_gain = (float(word) for word in python(TEN_LINES + score).split()[-2:])
     # One room of one material: what is simulated is of the family that is fitted. The line of sight alone, d = 2.06 m,
     # has (c / 4 pi f d)^2 = 1.488e-9.
     assert psnr_db > 45.0
     assert 1.488e-9 < path_gain < 2e-9
-    photos = tmp_path / "photos"
-    photos.mkdir()
+    (tmp_path / "photos").mkdir()
     for index in range(4):
-        (photos / f"{index}.jpg").write_bytes(b"")
-    done = python(
-        f"import warprrf as wr; wr.reconstruct({str(photos)!r}, workspace={str(tmp_path / 'w')!r})",
-        interpreter,
-        cwd=tmp_path,
-    )
-    assert done.returncode != 0
-    assert 'ImportError: pycolmap is not installed: pip install "warprrf[photos]"' in done.stderr
+        (tmp_path / "photos" / f"{index}.jpg").write_bytes(b"")
     room_glb(tmp_path)  # with a texture
-    done = python("import warprrf as wr; wr.Mesh.load('room.glb')", interpreter, cwd=tmp_path)
-    assert 'ImportError: PIL.Image is not installed: pip install "warprrf[mesh]"' in done.stderr
-    done = subprocess.run(
-        [str(fresh / "bin" / "warprrf"), "--version"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=tmp_path,
-    )
-    assert done.stdout.strip() == f"warprrf {PROJECT['version']}", done.stderr
+    for call, told in {
+        "reconstruct('photos', workspace='w')": 'ImportError: pycolmap is not installed: pip install "warprrf[photos]"',
+        "Mesh.load('room.glb')": 'ImportError: PIL.Image is not installed: pip install "warprrf[mesh]"',
+    }.items():
+        assert told in python(f"import warprrf as wr; wr.{call}", fails=True)
+    assert run(fresh / "bin" / "warprrf", "--version", cwd=tmp_path) == f"warprrf {PROJECT['version']}"
+
+
+def test_what_make_quick_names_is_there() -> None:
+    for line in (ROOT / "tests" / "quick.txt").read_text().splitlines():
+        path, _, name = line.partition("::")
+        assert (ROOT / path).exists() and (not name or f"def {name}(" in (ROOT / path).read_text()), line

@@ -19,35 +19,26 @@ def _started(cache: Path) -> subprocess.CompletedProcess[str]:
         "from warprrf.device import resolve; import warp; resolve('cpu'); print(warp.config.kernel_cache_dir)"
     )
     return subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        timeout=300,
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300, check=True,
         env={**os.environ, "WARP_CACHE_PATH": str(cache)},
-    )
+    )  # fmt: skip
 
 
 def test_nothing_is_said_at_a_start_without_a_gpu(tmp_path: Path) -> None:
     done = _started(tmp_path)
-    assert done.stderr == ""
-    assert done.stdout.startswith(str(tmp_path))
+    assert done.stderr == "" and done.stdout.startswith(str(tmp_path))
 
 
 def test_kernels_go_to_a_temporary_folder_where_the_cache_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     done = _started(tmp_path / "file" / "cache")
-    assert done.returncode == 0
-    assert "UserWarning: kernel cache: " in done.stderr
-    assert str(tmp_path / "file" / "cache") in done.stderr
-    assert "WARP_CACHE_PATH" in done.stderr
+    for word in ("UserWarning: kernel cache: ", str(tmp_path / "file" / "cache"), "WARP_CACHE_PATH"):
+        assert word in done.stderr
     assert "warprrf-kernels-" in done.stdout
     assert not Path(done.stdout.strip()).exists()  # it is gone with the process
 
 
-def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(monkeypatch, tmp_path):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(device, "_temporary", [])
 
@@ -62,9 +53,8 @@ def test_a_module_that_cannot_be_kept_in_the_cache_is_compiled_elsewhere(
     module = Module()
     with pytest.warns(UserWarning, match=rf"kernel cache: .*{tmp_path}.*WARP_CACHE_PATH"):
         device.load_module(module, "cpu", 1)
-    assert module.folders[0] == str(tmp_path)
-    assert Path(module.folders[1]).is_dir()
-    assert "warprrf-kernels-" in module.folders[1]
+    first, second = module.folders
+    assert first == str(tmp_path) and Path(second).is_dir() and "warprrf-kernels-" in second
 
 
 def test_other_words_on_standard_error_are_kept(capfd: pytest.CaptureFixture[str]) -> None:

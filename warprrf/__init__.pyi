@@ -112,8 +112,13 @@ from warprrf.rf.channel.precoding import precoded_sinr as precoded_sinr
 from warprrf.rf.channel.precoding import precoders as precoders
 from warprrf.rf.channel.precoding import transmit_covariance as transmit_covariance
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m as gas_attenuation_db_per_m
+from warprrf.rf.fields.bistatic.field import BistaticField as BistaticField
+from warprrf.rf.fields.bistatic.training import FitOptions as FitOptions
+from warprrf.rf.fields.harmonic.field import HarmonicField as HarmonicField
+from warprrf.rf.fields.harmonic.options import FieldOptions as FieldOptions
 from warprrf.rf.interop.deepmimo import write_deepmimo as write_deepmimo
 from warprrf.rf.interop.sionna_engine import load_sionna_scene as load_sionna_scene
 from warprrf.rf.interop.twin import write_twin as write_twin
+from warprrf.viewer.viewer import Viewer as Viewer
 
 __version__: str

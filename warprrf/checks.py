@@ -153,6 +153,26 @@ def _number(value: object) -> float:
         return np.nan
 
 
+def check_similarity(scale: object, rotation: object, shift: object) -> tuple[float, np.ndarray, np.ndarray]:
+    """What moves points ``x`` to ``scale rotation x + shift``.
+
+    Args:
+        scale: from 1e-6 to 1e6.
+        rotation: shape ``(3, 3)``; None for none.
+        shift: shape ``(3,)``, each up to 20,000 km [m].
+
+    Raises:
+        TypeError, ValueError: for numbers out of range, or a matrix that is no rotation.
+    """
+    turn = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
+        raise ValueError(f"rotation: got {turn.tolist()}, expected a rotation: orthonormal, not mirrored")
+    moved = check_array("shift", shift, (3,))
+    if np.abs(moved).max() > 0.2 * LARGEST_M:
+        raise ValueError(f"shift: got {moved.tolist()}, expected at most {0.2 * LARGEST_M:g} m")
+    return check_number("scale", scale, 1e-6, 1e6), turn, moved
+
+
 def users_level() -> int:
     """Frames from the caller to the first one outside this package: ``stacklevel`` of a warning there."""
     frame, level = inspect.currentframe(), 0
@@ -398,18 +418,19 @@ def _as_array(letters: str, of_axes: bool, value: Any) -> object:
 def _as_object(kind: type, value: object) -> object:
     if isinstance(value, str):
         return value if kind is object or (kind is str and "\0" not in value) else _OTHER
-    # One's own class may stand for one of ours, as long as it is an object with attributes.
+    # One's own class may stand for one of ours, as long as it is an object with attributes; another of ours may not.
     own = kind.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
+    own = own and not type(value).__module__.startswith("warprrf.")
     fits = isinstance(value, kind) or (own and not isinstance(value, wp.array))
     return value if fits and not isinstance(value, bytes) else _OTHER
 
 
 def one_line(self: Any) -> str:
-    """The ``__repr__`` of a dataclass of arrays: their shapes, other values as they are, None left out."""
+    """The ``__repr__`` of a dataclass of arrays: shapes of all but short ones, other values as they are, None left out."""
     parts = []
     for field in fields(self):
         value = getattr(self, field.name)
-        if hasattr(value, "shape") and np.prod(value.shape) > 3:
+        if hasattr(value, "shape") and (np.size(value) > 3 or np.ndim(value) > 1 or len(repr(value)) > 40):
             parts.append(f"{field.name} {tuple(value.shape)}")
         elif value is not None and len(text := repr(value)) <= 60:
             parts.append(f"{field.name}={text}")

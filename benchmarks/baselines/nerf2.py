@@ -15,24 +15,13 @@ Published schedule: 30 000 iterations of 8192 rays with 64 samples each, Adam of
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from benchmarks.baselines.images import SpectrumImages
-from benchmarks.baselines.training import (
-    ImageModel,
-    Learner,
-    Training,
-    draws,
-    seeded,
-    torch_device,
-    torch_module,
-    whole_number,
-)
-
-if TYPE_CHECKING:
-    from warprrf.rf.spectra.dataset import SpectrumDataset
+from benchmarks.baselines.training import Trained, Training, draws, learn, pictures, seeded, torch_module
+from warprrf.rf.spectra.dataset import SpectrumDataset
+from warprrf.rf.spectra.spectrum import pixel_directions
 
 ADAM_RATE, ADAM_DECAY, FINAL_RATE = 8e-4, 5e-5, 1e-6
 SPREADING_M = (
@@ -49,128 +38,87 @@ class NeRF2Options:
 
     Attributes:
         far_m: where rays end [m]: must span the room.
-        near_m: where they begin [m].
-        samples: points on a ray.
         scale_m: positions are encoded in this unit [m].
+        rays: per step, drawn evenly from all pixels of all spectra.
+        samples: points on a ray.
         depth, width, skip: of the trunk: layers, units, the layer that the encoded point is joined to again.
         octaves: of the encodings of point, direction and transmitter; the plain input is joined to each.
     """
 
     far_m: float
-    near_m: float = 0.0
-    samples: int = 64
     scale_m: float = 1.0
+    rays: int = 8192
+    samples: int = 64
     depth: int = 8
     width: int = 256
     skip: int = 4
     octaves: int = 10
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.near_m < self.far_m:
-            raise ValueError(
-                f"near_m, far_m: got {self.near_m} and {self.far_m}, expected 0 <= near < far, far across the room"
-            )
-        if not self.scale_m > 0:
-            raise ValueError(f"scale_m: got {self.scale_m!r}, expected a positive length")
-        for name, least in (("samples", 2), ("depth", 1), ("width", 2), ("octaves", 1)):
-            whole_number(name, getattr(self, name), least)
 
+def fit_nerf2(data: SpectrumDataset, options: NeRF2Options, how: Training) -> Trained:
+    """Train on spectra.
 
-class NeRF2(ImageModel):
-    """A trained NeRF2; build it with :meth:`fit` or :meth:`load`."""
+    Raises:
+        ImportError: without torch.
+        RuntimeError: if the loss stops being a number.
+    """
+    torch, where = torch_module(), how.place
+    network = build(options, how.seed).to(where)
+    optimiser = torch.optim.Adam(network.parameters(), lr=ADAM_RATE, weight_decay=ADAM_DECAY)
 
-    Options = NeRF2Options
+    def upload(values: Any) -> Any:
+        return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32)).to(where)
 
-    @classmethod
-    def fit(
-        cls,
-        data: SpectrumDataset | SpectrumImages,
-        options: NeRF2Options,
-        how: Training | None = None,
-        *,
-        rays: int = 8192,
-    ) -> NeRF2:
-        """Train on spectra.
+    target, toward = upload(pictures(data).reshape(-1)), upload(pixel_directions(data.shape).reshape(-1, 3))
+    origin, source = upload(data.receivers), upload(data.transmitter)
 
-        Args:
-            data: training set: spectra, or pictures of other origin.
-            options: network and rays.
-            how: of the training; by default 30 000 iterations.
-            rays: per step, drawn evenly from all pixels of all spectra.
+    def step(i: int) -> float:
+        chosen = torch.from_numpy(draws(how.seed, i).integers(len(target), size=options.rays)).to(where)
+        view, pixel = chosen // len(toward), chosen % len(toward)
+        cosine = 0.5 * (1.0 + np.cos(np.pi * i / how.iterations))
+        for group in optimiser.param_groups:
+            group["lr"] = FINAL_RATE + (ADAM_RATE - FINAL_RATE) * cosine
+        shown = render(network, options, origin[view], toward[pixel], source)
+        loss = torch.mean((shown - target[chosen]) ** 2)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        return float(loss.detach())
 
-        Raises:
-            ImportError: without torch.
-            ValueError: for bad options, or a checkpoint of another training.
-        """
-        torch = torch_module()
-        known = SpectrumImages.of(data)
-        how, rays = how or Training(), whole_number("rays", rays)
-        seed, where = int(how.seed), torch_device(how.device)
-        network = cls._build(options, known.shape, seed).to(where)
-        optimiser = torch.optim.Adam(network.parameters(), lr=ADAM_RATE, weight_decay=ADAM_DECAY)
-
-        def upload(values: np.ndarray) -> Any:
-            return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32)).to(where)
-
-        target, toward = upload(known.images.reshape(-1)), upload(known.directions.reshape(-1, 3))
-        origin, source = upload(known.receivers), upload(known.transmitters)
-
-        def step(i: int) -> float:
-            chosen = torch.from_numpy(draws(seed, i).integers(len(target), size=rays)).to(where)
-            view, pixel = chosen // len(toward), chosen % len(toward)
-            cosine = 0.5 * (1.0 + np.cos(np.pi * i / how.iterations))
-            for group in optimiser.param_groups:
-                group["lr"] = FINAL_RATE + (ADAM_RATE - FINAL_RATE) * cosine
-            shown = render(network, options, origin[view], toward[pixel], source[view])
-            loss = torch.mean((shown - target[chosen]) ** 2)
-            optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            optimiser.step()
-            return float(loss.detach())
-
-        learner = Learner({"network": network}, {"adam": optimiser}, step)
-        return cls._trained(known, options, learner, how, {"rays": rays})
-
-    def image(self, rx: Any, transmitter: Any = None) -> np.ndarray:
-        """The picture at ``rx`` (3,) [m], shape ``(H, W)`` float32, not below zero.
-
-        Args:
-            rx: receiver position.
-            transmitter: position (3,) [m]; the training one by default.
-        """
-        torch = torch_module()
-        receiver, source = self._positions(rx, transmitter)
-        where = self._torch_device
-        toward = torch.from_numpy(self.directions.reshape(-1, 3).astype(np.float32)).to(where)
-        origin, sent = (torch.from_numpy(p.astype(np.float32)).to(where) for p in (receiver, source))
+    def image(receiver: np.ndarray) -> np.ndarray:
+        at = upload(receiver)
         with torch.inference_mode():
             parts = [
-                render(self.network, self.options, origin.expand_as(d), d, sent.expand_as(d))
+                render(network, options, at.expand_as(d), d, source)
                 for d in torch.split(toward, RAYS_AT_ONCE)
             ]
-            return np.asarray(torch.cat(parts).cpu().numpy()).reshape(self.shape)
+            return np.asarray(torch.cat(parts).cpu().numpy()).reshape(data.shape)
 
-    @classmethod
-    def _build(cls, options: NeRF2Options, shape: tuple[int, int], seed: int) -> Any:
-        nn = torch_module().nn
-        encoded, width = 3 + 6 * options.octaves, options.width
-        joined = [width + (encoded if i == options.skip + 1 else 0) for i in range(options.depth)]
-        joined[0] = encoded
-        with seeded(seed):
-            return nn.ModuleDict(
-                {
-                    "trunk": nn.ModuleList([nn.Linear(n, width) for n in joined]),
-                    "attenuation": nn.Linear(width, 2),
-                    "feature": nn.Linear(width, width),
-                    "signal": nn.Sequential(
-                        nn.Linear(width + 2 * encoded, width),
-                        nn.ReLU(),
-                        nn.Linear(width, width // 2),
-                        nn.ReLU(),
-                        nn.Linear(width // 2, 2),
-                    ),
-                }
-            )
+    losses, seconds = learn(step, how)
+    return Trained(network.eval(), image, float(data.floor), data.range_db, losses, seconds)
+
+
+def build(options: NeRF2Options, seed: int) -> Any:
+    """The network before its training, on the CPU."""
+    nn = torch_module().nn
+    encoded, width = 3 + 6 * options.octaves, options.width
+    joined = [width + (encoded if i == options.skip + 1 else 0) for i in range(options.depth)]
+    joined[0] = encoded
+    with seeded(seed):
+        return nn.ModuleDict(
+            {
+                "trunk": nn.ModuleList([nn.Linear(n, width) for n in joined]),
+                "attenuation": nn.Linear(width, 2),
+                "feature": nn.Linear(width, width),
+                "signal": nn.Sequential(
+                    nn.Linear(width + 2 * encoded, width),
+                    nn.ReLU(),
+                    nn.Linear(width, width // 2),
+                    nn.ReLU(),
+                    nn.Linear(width // 2, 2),
+                ),
+            }
+        )
 
 
 def encode(values: Any, octaves: int) -> Any:
@@ -181,10 +129,10 @@ def encode(values: Any, octaves: int) -> Any:
 
 
 def render(network: Any, options: NeRF2Options, origin: Any, toward: Any, source: Any) -> Any:
-    """Brightness of rays, shape ``(B,)``, from ``origin``, along ``toward``, sent at ``source``, each ``(B, 3)``."""
+    """Brightness of rays, shape ``(B,)``, from ``origin`` along ``toward``, ``(B, 3)`` each, sent at ``source`` ``(3,)``."""
     torch = torch_module()
     functional = torch.nn.functional
-    t = torch.linspace(options.near_m, options.far_m, options.samples, device=origin.device)
+    t = torch.linspace(0.0, options.far_m, options.samples, device=origin.device)
     points = origin[:, None] + toward[:, None] * t[:, None]
     encoded = encode(points / options.scale_m, options.octaves)
     x = encoded
@@ -194,10 +142,8 @@ def render(network: Any, options: NeRF2Options, origin: Any, toward: Any, source
         x = torch.relu(layer(x))
     attenuation = network["attenuation"](x)
     # Direction and transmitter do not change along a ray, so they are encoded once a ray.
-    ray = torch.cat(
-        [encode(toward, options.octaves), encode(source / options.scale_m, options.octaves)], dim=-1
-    )
-    ray = ray[:, None].expand(-1, options.samples, -1)
+    sent = encode(source.expand_as(toward) / options.scale_m, options.octaves)
+    ray = torch.cat([encode(toward, options.octaves), sent], dim=-1)[:, None].expand(-1, options.samples, -1)
     signal = network["signal"](torch.cat([network["feature"](x), ray], dim=-1))
 
     lost = functional.leaky_relu(attenuation[..., 0]).abs()

@@ -1,1 +1,1 @@
-"""The engine's benchmarks: each knob's speed against error, growth, mesh rays, blending beside torch."""
+"""The engine's benchmark: spectra of many Gaussians, and mesh rays."""

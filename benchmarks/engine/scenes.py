@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import numpy as np
 
 from warprrf.geometry.mesh import Mesh
@@ -62,11 +58,6 @@ def panorama(height: int = 90, width: int = 180) -> Camera:
     return Camera.spherical(width, height, position=RECEIVER)
 
 
-def positions(count: int, seed: int) -> np.ndarray:
-    """Receivers in the room, 1 m off its walls, shape ``(count, 3)`` [m]."""
-    return np.random.default_rng(seed).uniform(1.0, np.asarray(ROOM) - 1.0, (count, 3))
-
-
 def room_mesh() -> Mesh:
     """The room's six sides, wound inwards."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * np.asarray(ROOM)
@@ -80,15 +71,3 @@ def gain(points: np.ndarray) -> np.ndarray:
     db = -35 + 15 * np.sin(1.3 * x) * np.cos(1.7 * y) + 10 * np.sin(2.1 * z + x)
     glint = np.exp(-0.5 * ((x - 9.0) ** 2 + (y - 12.0) ** 2 + (z - 2.0) ** 2) / 0.3**2)
     return 10 ** (db / 10) + glint
-
-
-def best_seconds(runners: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
-    """Shortest run of each [s], run in turn after one that doesn't count."""
-    best = dict.fromkeys(runners, np.inf)
-    for turn in range(repeats + 1):
-        for name, run in runners.items():
-            start = time.perf_counter()
-            run()
-            if turn:
-                best[name] = min(best[name], time.perf_counter() - start)
-    return best

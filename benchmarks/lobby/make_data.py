@@ -19,7 +19,6 @@ kept, so that a killed run continues.
 examples:
   python -m benchmarks data
   python -m benchmarks data --only spectra --full --workers 2      also the 800 receivers of the paper's size; resumable
-  python -m benchmarks data --look plain --data data/lobby_plain --only scene photos
 """
 
 
@@ -29,14 +28,12 @@ class Options:
 
     Attributes:
         data: folder to write.
-        look: ``"patterned"`` all over, or ``"plain"`` walls, ceiling and pillars; spectra are the same for both.
         only: steps to do, of ``"scene"``, ``"photos"``, ``"spectra"``.
         workers: processes of one thread each that simulate, by dask; 0: this one alone.
         full: also 800 receivers at the paper's size, beside the committed sample (``*_full.nc``).
     """
 
     data: str = option("data/lobby", "folder to write")
-    look: str = option("patterned", "what walls look like", choices=scene.LOOKS)
     only: tuple[str, ...] = option(STEPS, "steps to do", choices=STEPS)
     workers: int = option(0, "processes of one thread each that simulate; 0: this one alone")
     full: bool = option(
@@ -56,7 +53,7 @@ def run(options: Options, job: Job) -> None:
         raise ValueError(f"only: got {', '.join(unknown)}, expected some of {', '.join(STEPS)}")
     data = Path(options.data)
     if "scene" in options.only:
-        scene.build(data, look=options.look, progress=job.progress)
+        scene.build(data, progress=job.progress)
     if not (data / "scene.xml").is_file():
         raise ValueError(f"data: {data} holds no scene.xml; make the scene first (step scene)")
     if "photos" in options.only:

@@ -1,8 +1,8 @@
 """The main job: the lobby's photos and a few of its spectra become geometry, a radio field, and their errors.
 
 Steps, each kept once finished (:mod:`warprrf.steps`): ``geometry`` (photos to cameras, Gaussians, mesh),
-``geometry error``, then for each truth a ``fit`` of every model and an ``evaluation``, and ``pictures``. The true
-poses and the true scene are read by the scoring steps alone.
+``geometry error``, a step for each truth, method and number of spectra, and ``pictures``. The true poses and the true
+scene are read by the scoring steps alone.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ import numpy as np
 import warprrf as wr
 from benchmarks.data import VERSIONS, Geometry
 from benchmarks.lobby import report as page
-from benchmarks.lobby import score as truth_scores
-from benchmarks.lobby.photos import noise_psnr_db
+from benchmarks.lobby.photos import noise_psnr_db, read_poses
+from benchmarks.lobby.score import score_cameras, score_mesh
 from benchmarks.lobby.spectra import FILES as TRUTHS
 from benchmarks.machine import machine
-from benchmarks.methods import Fitted, fit_bistatic, fit_harmonic
+from benchmarks.methods import METHODS, Effort, Task, score
 from benchmarks.report import Report
 from benchmarks.runner import Benchmark, Job, option
 from warprrf.files import write_arrays, write_atomically, write_json
@@ -31,23 +31,26 @@ from warprrf.geometry import pipeline as stage_1
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.geometry.photos.config import ReconstructionConfig
 from warprrf.geometry.photos.photo_files import read_photo
-from warprrf.rf.spectra import lookups, metrics
+from warprrf.rf.spectra import lookups
 from warprrf.rf.spectra.spectrum import to_db
 from warprrf.steps import Attempt, Steps
 
-MODELS = ("bistatic", "rf3dgs+", "rf3dgs")
-LOOKUPS = {"nearest": lookups.nearest, "idw": lookups.idw, "constant": lookups.constant, "mean": lookups.mean}
+MAIN = "bistatic"
+MODELS = (MAIN, "rf3dgs+", "rf3dgs")
+COMPARED = {**dict.fromkeys(MODELS, "exp"), MAIN: "", "nearest": "", "idw": "", "constant": "", "mean": ""}
+"""Methods on the largest training set, and the variant of each."""
 MAP_POINTS = 40_000  # of the mesh, drawn in the report
 SECTION_HEIGHT_M = 1.2
 
 HELP = """\
 Continues where a killed run stopped; each step is redone only if its inputs or its version changed. Writes report.html,
 report.json (every figure), geometry.ply (Gaussians, opens in any splat viewer), mesh.ply, field.safetensors and
-cameras.json. About 15 minutes on two cores, no GPU.
+cameras.json. Six minutes on two cores, no GPU.
 
 examples:
   python -m benchmarks lobby
   python -m benchmarks lobby --reduced --out runs/quick        few photos and steps, to see it run
+  python -m benchmarks lobby --data data/lobby_plain --spectra data/lobby --out runs/plain       plain walls
 """
 
 
@@ -62,7 +65,7 @@ class Sizes:
         iterations: of the photometric refinement.
         steps: of the fit of RF-3DGS and RF-3DGS+.
         corner: receivers count where x and y [m] exceed these.
-        train: training receivers.
+        counts: training receivers; all methods on the most, the bistatic field on each.
         test: test receivers.
     """
 
@@ -72,7 +75,7 @@ class Sizes:
     iterations: int | None = None
     steps: int | None = None
     corner: tuple[float, float] = (0.0, 0.0)
-    train: int = 50
+    counts: tuple[int, ...] = (10, 50)
     test: int | None = None
 
 
@@ -88,7 +91,7 @@ REDUCED = Sizes(
     iterations=100,
     steps=60,
     corner=(8.0, 3.0),
-    train=16,
+    counts=(16,),
     test=16,
 )  # fmt: skip
 
@@ -98,11 +101,13 @@ class Options:
     """Options of the main job.
 
     Attributes:
-        data: folder of the lobby's photos, scene and spectra.
+        data: folder of the lobby's photos and scene.
+        spectra: folder of its spectra; ``data`` by default.
         reduced: few photos and steps: shows that it runs, its figures mean little.
     """
 
-    data: str = option("data/lobby", "the lobby's photos, scene and spectra")
+    data: str = option("data/lobby", "the lobby's photos and scene")
+    spectra: str | None = option(None, "folder of its spectra (that of the photos by default)")
     reduced: bool = option(False, "few photos and steps: shows that it runs, in minutes")
 
 
@@ -110,31 +115,22 @@ def run(options: Options, job: Job) -> Report:
     """Run every step that is not finished yet.
 
     Leaves in ``job.out``: ``report.json``, ``report.html``, ``geometry.ply`` (Gaussians), ``mesh.ply``,
-    ``cameras.json``, ``field.safetensors`` (bistatic, exact truth) and the other fields.
+    ``cameras.json``, ``field.safetensors`` (bistatic, exact truth, the most spectra) and the other fields.
 
     Raises:
         ValueError: if data are missing or broken, or another run is at work in ``job.out``.
         ImportError: if the extra ``photos`` or ``plots`` is not installed.
     """
-    lobby = Lobby(Path(options.data), job, REDUCED if options.reduced else FULL)
+    data, spectra = Path(options.data), Path(options.spectra or options.data)
+    lobby = Lobby(data, spectra, job, REDUCED if options.reduced else FULL)
     lobby.check_data()
     with Steps(job.out, fresh=job.fresh, progress=job.progress) as steps:
         figures = lobby.figures(steps)
     figures |= {"seed": job.seed, "reduced": options.reduced, "machine": machine(job.device)}
-    look = f"in the browser: warprrf view {job.out} {Path(options.data) / TRUTHS['exact']}"
-    return Report("report", figures, f"{summary(figures)}\n\n{look}", html=partial(page.draw, job.out))
-
-
-def summary(report: dict[str, Any]) -> str:
-    """The report's figures as Markdown tables."""
-    lines = []
-    for key, name, unit in page.FIGURES:
-        value = report.get(key)
-        lines.append(f"{name:<66} {'-' if value is None else f'{value:.4g} {unit}':>16}")
-    parts = ["\n".join(lines)]
-    for truth, key in (("exact", "methods"), ("Sionna RT", "methods_sionna")):
-        parts.append(f"held-out receivers, truth: {truth}\n\n{page.method_table(report[key])}")
-    return "\n\n".join(parts)
+    look = f"In the browser: `warprrf view {job.out} {spectra / TRUTHS['exact']}`"
+    title = "The lobby: from photos and a few spectra to a radio field"
+    pictures = page.pictures(figures, job.out / "pictures.npz")
+    return Report("report", figures, f"{page.text(figures)}\n\n{look}", pictures, title=title)
 
 
 @dataclass(frozen=True)
@@ -142,6 +138,7 @@ class Lobby:
     """One run: where its data lie, and its steps."""
 
     data: Path
+    spectra: Path
     job: Job
     sizes: Sizes = FULL
 
@@ -151,68 +148,50 @@ class Lobby:
         return Geometry(self.job.out / "reconstruction", self.data / "scene.xml", self.job.device)
 
     def check_data(self) -> None:
-        """Refuse a folder that lacks something; ValueError names it."""
-        self.check_photos(*TRUTHS.values())
-
-    def check_photos(self, *more: str) -> None:
-        """Refuse a folder that lacks a file that stage 1 or its score needs, or one of ``more``; ValueError names it."""
-        needed = ("photos", "photos.json", "surveyed.json", "poses_true.json", "scene.xml", *more)
-        missing = [name for name in needed if not (self.data / name).exists()]
+        """Refuse folders that lack something; ValueError names it."""
+        needed = ("photos", "photos.json", "surveyed.json", "poses_true.json", "scene.xml")
+        paths = [*(self.data / name for name in needed), *(self.spectra / name for name in TRUTHS.values())]
+        missing = [str(path) for path in paths if not path.exists()]
         if missing:
             raise ValueError(
-                f"data: {self.data} lacks {', '.join(missing)}; expected the folder {self.data.name} of a checkout's "
-                "data, or make it: python -m benchmarks data"
+                f"data: there is no {', '.join(missing)}; expected the folder of a checkout's data, or make it: "
+                "python -m benchmarks data"
             )
 
-    def stage_1(self, steps: Steps) -> tuple[dict[str, Any], dict[str, Any]]:
-        """What the geometry is and how far it is from the truth, from the steps."""
-        inputs = [
-            *(self.data / name for name in ("photos", "photos.json", "surveyed.json")),
-            self.job.seed,
-            self.sizes,
-        ]
+    def figures(self, steps: Steps) -> dict[str, Any]:
+        """Everything that the report holds, from the steps."""
+        files = [self.data / name for name in ("photos", "photos.json", "surveyed.json")]
         geometry = steps.run(
-            "geometry", self.geometry, version=VERSIONS["geometry"], inputs=[*inputs, stage_1.VERSIONS],
+            "geometry", self.geometry, version=VERSIONS["geometry"],
+            inputs=[*files, self.job.seed, self.sizes, stage_1.VERSIONS],
             outputs=("reconstruction", "geometry.ply", "mesh.ply", "cameras.json"),
         )  # fmt: skip
         errors = steps.run(
             "geometry error", self.geometry_error, version=1, outputs=("geometry_error.npz",),
             inputs=[steps.key("geometry"), self.data / "poses_true.json", self.data / "scene.xml"],
         )  # fmt: skip
-        return geometry, errors
-
-    def figures(self, steps: Steps) -> dict[str, Any]:
-        """Everything that the report holds, from the steps."""
-        v = VERSIONS
-        geometry, errors = self.stage_1(steps)
-        base = [steps.key("geometry")]
-        found: dict[str, dict[str, Any]] = {}
+        most = max(self.sizes.counts)
+        asked = [(MAIN, count) for count in sorted(self.sizes.counts)[:-1]] + [(m, most) for m in COMPARED]
+        found: dict[str, dict[str, Any]] = {truth: {} for truth in TRUTHS}
         for truth, name in TRUTHS.items():
-            radio = [*base, self.data / name]
-            for model in MODELS:
-                steps.run(
-                    f"fit {model}, {truth}", partial(self.fit, model, truth), inputs=[*radio, model],
-                    version=v["bistatic" if model == "bistatic" else "harmonic"],
-                    outputs=(field_name(model, truth),),
+            for method, count in asked:
+                row = steps.run(
+                    f"{method} {count}, {truth}", partial(self.method, method, count, truth),
+                    version=METHODS[method].version, inputs=[steps.key("geometry"), self.spectra / name, count],
+                    outputs=(field_name(method, count, truth, most),) if method in MODELS else (),
                 )  # fmt: skip
-            fitted = [steps.key(f"fit {model}, {truth}") for model in MODELS]
-            found[truth] = steps.run(
-                f"evaluation, {truth}", partial(self.evaluation, truth), version=v["metrics"],
-                inputs=[*radio, *fitted, v["lookups"]],
-            )  # fmt: skip
-            for model in MODELS:
-                found[truth]["methods"][model] |= steps.figures(f"fit {model}, {truth}")
+                found[truth][method if count == most else f"{method}-{count}"] = row
+        scored = [steps.key(f"{model} {most}, exact") for model in MODELS]
         steps.run(
-            "pictures", partial(self.pictures, found["exact"]["methods"]), version=1, outputs=("pictures.npz",),
-            inputs=[steps.key("geometry error"), *(steps.key(f"evaluation, {truth}") for truth in TRUTHS)],
+            "pictures", partial(self.pictures, found["exact"]["rf3dgs+"]), version=1, outputs=("pictures.npz",),
+            inputs=[steps.key("geometry error"), *scored],
         )  # fmt: skip
         return {
             **{key: errors.get(key) for key, *_ in page.FIGURES},
-            "fit_time_s": found["exact"]["methods"]["rf3dgs+"]["fit_time_s"],
             "pipeline_time_s": steps.seconds(),
-            "methods": found["exact"]["methods"],
-            "methods_sionna": found["sionna"]["methods"],
-            "data": {truth: found[truth]["data"] for truth in TRUTHS},
+            "methods": found["exact"],
+            "methods_sionna": found["sionna"],
+            "data": {truth: self.about(truth) for truth in TRUTHS},
             "geometry": {**geometry, **errors},
             "stages": {
                 name: {
@@ -224,9 +203,26 @@ class Lobby:
             },
         }
 
-    def split(self, truth: str) -> tuple[Any, Any]:
-        """Training and test set; see :func:`receivers`."""
-        return receivers(wr.SpectrumDataset.load(self.data / TRUTHS[truth]), self.sizes, seed=self.job.seed)
+    def split(self, truth: str, count: int | None = None) -> tuple[Any, Any]:
+        """Training and test set of a run of these sizes, in the nested order of the data set.
+
+        Raises:
+            ValueError: if there are too few training receivers, or none to test.
+        """
+        ds = wr.SpectrumDataset.load(self.spectra / TRUTHS[truth])
+        inside = (np.asarray(ds.receivers)[:, :2] > self.sizes.corner).all(axis=1)
+        train, test = ds.subset(inside).split(count or max(self.sizes.counts), seed=self.job.seed)
+        return train, test if self.sizes.test is None else test.subset(range(min(self.sizes.test, len(test))))
+
+    def about(self, truth: str) -> dict[str, Any]:
+        """What a truth's data are."""
+        train, test = self.split(truth)
+        return {
+            "engine": test.engine, "train": len(train), "test": len(test),
+            "blocked": int(np.count_nonzero(~np.asarray(test.line_of_sight))), "shape": list(test.shape),
+            "frequency_hz": float(test.frequency_hz), "range_db": list(test.range_db),
+            "beam_sigma_rad": float(test.beam_sigma_rad), "settings": dict(test.attributes),
+        }  # fmt: skip
 
     def geometry(self, attempt: Attempt) -> dict[str, Any]:
         """Photos to cameras, Gaussians and mesh."""
@@ -267,17 +263,12 @@ class Lobby:
         """Cameras, mesh and held-out photos against the truth."""
         files, held_out, _ = photos(self.data, self.sizes)
         used = {file.name for file in files}
-        known = truth_scores.true_cameras(self.data / "poses_true.json")
+        known = read_poses(self.data / "poses_true.json")
         truth = {name: camera for name, camera in known.items() if name in used}
         found = self.place.reconstruction
-        figures: dict[str, Any] = truth_scores.score_cameras(found.cameras, truth)
-        scored = truth_scores.score_mesh(
-            found.mesh,
-            self.place.scene.mesh,
-            list(truth.values()),
-            seed=self.job.seed,
-            device=self.job.device,
-        )
+        figures: dict[str, Any] = score_cameras(found.cameras, truth)
+        true_mesh, seen = self.place.scene.mesh, list(truth.values())
+        scored = score_mesh(found.mesh, true_mesh, seen, seed=self.job.seed, device=self.job.device)
         figures |= scored.figures
         names = [name for name in held_out if name in found.cameras]
         if not names:
@@ -309,87 +300,28 @@ class Lobby:
         write_arrays(self.job.out / "geometry_error.npz", arrays)
         return figures
 
-    def fit(self, model: str, truth: str, attempt: Attempt) -> dict[str, Any]:
-        """One field, and what its fit cost."""
-        train, test = self.split(truth)
-        fitted: Fitted
-        if model == "bistatic":
-            fitted = fit_bistatic(self.place, train, seed=self.job.seed, progress=attempt.progress)
-        else:
-            options: dict[str, Any] = {} if self.sizes.steps is None else {"iterations": self.sizes.steps}
-            fitted = fit_harmonic(
-                self.place, train, test, model, seed=self.job.seed, progress=attempt.progress,
-                checkpoint=attempt.folder / "checkpoint", **options,
-            )  # fmt: skip
-        file = self.job.out / field_name(model, truth)
-        write_atomically(file, fitted.field.save)
-        transport_s, fit_s, report = fitted.transport_s or 0.0, fitted.fit_s or 0.0, fitted.field.report
-        return {
-            "transport_time_s": transport_s,
-            "fit_time_s": transport_s + fit_s,
-            "loss_first": {name: losses[0] for name, losses in report["losses"].items() if losses},
-            "loss_last": {name: losses[-1] for name, losses in report["losses"].items() if losses},
-            "gaussians_seen": report.get("gaussians_seen"),
-            "terms": report.get("choices"),
-            "model_bytes": file.stat().st_size,
-        }
+    def method(self, method: str, count: int, truth: str, attempt: Attempt) -> dict[str, Any]:
+        """Figures of a method on ``count`` spectra; a field is left in its file."""
+        train, test = self.split(truth, count)
+        task = Task(
+            train, test, self.place, attempt.folder, attempt.progress, slot=truth, variant=COMPARED[method],
+            seed=self.job.seed, effort=Effort(harmonic_iterations=self.sizes.steps),
+        )  # fmt: skip
+        name = field_name(method, count, truth, max(self.sizes.counts))
+        fitted, row = score(method, task, self.job.out / name)
+        return {**row, "choices": fitted.field.report.get("choices")} if method in MODELS else row
 
-    def field(self, model: str, truth: str) -> Any:
-        """A field that :meth:`fit` left."""
-        return wr.RadioField.load(self.job.out / field_name(model, truth), device=self.job.device)
-
-    def evaluation(self, truth: str, attempt: Attempt) -> dict[str, Any]:
-        """Every model and lookup on the test receivers."""
-        train, test = self.split(truth)
-        weights, seconds = self.place.weights(test, slot="test", progress=attempt.progress)
-        methods: dict[str, Any] = {}
-        for model in MODELS:
-            field = self.field(model, truth)
-
-            def predict(receiver: Any, field: Any = field) -> Any:
-                return field.spectrum(receiver, transport=weights.at(receiver))
-
-            harmonic = model != "bistatic"
-            methods[model] = metrics.evaluate(
-                test, predict if harmonic else field.spectrum, progress=attempt.progress
-            )
-            # Weights were computed beforehand for all methods: the time of a spectrum from nothing includes them.
-            methods[model]["seconds_per_spectrum"] += harmonic * seconds / len(test.receivers)
-        for name, build in LOOKUPS.items():
-            lookup = build(train)
-            methods[name] = {
-                **metrics.evaluate(test, lookup, progress=attempt.progress),
-                "note": lookup.note,
-            }
-        gaps = np.linalg.norm(test.receivers[:, None] - train.receivers[None], axis=-1).min(axis=1)
-        for figures in methods.values():
-            figures["per_receiver"]["distance_to_training_m"] = gaps
-        return {
-            "methods": methods,
-            "data": {
-                "engine": test.engine,
-                "train": len(train.receivers),
-                "test": len(test.receivers),
-                "blocked": int(np.count_nonzero(~np.asarray(test.line_of_sight))),
-                "shape": list(test.path_gain.shape[1:]),
-                "frequency_hz": float(test.frequency_hz),
-                "range_db": list(test.range_db),
-                "beam_sigma_rad": float(test.beam_sigma_rad),
-                "settings": dict(test.attributes),
-            },
-        }
-
-    def pictures(self, methods: dict[str, Any], attempt: Attempt) -> dict[str, Any]:
+    def pictures(self, scored: dict[str, Any], attempt: Attempt) -> dict[str, Any]:
         """What the report draws, as arrays."""
         train, test = self.split("exact")
-        score = np.array(methods["rf3dgs+"]["per_receiver"]["psnr_db"], dtype=np.float64)
+        psnr = np.array(scored["per_receiver"]["psnr_db"], dtype=np.float64)
         blocked = ~np.asarray(test.line_of_sight, dtype=bool)
-        chosen = _spread_by_score(score, blocked)
+        chosen = _spread_by_score(psnr, blocked)
         mesh = self.place.scene.mesh
         arrays: dict[str, np.ndarray] = {
             "train_receivers": np.asarray(train.receivers),
             "test_receivers": np.asarray(test.receivers),
-            "test_psnr_db": score,
+            "test_psnr_db": psnr,
             "test_blocked": blocked,
             "transmitter": np.asarray(test.transmitter),
             "range_db": np.asarray(test.range_db),
@@ -398,7 +330,11 @@ class Lobby:
             "spectrum_blocked": blocked[chosen],
             "spectrum_truth": to_db(np.asarray(test.path_gain)[chosen], test.floor).astype(np.float32),
         }
-        predictors: dict[str, Any] = {m: self.field(m, "exact").spectrum for m in MODELS}
+        most = max(self.sizes.counts)
+        files = {m: self.job.out / field_name(m, most, "exact", most) for m in MODELS[:2]}
+        predictors: dict[str, Any] = {
+            m: wr.RadioField.load(file, device=self.job.device).spectrum for m, file in files.items()
+        }
         predictors["nearest"] = lookups.nearest(train)
         for done, (name, predict) in enumerate(predictors.items()):
             images = [predict(test.receivers[i]).path_gain_db for i in chosen]
@@ -420,10 +356,10 @@ def _spread_by_score(score: np.ndarray, blocked: np.ndarray) -> np.ndarray:
     return np.array(sorted(set(chosen), key=chosen.index), dtype=np.int64)
 
 
-def field_name(model: str, truth: str) -> str:
-    """The main field is ``field.safetensors``; the others carry model and truth in their name."""
-    main = (model, truth) == (MODELS[0], "exact")
-    return "field.safetensors" if main else f"field-{model}-{truth}.safetensors"
+def field_name(model: str, count: int, truth: str, most: int) -> str:
+    """The main field is ``field.safetensors``; the others carry model, number of spectra and truth in their name."""
+    main = (model, count, truth) == (MAIN, most, "exact")
+    return "field.safetensors" if main else f"field-{model}-{count}-{truth}.safetensors"
 
 
 def config(sizes: Sizes) -> ReconstructionConfig:
@@ -440,17 +376,6 @@ def photos(data: Path, sizes: Sizes = FULL) -> tuple[list[Path], list[str], dict
     held_out = [name for name in roles["held_out"] if name in names]
     known = {n: p for n, p in surveyed.items() if n in names}
     return [data / "photos" / name for name in names], held_out, known
-
-
-def receivers(dataset: Any, sizes: Sizes = FULL, *, seed: int = 0) -> tuple[Any, Any]:
-    """Training and test set of a run of these sizes, in the nested order of the data set.
-
-    Raises:
-        ValueError: if there are too few training receivers, or none to test.
-    """
-    inside = (np.asarray(dataset.receivers)[:, :2] > sizes.corner).all(axis=1)
-    train, test = dataset.subset(inside).split(sizes.train, seed=seed)
-    return train, test if sizes.test is None else test.subset(range(min(sizes.test, len(test))))
 
 
 BENCHMARKS = {"lobby": Benchmark("lobby", Options, run, HELP)}

@@ -6,21 +6,20 @@ around the room; what stands or hangs is sunk a little into what carries it, so 
 
 Sionna RT reads a radio material from the identifier of a ``bsdf`` element (``mat-itu_concrete``), so one such element
 stands for one radio material; its faces share one texture, an atlas in which each face has an area of its own.
-The ceiling is backlit: its texture is its radiance too, which gives even light and little noise.
+The ceiling is backlit: its texture is its radiance too, which gives even light and little noise. What the materials are
+to radio stands in ``data/lobby/materials.json``.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.lobby.radio import material_table
 from benchmarks.lobby.textures import paint
 from warprrf.device import Progress, require
 from warprrf.files import write_atomically, write_text
@@ -28,11 +27,14 @@ from warprrf.geometry.mesh_files import write_mesh
 
 ROOM = np.array([[0.0, 0.0, 0.0], [15.0, 12.0, 4.0]])
 """Lower and upper corner of the room's air [m]."""
+MATERIALS = Path(__file__).parents[2] / "data" / "lobby" / "materials.json"
 
 ATLAS_WIDTH = 1600  # texels
 MARGIN = 4  # texels of repeated border round each face, so that bilinear look-ups never meet a neighbour
 HIDDEN = 8  # texels a side of the grey patch that all unseen faces share
 JPEG_QUALITY = 82
+
+Pair = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Solid:
     """A prism: ``profile`` (counter-clockwise, its first corner sees all others) extruded from ``low`` to ``high``.
 
     The profile lies in the plane of the two axes that follow ``axis`` in cyclic order: (x, y) for z, (y, z) for x,
-    (z, x) for y. ``top`` overrides the style of upward faces.
+    (z, x) for y.
     """
 
     name: str
@@ -49,196 +51,126 @@ class Solid:
     axis: str
     low: float
     high: float
-    profile: tuple[tuple[float, float], ...]
-    texel: float = 0.008
-    top: str | None = None
-    emits: bool = False
+    profile: tuple[Pair, ...]
+
+    @property
+    def texel(self) -> float:
+        """Size of a texel [m]: what bounds the room has coarser ones."""
+        return 0.01 if self.name.startswith(("floor", "ceiling", "wall")) else 0.008
+
+    @property
+    def top(self) -> str:
+        """Style of upward faces: plants grow in planters."""
+        return "foliage" if self.name.startswith("planter") else self.style
 
 
-def _box(
-    name: str,
-    material: str,
-    style: str,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    z: tuple[float, float],
-    *,
-    texel: float = 0.008,
-    top: str | None = None,
-) -> Solid:
+def _box(name: str, material: str, style: str, x: Pair, y: Pair, z: Pair) -> Solid:
     profile = ((x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1]))
-    return Solid(name, material, style, "z", z[0], z[1], profile, texel, top)
+    return Solid(name, material, style, "z", *z, profile)
 
 
 def _sofa(name: str, axis: str, low: float, high: float, back: float, front: float, base: float) -> Solid:
     """An L of seat and back along ``axis`` ("x" or "y"), its back at ``back``, the seat's edge at ``front``."""
-    seat, top, sign = 0.45 + base, 0.92 + base, np.sign(front - back)
-    inner = back + 0.3 * sign
-    corners = [
-        (inner, seat),
-        (inner, top),
-        (back, top),
-        (back, base - 0.03),
-        (front, base - 0.03),
-        (front, seat),
-    ]
+    seat, top, bottom = 0.45 + base, 0.92 + base, base - 0.03
+    inner = back + 0.3 * float(np.sign(front - back))
+    corners = [(inner, seat), (inner, top), (back, top), (back, bottom), (front, bottom), (front, seat)]
     if axis == "y":
         corners = [(z, x) for x, z in corners]
     area = sum(a[0] * b[1] - b[0] * a[1] for a, b in zip(corners, corners[1:] + corners[:1], strict=True))
     profile = corners if area > 0 else [corners[0], *corners[:0:-1]]
-    return Solid(
-        name, "carpet_tile", "textile", axis, low, high, tuple((float(a), float(b)) for a, b in profile)
-    )
+    return Solid(name, "carpet_tile", "textile", axis, low, high, tuple(profile))
 
 
-def lobby() -> list[Solid]:
-    """All solids of the lobby."""
-    pillars = [(3.6, 3.3), (3.6, 8.4), (8.6, 6.6), (12.2, 3.2)]
-    gallery = ((9.6, 2.6), (9.6, 3.55), (9.45, 3.55), (9.45, 2.35), (12.02, 2.35), (12.02, 2.6))
-    return [
-        _box("floor", "marble", "terrazzo", (-0.10, 15.10), (-0.10, 12.10), (-0.20, 0.0), texel=0.01),
-        replace(
-            _box(
-                "ceiling", "ceiling_board", "ceiling", (-0.11, 15.11), (-0.11, 12.11), (4.0, 4.2), texel=0.01
-            ),
-            emits=True,
-        ),
-        _box("wall_south", "concrete", "concrete", (-0.12, 15.12), (-0.25, 0.0), (-0.12, 4.12), texel=0.01),
-        _box("wall_north", "brick", "brick", (-0.13, 15.13), (12.0, 12.25), (-0.13, 4.13), texel=0.01),
-        _box("wall_west", "glass", "glass", (-0.20, 0.0), (-0.14, 12.14), (-0.14, 4.14), texel=0.01),
-        _box(
-            "wall_east", "plasterboard", "plaster", (15.0, 15.20), (-0.15, 12.15), (-0.15, 4.15), texel=0.01
-        ),
-        *(
-            _box(
-                f"pillar_{k + 1}",
-                "concrete",
-                "concrete",
-                (x - 0.3, x + 0.3),
-                (y - 0.3, y + 0.3),
-                (-0.02, 4.02),
-            )
-            for k, (x, y) in enumerate(pillars)
-        ),
-        # Its profile is the slab with the parapet on its southern edge; it ends in the north and west walls.
-        Solid(
-            "gallery",
-            "concrete",
-            "concrete",
-            "x",
-            -0.02,
-            6.8,
-            tuple((float(a), float(b)) for a, b in gallery),
-        ),
-        _box("partition", "plasterboard", "plaster", (6.1, 6.3), (-0.02, 4.4), (-0.02, 2.8)),
-        _box("screen", "wood", "wood", (11.4, 15.02), (6.0, 6.2), (-0.02, 2.5)),
-        _box("kiosk", "plywood", "wood", (8.2, 10.3), (1.9, 4.0), (-0.02, 2.6)),
-        _box("platform", "carpet_tile", "textile", (11.0, 15.02), (7.4, 12.02), (-0.04, 0.15)),
-        _box("desk", "marble", "terrazzo", (7.6, 10.4), (9.7, 10.4), (-0.02, 1.1)),
-        _box("desk_wing", "marble", "terrazzo", (7.4, 8.1), (10.38, 11.4), (-0.03, 1.09)),
-        _box("elevator", "metal", "metal", (12.6, 14.4), (-0.03, 0.08), (-0.03, 2.3)),
-        _box("vending", "metal", "metal", (14.1, 15.03), (4.6, 5.6), (-0.03, 1.9)),
-        _box("totem", "metal", "metal", (5.2, 6.0), (6.0, 6.3), (-0.03, 2.0)),
-        _box("sign_north", "metal", "metal", (8.2, 9.8), (11.92, 12.03), (1.9, 2.9)),
-        _box("sign_east", "metal", "metal", (14.92, 15.04), (8.9, 10.5), (1.5, 2.5)),
-        _box("sign_south", "wood", "wood", (2.0, 4.0), (-0.03, 0.07), (1.3, 2.5)),
-        _box("bench", "wood", "wood", (1.2, 1.9), (6.2, 7.8), (-0.03, 0.45)),
-        _box("table", "wood", "wood", (12.6, 13.6), (9.0, 9.8), (0.12, 0.6)),
-        _box("table_west", "wood", "wood", (1.6, 2.4), (1.4, 2.3), (-0.03, 0.5)),
-        _sofa("sofa_north", "x", 11.9, 14.2, 12.02, 11.1, 0.15),
-        _sofa("sofa_east", "y", 7.8, 9.9, 15.02, 14.1, 0.15),
-        _sofa("sofa_west", "y", 0.7, 3.0, -0.02, 0.9, 0.0),
-        _box("planter_west", "concrete", "concrete", (0.5, 1.3), (4.2, 5.0), (-0.03, 0.8), top="foliage"),
-        _box("planter_hall", "concrete", "concrete", (10.9, 11.7), (0.5, 1.3), (-0.03, 0.8), top="foliage"),
-        _box("planter_lounge", "concrete", "concrete", (11.2, 11.9), (6.6, 7.2), (-0.03, 0.7), top="foliage"),
-    ]
+def _pillar(number: int, x: float, y: float) -> Solid:
+    across = (x - 0.3, x + 0.3), (y - 0.3, y + 0.3)
+    return _box(f"pillar_{number}", "concrete", "concrete", *across, (-0.02, 4.02))
 
 
-PLAIN_STYLES = {
-    "ceiling": "luminous paint", "wall_south": "grey paint", "wall_north": "clay paint", "wall_west": "dark pane",
-    "wall_east": "cream paint", "pillar": "white paint", "gallery": "white paint", "partition": "cream paint",
-}  # fmt: skip
-"""Styles of the plain lobby by the start of a solid's name; the floor, signs and furniture keep their patterns."""
+# A slab with the parapet on its southern edge; it ends in the north and west walls.
+GALLERY = (9.6, 2.6), (9.6, 3.55), (9.45, 3.55), (9.45, 2.35), (12.02, 2.35), (12.02, 2.6)
+SOLIDS = (
+    _box("floor", "marble", "terrazzo", (-0.10, 15.10), (-0.10, 12.10), (-0.20, 0.0)),
+    _box("ceiling", "ceiling_board", "ceiling", (-0.11, 15.11), (-0.11, 12.11), (4.0, 4.2)),
+    _box("wall_south", "concrete", "concrete", (-0.12, 15.12), (-0.25, 0.0), (-0.12, 4.12)),
+    _box("wall_north", "brick", "brick", (-0.13, 15.13), (12.0, 12.25), (-0.13, 4.13)),
+    _box("wall_west", "glass", "glass", (-0.20, 0.0), (-0.14, 12.14), (-0.14, 4.14)),
+    _box("wall_east", "plasterboard", "plaster", (15.0, 15.20), (-0.15, 12.15), (-0.15, 4.15)),
+    _pillar(1, 3.6, 3.3),
+    _pillar(2, 3.6, 8.4),
+    _pillar(3, 8.6, 6.6),
+    _pillar(4, 12.2, 3.2),
+    Solid("gallery", "concrete", "concrete", "x", -0.02, 6.8, GALLERY),
+    _box("partition", "plasterboard", "plaster", (6.1, 6.3), (-0.02, 4.4), (-0.02, 2.8)),
+    _box("screen", "wood", "wood", (11.4, 15.02), (6.0, 6.2), (-0.02, 2.5)),
+    _box("kiosk", "plywood", "wood", (8.2, 10.3), (1.9, 4.0), (-0.02, 2.6)),
+    _box("platform", "carpet_tile", "textile", (11.0, 15.02), (7.4, 12.02), (-0.04, 0.15)),
+    _box("desk", "marble", "terrazzo", (7.6, 10.4), (9.7, 10.4), (-0.02, 1.1)),
+    _box("desk_wing", "marble", "terrazzo", (7.4, 8.1), (10.38, 11.4), (-0.03, 1.09)),
+    _box("elevator", "metal", "metal", (12.6, 14.4), (-0.03, 0.08), (-0.03, 2.3)),
+    _box("vending", "metal", "metal", (14.1, 15.03), (4.6, 5.6), (-0.03, 1.9)),
+    _box("totem", "metal", "metal", (5.2, 6.0), (6.0, 6.3), (-0.03, 2.0)),
+    _box("sign_north", "metal", "metal", (8.2, 9.8), (11.92, 12.03), (1.9, 2.9)),
+    _box("sign_east", "metal", "metal", (14.92, 15.04), (8.9, 10.5), (1.5, 2.5)),
+    _box("sign_south", "wood", "wood", (2.0, 4.0), (-0.03, 0.07), (1.3, 2.5)),
+    _box("bench", "wood", "wood", (1.2, 1.9), (6.2, 7.8), (-0.03, 0.45)),
+    _box("table", "wood", "wood", (12.6, 13.6), (9.0, 9.8), (0.12, 0.6)),
+    _box("table_west", "wood", "wood", (1.6, 2.4), (1.4, 2.3), (-0.03, 0.5)),
+    _sofa("sofa_north", "x", 11.9, 14.2, 12.02, 11.1, 0.15),
+    _sofa("sofa_east", "y", 7.8, 9.9, 15.02, 14.1, 0.15),
+    _sofa("sofa_west", "y", 0.7, 3.0, -0.02, 0.9, 0.0),
+    _box("planter_west", "concrete", "concrete", (0.5, 1.3), (4.2, 5.0), (-0.03, 0.8)),
+    _box("planter_hall", "concrete", "concrete", (10.9, 11.7), (0.5, 1.3), (-0.03, 0.8)),
+    _box("planter_lounge", "concrete", "concrete", (11.2, 11.9), (6.6, 7.2), (-0.03, 0.7)),
+)
 
-LOOKS = ("patterned", "plain")
 
-
-def solids_of(look: str) -> list[Solid]:
-    """All solids, patterned all over or with plain walls, ceiling and pillars, as real lobbies have them.
-
-    Raises:
-        ValueError: for an unknown look.
-    """
-    if look not in LOOKS:
-        raise ValueError(f"look: got {look!r}, expected one of {', '.join(LOOKS)}")
-    if look == "patterned":
-        return lobby()
-    plain = [
-        (
-            solid,
-            next(
-                (style for start, style in PLAIN_STYLES.items() if solid.name.startswith(start)), solid.style
-            ),
-        )
-        for solid in lobby()
-    ]
-    return [replace(solid, style=style) for solid, style in plain]
-
-
-@dataclass
-class _Face:
-    """One planar face: its corners (a fan from the first), and where its texture lies."""
+@dataclass(frozen=True, eq=False)
+class Face:
+    """One planar face: its corners (a fan from the first), its look, and whether the room's air touches it."""
 
     corners: np.ndarray
     normal: np.ndarray
     style: str
     texel: float
     visible: bool
-    right: np.ndarray = field(init=False)
-    up: np.ndarray = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.up = np.array([0.0, 0.0, 1.0]) if abs(self.normal[2]) < 0.5 else np.array([0.0, 1.0, 0.0])
-        self.right = np.cross(-self.normal, self.up)
 
     def plane(self) -> np.ndarray:
         """Metres to the right of, and below, the face's upper left corner, shape ``(corners, 2)``."""
-        u, v = self.corners @ self.right, self.corners @ self.up
+        up = np.array([0.0, 0.0, 1.0]) if abs(self.normal[2]) < 0.5 else np.array([0.0, 1.0, 0.0])
+        u, v = self.corners @ np.cross(-self.normal, up), self.corners @ up
         return np.column_stack([u - u.min(), v.max() - v])
 
 
-def _faces(solid: Solid) -> list[_Face]:
-    axis = "xyz".index(solid.axis)
-    order = [(axis + 1) % 3, (axis + 2) % 3, axis]
+def faces_of(solid: Solid) -> list[Face]:
+    """Both ends of a prism, then its sides."""
+    axis, profile = "xyz".index(solid.axis), np.array(solid.profile)
+    order, along = [(axis + 1) % 3, (axis + 2) % 3, axis], np.eye(3)[axis]
 
-    def lift(profile: np.ndarray, height: float) -> np.ndarray:
+    def lift(height: float) -> np.ndarray:
         points = np.empty((len(profile), 3))
-        points[:, order[0]], points[:, order[1]], points[:, order[2]] = profile[:, 0], profile[:, 1], height
+        points[:, order] = np.column_stack([profile, np.full(len(profile), height)])
         return points
 
-    profile = np.array(solid.profile)
-    low, high = lift(profile, solid.low), lift(profile, solid.high)
-    along = np.eye(3)[axis]
-    faces = []
-    n = len(profile)
+    low, high = lift(solid.low), lift(solid.high)
     polygons = [(np.concatenate([low[:1], low[:0:-1]]), -along), (high, along)]
-    for k in range(n):
-        j = (k + 1) % n
-        corners = np.array([low[k], low[j], high[j], high[k]])
+    for k in range(len(profile)):
+        j = (k + 1) % len(profile)
         normal = np.cross(low[j] - low[k], along)
-        polygons.append((corners, normal / np.linalg.norm(normal)))
+        polygons.append((np.array([low[k], low[j], high[j], high[k]]), normal / np.linalg.norm(normal)))
+    faces = []
     for corners, normal in polygons:
         centre = corners.mean(axis=0)
-        style = solid.top if solid.top is not None and normal[2] > 0.5 else solid.style
         inside = bool(np.all(centre >= ROOM[0] - 1e-9) and np.all(centre <= ROOM[1] + 1e-9))
-        faces.append(_Face(corners, normal, style, solid.texel, inside))
+        faces.append(
+            Face(corners, normal, solid.top if normal[2] > 0.5 else solid.style, solid.texel, inside)
+        )
     return faces
 
 
-class _Atlas:
+class Atlas:
     """Textures of one material, packed in rows (a "shelf" each, the tallest faces first)."""
 
-    def __init__(self, faces: Sequence[_Face], rng: np.random.Generator) -> None:
+    def __init__(self, faces: Sequence[Face], rng: np.random.Generator) -> None:
         self.place: dict[int, tuple[int, int]] = {}
         sizes = [np.ceil(f.plane().max(axis=0) / f.texel).astype(int) + 2 * MARGIN for f in faces]
         width = max([ATLAS_WIDTH, *(int(s[0]) for s in sizes)])
@@ -260,7 +192,7 @@ class _Atlas:
             padded = np.pad(tile, ((MARGIN, MARGIN), (MARGIN, MARGIN), (0, 0)), mode="edge")
             self.image[y : y + padded.shape[0], x : x + padded.shape[1]] = padded
 
-    def uv(self, k: int, face: _Face) -> np.ndarray:
+    def uv(self, k: int, face: Face) -> np.ndarray:
         """Texture coordinates of the corners of face ``k``; v grows downwards, as Mitsuba reads PLY files."""
         if k not in self.place:
             texels = np.full((len(face.corners), 2), HIDDEN / 2)
@@ -269,83 +201,61 @@ class _Atlas:
         return np.column_stack([texels[:, 0] / self.width, texels[:, 1] / self.height])
 
 
-def scene_xml(solids: Sequence[Solid]) -> str:
-    """The scene description: one textured ``bsdf`` a radio material, one ``shape`` an object.
-
-    A dark pane mirrors what stands before it: it is a smooth dielectric over its colour (Mitsuba's ``plastic``).
-    """
-    lines = [
-        '<scene version="3.0.0">',
-        "",
-        "  <!-- Look: the atlas. Radio: the identifier, see materials.json. -->",
-    ]
-    mirrors = {s.material for s in solids if s.style == "dark pane"}
-    for material in dict.fromkeys(s.material for s in solids):
-        look, colour = (
-            ("plastic", "diffuse_reflectance") if material in mirrors else ("diffuse", "reflectance")
-        )
-        lines += [
-            f'  <bsdf type="{look}" id="mat-itu_{material}">',
-            f'    <texture type="bitmap" name="{colour}">',
-            f'      <string name="filename" value="textures/{material}.jpg"/>',
-            "    </texture>",
-            "  </bsdf>",
-        ]
-    lines.append("")
-    for solid in solids:
-        lines += [
-            f'  <shape type="ply" id="{solid.name}">',
-            f'    <string name="filename" value="meshes/{solid.name}.ply"/>',
-            '    <boolean name="face_normals" value="true"/>',
-            f'    <ref id="mat-itu_{solid.material}" name="bsdf"/>',
-        ]
-        if solid.emits:
-            lines += [
-                '    <emitter type="area">',
-                '      <texture type="bitmap" name="radiance">',
-                f'        <string name="filename" value="textures/{solid.material}.jpg"/>',
-                "      </texture>",
-                "    </emitter>",
-            ]
-        lines.append("  </shape>")
-    return "\n".join([*lines, "", "</scene>", ""])
+BSDF = """\
+  <bsdf type="diffuse" id="mat-itu_{0}">
+    <texture type="bitmap" name="reflectance">
+      <string name="filename" value="textures/{0}.jpg"/>
+    </texture>
+  </bsdf>"""
+SHAPE = """\
+  <shape type="ply" id="{0.name}">
+    <string name="filename" value="meshes/{0.name}.ply"/>
+    <boolean name="face_normals" value="true"/>
+    <ref id="mat-itu_{0.material}" name="bsdf"/>{1}
+  </shape>"""
+EMITTER = """
+    <emitter type="area">
+      <texture type="bitmap" name="radiance">
+        <string name="filename" value="textures/{0.material}.jpg"/>
+      </texture>
+    </emitter>"""
 
 
-def build(
-    directory: str | os.PathLike[str],
-    *,
-    look: str = "patterned",
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Path:
+def scene_xml() -> str:
+    """The scene description: one textured ``bsdf`` a radio material, one ``shape`` an object."""
+    about = "  <!-- Look: the atlas. Radio: the identifier, see materials.json. -->"
+    looks = [BSDF.format(material) for material in dict.fromkeys(s.material for s in SOLIDS)]
+    shapes = [SHAPE.format(s, EMITTER.format(s) if s.name == "ceiling" else "") for s in SOLIDS]
+    return "\n".join(['<scene version="3.0.0">', "", about, *looks, "", *shapes, "", "</scene>", ""])
+
+
+def build(directory: str | os.PathLike[str], *, seed: int = 0, progress: Progress | None = None) -> Path:
     """Write ``scene.xml``, ``materials.json``, meshes and textures under ``directory``; returns the XML's path."""
     directory = Path(directory)
     (directory / "meshes").mkdir(parents=True, exist_ok=True)
     (directory / "textures").mkdir(exist_ok=True)
-    image_module = require("PIL.Image", extra="photos")
-    solids = solids_of(look)
-    materials = list(dict.fromkeys(s.material for s in solids))
+    images = require("PIL.Image", extra="photos")
+    materials = list(dict.fromkeys(s.material for s in SOLIDS))
     for done, material in enumerate(materials):
-        members = [(s, f) for s in solids if s.material == material for f in _faces(s)]
-        faces = [f for _, f in members]
-        atlas = _Atlas(faces, np.random.default_rng([seed, *material.encode()]))
-        target = directory / "textures" / f"{material}.jpg"
-        picture = image_module.fromarray(np.round(255 * atlas.image).astype(np.uint8))
-        write_atomically(target, partial(picture.save, format="JPEG", quality=JPEG_QUALITY, optimize=True))
-        for solid in (s for s in solids if s.material == material):
-            vertices, triangles, uv, count = [], [], [], 0
-            for k, (owner, face) in enumerate(members):
-                if owner is not solid:
-                    continue
-                n = len(face.corners)
-                vertices.append(face.corners)
-                uv.append(atlas.uv(k, face))
-                triangles += [(count, count + i, count + i + 1) for i in range(1, n - 1)]
-                count += n
-            path = directory / "meshes" / f"{solid.name}.ply"
-            write_mesh(path, np.concatenate(vertices), np.array(triangles), uv=np.concatenate(uv))
+        members = [(s, f) for s in SOLIDS if s.material == material for f in faces_of(s)]
+        atlas = Atlas([f for _, f in members], np.random.default_rng([seed, *material.encode()]))
+        picture = images.fromarray(np.round(255 * atlas.image).astype(np.uint8))
+        save = partial(picture.save, format="JPEG", quality=JPEG_QUALITY, optimize=True)
+        write_atomically(directory / "textures" / f"{material}.jpg", save)
+        for solid in dict.fromkeys(s for s, _ in members):
+            own = [(face, atlas.uv(k, face)) for k, (s, face) in enumerate(members) if s is solid]
+            first = np.cumsum([0, *(len(face.corners) for face, _ in own)])
+            triangles = [
+                (start, start + i, start + i + 1)
+                for start, (face, _) in zip(first, own, strict=False)
+                for i in range(1, len(face.corners) - 1)
+            ]
+            write_mesh(
+                directory / "meshes" / f"{solid.name}.ply", np.concatenate([face.corners for face, _ in own]),
+                np.array(triangles), uv=np.concatenate([uv for _, uv in own]),
+            )  # fmt: skip
         if progress is not None:
             progress("scene", done + 1, len(materials))
-    write_text(directory / "materials.json", json.dumps(material_table(), indent=1) + "\n")
-    write_text(directory / "scene.xml", scene_xml(solids))
+    write_text(directory / "materials.json", MATERIALS.read_text(encoding="utf-8"))
+    write_text(directory / "scene.xml", scene_xml())
     return directory / "scene.xml"

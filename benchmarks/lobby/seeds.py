@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from benchmarks.lobby import pipeline
 from benchmarks.lobby.report import FIGURES
 from benchmarks.machine import machine
-from benchmarks.pictures import METHODS
+from benchmarks.pictures import name_of
 from benchmarks.report import Report, Row, columns_table
 from benchmarks.runner import Benchmark, Job, option
 
@@ -32,12 +31,12 @@ COLUMNS = (("figure", "figure", "{}"), ("mean", "mean", "{:.4g}"), ("spread", "s
            ("least", "least", "{:.4g}"), ("most", "most", "{:.4g}"))  # fmt: skip
 
 HELP = """\
-Runs the main job once a seed (a quarter of an hour each) and writes mean, standard deviation, least and most of its
-figures; `--results FILE` leaves the same beside the results that the documentation quotes.
+Runs the main job once a seed (six minutes each) and writes mean, standard deviation, least and most of its
+figures, with both truths at ten and fifty spectra.
 
 examples:
   python -m benchmarks lobby-seeds
-  python -m benchmarks lobby-seeds --seeds 0 1 2 --results benchmarks/results/lobby_seeds.json
+  python -m benchmarks lobby-seeds --seeds 0 1 2 3 4
 """
 
 
@@ -46,7 +45,6 @@ class Options(pipeline.Options):
     """Options of the main job, and the seeds."""
 
     seeds: tuple[int, ...] = option((0, 1, 2), "seeds of the runs")
-    results: str | None = option(None, "file to write the figures to besides, as JSON")
 
 
 def run(options: Options, job: Job) -> Report:
@@ -57,7 +55,7 @@ def run(options: Options, job: Job) -> Report:
     """
     if len(set(options.seeds)) < 2:
         raise ValueError(f"seeds: got {list(options.seeds)}, expected at least two different ones")
-    own = pipeline.Options(options.data, options.reduced)
+    own = pipeline.Options(options.data, options.spectra, options.reduced)
     reports = []
     for seed in options.seeds:
         one = replace(job, out=job.out / f"seed-{seed}", seed=seed)
@@ -70,11 +68,7 @@ def run(options: Options, job: Job) -> Report:
         "reduced": options.reduced,
     }
     text = f"Seeds {', '.join(map(str, options.seeds))}; spread: standard deviation.\n\n{columns_table(COLUMNS, rows)}"
-    report = Report("lobby_seeds", figures, text)
-    if options.results is not None:
-        target = Path(options.results)
-        replace(report, name=target.stem).write(target.parent)
-    return report
+    return Report("lobby_seeds", figures, text)
 
 
 def spread(reports: list[dict[str, Any]]) -> list[Row]:
@@ -98,7 +92,7 @@ def _figures(reports: list[dict[str, Any]]) -> list[tuple[str, str, list[float |
     for group, truth in (("methods", "exact"), ("methods_sionna", "Sionna RT")):
         methods: Mapping[str, Any] = reports[0][group]
         found += [
-            (f"{group}.{method}.{figure}", f"{METHODS[method][0]}, truth {truth}: {figure}",
+            (f"{group}.{method}.{figure}", f"{name_of(method)}, truth {truth}: {figure}",
              [r[group][method].get(figure) for r in reports])
             for method in methods for figure in METHOD_FIGURES
         ]  # fmt: skip

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ import numpy as np
 
 from warprrf.device import Progress
 from warprrf.files import write_text
-from warprrf.rf.exact import ExactEngine
-from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import sample_receivers, simulate
 from warprrf.rf.spectra.dataset import assign_roles
@@ -125,40 +122,3 @@ def _write_receivers(path: Path, scene: Scene, who: Plan) -> None:
     }
     lines = ",\n".join(f"  {json.dumps(name)}: {json.dumps(value)}" for name, value in text.items())
     write_text(path, "{\n" + lines + "\n}\n")
-
-
-def compare_engines(
-    scene: Scene, *, receivers: int = 5, samples: int = 1_000_000, device: Any = None
-) -> dict[str, list[float]]:
-    """Both engines at depth 1 on the first test receivers: ratios less one, and seconds.
-
-    Returns:
-        Lists with an entry a receiver: ``diffuse`` (Sionna scatters every ray: its noise is about 3e-4),
-        ``diffuse_mixed`` (as in its data sets, rays shared with specular reflection: noise of about 5e-3), ``mirror``
-        and ``los`` (NaN where there is none), ``exact_s``, ``sionna_s``.
-    """
-    who = plan(scene)
-    points = who.receivers[who.sample[SAMPLE_TRAINING : SAMPLE_TRAINING + receivers]]
-    common: dict[str, Any] = {"transmitter": TRANSMITTER, "frequency_hz": FREQUENCY_HZ, "shape": SHAPE}
-    ours = ExactEngine(scene, **common, device=device)
-    theirs = SionnaEngine(scene, **common, sampling=Sampling(depth=1, samples=samples), device=device)
-    ours.receive(points[0])
-    theirs.receive(points[0])
-    figures: dict[str, list[float]] = {
-        name: [] for name in ("diffuse", "diffuse_mixed", "mirror", "los", "exact_s", "sionna_s")
-    }
-    for point in points:
-        start = time.perf_counter()
-        exact = ours.receive(point).totals
-        figures["exact_s"].append(time.perf_counter() - start)
-        start = time.perf_counter()
-        sionna = theirs.receive(point).totals
-        figures["sionna_s"].append(time.perf_counter() - start)
-        scattered = theirs.solve(point, specular=False)
-        figures["diffuse"].append(
-            exact["diffuse"] / float(scattered["power"][scattered["diffuse"]].sum()) - 1.0
-        )
-        figures["diffuse_mixed"].append(exact["diffuse"] / sionna["diffuse"] - 1.0)
-        for name in ("mirror", "los"):
-            figures[name].append(exact[name] / sionna[name] - 1.0 if sionna[name] > 0 else float("nan"))
-    return figures

@@ -2,12 +2,12 @@
 
 A texture is an sRGB image in [0, 1], row 0 at the top, painted for one face at its real size in metres. Every style
 carries detail at all scales from a few texels to half a metre that never repeats, since structure from motion matches
-nothing on a plain or periodic wall; but for the paints of the plain lobby, which carry nothing at all.
+nothing on a plain or periodic wall.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +16,105 @@ from warprrf.device import require
 LIFT = 0.75  # exponent that brightens all but the ceiling, so that the walls are not dark beside the light
 FINE = 0.05  # m: detail below this deviation of a Gaussian window is damped
 FINE_CONTRAST = 0.35
-Paint = Callable[[int, int, float, np.random.Generator], np.ndarray]
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A random field of a colour; see :func:`octaves`. ``along``: the pattern runs along the face's longer side."""
+
+    colour: Colour
+    coarsest: float = 0.8
+    finest: float = 0.02
+    stretch: tuple[float, float] = (1.0, 1.0)
+    along: bool = False
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Random shapes: how many a square metre, their sizes [m], and their colours, or the range and number of random ones."""
+
+    density: float
+    sizes: tuple[float, float]
+    colours: tuple[Colour, ...] | tuple[float, float, int]
+    kind: str = "polygon"
+
+    def palette(self, rng: np.random.Generator) -> np.ndarray:
+        """Colours, shape ``(C, 3)``."""
+        if isinstance(self.colours[0], tuple):
+            return np.array(self.colours)
+        low, high, count = self.colours
+        return rng.uniform(low, high, (int(count), 3))
+
+
+@dataclass(frozen=True)
+class Style:
+    """Layers on a base colour, shapes over them, posters, and a grain: its strength and coarsest wavelength [m]."""
+
+    base: Colour
+    layers: tuple[Layer, ...]
+    shapes: Shapes
+    grain: tuple[float, float] | None
+    posters: bool = False
+
+
+STYLES = {
+    "terrazzo": Style(
+        (0.68, 0.65, 0.6),
+        (Layer((0.07, 0.07, 0.08), coarsest=1.5),),
+        Shapes(30, (0.04, 0.3), (
+            (0.9, 0.88, 0.85), (0.3, 0.27, 0.25), (0.62, 0.42, 0.33), (0.45, 0.5, 0.55), (0.8, 0.7, 0.5), (0.15, 0.15, 0.15),
+        )),
+        (0.05, 0.3),
+    ),
+    "concrete": Style(
+        (0.62, 0.62, 0.6),
+        (Layer((0.13, 0.13, 0.12)), Layer((0.05, 0.045, 0.03), coarsest=2, stretch=(4, 1))),
+        Shapes(6, (0.03, 0.35), ((0.35, 0.33, 0.3), (0.5, 0.45, 0.38), (0.82, 0.82, 0.8), (0.25, 0.25, 0.25))),
+        (0.06, 0.2),
+    ),
+    "plaster": Style(
+        (0.74, 0.7, 0.62),
+        (Layer((0.1, 0.1, 0.11)), Layer((0.05, 0.03, -0.03), coarsest=3, finest=0.3)),
+        Shapes(10, (0.03, 0.3), (0.25, 0.95, 9)),
+        (0.05, 0.2),
+        posters=True,
+    ),
+    # Backlit printed fabric: bright, with shapes at every scale. The image is also its radiance.
+    "ceiling": Style(
+        (0.74, 0.74, 0.72),
+        (Layer((0.09, 0.09, 0.09), coarsest=2),),
+        Shapes(24, (0.05, 0.6), (
+            (0.95, 0.93, 0.88), (0.55, 0.57, 0.6), (0.7, 0.66, 0.58), (0.85, 0.87, 0.9), (0.36, 0.3, 0.28),
+        )),
+        (0.05, 0.4),
+    ),
+    "wood": Style(
+        (0.62, 0.46, 0.32),
+        (Layer((0.13, 0.11, 0.09), coarsest=0.6, stretch=(5, 1), along=True),),
+        Shapes(
+            35, (0.03, 0.3), ((0.3, 0.2, 0.12), (0.75, 0.6, 0.42), (0.45, 0.3, 0.2), (0.85, 0.75, 0.6)), "rectangle"
+        ),
+        (0.06, 0.25),
+    ),
+    "textile": Style(
+        (0.45, 0.5, 0.6), (Layer((0.09, 0.08, 0.08)),), Shapes(45, (0.04, 0.35), (0.15, 0.9, 8)), (0.06, 0.2)
+    ),
+    "metal": Style(
+        (0.6, 0.62, 0.65),
+        (Layer((0.09, 0.09, 0.09), coarsest=0.6, stretch=(1, 4)),),
+        Shapes(40, (0.04, 0.3), (0.1, 0.95, 8), "rectangle"),
+        (0.05, 0.3),
+    ),
+    "foliage": Style(
+        (0.3, 0.42, 0.22),
+        (Layer((0.06, 0.08, 0.04)),),
+        Shapes(250, (0.03, 0.2), (
+            (0.25, 0.4, 0.15), (0.5, 0.62, 0.3), (0.7, 0.72, 0.4), (0.15, 0.25, 0.12), (0.8, 0.45, 0.4),
+        ), "ellipse"),
+        None,
+    ),
+}  # fmt: skip
 
 
 def octaves(
@@ -113,40 +211,29 @@ def _poster(
     image[r0:r1, c0:c1] = poster
 
 
-def _mix(
-    base: tuple[float, float, float], *layers: tuple[np.ndarray, tuple[float, float, float]]
-) -> np.ndarray:
-    image = np.ones((*layers[0][0].shape, 3)) * base
-    for field, colour in layers:
-        image += field[..., None] * np.asarray(colour)
-    return image
-
-
-def _terrazzo(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    image = _mix((0.68, 0.65, 0.6), (octaves(h, w, texel, rng, coarsest=1.5), (0.07, 0.07, 0.08)))
-    chips = np.array(
-        [
-            [0.9, 0.88, 0.85],
-            [0.3, 0.27, 0.25],
-            [0.62, 0.42, 0.33],
-            [0.45, 0.5, 0.55],
-            [0.8, 0.7, 0.5],
-            [0.15] * 3,
-        ]
+def _styled(style: Style, h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
+    image = np.ones((h, w, 3)) * style.base
+    for layer in style.layers:
+        turned = layer.along and w > h
+        stretch = layer.stretch[::-1] if turned else layer.stretch
+        pattern = octaves(h, w, texel, rng, finest=layer.finest, coarsest=layer.coarsest, stretch=stretch)
+        image += pattern[..., None] * np.asarray(layer.colour)
+    shapes = style.shapes
+    palette = shapes.palette(rng)
+    image = _scatter(
+        image, texel, rng, density=shapes.density, sizes=shapes.sizes, palette=palette, kind=shapes.kind
     )
-    image = _scatter(image, texel, rng, density=30, sizes=(0.04, 0.3), palette=chips)
-    return image + 0.05 * octaves(h, w, texel, rng, coarsest=0.3)[..., None]
-
-
-def _concrete(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    image = _mix(
-        (0.62, 0.62, 0.6),
-        (octaves(h, w, texel, rng), (0.13, 0.13, 0.12)),
-        (octaves(h, w, texel, rng, coarsest=2, stretch=(4, 1)), (0.05, 0.045, 0.03)),
-    )
-    stains = np.array([[0.35, 0.33, 0.3], [0.5, 0.45, 0.38], [0.82, 0.82, 0.8], [0.25] * 3])
-    image = _scatter(image, texel, rng, density=6, sizes=(0.03, 0.35), palette=stains)
-    return image + 0.06 * octaves(h, w, texel, rng, coarsest=0.2)[..., None]
+    wide, tall = w * texel, h * texel
+    if style.posters and wide > 1.5 and tall > 1.5:
+        left = rng.uniform(0.2, 0.6)
+        while left < wide - 0.8:
+            pw, ph = rng.uniform(0.6, 1.2), rng.uniform(0.8, 1.4)
+            _poster(image, texel, rng, left, max(0.0, tall - 2.4 + rng.uniform(-0.4, 0.5)), pw, ph)
+            left += pw + rng.uniform(0.2, 0.8)
+    if style.grain is None:
+        return image
+    strength, coarsest = style.grain
+    return image + strength * octaves(h, w, texel, rng, coarsest=coarsest)[..., None]
 
 
 def _brick(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
@@ -167,9 +254,9 @@ def _brick(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray
 def _glass(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
     """Frosted glass printed with a skyline under a cloudy sky, above a hedge."""
     y = np.linspace(0, 1, h)[:, None] * np.ones((1, w))
-    image = _mix(
-        (0.55, 0.7, 0.85), (octaves(h, w, texel, rng, coarsest=1.5), (0.12, 0.1, 0.07)), (y, (0.2, 0.1, 0))
-    )
+    image = np.ones((h, w, 3)) * (0.55, 0.7, 0.85)
+    image += octaves(h, w, texel, rng, coarsest=1.5)[..., None] * (0.12, 0.1, 0.07)
+    image += y[..., None] * (0.2, 0.1, 0)
     for _ in range(int(w * texel * 5)):
         left, wide = int(rng.random() * w), int(rng.uniform(0.3, 1.0) / texel)
         top = int(h * rng.uniform(0.2, 0.75))
@@ -188,102 +275,8 @@ def _glass(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray
     return image + 0.05 * octaves(h, w, texel, rng, coarsest=0.4)[..., None]
 
 
-def _plaster(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    image = _mix(
-        (0.74, 0.7, 0.62),
-        (octaves(h, w, texel, rng), (0.1, 0.1, 0.11)),
-        (octaves(h, w, texel, rng, coarsest=3, finest=0.3), (0.05, 0.03, -0.03)),
-    )
-    image = _scatter(
-        image, texel, rng, density=10, sizes=(0.03, 0.3), palette=rng.uniform(0.25, 0.95, (9, 3))
-    )
-    wide, tall = w * texel, h * texel
-    if wide > 1.5 and tall > 1.5:
-        left = rng.uniform(0.2, 0.6)
-        while left < wide - 0.8:
-            pw, ph = rng.uniform(0.6, 1.2), rng.uniform(0.8, 1.4)
-            _poster(image, texel, rng, left, max(0.0, tall - 2.4 + rng.uniform(-0.4, 0.5)), pw, ph)
-            left += pw + rng.uniform(0.2, 0.8)
-    return image + 0.05 * octaves(h, w, texel, rng, coarsest=0.2)[..., None]
-
-
-def _ceiling(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    """Backlit printed fabric: bright, with shapes at every scale. The image is also its radiance."""
-    image = _mix((0.74, 0.74, 0.72), (octaves(h, w, texel, rng, coarsest=2), (0.09, 0.09, 0.09)))
-    tones = np.array(
-        [[0.95, 0.93, 0.88], [0.55, 0.57, 0.6], [0.7, 0.66, 0.58], [0.85, 0.87, 0.9], [0.36, 0.3, 0.28]]
-    )
-    image = _scatter(image, texel, rng, density=24, sizes=(0.05, 0.6), palette=tones)
-    return np.clip(image + 0.05 * octaves(h, w, texel, rng, coarsest=0.4)[..., None], 0.3, 0.97)
-
-
-def _wood(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    grain = (
-        octaves(h, w, texel, rng, coarsest=0.6, stretch=(1, 5))
-        if w > h
-        else octaves(h, w, texel, rng, coarsest=0.6, stretch=(5, 1))
-    )
-    image = _mix((0.62, 0.46, 0.32), (grain, (0.13, 0.11, 0.09)))
-    knots = np.array([[0.3, 0.2, 0.12], [0.75, 0.6, 0.42], [0.45, 0.3, 0.2], [0.85, 0.75, 0.6]])
-    image = _scatter(image, texel, rng, density=35, sizes=(0.03, 0.3), palette=knots, kind="rectangle")
-    return image + 0.06 * octaves(h, w, texel, rng, coarsest=0.25)[..., None]
-
-
-def _textile(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    image = _mix((0.45, 0.5, 0.6), (octaves(h, w, texel, rng), (0.09, 0.08, 0.08)))
-    image = _scatter(
-        image, texel, rng, density=45, sizes=(0.04, 0.35), palette=rng.uniform(0.15, 0.9, (8, 3))
-    )
-    return image + 0.06 * octaves(h, w, texel, rng, coarsest=0.2)[..., None]
-
-
-def _metal(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    image = _mix(
-        (0.6, 0.62, 0.65), (octaves(h, w, texel, rng, coarsest=0.6, stretch=(1, 4)), (0.09, 0.09, 0.09))
-    )
-    image = _scatter(
-        image,
-        texel,
-        rng,
-        density=40,
-        sizes=(0.04, 0.3),
-        palette=rng.uniform(0.1, 0.95, (8, 3)),
-        kind="rectangle",
-    )
-    return image + 0.05 * octaves(h, w, texel, rng, coarsest=0.3)[..., None]
-
-
-def _foliage(h: int, w: int, texel: float, rng: np.random.Generator) -> np.ndarray:
-    image = _mix((0.3, 0.42, 0.22), (octaves(h, w, texel, rng), (0.06, 0.08, 0.04)))
-    greens = np.array(
-        [[0.25, 0.4, 0.15], [0.5, 0.62, 0.3], [0.7, 0.72, 0.4], [0.15, 0.25, 0.12], [0.8, 0.45, 0.4]]
-    )
-    return _scatter(image, texel, rng, density=250, sizes=(0.03, 0.2), palette=greens, kind="ellipse")
-
-
-def _plain(*colour: float) -> Paint:
-    """Paint of one colour."""
-    return lambda h, w, texel, rng: np.ones((h, w, 3)) * colour
-
-
-STYLES: dict[str, Paint] = {
-    "terrazzo": _terrazzo,
-    "concrete": _concrete,
-    "brick": _brick,
-    "glass": _glass,
-    "plaster": _plaster,
-    "ceiling": _ceiling,
-    "wood": _wood,
-    "textile": _textile,
-    "metal": _metal,
-    "foliage": _foliage,
-    "white paint": _plain(0.86, 0.86, 0.84),
-    "cream paint": _plain(0.82, 0.78, 0.68),
-    "grey paint": _plain(0.62, 0.63, 0.64),
-    "clay paint": _plain(0.7, 0.52, 0.44),
-    "dark pane": _plain(0.16, 0.2, 0.22),
-    "luminous paint": _plain(0.8, 0.8, 0.78),
-}
+PAINTED = {"brick": _brick, "glass": _glass}
+"""Styles that are more than layers and shapes."""
 
 
 def soften(image: np.ndarray, texel: float) -> np.ndarray:
@@ -304,8 +297,14 @@ def paint(style: str, width_m: float, height_m: float, texel: float, rng: np.ran
     Raises:
         ValueError: for an unknown style.
     """
-    if style not in STYLES:
-        raise ValueError(f"style: got {style!r}, expected one of {', '.join(sorted(STYLES))}")
+    if style not in {**STYLES, **PAINTED}:
+        raise ValueError(f"style: got {style!r}, expected one of {', '.join(sorted({**STYLES, **PAINTED}))}")
     rows, columns = max(4, round(height_m / texel)), max(4, round(width_m / texel))
-    image = np.clip(soften(STYLES[style](rows, columns, texel, rng), texel), 0.02, 0.97)
-    return image if style in ("ceiling", "luminous paint") else image**LIFT
+    if style in PAINTED:
+        image = PAINTED[style](rows, columns, texel, rng)
+    else:
+        image = _styled(STYLES[style], rows, columns, texel, rng)
+    if style == "ceiling":
+        image = np.clip(image, 0.3, 0.97)
+    image = np.clip(soften(image, texel), 0.02, 0.97)
+    return image if style == "ceiling" else image**LIFT

@@ -1,4 +1,4 @@
-"""One runner: options are the command's, figures go to files, what was asked stands beside what was measured."""
+"""One runner: options are the command's, figures go to files."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import targets
 from benchmarks.report import Report, columns_table
 from benchmarks.runner import Benchmark, Job, option
-from benchmarks.targets import TARGETS, Target, compared, found
 
 
 @pytest.mark.parametrize("name", command.NAMES)
@@ -58,34 +56,18 @@ def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     one = Benchmark("nothing", _Options, _run, "examples:")
     monkeypatch.setitem(command.NAMES, "nothing", ("nowhere", "measures nothing"))
     monkeypatch.setattr(command, "benchmark", lambda name: one)
-    monkeypatch.setitem(TARGETS, "nothing", (Target("count", "the count", 2.0),))
 
 
 def test_options_of_the_command_reach_the_benchmark_and_its_figures_the_files(
     nothing: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [
-        "nothing",
-        "--out",
-        str(tmp_path),
-        "--count",
-        "2",
-        "--names",
-        "x",
-        "--quick",
-        "--seed",
-        "7",
-        "--quiet",
-    ]
-    assert command.main([*words, "--every", "5"]) == 0
+    words = f"nothing --out {tmp_path} --count 2 --names x --quick --seed 7 --quiet --every 5"
+    assert command.main(words.split()) == 0
     kept = json.loads((tmp_path / "nothing.json").read_text())
     assert kept["options"] == {"count": 2, "names": ["x"], "every": 5, "quick": True, "hidden": 0.5}
     assert (kept["seed"], kept["value"]) == (7, None)
-    text = (tmp_path / "nothing.md").read_text()
-    assert text.startswith("some text") and "| the count | at most 2 | 2 | met |" in text
+    assert (tmp_path / "nothing.md").read_text() == "some text\n"
     assert "nothing.md" in capsys.readouterr().out
-    assert command.main(["nothing", "--out", str(tmp_path), "--quiet"]) == 0  # defaults
-    assert "| the count | at most 2 | 3 | NOT met |" in (tmp_path / "nothing.md").read_text()
 
 
 def test_bad_input_is_one_line_and_status_two(nothing: None, tmp_path: Path, capsys: Any) -> None:
@@ -95,38 +77,14 @@ def test_bad_input_is_one_line_and_status_two(nothing: None, tmp_path: Path, cap
     )
 
 
-def test_with_json_a_benchmark_prints_its_figures(nothing: None, tmp_path: Path, capsys: Any) -> None:
-    assert command.main(["nothing", "--out", str(tmp_path), "--json"]) == 0
-    (said,) = map(json.loads, capsys.readouterr().out.splitlines())
-    assert said["figures"]["value"] is None and said["figures"]["count"] == 3
-    assert said["files"] == [str(tmp_path / "nothing.md"), str(tmp_path / "nothing.json")]
-
-
-def test_figures_are_found_by_their_path() -> None:
-    figures = {
-        "rows": [{"n": 1, "x": 2.0}, {"n": 2, "x": 3.0, "ok": True}],
-        "a": {"99.9": 4, "b.c": {"d": 5}},
-    }
-    assert found(figures, "rows.n=2.x") == 3.0
-    assert found(figures, "rows.n=2&ok=True.x") == 3.0
-    assert found(figures, "a.99.9") == 4.0 and found(figures, "a.b.c.d") == 5.0
-    for path in ("rows.n=3.x", "rows.n=1.y", "a.none", "rows", "rows.n=2.ok"):
-        assert found(figures, path) is None
-
-
-def test_a_bound_is_met_from_its_own_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    bounds = (
-        Target("a", "most", 1.0, unit="m"),
-        Target("b", "least", 1.0, at_least=True),
-        Target("c", "none", 1.0),
-    )
-    monkeypatch.setitem(targets.TARGETS, "x", bounds)
-    assert [line[3] for line in compared("x", {"a": 1.0, "b": 1.0})] == ["met", "met"]
-    assert [line[3] for line in compared("x", {"a": 1.1, "b": 0.9})] == ["NOT met", "NOT met"]
-    assert compared("x", {"a": 1.1})[0] == ["most", "at most 1 m", "1.1 m", "NOT met"]
-
-
 def test_columns_that_no_row_fills_are_left_out() -> None:
     columns = (("a", "A", "{:.1f}"), ("b", "B", "{}"), ("c", "C", "{}"))
     text = columns_table(columns, [{"a": 1.0, "b": None}, {"c": "x"}])
     assert text.splitlines() == ["| A | C |", "| --- | --- |", "| 1.0 | - |", "| - | x |"]
+
+
+def test_a_page_with_a_title_is_html_with_its_tables(tmp_path: Path) -> None:
+    Report("page", {}, "## A & B\n\nwords\n\n| a | b |\n| --- | --- |\n| 1 | <2 |", title="T").write(tmp_path)
+    text = (tmp_path / "page.html").read_text()
+    assert "<h1>T</h1>" in text and "<h2>A &amp; B</h2>" in text and "<p>words</p>" in text
+    assert "<tr><th>a</th><th>b</th></tr><tr><td>1</td><td>&lt;2</td></tr>" in text

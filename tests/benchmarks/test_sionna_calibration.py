@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from places import ROOT
 
 pytest.importorskip("sionna.rt")
-sys.path.insert(0, str(ROOT / "bench"))
 from small_room import small_room
 
 import warprrf as wr

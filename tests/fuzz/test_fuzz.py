@@ -1,6 +1,7 @@
-"""A minute of fuzzing: part of what `python -m benchmarks fuzz` tries, the same in every run."""
+"""A minute of fuzzing: part of what `python -m tests.fuzz` tries, the same in every run; and what was found before."""
 
 import os
+import re
 import time
 from collections import Counter
 from functools import partial
@@ -9,149 +10,165 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from benchmarks.fuzz import calls, cases, damage, judge
-from benchmarks.fuzz.command import stated, stream
-from benchmarks.fuzz.place import Place
-from benchmarks.fuzz.workers import Workers
+from fuzz import calls, trial
+from fuzz.answers import complaint, differs, leaves, wrong
+from fuzz.files import CODECS, FORMATS
+from fuzz.laws import LAWS
+from fuzz.trial import FILE, LAW, Case, Trial, ended
+from fuzz.workers import Workers
 
 CASES = 600
 """About a minute of two processes, the same ones wherever they run."""
 
 
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    return Place(tmp_path_factory.mktemp("fuzz")).make()
+@pytest.fixture
+def attempt(place, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return Trial(place, tmp_path)
 
 
-def test_every_public_name_has_an_example_with_all_it_needs(place):
-    names = calls.public()
-    assert names.keys() == calls.EXAMPLES.keys()
-    for name, example in calls.EXAMPLES.items():
-        given = calls.parameters(name, example(place))
-        assert not [argument for argument, value in given.items() if value is calls.MISSING], name
+def found(place, cases, **how):
+    """Findings of cases, and how many ended how."""
+    findings, tried = [], Counter()
+    with Workers(partial(Trial, str(place.folder)), ended, **how) as workers:
+        for case, outcome in workers.run(cases):
+            tried[outcome.kind] += 1
+            if outcome.kind == "finding":
+                findings.append(f"{case}: {outcome.text}")
+    return findings, tried
 
 
 def test_a_minute_of_fuzzing_finds_nothing(place):
-    findings = []
-    tried = Counter()
-    with Workers(partial(cases.trial, str(place.folder)), cases.ended) as workers:
-        for case, outcome in workers.run(islice(stream(place, 0, ""), CASES)):
-            tried[outcome.kind] += 1
-            if outcome.kind == "finding":
-                findings.append(f"{stated(case)}: {outcome.text}")
+    findings, tried = found(place, islice(trial.stream(place, 0), CASES))
     assert tried["answered"] > 50 and tried["refused"] > 50
     assert not findings, "\n".join(findings)
 
 
-FOUND = [
-    ("Mesh.look_around", ("directions", "as bool"), ("points", "no rows")),
-    ("Paths.taps", ("center_hz", "huge")),
-    ("Paths.select", ("chosen", "2^63")),
-    ("RadioField.at_frequency", ("frequency_hz", "tiny")),
-    ("RadioField.cfr", ("client", "true")),
-    ("RadioField.fit", ("relevance", "text")),
-    ("RadioField.links", ("shape", "with inf")),
-    ("RadioField.load", ("path", "no text")),
-    ("RadioField.suggest", ("candidates", "with 1e9")),
-    ("Readings", ("chain", "ragged")),
-    ("Readings.from_table", ("table", "list")),
-    ("SpectrumDataset.empty", ("frequency_hz", "tiny")),
-    ("Spectrum", ("range_db", "as objects")),
-    ("Reconstruction", ("photos", "dictionary")),
-    ("SpectrumDataset.deembed", ("pattern", "class")),
-    ("SpectrumDataset.deembed", ("pattern", "ragged")),
-    ("SpectrumDataset.from_spectra", ("path_gain", "negated"), ("aod", "with 1e20")),
-    ("SpectrumDataset.from_spectra", ("role", "ragged")),
-    ("channel.Codebook", ("factors", "as objects")),
-    ("channel.angular_spread", ("power", "torch")),
-    ("channel.coherence_bandwidth", ("power", "zeros")),
-    ("channel.delay_spread", ("power", "as int8")),
-    ("em.Band.conductivity", ("frequency_hz", "minus one")),
-    ("em.lobe", ("cos_incidence", "complex")),
-    ("em.lobe", ("cos_to_mirror", "with huge"), ("alpha_r", "2^31")),
-    ("em.slab_reflection", ("thickness_m", "nested"), ("cos_incidence", "zero")),
-    ("em.slab_reflection", ("wavelength_m", "tiny")),
-    ("em.slab_transmission", ("thickness_m", "zero"), ("cos_incidence", "zero")),
-    ("evaluate", ("beam_width_rad", "tiny")),
-    ("evaluate", ("predict", "class")),
-    ("metrics.beam_gain_loss_db", ("width_rad", "tiny")),
-    ("metrics.beam_response", ("width_rad", "tiny")),
-    ("metrics.psnr", ("truth", "empty"), ("prediction", "no list")),
-    ("metrics.unit_image", ("floor", "minus one")),
-    ("reconstruct", ("photos", "list")),
-]
+def test_damage_of_files_with_a_checksum_is_refused_or_changes_nothing(place):
+    """200 flipped bits, a third of them early, and 60 cuts each; where there is no place for a checksum, a flipped bit
+    changes one value at most, and a cut nothing."""
+    draw = np.random.default_rng(0).integers(0, 2**31, (260, 2)).tolist()
+    kinds = [*["flip early"] * 67, *["flip"] * 133, *["cut"] * 60]
+    names = [FILE + name for name, form in FORMATS.items() if form.law]
+    cases = (Case(name, ((kind, a, b),)) for name in names for kind, (a, b) in zip(kinds, draw, strict=True))
+    findings, tried = found(place, cases, limit_s=10.0)
+    assert not findings, "\n".join(findings)
+    assert tried["refused"] > 200 * len(names) and tried.total() == 260 * len(names)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_reads_the_same_when_its_contents_are_put_back(place, name, tmp_path):
+    form = FORMATS[name]
+    path = form.make(place, tmp_path)
+    usual = leaves(form.read(path))
+    assert usual
+    if form.codec:
+        unpack, pack = CODECS[form.codec]
+        pack(path, unpack(path))
+        assert not differs(leaves(form.read(path)), usual)
+
+
+def test_every_public_name_has_an_example_that_is_answered(place, attempt):
+    for name in calls.public():
+        example = calls.example(name, place)
+        if name in calls.REFUSED:
+            with pytest.raises((ValueError, TypeError, OSError)):
+                calls.call(name, example)
+        else:
+            calls.call(name, example)
+    assert {*calls.EXAMPLES, *calls.REFUSED} <= calls.public().keys()
+
+
+CHECKED = {
+    "simulate": "scene seed transmitter receivers frequency_hz", "sample_receivers": "scene n z clearance seed",
+    "trace_paths": "mesh_or_scene mirror_order transmitter receivers frequency_hz", "RadioField.fit": "ds",
+    "render": "g cam", "splats.blend_weights": "g cam top_k", "Mesh": "vertices faces", "Mesh.cast": "origins directions",
+    "Mesh.visible": "a b clearance", "Mesh.closest": "points", "Mesh.look_around": "points directions",
+    "Mesh.cross_section": "height", "Paths.taps": "bandwidth_hz l_min l_max", "Paths.cfr": "frequencies_hz",
+    "em.gas_attenuation_db_per_m": "frequency_hz", "Air": "temperature_k pressure_hpa water_vapour_g_m3",
+    "lookups.nearest": "train", "lookups.mean": "train", "evaluate": "test", "em.lobe": "alpha_r",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHECKED)
+def test_what_is_no_argument_is_refused_by_its_name(attempt, name):
+    for argument in CHECKED[name].split():
+        for value in ("none", "text", "object", "ragged", "nan"):
+            outcome = attempt(Case(name, ((argument, value),)))
+            assert outcome.kind == "refused" and argument in outcome.text, (argument, value, outcome)
+
+
+FOUND = """
+Mesh.look_around: directions=as bool, points=no rows; Paths.taps: center_hz=huge; Paths.select: chosen=2^63
+BistaticField.at_frequency: frequency_hz=tiny; RadioField.cfr: client=true; RadioField.fit: relevance=text
+RadioField.links: shape=with -inf; RadioField.load: path=no text; RadioField.suggest: candidates=with 1e+09
+Readings: chain=ragged; Readings.from_table: table=list; SpectrumDataset.empty: frequency_hz=tiny
+Spectrum: range_db=as objects; Reconstruction: photos=dictionary; SpectrumDataset.deembed: pattern=class
+SpectrumDataset.deembed: pattern=ragged; SpectrumDataset.from_spectra: path_gain=negated, aod=with 1e+20
+SpectrumDataset.from_spectra: role=ragged; channel.Codebook: factors=as objects; channel.angular_spread: power=torch
+channel.coherence_bandwidth: power=zeros; channel.delay_spread: power=as int8; em.Band.conductivity: frequency_hz=minus one
+em.lobe: cos_incidence=complex; em.lobe: cos_to_mirror=huge, alpha_r=2^31
+em.slab_reflection: thickness_m=nested, cos_incidence=zero; em.slab_reflection: wavelength_m=tiny
+em.slab_transmission: thickness_m=zero, cos_incidence=zero; evaluate: beam_width_rad=tiny; evaluate: predict=class
+metrics.beam_gain_loss_db: width_rad=tiny; metrics.beam_response: width_rad=tiny
+metrics.psnr: truth=empty, prediction=no list; metrics.unit_image: floor=minus one; reconstruct: photos=list
+"""
 """Findings of earlier hours, one of each cause."""
 
 
-@pytest.fixture(scope="module")
-def trial(place, tmp_path_factory):
-    return cases.Trial(place, tmp_path_factory.mktemp("trial"))
-
-
-@pytest.mark.parametrize("target_and_edits", FOUND, ids=lambda case: f"{case[0]}-{case[1][0]}-{case[1][1]}")
-def test_what_was_found_once_is_right_now(trial, target_and_edits, monkeypatch):
-    monkeypatch.chdir(trial.scratch)
-    target, *edits = target_and_edits
-    outcome = trial(cases.Case(target, tuple(edits)))
+@pytest.mark.parametrize("case", re.split("; |\n", FOUND.strip()))
+def test_what_was_found_once_is_right_now(attempt, case):
+    target, _, edits = case.partition(": ")
+    outcome = attempt(Case(target, tuple(tuple(edit.split("=")) for edit in edits.split(", "))))
     assert outcome.kind in ("refused", "answered"), outcome.text
 
 
-def test_cases_of_a_target_do_not_depend_on_other_targets(place):
-    alone = cases.drawn(place, 3, 0, "channel.thz_channel")
-    among = [case for case in cases.drawn(place, 3, 0, "channel.") if case.target == "channel.thz_channel"]
-    assert alone == among
+@pytest.mark.parametrize("law", LAWS)
+def test_a_law_holds(attempt, law):
+    plain = [Case(LAW + law, ((name, 0, 0),)) for name in dict.fromkeys(LAWS[law].edits)]
+    for case in plain + trial.drawn(LAW + law, [], 6, 0):
+        outcome = attempt(case)
+        assert outcome.kind in ("answered", "unfit"), f"{case}: {outcome.text}"
+
+
+@pytest.mark.parametrize(
+    ("target", "edits"),
+    [
+        ("simulate", {"beam_sigma_rad": "zero"}),
+        ("PlanarArray", {"orientation": "mirror"}),
+        ("Mesh", {"vertices": "all alike"}),
+        ("RadioField.fit", {"ds": "readings", "model": "rf3dgs+"}),
+    ],
+)
+def test_what_no_answer_exists_for_is_refused(attempt, target, edits):
+    outcome = attempt(Case(target, tuple(edits.items())))
+    assert outcome.kind == "refused", outcome
 
 
 def misbehaving(scratch):
-    return {
-        "answers": str,
-        "dies": lambda case: os.abort(),
-        "hangs": lambda case: time.sleep(60.0),
-    }.__getitem__
-
-
-def attempts(scratch):
-    known = misbehaving(scratch)
-    return lambda case: known(case)(case)
+    asked = {"answers": str, "dies": lambda case: os.abort(), "hangs": lambda case: time.sleep(60.0)}
+    return lambda case: asked[case](case)
 
 
 def test_a_crash_and_a_hang_are_seen_and_others_go_on():
     asked = ["answers", "dies", "answers", "hangs", "answers", "answers"]
-    with Workers(attempts, lambda words: f"ended: {words}", 1, 2.0) as workers:
-        found = dict(islice(workers.run(asked), len(asked)))
+    with Workers(misbehaving, lambda words: f"ended: {words}", 1, 2.0) as workers:
+        found = dict(workers.run(asked))
     assert found["answers"] == "answers"
     assert "exit code -6" in found["dies"]
     assert "took more than 2 s" in found["hangs"]
 
 
 def test_errors_of_other_kinds_or_without_a_name_are_findings():
-    assert not judge.complaint(ValueError("rx: got NaN"), ["rx"])
-    assert "KeyError" in judge.complaint(KeyError("rx"), ["rx"])
-    assert "names nothing" in judge.complaint(ValueError("bad prx"), ["rx"])
+    assert not complaint(ValueError("rx: got NaN"), ["rx"])
+    assert "KeyError" in complaint(KeyError("rx"), ["rx"])
+    assert "names nothing" in complaint(ValueError("bad prx"), ["rx"])
 
 
 def test_nan_is_a_finding_where_it_is_not_usual():
-    usual = judge.leaves({"a": np.array([1.0, np.nan]), "b": 1.0})
-    assert not judge.wrong(judge.leaves({"a": np.array([np.nan]), "b": 2.0}), usual)
-    assert "b" in judge.wrong(judge.leaves({"a": np.array([1.0]), "b": np.nan}), usual)
-
-
-def test_only_an_empty_pixel_has_no_delay():
-    delay = np.array([[1e-9, np.nan]])
-    assert not judge.wrong(judge.leaves({"path_gain": np.array([[1.0, 0.0]]), "delay_s": delay}), {})
-    assert "delay_s" in judge.wrong(judge.leaves({"path_gain": np.array([[1.0, 1.0]]), "delay_s": delay}), {})
-
-
-@pytest.mark.parametrize("name", cases.FORMATS)
-def test_every_format_reads_the_same_when_its_contents_are_put_back(place, name, tmp_path):
-    form = cases.FORMATS[name]
-    path = form.make(place, tmp_path)
-    usual = judge.leaves(form.read(path))
-    assert usual
-    if form.codec:
-        unpack, pack = damage.CODECS[form.codec]
-        pack(path, unpack(path))
-        assert not judge.differs(judge.leaves(form.read(path)), usual)
-    before = path.read_bytes()
-    damage.damage(path, form.codec, (("flip", 3, 1),))
-    assert path.read_bytes() != before
+    usual = leaves({"a": np.array([1.0, np.nan]), "b": 1.0})
+    assert not wrong(leaves({"a": np.array([np.nan]), "b": 2.0}), usual)
+    assert "b" in wrong(leaves({"a": np.array([1.0]), "b": np.nan}), usual)
+    delay = np.array([[1e-9, np.nan]])  # of an empty pixel alone
+    assert not wrong(leaves({"path_gain": np.array([[1.0, 0.0]]), "delay_s": delay}), {})
+    assert "delay_s" in wrong(leaves({"path_gain": np.array([[1.0, 1.0]]), "delay_s": delay}), {})

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+from golden.make import box_mesh as box_mesh
+from golden.make import joined as joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
@@ -49,29 +51,19 @@ class RadioScene:
         return self.mesh.bounds
 
 
-def box_mesh(low, high, inward=False):
-    """Vertices and faces of a closed box, 6 sides of 2 faces."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return low + corners * (high - low), faces[:, ::-1] if inward else faces
-
-
-def joined(*parts):
-    """One mesh of several (vertices, faces), and the part each face came from."""
-    shift = np.cumsum([0] + [len(v) for v, _ in parts])
-    mesh = Mesh(
-        np.concatenate([v for v, _ in parts]),
-        np.concatenate([f + s for (_, f), s in zip(parts, shift, strict=False)]),
-    )
-    return mesh, np.repeat(np.arange(len(parts)), [len(f) for _, f in parts])
-
-
 def square(half, z=0.0):
     """A horizontal square sheet, normal up."""
     v = [[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]]
     return np.array(v, float), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def tube(sides, radius, height):
+    """Vertices and faces of a pillar's outside, open at its ends."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    ring = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(sides)])
+    a, b = np.arange(sides), (np.arange(sides) + 1) % sides
+    faces = np.concatenate([np.column_stack([a, b, b + sides]), np.column_stack([a, b + sides, a + sides])])
+    return np.concatenate([ring, ring + [0, 0, height]]), faces
 
 
 def exact_spectra(scene, receivers, *, transmitter, frequency_hz, shape, sigma, sub_pixels=6):

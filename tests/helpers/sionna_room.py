@@ -3,6 +3,7 @@
 import pytest
 from radio_scenes import box_mesh, joined
 
+from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf import scene_sionna
 from warprrf.rf.em.materials import Material
 from warprrf.rf.scene import Scene
@@ -19,26 +20,28 @@ def sionna_or_skip():
     return SionnaEngine
 
 
+def write_xml(folder, parts):
+    """Named parts, each of an ITU material and its vertices and faces, as PLY files and the XML that Sionna reads."""
+    shapes = ""
+    for name, (itu, mesh) in parts.items():
+        write_mesh(folder / f"{name}.ply", *mesh)
+        shapes += (
+            f'<bsdf type="diffuse" id="mat-itu_{itu}"/><shape type="ply" id="{name}">'
+            f'<string name="filename" value="{name}.ply"/><boolean name="face_normals" value="true"/>'
+            f'<ref id="mat-itu_{itu}" name="bsdf"/></shape>\n'
+        )
+    (folder / "scene.xml").write_text(f'<scene version="3.0.0">\n{shapes}</scene>\n')
+    return folder / "scene.xml"
+
+
 def write_scene(folder):
-    """A room and a block in it, as PLY files and the XML that Sionna reads."""
+    """A room and a block in it, and its files."""
     parts = {
         "walls": box_mesh([-7, -6, 0], [8, 6, 4], inward=True),
         "block": box_mesh([-1.5, -2, -0.01], [0.5, 1.5, 2.2]),
     }
-    shapes = ""
-    for name, (vertices, faces) in parts.items():
-        header = f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\n"
-        header += "property float x\nproperty float y\nproperty float z\n"
-        header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-        rows = [" ".join(f"{x:.9g}" for x in v) for v in vertices] + [f"3 {a} {b} {c}" for a, b, c in faces]
-        (folder / f"{name}.ply").write_text(header + "\n".join(rows) + "\n")
-        shapes += (
-            f'<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>'
-            '<boolean name="face_normals" value="true"/><ref id="mat-itu_concrete" name="bsdf"/></shape>\n'
-        )
-    xml = folder / "scene.xml"
-    bsdf = '<bsdf type="diffuse" id="mat-itu_concrete"/>'
-    xml.write_text(f'<scene version="3.0.0">\n{bsdf}\n{shapes}</scene>\n')
+    itu = zip(parts, ("concrete", "brick"), strict=True)
+    xml = write_xml(folder, {name: (material, parts[name]) for name, material in itu})
     mesh, part = joined(*parts.values())
     stone = Material.custom(
         "stone",

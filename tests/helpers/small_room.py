@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from places import LOBBY
 from radio_scenes import box_mesh
+from sionna_room import write_xml
 
 import warprrf as wr
-from warprrf.geometry.mesh_files import write_mesh
 from warprrf.geometry.splats.gaussians import discs_on_mesh
 from warprrf.rf.simulate import sample_receivers
 
@@ -22,18 +22,9 @@ SHAPE = (12, 24)
 def small_room(folder: Path) -> Path:
     """Scene, its mesh as a reconstruction, and spectra of 10 training and 4 test receivers, in ``folder``."""
     shutil.copy(LOBBY / "materials.json", folder)
-    shapes = ""
-    for name, material, (vertices, faces) in (
-        ("walls", "concrete", box_mesh([0, 0, 0], [5, 4, 3], inward=True)),
-        ("block", "marble", box_mesh([2.2, 1.2, -0.01], [3.0, 2.8, 2.6])),
-    ):
-        write_mesh(folder / f"{name}.ply", vertices, faces)
-        shapes += (
-            f'<bsdf type="diffuse" id="mat-itu_{material}"/><shape type="ply" id="{name}">'
-            f'<string name="filename" value="{name}.ply"/><ref id="mat-itu_{material}" name="bsdf"/></shape>\n'
-        )
-    (folder / "scene.xml").write_text(f'<scene version="3.0.0">\n{shapes}</scene>\n')
-    scene = wr.Scene.load(folder / "scene.xml")
+    walls = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
+    block = box_mesh([2.2, 1.2, -0.01], [3.0, 2.8, 2.6])
+    scene = wr.Scene.load(write_xml(folder, {"walls": ("concrete", walls), "block": ("marble", block)}))
     receivers = sample_receivers(scene, 14, clearance=0.2, seed=3)
     ds = wr.simulate(
         scene,

@@ -1,14 +1,15 @@
 """A bistatic field of known parameters on a room with a block in it: nothing is fitted."""
 
 import numpy as np
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
+from furnished import RECEIVERS, TX, furnished
+from radio_scenes import RadioScene, SlabMaterial
 
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.surface import Surface
 
 F, SHAPE, SIGMA = 300e9, (30, 60), np.radians(5.0)
-TX, SEES, BLOCKED = np.array([0.8, 0.9, 2.2]), np.array([4.2, 3.1, 1.2]), np.array([3.6, 3.3, 0.9])
+SEES, BLOCKED = RECEIVERS[0], np.array([3.6, 3.3, 0.9])
 MATERIALS = [
     SlabMaterial("walls", 3.0, 0.0, np.inf, 0.5, "directive", 4),
     SlabMaterial("block/top <1>", 6.0, 0.0, np.inf, 0.8),
@@ -19,10 +20,7 @@ LOBES = (0, 4, 12)
 
 def room() -> RadioScene:
     """Half-spaces that a field and a material can both describe; no face is of the third."""
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    return RadioScene(mesh, part, MATERIALS)
+    return furnished(*MATERIALS)
 
 
 def known_field(**changes) -> BistaticField:

@@ -10,7 +10,7 @@ from radio_scenes import box_mesh, joined
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.materials import Material
-from warprrf.rf.positions import NEAR_FIELD, check_positions, in_another_solid
+from warprrf.rf.positions import NEAR_FIELD, check_positions, in_the_air, parted
 from warprrf.rf.scene import Scene
 
 F = 300e9
@@ -129,27 +129,74 @@ def test_solids_are_known_and_air_passes_however_the_mesh_is(mesh):
     air = points[((points < low - 0.1) | (points > high + 0.1)).any(axis=1)]
     if mesh.is_closed and len(mesh.faces) > 24:  # the pillar's faces
         air = air[((air < PILLAR[0] - 0.05) | (air > PILLAR[1] + 0.05)).any(axis=1)]
-    assert in_another_solid(mesh, solid, TX).mean() > (0.6 if len(mesh.faces) > 100 else 0.99)
-    assert not in_another_solid(mesh, air, TX).any()
+    assert parted(mesh, solid, TX).mean() > (0.6 if len(mesh.faces) > 100 else 0.99)
+    assert not parted(mesh, air, TX).any()
 
 
-@pytest.mark.parametrize(
-    "parts",
-    [
-        [sheet([3, 0, 0], [3, 5, 0], [3, 5, 3], [3, 0, 3])],  # a partition from wall to wall
-        [sheet([3, 5, 0], [3, 0, 0], [3, 0, 3], [3, 5, 3])],
-        [sheet([1.2, 0.2, 1], [5.5, 0.2, 1], [5.5, 4.8, 1], [1.2, 4.8, 1])],  # a table top
-        [
-            sheet([3, 0, 0], [3, 5, 0], [3, 5, 3], [3, 0, 3]),
-            sheet([3, 2.5, 0], [6, 2.5, 0], [6, 2.5, 3], [3, 2.5, 3]),
-        ],
-    ],
-)
-def test_sheets_in_a_room_hold_no_solid(parts):
-    mesh = joined(box_mesh(LOW, HIGH, inward=True), *parts)[0]
-    points = np.random.default_rng(2).uniform(LOW + 0.05, HIGH - 0.05, (500, 3))
-    assert (~mesh.visible(points, TX)).sum() > 50
-    assert not in_another_solid(mesh, points, TX).any()
+def wall(rng, x, over):
+    """A sheet across the room at ``x``, from wall to wall, ``over`` [m] beyond, wound either way."""
+    low, high = LOW - over, HIGH + over
+    vertices, faces = sheet(
+        *([x, y, z] for y, z in ((low[1], low[2]), (high[1], low[2]), (high[1], high[2]), (low[1], high[2])))
+    )
+    return vertices, faces[:, :: rng.choice([-1, 1])]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_only_what_a_closed_surface_holds_is_no_air_however_surfaces_are_wound(seed):
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(LOW + 0.05, HIGH - 0.05, (300, 3))
+    parts, solid = [box_mesh(LOW, HIGH, inward=seed % 2 > 0)], np.zeros(len(places), bool)
+    for _ in range(rng.integers(0, 4)):
+        low = rng.uniform(LOW, HIGH - 1.6) * [1, 1, rng.integers(2)] - [
+            0,
+            0,
+            0.02,
+        ]  # through the floor a little
+        high = low + rng.uniform(0.3, 1.5, 3)
+        parts.append(box_mesh(low, high, inward=rng.random() < 0.2))
+        solid |= ((places > low) & (places < high)).all(axis=1)
+    parts += [wall(rng, rng.uniform(1, 5), rng.choice([0.0, 0.01, -0.3])) for _ in range(rng.integers(0, 4))]
+    mesh = joined(*parts)[0]
+    off = mesh.distance(places) > 0.01
+    for known in (places[~solid & off][0], None):
+        np.testing.assert_array_equal(in_the_air(mesh, places, known)[off], ~solid[off])
+
+
+def test_a_room_is_one_though_crumbs_lie_beside_it():
+    """As in a reconstruction, whose walls have pieces before and behind them."""
+    crumb = sheet([6.1, 2, 1], [6.1, 3, 1], [6.1, 3, 2], [6.1, 2, 2])
+    mesh = joined(box_mesh(LOW, HIGH, inward=True), crumb)[0]
+    check_positions(mesh, TX, np.zeros((0, 3)), WAVELENGTH)
+    assert in_the_air(mesh, np.array([AIR, TX])).all()
+
+
+def test_places_round_open_walls_and_lone_boxes_pass_and_in_a_box_do_not():
+    rng = np.random.default_rng(4)
+    for side in range(6):  # a room without it
+        vertices, faces = box_mesh(LOW, HIGH, inward=side % 2 > 0)
+        without = Mesh(vertices, np.delete(faces, [2 * side, 2 * side + 1], axis=0))
+        check_positions(without, AIR, rng.uniform(LOW - 2, HIGH + 2, (30, 3)), WAVELENGTH)
+    walls = joined(
+        *(wall(rng, x, 0.0) for x in (1, 2.5, 4)), sheet([1, 2, 0], [4, 2, 0], [4, 2, 3], [1, 2, 3])
+    )[0]
+    check_positions(walls, AIR, rng.uniform(LOW, HIGH, (60, 3)), WAVELENGTH)
+    box, around = joined(box_mesh(*CUPBOARD))[0], rng.uniform(CUPBOARD[0] - 3, CUPBOARD[1] + 3, (60, 3))
+    inside = ((around > CUPBOARD[0]) & (around < CUPBOARD[1])).all(axis=1)
+    check_positions(box, TX, around[~inside], WAVELENGTH)
+    check_positions(box, IN_CUPBOARD, around[inside], WAVELENGTH)
+    with pytest.raises(ValueError, match=r"receivers\[0\].*inside a solid"):
+        check_positions(box, TX, np.array([IN_CUPBOARD, TX - 1]), WAVELENGTH)
+
+
+@pytest.mark.parametrize("name", ["box", "box_one_screen", "box_two_screens"])
+def test_sionnas_boxes_of_sheets_are_rooms(name):
+    rt = pytest.importorskip("sionna.rt")
+    scene = wr.Scene.load(getattr(rt.scene, name))
+    places = np.random.default_rng(0).uniform([-4.9, -4.9, 0.1], [4.9, 4.9, 4.9], (400, 3))
+    assert scene.is_free(places).all()
+    assert in_the_air(scene.mesh, places, np.array([-4.0, -4.0, 4.0])).all()
+    assert len(wr.sample_receivers(scene, 50, seed=0)) == 50
 
 
 def test_two_rooms_with_a_door_are_one_air():
@@ -166,7 +213,7 @@ def test_two_rooms_with_a_door_are_one_air():
         mesh = joined(shell(LOW, HIGH, 6.0, True), shell([6.2, 0, 0], [10.0, 5, 3], 6.2, inward))[0]
         points = np.random.default_rng(3).uniform([6.4, 0.2, 0.2], [9.8, 4.8, 2.8], (300, 3))
         assert (~mesh.visible(points, TX)).sum() > 50
-        assert not in_another_solid(mesh, points, TX).any()
+        assert not parted(mesh, points, TX).any()
 
 
 def test_an_open_scene_reaches_beyond_its_bounds_and_a_room_does_not():
@@ -213,21 +260,15 @@ def test_sizes_that_are_no_metres_are_questioned(scale, unit):
     assert len(told) == (unit is not None)
 
 
-def test_relevance_questions_the_unit_too():
-    mesh = joined(box_mesh(3e3 * LOW, 3e3 * HIGH, inward=True))[0]
-    with (
-        pytest.warns(UserWarning, match="coordinates look like millimetres"),
-        pytest.raises(ValueError, match="geometry.*elements"),
-    ):
-        wr.relevance(mesh, transmitter=3e3 * TX, receivers=[3e3 * AIR], frequency_hz=F)
-
-
-def test_a_room_in_millimetres_is_refused_by_a_fit_before_it_is_cut_to_elements():
+def test_a_room_in_millimetres_is_refused_before_it_is_cut_to_elements():
     s = scene()
     ds = wr.simulate(s, transmitter=TX, receivers=[AIR], frequency_hz=F, shape=(16, 32))
     ds = replace(ds, receivers=1e3 * ds.receivers, transmitter=1e3 * ds.transmitter)
-    with (
-        pytest.warns(UserWarning, match="coordinates look like millimetres"),
-        pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
-    ):
-        wr.RadioField.fit(Mesh(1e3 * s.mesh.vertices, s.mesh.faces), ds)
+    mesh = Mesh(1e3 * s.mesh.vertices, s.mesh.faces)
+    ends = {"transmitter": ds.transmitter, "receivers": ds.receivers, "frequency_hz": F}
+    for ask in (lambda: wr.RadioField.fit(mesh, ds), lambda: wr.relevance(mesh, **ends)):
+        with (
+            pytest.warns(UserWarning, match="coordinates look like millimetres"),
+            pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
+        ):
+            ask()

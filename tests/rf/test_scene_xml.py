@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from radio_scenes import box_mesh, enclosed_volume, is_wound_alike
 from sionna_room import sionna_or_skip
 
@@ -74,8 +75,6 @@ def test_what_nobody_knows_is_named_and_can_be_given(tmp_path: Path) -> None:
     assert one(tmp_path, '<bsdf type="diffuse" id="it"/>', materials={"it": cork}) == cork
     with pytest.raises(ValueError, match="^materials: got 'that'.*it has it"):
         one(tmp_path, '<bsdf type="diffuse" id="it"/>', materials={"it": cork, "that": cork})
-    with pytest.raises(TypeError, match=r"^materials\['it'\]"):
-        one(tmp_path, '<bsdf type="diffuse" id="it"/>', materials={"it": "cork"})
     with pytest.raises(ValueError, match="circle"):
         one(tmp_path, '<bsdf type="twosided" id="it"><ref id="it"/></bsdf>')
     with pytest.raises(ValueError, match=r"'it'.*'thickness'.*'thick'"):
@@ -126,11 +125,7 @@ def test_surfaces_stand_where_mitsuba_puts_them(tmp_path: Path) -> None:
 
     mitsuba = select_variant()
     write_mesh(tmp_path / "box.ply", *box_mesh([0, 0, 0], [1, 2, 3]))
-    vertices, faces = box_mesh([0, 0, 0], [1, 2, 3])
-    lines = [f"v {x} {y} {z}\n" for x, y, z in vertices] + [
-        f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces
-    ]
-    (tmp_path / "box.obj").write_text("".join(lines))
+    trimesh.Trimesh(*box_mesh([0, 0, 0], [1, 2, 3]), process=False).export(tmp_path / "box.obj")
     shapes = [
         f'<shape type="{kind}" id="{kind}{k}">{file}<transform name="to_world">{transform}</transform>'
         '<bsdf type="diffuse" id="itu_wood"/></shape>'
@@ -202,32 +197,15 @@ HOSTILE = {
         + CUBE.format(""),
         "more than 10000 characters",
     ),
-    "an unknown name": (CUBE.replace("cube", "$kind"), r"\$kind"),
     "itself": ('<include filename="scene.xml"/>', "deep"),
     "a file above": ('<include filename="../scene.xml"/>', "outside"),
     "a file of the system": ('<include filename="/etc/passwd"/>', "outside"),
-    "a name with zero": ('<shape type="ply"><bsdf id="itu_wood"/></shape>', "no name"),
     "a name twice": (2 * CUBE.replace("cube", 'cube" id="a').format(""), "alike"),
-    "no shapes": ('<shape type="merge"/>', "no shapes"),
-    "an unknown shape": (CUBE.replace("cube", "hair"), "'hair'.*export it as a mesh"),
-    "a matrix of 8": (
-        CUBE.format('<transform name="to_world"><matrix value="1 0 0 0 1 0 0 1"/></transform>'),
-        "9 or 16",
-    ),
     "a perspective": (
         CUBE.format(
             '<transform name="to_world"><matrix value="1 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0"/></transform>'
         ),
         "last row",
-    ),
-    "an axis of zeros": (
-        CUBE.format('<transform name="to_world"><rotate angle="9"/></transform>'),
-        "length 1",
-    ),
-    "NaN": (CUBE.format('<transform name="to_world"><translate x="nan"/></transform>'), "finite"),
-    "an unknown transform": (
-        CUBE.format('<transform name="to_world"><shear x="1"/></transform>'),
-        "'shear'",
     ),
 }
 

@@ -16,19 +16,8 @@ LOW, HIGH = np.array([-7.0, -6, 0]), np.array([8.0, 6, 4])
 BOX = np.array([-1.0, -1, 0]), np.array([0.5, 1.5, 2.2])
 
 
-def scene(material=None, solid_walls=False):
-    if solid_walls:
-        walls = []
-        for axis in range(3):
-            for side in (0, 1):
-                low, high = LOW - 0.2, HIGH + 0.2
-                low[axis], high[axis] = (
-                    (HIGH[axis], HIGH[axis] + 0.2) if side else (LOW[axis] - 0.2, LOW[axis])
-                )
-                walls.append(box_mesh(low, high))
-        mesh, part = joined(box_mesh(BOX[0] - [0, 0, 0.05], BOX[1]), *walls)
-    else:
-        mesh, part = joined(box_mesh(LOW, HIGH, inward=True), box_mesh(*BOX))
+def scene(material=None):
+    mesh, part = joined(box_mesh(LOW, HIGH, inward=True), box_mesh(*BOX))
     stuff = material or Material.custom("stone", relative_permittivity=5.0, conductivity=0.5, scattering=0.5)
     return Scene(
         mesh,
@@ -45,38 +34,10 @@ def run(receivers, s=None, **options):
     )
 
 
-@pytest.mark.parametrize("solid_walls", [False, True])
-@pytest.mark.parametrize(
-    ("place", "words"),
-    [
-        ([9.0, 0, 1], r"receivers\[1\].*outside"),
-        ([3.0, 0, -1], r"receivers\[1\].*outside"),
-        ([0.0, 0, 1], r"receivers\[1\].*inside a solid"),
-        ([0.50005, 0, 1], r"receivers\[1\].*on a surface"),
-        ([3.0, 0, 0], r"receivers\[1\].*on a surface"),
-        ([np.nan, 0, 1], "receivers.*NaN"),
-    ],
-)
-def test_places_that_cannot_receive_are_refused(place, words, solid_walls):
-    with pytest.raises(ValueError, match=words):
-        run([[3.0, 0, 1], place], scene(solid_walls=solid_walls))
-
-
-def test_a_transmitter_in_a_solid_is_refused():
-    with pytest.raises(ValueError, match="transmitter.*inside a solid|receivers.*inside a solid"):
-        simulate(scene(), transmitter=[0, 0, 1.0], receivers=[[3.0, 0, 1]], frequency_hz=F, shape=(20, 40))
-
-
 def test_a_frequency_outside_the_band_names_material_and_band():
     stuff = Material("stone", (Band(1e9, 100e9, 5.0, 0.0, 0.1, 0.8),))
     with pytest.raises(ValueError, match=r"300 GHz.*'stone'.*1 to 100 GHz"):
         run([[3.0, 0, 1]], scene(stuff))
-
-
-@pytest.mark.parametrize("options", [{"engine": "best"}, {"shape": (1, 4)}, {"depth": -1}, {"samples": 0.5}])
-def test_bad_options_are_refused(options):
-    with pytest.raises((ValueError, TypeError), match=next(iter(options))):
-        run([[3.0, 0, 1]], **options)
 
 
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
@@ -108,17 +69,8 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
     assert len(calls) == 6
 
 
-def test_the_number_of_threads_does_not_change_a_spectrum(monkeypatch):
-    places = [[3.0, 0, 1]]
-    several = run(places)
-    import warprrf.device
-
-    monkeypatch.setattr(warprrf.device, "threads", lambda: 1)
-    np.testing.assert_array_equal(run(places).path_gain, several.path_gain)
-
-
 def test_receivers_are_drawn_from_the_air():
-    s = scene(solid_walls=True)
+    s = scene()
     places = sample_receivers(s, 500, seed=4, clearance=0.3)
     assert (
         (places >= LOW + [0.3, 0.3, 0.8]).all() and (places <= HIGH - 0.3).all() and places[:, 2].max() <= 2.2
@@ -130,14 +82,10 @@ def test_receivers_are_drawn_from_the_air():
     west = places[:, 0] < -1.3
     free = (5.4 * 11.4) / (14.4 * 11.4 - 2.1 * 3.1)
     assert west.mean() == pytest.approx(free, abs=0.07)
-    with pytest.raises(ValueError, match="clearance"):
-        sample_receivers(s, 5, seed=0, clearance=3.0)
-    with pytest.raises(ValueError, match="n: got"):
-        sample_receivers(s, 2**31 - 1, seed=0)
 
 
 def test_places_too_near_a_surface_are_ruled_out_before_solids(monkeypatch):
-    room = scene(solid_walls=True)
+    room = scene()
     places = sample_receivers(room, 3, seed=0)
     monkeypatch.delattr(Mesh, "look_around")  # the last of the tests
     assert not room.is_free(places, clearance_m=1e3).any()

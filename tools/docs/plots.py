@@ -13,8 +13,6 @@ import matplotlib.pyplot as plt  # noqa: E402
 from tables.common import NAMES, TRUTHS, read  # noqa: E402
 from tables.paper import PLACES, paper  # noqa: E402
 
-from benchmarks.evaluation.plots import learning_curves  # noqa: E402
-
 STYLE = {
     "svg.fonttype": "none", "svg.hashsalt": "warprrf", "font.family": "sans-serif", "font.size": 9, "axes.grid": True,
     "grid.alpha": 0.3, "axes.spines.top": False, "axes.spines.right": False, "figure.constrained_layout.use": True,
@@ -98,12 +96,27 @@ def _speed() -> Any:
 
 @entry("learning", "Loss of the networks over their training time")
 def _learning() -> Any:
-    return learning_curves([r for place in PLACES for r in paper(*place) if r["loss_curve"]])
+    rows = read("networks")["rows"]
+    truths = {truth: f"C{k}" for k, truth in enumerate(TRUTHS)}
+    figure, axes = plt.subplots(1, 2, figsize=(11.0, 4.0))
+    for ax, method in zip(axes, ("nerf2", "cgan"), strict=True):
+        for r in (r for r in rows if r["method"] == method):
+            curve = [loss / r["loss_curve"][0] for loss in r["loss_curve"]]
+            minutes = [k * r["fit_s"] / 60.0 / (len(curve) - 1) for k in range(len(curve))]
+            style = {700: "-", 100: "--", 10: ":"}[r["count"]]
+            label = f"{TRUTHS[r['truth']]}, {r['count']} spectra"
+            ax.plot(minutes, curve, style, color=truths[r["truth"]], label=label)
+        ax.set(
+            title=_name(method), xlabel="training time [min]", ylabel="loss over that of the first fortieth"
+        )
+        ax.set_yscale("log")
+        ax.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.15))
+    return figure
 
 
 @entry("knobs", "Error and time of each setting of the renderer")
 def _knobs() -> Any:
-    engine = read("engine")
+    engine, growth = read("renderer"), read("engine")["growth"]
     words = {"alpha_min": "least alpha that counts", "top_k": "Gaussians kept a pixel"}
     figure, axes = plt.subplots(1, 3, figsize=(9, 3.2))
     for ax, (knob, title) in zip(axes, words.items(), strict=False):
@@ -118,9 +131,8 @@ def _knobs() -> Any:
         twin.set_ylabel("ms a receiver", color="#c4570f")
         twin.grid(False)
     axes[2].loglog(
-        [r["gaussians"] for r in engine["growth"]], [1e3 * r["seconds"] for r in engine["growth"]], "o-", ms=3,
-        color="#0b6e99",
-    )  # fmt: skip
+        [r["gaussians"] for r in growth], [1e3 * r["seconds"] for r in growth], "o-", ms=3, color="#0b6e99"
+    )
     axes[2].set(title="growth", xlabel="Gaussians", ylabel="ms a panorama")
     return figure
 

@@ -43,13 +43,10 @@ def pages() -> dict[str, str]:
         elif inspect.isclass(found) or inspect.isfunction(found):
             groups[_group(found.__module__)].append(_entry("warprrf", name, found))
     for model in _models():
-        groups["rf.fields"].append(_entry(model.__module__, model.__name__, model))
+        groups["rf.fields"].append(_entry("warprrf", model.__name__, model))
         options = _options(model)
-        groups["rf.fields"].append(
-            _entry(options.__module__, options.__name__, options) + "\n   :no-members:"
-        )
-    shown = importlib.import_module("warprrf.viewer")
-    groups["viewer"].append(_entry(shown.__name__, "Viewer", shown.Viewer))
+        groups["rf.fields"].append(_entry("warprrf", options.__name__, options) + "\n   :no-members:")
+    groups["viewer"].append(_entry("warprrf", "Viewer", warprrf.Viewer))
     written = {
         f"reference/{key.replace('.', '-')}.rst": "\n\n".join([_title(title), words, *groups[key]]) + "\n"
         for key, (title, words) in GROUPS.items()
@@ -110,7 +107,7 @@ def _module_page(name: str, module: ModuleType) -> str:
         known = inspect.isclass(found) or inspect.isfunction(found)
         listed = hasattr(module, "__path__") or getattr(found, "__module__", "") == module.__name__
         if known and listed and not member.startswith("_"):
-            parts.append(_entry(module.__name__, member, found) if member not in dir(warprrf) else "")
+            parts.append(_entry(f"warprrf.{name}", member, found) if member not in dir(warprrf) else "")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

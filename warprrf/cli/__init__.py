@@ -12,21 +12,30 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import warprrf as wr
-from warprrf.cli.inputs import Add
+from warprrf.cli.inputs import Add, Parser
 from warprrf.cli.output import INTERRUPTED, Output
-from warprrf.cli.steps import add_evaluate, add_fit, add_reconstruct, add_relevance, add_simulate, add_suggest
+from warprrf.cli.steps import (
+    add_evaluate,
+    add_fit,
+    add_reconstruct,
+    add_relevance,
+    add_sample,
+    add_simulate,
+    add_suggest,
+)
 from warprrf.cli.views import add_map, add_render, add_twin, add_view
 
 EPILOG = """\
 a walk through:
   warprrf reconstruct photos/ -o room --known-positions surveyed.json
+  warprrf sample data/lobby/scene.xml -o receivers.csv -n 60
   warprrf simulate data/lobby/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv
-  warprrf fit room spectra.nc -o field.safetensors --model rf3dgs+
+  warprrf fit room spectra.nc -o field.safetensors
   warprrf suggest field.safetensors candidates.csv -n 3
-  warprrf evaluate field.safetensors spectra.nc --train 50
+  warprrf evaluate field.safetensors spectra.nc
   warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
   warprrf map field.safetensors -o map.nc --height 1.5 --cell 0.25
   warprrf view room field.safetensors              in the browser: drag a receiver
@@ -70,13 +79,6 @@ def run(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> i
     return 0
 
 
-class _Parser(argparse.ArgumentParser):
-    """Words that it cannot take are bad input as any other: one line, or JSON."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message} (see {self.prog} --help)")
-
-
 def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
@@ -90,6 +92,7 @@ def _parser() -> argparse.ArgumentParser:
         EPILOG,
         (
             add_reconstruct,
+            add_sample,
             add_simulate,
             add_fit,
             add_suggest,
@@ -119,7 +122,7 @@ def make_parser(
     )
     common.add_argument("--debug", action="store_true", help="show the traceback of an error")
 
-    parser = _Parser(
+    parser = Parser(
         prog=prog,
         description=description,
         epilog=epilog,

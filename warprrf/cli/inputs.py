@@ -6,9 +6,10 @@ import argparse
 import csv
 import os
 import re
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -65,36 +66,172 @@ def read_positions(path: str | os.PathLike[str]) -> dict[str, tuple[float, float
         ) from error
 
 
-def add_readings_options(parser: argparse.ArgumentParser) -> None:
-    """Define what tables of received power do not say themselves."""
-    own = parser.add_argument_group("tables of received power (CSV)")
-    own.add_argument("--carrier", type=float, metavar="HZ", help="carrier frequency")
+class Parser(argparse.ArgumentParser):
+    """Words that it cannot take are bad input as any other: one line, or JSON."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise ValueError."""
+        raise ValueError(f"{message} (see {self.prog} --help)")
+
+
+def add_frequency(parser: Any, text: str, **options: Any) -> None:
+    """Define the option of the carrier frequency, of one name wherever there is one."""
+    parser.add_argument("--frequency", type=float, metavar="HZ", help=text, **options)
+
+
+def add_pattern(parser: Any, flag: str, text: str) -> None:
+    """Define the option of an antenna's pattern."""
+    parser.add_argument(
+        flag, metavar="PATTERN",
+        help=f"{text}: a horn's width at half maximum in degrees, with its side lobes' level in dB where known (10 or "
+        "10,-25), a file of linear gains from 0 to 180 degrees, or isotropic",
+    )  # fmt: skip
+
+
+def add_measured_options(parser: Any) -> None:
+    """Define what files of measurements do not say themselves."""
+    own = parser.add_argument_group(
+        "measurements", "for all files, or NAME=VALUE behind a file for that one: horn.csv receive-pattern=10"
+    )
+    add_frequency(own, "carrier of tables (CSV) and of arrays (folders)")
     own.add_argument(
         "--noise-floor-db", type=float, help="readings not above it only say that there was no more"
     )
-    own.add_argument("--horn-deg", type=float, help="width of the receiver's horn at half maximum")
-    own.add_argument("--tx-horn-deg", type=float, help="width of the transmitter's horn")
+    add_pattern(own, "--receive-pattern", "of the receiver's antenna, where a table tells its direction")
+    add_pattern(own, "--transmit-pattern", "of the transmitter's antenna")
+    own.add_argument(
+        "--samples", type=int, metavar="N", help="of fading in a reading's mean: 1 for one place"
+    )
     own.add_argument("--bandwidth", type=float, metavar="HZ", help="of the sounder, for delays")
+    own.add_argument("--window", choices=("rectangular", "hann"), help="of the sounder (default rectangular)")
+    own.add_argument(
+        "--azimuth", choices=("known", "unknown"), help="whether azimuths count from a known zero"
+    )
+    own.add_argument("--position-std", type=float, metavar="M", help="how far off receivers may have stood")
+    own.add_argument("--length-std", type=float, metavar="M", help="how well an array's mesh knows lengths")
+    own.add_argument("--name", help="by which the report tells the readings (default the file's)")
 
 
-OF_TABLES = ("carrier", "noise_floor_db", "horn_deg", "tx_horn_deg", "bandwidth")
+OF_TABLES = {
+    "frequency": "frequency_hz", "receive_pattern": "receive_pattern", "transmit_pattern": "transmit_pattern",
+    "samples": "samples", "bandwidth": "bandwidth_hz", "window": "window", "position_std": "position_std_m", "name": "name",
+}  # fmt: skip
+OF_ARRAYS = {"frequency": "frequency_hz", "length_std": "length_std_m", "name": "name"}
+TAKEN = {
+    "table": (*OF_TABLES, "noise_floor_db", "azimuth"), "array": tuple(OF_ARRAYS), "spectra": ("train",), "thing": (),
+}  # fmt: skip
+"""Options by the kind of file that they say something of, and what the library calls those that are passed on."""
 
 
-def read_readings(path: Path, args: argparse.Namespace) -> wr.Readings:
-    """A table of received power."""
-    for flag in ("carrier", "noise_floor_db"):
+def read_measured(words: Sequence[str], args: argparse.Namespace, others: bool = False) -> list[Any]:
+    """What files hold: spectra (NetCDF, or NPZ of the arguments of ``from_spectra``), readings (CSV), spectra of arrays
+    (a folder as NeRF2 has it); behind each file its own settings. With ``others`` the names of other files stay."""
+    files: list[tuple[str, list[str]]] = []
+    for word in words:
+        if "=" in word and files and not Path(word).exists():
+            files[-1][1].append(f"--{word}")
+        else:
+            files.append((word, []))
+    parser = Parser(prog=" ".join(sys.argv[1:2]), add_help=False, allow_abbrev=False)
+    add_measured_options(parser)
+    unused = [name for name in vars(parser.parse_args([])) if getattr(args, name) is not None]
+    unused += ["train"] if getattr(args, "train", None) is not None else []
+    kinds = [_kind(existing(path), others) for path, _ in files]
+    unused = [name for name in unused if not any(name in TAKEN[kind] for kind in kinds)]
+    refuse(args, unused, "no file is given that it could be of")
+    own = [parser.parse_args(settings) for _, settings in files]
+    found = []
+    for kind, (path, _), said in zip(kinds, files, own, strict=True):
+        refuse(
+            said, [n for n in vars(said) if n not in TAKEN[kind]], f"{path} is no file that it could be of"
+        )
+        for name, value in vars(said).items():
+            setattr(said, name, getattr(args, name) if value is None else value)
+        said.train, said.seed = getattr(args, "train", None), args.seed
+        found.append(_READ[kind](Path(path), said))
+    return found
+
+
+def _kind(path: Path, others: bool) -> str:
+    if path.suffix.lower() == ".csv":
+        return "table"
+    if path.is_dir() and (path / "tx_pos.csv").exists():
+        return "array"
+    return "thing" if others else "spectra"
+
+
+def _table(path: Path, args: argparse.Namespace) -> wr.Readings:
+    for flag in ("frequency", "noise_floor_db"):
         if getattr(args, flag) is None:
             raise ValueError(f"--{flag.replace('_', '-')}: {path} needs it, it is a table of received power")
-    horns = {
-        name: None if width is None else wr.horn(np.radians(width))
-        for name, width in (("receive_pattern", args.horn_deg), ("transmit_pattern", args.tx_horn_deg))
-    }
     if abs(args.noise_floor_db) > 1000.0:
         raise ValueError(f"--noise-floor-db: got {args.noise_floor_db:g}, expected -1000 to 1000")
-    return wr.Readings.load(
-        path, frequency_hz=args.carrier, floor=10.0 ** (args.noise_floor_db / 10.0), bandwidth_hz=args.bandwidth,
-        name=path.stem, **horns,
-    )  # fmt: skip
+    settings = {"name": path.stem} | _passed_on(args, OF_TABLES)
+    settings |= {name: read_pattern(text) for name, text in settings.items() if name.endswith("pattern")}
+    floor = 10.0 ** (args.noise_floor_db / 10.0)
+    return wr.Readings.load(path, floor=floor, azimuth_known=args.azimuth != "unknown", **settings)
+
+
+def _array(path: Path, args: argparse.Namespace) -> wr.channel.ArraySpectra:
+    if args.frequency is None:
+        raise ValueError(f"--frequency: {path} needs it, it is a folder of an array's spectra")
+    settings = {"name": path.name} | _passed_on(args, OF_ARRAYS)
+    part = "train" if (path / "train_index.txt").exists() else None
+    return wr.channel.ArraySpectra.load(path, part=part, **settings)
+
+
+def _passed_on(args: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:
+    return {name: getattr(args, flag) for flag, name in names.items() if getattr(args, flag) is not None}
+
+
+def _training(path: Path, args: argparse.Namespace) -> wr.SpectrumDataset:
+    """Its training receivers; all where none are said to be for training."""
+    dataset = load_spectra(path)
+    if args.train is not None:
+        return dataset.split(args.train, seed=args.seed)[0]
+    training = dataset.role == "train"
+    return dataset.subset(training) if training.any() else dataset
+
+
+_READ: dict[str, Callable[[Path, argparse.Namespace], Any]] = {
+    "table": _table, "array": _array, "spectra": _training, "thing": lambda path, args: path,
+}  # fmt: skip
+
+
+def load_spectra(path: str | Path) -> wr.SpectrumDataset:
+    """A NetCDF file of spectra, or arrays (.npz) under the names of the arguments of ``SpectrumDataset.from_spectra``."""
+    file = existing(path)
+    if file.suffix.lower() != ".npz":
+        return wr.SpectrumDataset.load(file)
+    with named(file, "expected arrays named as the arguments of SpectrumDataset.from_spectra"):
+        with np.load(file, allow_pickle=False) as arrays:
+            given: dict[str, Any] = {
+                name: array if array.ndim else array.item() for name, array in arrays.items()
+            }
+        return wr.SpectrumDataset.from_spectra(**given)
+
+
+def load_field(path: str | Path, args: argparse.Namespace) -> wr.RadioField:
+    """A field's file, at the carrier that is asked for."""
+    field = wr.RadioField.load(existing(path), device=args.device)
+    if args.frequency is None:
+        return field
+    if field.model != "bistatic":
+        raise ValueError(f"--frequency: {path} is of model {field.model}, which knows its own carrier alone")
+    return field.at_frequency(args.frequency)  # type: ignore[attr-defined, no-any-return]
+
+
+def read_pattern(text: str) -> Any:
+    """The gain of a horn of ``WIDTH`` degrees, or ``WIDTH,LEVEL`` with side lobes in dB; of a file; or of no antenna."""
+    if text == "isotropic":
+        return np.ones(2)
+    try:
+        width, *level = (float(word) for word in text.split(","))
+    except ValueError:
+        return read_rows(existing(text), "gains from 0 to 180 degrees, a number a row", 1)[:, 0]
+    if len(level) > 1:
+        raise ValueError(f"pattern: got {text!r}, expected WIDTH or WIDTH,LEVEL in degrees and dB")
+    return wr.horn(np.radians(width), *level)
 
 
 def read_scale(words: Sequence[str]) -> float | tuple[str, str, float]:
@@ -116,27 +253,43 @@ def refuse(args: argparse.Namespace, flags: Sequence[str], reason: str) -> None:
             raise ValueError(f"--{flag.replace('_', '-')}: got {getattr(args, flag)!r}, but {reason}")
 
 
+def read_rows(path: Path, what: str, columns: int) -> np.ndarray:
+    """Rows of ``columns`` numbers of a CSV or NPY file; a line of names and comments are left out."""
+    with named(path, f"expected {what}"):
+        if path.suffix == ".npy":
+            found = np.load(path, mmap_mode="r", allow_pickle=False)
+        else:
+            lines = [re.split("[#x]", line)[0] for line in path.read_text("utf-8-sig").splitlines()]
+            lines = [line for line in lines if line.strip()]
+            found = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, columns))
+        return check_array(what, found, (None, columns))
+
+
 def read_receivers(values: Sequence[str], name: str = "--receivers") -> np.ndarray:
     """(R, 3) positions in metres from a CSV or NPY file, or from `x,y,z` words."""
+    return _read_places(values, name, "x,y,z", 3)
+
+
+def read_pointings(values: Sequence[str], name: str) -> np.ndarray:
+    """(R, 5): positions as of :func:`read_receivers`, azimuth and elevation [degrees] that a horn is turned to."""
+    return _read_places(values, name, "x,y,z,azimuth,elevation", 5)
+
+
+def _read_places(values: Sequence[str], name: str, columns: str, count: int) -> np.ndarray:
     if len(values) == 1 and "," not in values[0]:
-        path = existing(values[0])
-        with named(path, "expected rows x,y,z in metres"):
-            if path.suffix == ".npy":
-                found = np.load(path, mmap_mode="r", allow_pickle=False)
-            else:
-                lines = [re.split("[#x]", line)[0] for line in path.read_text("utf-8-sig").splitlines()]
-                lines = [line for line in lines if line.strip()]
-                found = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, 3))
-            return check_array("rows x,y,z in metres", found, (None, 3))
+        return read_rows(existing(values[0]), f"rows {columns} in metres and degrees", count)
     try:
-        rows = np.array([word.split(",") for word in values], dtype=np.float64)
+        rows = [[float(number) for number in word.split(",")] for word in values]
     except ValueError as error:
         raise ValueError(
-            f"{name}: got {' '.join(values)!r}, expected numbers x,y,z in metres or one CSV/NPY file"
+            f"{name}: got {' '.join(values)!r}, expected numbers {columns} in metres and degrees, or one CSV/NPY file"
         ) from error
-    if rows.shape[1] != 3:
-        raise ValueError(f"{name}: got {values[0]!r}, expected x,y,z in metres or one CSV/NPY file")
-    return rows
+    wrong = [word for word, row in zip(values, rows, strict=True) if len(row) != count]
+    if wrong:
+        raise ValueError(
+            f"{name}: got {wrong[0]!r}, expected {columns} in metres and degrees, or one CSV/NPY file"
+        )
+    return np.array(rows)
 
 
 def add_mesh_options(parser: argparse.ArgumentParser) -> None:
@@ -180,22 +333,27 @@ def load_scene(path: str | Path, options: argparse.Namespace) -> wr.Scene:
 
 
 def load_geometry(path: str, mesh: str | None, options: argparse.Namespace) -> Any:
-    """A saved reconstruction (folder), splats (PLY, optionally with a mesh), a scene (XML) or a mesh file."""
+    """A saved reconstruction (folder), splats (PLY, optionally with a mesh), a scene (XML) or a mesh file, which is a scene
+    where materials are given."""
     source = existing(path)
+    splats = source.suffix.lower() == ".ply" and "scale_0" in ply_columns(source).get("vertex", ())
+    if options.materials is not None and (source.is_dir() or splats):
+        raise ValueError(f"--materials: {source} names no materials, expected a scene (.xml) or a mesh file")
     if source.is_dir():
         return wr.Reconstruction.load(source)
-    if source.suffix == ".xml":
+    if splats:
+        return wr.Reconstruction.from_files(source, mesh=None if mesh is None else _load_mesh(mesh, options))
+    if mesh is not None:
+        raise ValueError(
+            f"--mesh: {source} has surfaces itself, expected splats (.ply) where --mesh is given"
+        )
+    if source.suffix == ".xml" or options.materials is not None:
         return load_scene(source, options)
     if not is_mesh_file(source):
         raise ValueError(
             f"{source}: expected a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh "
             f"({', '.join(READERS)})"
         )
-    if source.suffix.lower() == ".ply" and "scale_0" in ply_columns(source).get("vertex", ()):
-        own = None if mesh is None else _load_mesh(mesh, options)
-        return wr.Reconstruction.from_files(source, mesh=own)
-    if mesh is not None:
-        raise ValueError(f"--mesh: {source} is a mesh itself, expected splats (.ply) where --mesh is given")
     return _load_mesh(source, options)
 
 

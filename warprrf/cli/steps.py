@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +15,23 @@ import numpy as np
 import warprrf as wr
 from warprrf.checks import check_count
 from warprrf.cli.inputs import (
-    OF_TABLES,
     Add,
+    add_frequency,
+    add_measured_options,
     add_mesh_options,
     add_out,
+    add_pattern,
     add_point,
-    add_readings_options,
     add_scene_options,
     existing,
+    load_field,
     load_geometry,
     load_scene,
+    load_spectra,
+    read_measured,
+    read_pattern,
+    read_pointings,
     read_positions,
-    read_readings,
     read_receivers,
     read_scale,
     refuse,
@@ -119,6 +126,46 @@ def _reconstruct(args: argparse.Namespace, out: Output) -> None:
     out.result(f"{args.out}: {text}; see {report}", files=[args.out, report], **found)
 
 
+def add_sample(add: Add) -> None:
+    """Define `sample`."""
+    sam = add("sample", _sample)
+    sam.add_argument("scene", help="scene file that Sionna RT opens (Mitsuba's XML), or mesh file")
+    add_mesh_options(sam)
+    add_scene_options(sam)
+    add_out(sam, "CSV file of x,y,z rows")
+    sam.add_argument("-n", type=int, default=1, help="how many (default 1)")
+    sam.add_argument(
+        "--height", nargs=2, type=float, default=(0.8, 2.2), metavar=("LOW", "HIGH"), help="metres (0.8 2.2)"
+    )
+    sam.add_argument(
+        "--above-ground", action="store_true", help="heights count from the ground, not from z = 0"
+    )
+    sam.add_argument(
+        "--clearance", type=float, default=0.3, metavar="M", help="to every surface (default 0.3)"
+    )
+
+
+def _sample(args: argparse.Namespace, out: Output) -> None:
+    """Receivers drawn evenly from a scene's air.
+
+    A longer draw starts with a shorter one; --seed gives another.
+
+    examples:
+      warprrf sample data/lobby/scene.xml -o receivers.csv -n 60
+      warprrf sample room.glb -o candidates.csv -n 200 --height 1.5 1.5 --clearance 0.5
+    """
+    places = wr.sample_receivers(
+        load_scene(args.scene, args), args.n, z=args.height, clearance=args.clearance,
+        above_ground=args.above_ground, seed=args.seed, device=args.device,
+    )  # fmt: skip
+    write_text(args.out, f"x,y,z\n{_rows(places)}\n")
+    out.result(f"{args.out}: {len(places)} places", files=[args.out], places=places)
+
+
+def _rows(places: Iterable[np.ndarray]) -> str:
+    return "\n".join(",".join(f"{x:.12g}" for x in place) for place in places)
+
+
 def add_simulate(add: Add) -> None:
     """Define `simulate`."""
     sim = add("simulate", _simulate)
@@ -130,7 +177,7 @@ def add_simulate(add: Add) -> None:
         "--receivers", nargs="+", required=True, help="CSV or NPY file of x,y,z rows, or x,y,z words"
     )
     add_scene_options(sim)
-    sim.add_argument("--frequency", type=float, default=300e9, metavar="HZ", help="carrier (default 300e9)")
+    add_frequency(sim, "carrier (default 300e9)", default=300e9)
     sim.add_argument(
         "--shape", nargs=2, type=int, default=(90, 180), metavar=("H", "W"), help="pixels (90 180)"
     )
@@ -193,10 +240,11 @@ def add_fit(add: Add) -> None:
         "geometry", help="a reconstruction's folder, splats (.ply), a scene (.xml) or a mesh file"
     )
     fit.add_argument(
-        "measurements", nargs="+", help="NetCDF files of spectra, CSV files of received power, of one carrier"
-    )
+        "measurements", nargs="+",
+        help="files of spectra (.nc, or .npz of arrays), tables of received power (.csv), folders of arrays' spectra",
+    )  # fmt: skip
     add_out(fit, "field file (.safetensors)")
-    add_readings_options(fit)
+    add_measured_options(fit)
     fit.add_argument(
         "--model", choices=("bistatic", "rf3dgs+", "rf3dgs"), default="bistatic", help="default bistatic"
     )
@@ -223,6 +271,13 @@ def add_fit(add: Add) -> None:
         action="store_true",
         help="bistatic: scattering that is the same when transmitter and receiver change places",
     )
+    fit.add_argument(
+        "--option",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="any option of the model; see below",
+    )
 
 
 def _fit(args: argparse.Namespace, out: Output) -> None:
@@ -239,20 +294,22 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
       warprrf fit room.glb spectra.nc -o field.safetensors
       warprrf fit scan.stl spectra.nc -o field.safetensors --unit mm --simplify 200000
       warprrf fit splats.ply spectra.nc --mesh mesh.ply -o field.safetensors --model rf3dgs --train 50
-      warprrf fit room.glb horn.csv -o field.safetensors --carrier 300e9 --noise-floor-db -120 --horn-deg 10
+      warprrf fit room.glb horn.csv -o field.safetensors --frequency 300e9 --noise-floor-db -120 --receive-pattern 10
+      warprrf fit room horn.csv receive-pattern=10 power.csv samples=1 -o f.safetensors --frequency 300e9 --noise-floor-db -120
+
+    options of a model, as of RadioField.fit in Python (--option mirror_order=2 --option lobes=[0,12]):
+      bistatic       line_of_sight, diffuse, mirror_order, lobes, reciprocal, mirror_scatter, scatter_mirror, diffuse_order,
+                     indirect, residual, sub_pixels, quick, gain_offset, iterations
+      rf3dgs(+)      transmittance, interaction_point, gain, sh_degree, top_k, line_of_sight, iterations, batch,
+                     train_opacity, checkpoint
     """
     geometry = load_geometry(args.geometry, args.mesh, args)
-    tables = [Path(path).suffix.lower() == ".csv" for path in args.measurements]
-    if not any(tables):
-        refuse(args, OF_TABLES, "no table of received power (CSV) is given")
-    if all(tables):
-        refuse(args, ["train"], "no file of spectra is given")
-    data = [_training_set(path, args) for path in args.measurements]
-    options: dict[str, Any] = {}
+    data = read_measured(args.measurements, args)
+    options: dict[str, Any] = dict(map(_option, args.option))
     if args.relevance is not None:
         options["relevance"] = wr.Relevance.load(existing(args.relevance))
     options |= {name: True for name in ("quick", "reciprocal") if getattr(args, name)}
-    for option in options:
+    for option in {"relevance", "quick", "reciprocal"} & set(options):
         if args.model != "bistatic":
             raise ValueError(f"--{option}: only the bistatic model takes it, got --model {args.model}")
     if args.iterations is not None:
@@ -274,26 +331,26 @@ def _fit(args: argparse.Namespace, out: Output) -> None:
         lines.append(f"gain of {name}: {chain['gain_db']:.2f} +- {chain['std_db']:.2f} dB")
     for name, rows in wrong.items():
         lines.append(f"{name}: left out as wrong, counted from 0: {', '.join(map(str, rows))}")
-    found = {
-        "model": args.model,
-        "receivers": places,
-        "chains": chains,
-        "unexplained": wrong,
-        "noise_db": field.report.get("noise_db"),
-    }
+    told = {name: field.report.get(name) for name in ("noise_db", "azimuth_zero_deg", "position_offset_m")}
+    for name, zero in (told["azimuth_zero_deg"] or {}).items():
+        lines.append(f"{name}: add {zero:.2f} degrees to its azimuths")
+    for name, moved in (told["position_offset_m"] or {}).items():
+        for place, offset in np.round(moved, 4):
+            lines.append(f"{name}: the receiver at {_rows([place])} stood off by {_rows([offset])} m")
+    for name, noise in (told["noise_db"] or {}).items():
+        lines.append(f"{name}: readings are {noise:.2f} dB from the field (standard deviation)")
+    found = {"model": args.model, "receivers": places, "chains": chains, "unexplained": wrong, **told}
     out.result("\n".join(lines), files=[args.out], **found)
 
 
-def _training_set(path: str, args: argparse.Namespace) -> wr.SpectrumDataset | wr.Readings:
-    """The training receivers of a file of spectra, or a table of received power."""
-    file = existing(path)
-    if file.suffix.lower() == ".csv":
-        return read_readings(file, args)
-    dataset = wr.SpectrumDataset.load(file)
-    training = dataset.role == "train"
-    if args.train is not None:
-        return dataset.split(args.train, seed=args.seed)[0]
-    return dataset.subset(training) if training.any() else dataset
+def _option(text: str) -> tuple[str, Any]:
+    """Name and value of an option; a value is JSON, or else text."""
+    name, _, value = text.partition("=")
+    try:
+        found = json.loads(value)
+    except ValueError:
+        found = value
+    return name, tuple(found) if isinstance(found, list) else found
 
 
 def add_suggest(add: Add) -> None:
@@ -306,7 +363,12 @@ def add_suggest(add: Add) -> None:
     sug.add_argument("-n", type=int, default=1, help="how many (default 1)")
     add_out(sug, "CSV file of the places chosen, best first", required=False)
     add_point(sug, "--transmitter", "metres; of geometry")
-    sug.add_argument("--carrier", type=float, metavar="HZ", help="carrier frequency; of geometry")
+    add_frequency(sug, "carrier (a field's own)")
+    add_pattern(
+        sug,
+        "--receive-pattern",
+        "of a horn that candidates x,y,z,azimuth,elevation turn; isotropic: power alone",
+    )
     sug.add_argument("--mesh", help="mesh for line of sight, where SOURCE is splats")
     add_mesh_options(sug)
     add_scene_options(sug)
@@ -319,26 +381,38 @@ def _suggest(args: argparse.Namespace, out: Output) -> None:
     materials; give the transmitter and the carrier then.
 
     examples:
-      warprrf suggest room.glb candidates.csv -n 3 --transmitter 13.6 11.2 2.5 --carrier 300e9
+      warprrf suggest room.glb candidates.csv -n 3 --transmitter 13.6 11.2 2.5 --frequency 300e9
       warprrf suggest field.safetensors candidates.csv -n 3 -o next.csv
+      warprrf suggest field.safetensors 2,3,1.5,-90,0 2,3,1.5,90,0 7,4,1.5,0,0 -n 2 --receive-pattern 10
     """
-    places, source = read_receivers(args.candidates, "candidates"), existing(args.source)
-    if source.suffix == ".safetensors":
-        own = ("transmitter", "carrier", "mesh", "unit", "up", "simplify", "materials")
-        refuse(args, own, f"{source} is a field, which has its own")
-        field = wr.RadioField.load(source, device=args.device)
+    places, source, turned = None, existing(args.source), {}
+    if args.receive_pattern not in (None, "isotropic"):
+        pointings = read_pointings(args.candidates, "candidates")
+        places, arrival = (
+            pointings[:, :3],
+            np.radians(np.column_stack([90.0 - pointings[:, 4], pointings[:, 3]])),
+        )
     else:
-        for flag in ("transmitter", "carrier"):
+        pointings = places = read_receivers(args.candidates, "candidates")
+        arrival = np.full((len(places), 2), 0.5 * np.pi)
+    if args.receive_pattern is not None:
+        turned = {"arrival": arrival, "receive_pattern": read_pattern(args.receive_pattern)}
+    if source.suffix == ".safetensors":
+        own = ("transmitter", "mesh", "unit", "up", "simplify", "materials")
+        refuse(args, own, f"{source} is a field, which has its own")
+        field = load_field(source, args)
+    else:
+        for flag in ("transmitter", "frequency"):
             if getattr(args, flag) is None:
                 raise ValueError(f"--{flag}: {source} needs it, it is no field")
-        nothing = wr.SpectrumDataset.empty(transmitter=args.transmitter, frequency_hz=args.carrier)
+        nothing = wr.SpectrumDataset.empty(transmitter=args.transmitter, frequency_hz=args.frequency)
         field = wr.RadioField.fit(
             load_geometry(args.source, args.mesh, args), nothing, device=args.device, progress=out
         )
-    chosen = places[field.suggest(places, args.n, progress=out)]
-    rows = "\n".join(",".join(f"{x:.12g}" for x in place) for place in chosen)
+    chosen = pointings[field.suggest(places, args.n, **turned, progress=out)]
+    rows = _rows(chosen)
     if args.out:
-        write_text(args.out, f"x,y,z\n{rows}\n")
+        write_text(args.out, f"x,y,z{',azimuth,elevation' * (chosen.shape[1] == 5)}\n{rows}\n")
     out.result(rows, files=[args.out] if args.out else [], places=chosen)
 
 
@@ -370,7 +444,7 @@ def _evaluate(args: argparse.Namespace, out: Output) -> None:
     from warprrf.rf.spectra import lookups, metrics
 
     field = wr.RadioField.load(existing(args.field))
-    dataset = wr.SpectrumDataset.load(existing(args.spectra))
+    dataset = load_spectra(args.spectra)
     if field.fitted_on is None:
         warnings.warn(f"{args.field}: an older file, which does not say what it was fitted on", stacklevel=1)
     there = int(np.count_nonzero(dataset.role == "train"))
@@ -407,7 +481,7 @@ def add_relevance(add: Add) -> None:
     rel.add_argument("--spectra", help="NetCDF file whose transmitter, carrier and receivers are used")
     add_point(rel, "--transmitter", "metres")
     rel.add_argument("--receivers", nargs="+", help="CSV or NPY file of x,y,z rows, or x,y,z words")
-    rel.add_argument("--frequency", type=float, metavar="HZ", help="carrier (a field's own)")
+    add_frequency(rel, "carrier (a field's own)")
     rel.add_argument("--tolerance", type=float, default=0.1, metavar="DB", help="default 0.1")
     rel.add_argument(
         "--most", type=int, default=12, metavar="N", help="receivers used, drawn by --seed (default 12)"
@@ -434,7 +508,7 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     given = {"transmitter": args.transmitter, "frequency_hz": args.frequency}
     receivers = None if args.receivers is None else read_receivers(args.receivers)
     if args.spectra is not None:
-        dataset = wr.SpectrumDataset.load(existing(args.spectra))
+        dataset = load_spectra(args.spectra)
         measured = {"transmitter": dataset.transmitter, "frequency_hz": float(dataset.frequency_hz)}
         given = {name: measured[name] if value is None else value for name, value in given.items()}
         receivers = dataset.receivers if receivers is None else receivers
@@ -445,9 +519,14 @@ def _relevance(args: argparse.Namespace, out: Output) -> None:
     check_count("--most", args.most)
     if len(receivers) > args.most:
         receivers = receivers[np.random.default_rng(args.seed).permutation(len(receivers))[: args.most]]
-    fitted = source.suffix == ".safetensors"
+    if source.suffix == ".safetensors":
+        own = ("mesh", "unit", "up", "simplify", "materials")
+        refuse(args, own, f"{source} is a field, which has its own")
+        geometry = load_field(source, args)
+    else:
+        geometry = load_geometry(args.source, args.mesh, args)
     found = wr.relevance(
-        wr.RadioField.load(source) if fitted else load_geometry(args.source, args.mesh, args),
+        geometry,
         receivers=receivers,
         tolerance_db=args.tolerance,
         progress=out,

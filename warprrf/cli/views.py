@@ -11,7 +11,16 @@ from typing import Any
 import numpy as np
 
 import warprrf as wr
-from warprrf.cli.inputs import Add, add_out, add_point, existing
+from warprrf.cli.inputs import (
+    Add,
+    add_frequency,
+    add_measured_options,
+    add_out,
+    add_point,
+    existing,
+    load_field,
+    read_measured,
+)
 from warprrf.cli.output import Output
 from warprrf.cli.tables import aligned
 from warprrf.device import require
@@ -24,6 +33,19 @@ def add_render(add: Add) -> None:
     ren.add_argument("source", help="Gaussians (.ply) or a radio field (.safetensors)")
     add_out(ren, "picture (.png), or for a spectrum also .npz")
     add_point(ren, "--receiver", "where the spectrum is taken")
+    add_point(ren, "--transmitter", "if another than the fitted one")
+    add_frequency(ren, "another carrier than the field's own")
+    ren.add_argument(
+        "--array",
+        nargs=2,
+        type=int,
+        metavar=("ROWS", "COLS"),
+        help="what a coherent array hears, phases and all",
+    )
+    ren.add_argument(
+        "--facing", nargs=2, type=float, default=(0.0, 90.0), metavar=("AZIMUTH", "ELEVATION"),
+        help="of the array, degrees (0 90: up)",
+    )  # fmt: skip
     add_point(ren, "--position", "where the camera stands")
     add_point(ren, "--look-at", "a point it looks at")
     ren.add_argument(
@@ -38,13 +60,19 @@ def _render(args: argparse.Namespace, out: Output) -> None:
     examples:
       warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.png
       warprrf render field.safetensors --receiver 7 4 1.5 -o spectrum.npz       path_gain, delay_s, aod as arrays
+      warprrf render field.safetensors --receiver 7 4 1.5 -o other.png --transmitter 2 3 3.2 --frequency 140e9
+      warprrf render field.safetensors --receiver 7 4 1.5 -o array.png --array 4 4
       warprrf render room/geometry.ply --position 2 2 1.6 --look-at 8 6 1.2 -o view.png
     """
     source = existing(args.source)
     if source.suffix == ".safetensors":
         if args.receiver is None:
             raise ValueError("--receiver: none given, expected three coordinates in metres for a radio field")
-        spectrum = wr.RadioField.load(source).spectrum(np.array(args.receiver, dtype=np.float64))
+        field, place = load_field(source, args), np.array(args.receiver, dtype=np.float64)
+        if args.array is None:
+            spectrum = field.spectrum(place, args.transmitter)
+        else:
+            spectrum = _array_spectrum(field, place, args)
         _write_spectrum(spectrum, Path(args.out))
         total = 10.0 * np.log10(max(float(np.sum(spectrum.path_gain, dtype=np.float64)), 1e-300))
         text = f"{args.out}: total path gain {total:.2f} dB at {' '.join(f'{x:g}' for x in args.receiver)}"
@@ -63,6 +91,20 @@ def _render(args: argparse.Namespace, out: Output) -> None:
     write_atomically(args.out, lambda path: Image.fromarray(pixels).save(path))
     text = f"{args.out}: {args.size[0]} x {args.size[1]} pixels, {len(gaussians.means)} Gaussians"
     out.result(text, files=[args.out], Gaussians=len(gaussians.means))
+
+
+def _array_spectrum(field: Any, place: np.ndarray, args: argparse.Namespace) -> wr.Spectrum:
+    if field.model != "bistatic":
+        raise ValueError(
+            f"--array: got a field of model {field.model}, which knows no phases; expected bistatic"
+        )
+    from warprrf.rf.spectra.spectrum import pixel_directions
+
+    azimuth, elevation = np.radians(args.facing)
+    rows, columns = args.array
+    array = wr.PlanarArray(rows, columns, orientation=(azimuth, -elevation, 0.0))
+    heard = field.array_spectrum(place, array, pixel_directions(field.shape), args.transmitter)
+    return wr.Spectrum(heard, floor=field.floor, range_db=field.range_db)
 
 
 def _write_spectrum(spectrum: wr.Spectrum, path: Path) -> None:
@@ -104,8 +146,9 @@ def add_view(add: Add) -> None:
     viewer.add_argument(
         "things",
         nargs="+",
-        help="folder of a reconstruction or of `make lobby`, mesh, scene, field or spectra",
+        help="folder of a reconstruction or of `make lobby`, mesh, scene, field, spectra or readings (CSV)",
     )
+    add_measured_options(viewer)
     viewer.add_argument(
         "--port", type=int, default=8080, help="of the page; the next free one if taken (default 8080)"
     )
@@ -123,8 +166,9 @@ def _view(args: argparse.Namespace, out: Output) -> None:
     examples:
       warprrf view runs/lobby data/lobby/spectra.nc      what `make lobby` made, the truth beside it
       warprrf view room.glb field.safetensors
+      warprrf view room.glb field.safetensors horn.csv --frequency 300e9 --noise-floor-db -120 --receive-pattern 10
     """
-    viewer = wr.view(*args.things, host=args.host, port=args.port)
+    viewer = wr.view(*read_measured(args.things, args, others=True), host=args.host, port=args.port)
     out.result(f"{viewer.url}   (Ctrl-C ends it)", url=viewer.url)
     if not args.no_browser:
         webbrowser.open(viewer.url)
@@ -145,6 +189,7 @@ def add_map(add: Add) -> None:
     )
     plan.add_argument("--cell", type=float, default=0.25, metavar="M", help="width of a cell (default 0.25)")
     add_point(plan, "--transmitter", "if another than the fitted one")
+    add_frequency(plan, "another carrier than the field's own")
     plan.add_argument(
         "--bounds", nargs=4, type=float, metavar=("X0", "Y0", "X1", "Y1"), help="part of the plan, metres"
     )
@@ -174,7 +219,7 @@ def _map(args: argparse.Namespace, out: Output) -> None:
     path = Path(args.out)
     if path.suffix not in (".nc", ".png"):
         raise ValueError(f"{path}: expected .nc (NetCDF, a picture beside it) or .png (the picture alone)")
-    field = wr.RadioField.load(existing(args.field), device=args.device)
+    field = load_field(args.field, args)
     found = field.radio_map(
         args.height,
         args.cell,
@@ -205,7 +250,12 @@ def add_twin(add: Add) -> None:
     """Define `twin`."""
     twin = add("twin", _twin)
     twin.add_argument("field", help="field file (.safetensors) of model bistatic")
+    twin.add_argument(
+        "--thickness", nargs="+", default=[], metavar="M",
+        help="thickness of all surfaces, or NAME=M of some [m]; by default that of the scene that the field was fitted on",
+    )  # fmt: skip
     add_out(twin, "folder of the twin: new, empty or an earlier twin's")
+    add_frequency(twin, "another carrier than the field's own")
 
 
 def _twin(args: argparse.Namespace, out: Output) -> None:
@@ -217,15 +267,17 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
 
     examples:
       warprrf twin field.safetensors -o twin
+      warprrf twin field.safetensors -o twin --thickness glass=0.01 walls=0.1
       warprrf simulate twin/scene.xml -o spectra.nc --transmitter 2 3 3.2 --receivers receivers.csv --engine sionna
     """
-    twin = wr.write_twin(wr.RadioField.load(existing(args.field)), args.out)
-    rows = [["surface", "area m2", "permittivity", "S", "lobe", "lobe error dB"]]
+    twin = wr.write_twin(load_field(args.field, args), args.out, thickness_m=_thickness(args.thickness))
+    rows = [["surface", "area m2", "thickness m", "permittivity", "S", "lobe", "lobe error dB"]]
     for group in twin.groups:
         rows.append(
             [
                 group.name,
                 f"{group.area_m2:.1f}",
+                f"{group.thickness_m:.3g}",
                 f"{group.permittivity.real:.3g}",
                 f"{group.scattering:.3f}",
                 f"{group.alpha_r}" if group.alpha_r else "Lambertian",
@@ -243,3 +295,16 @@ def _twin(args: argparse.Namespace, out: Output) -> None:
     out.result(
         "\n".join(lines), files=[args.out], materials=len(twin.groups), **figures, left_out=twin.left_out
     )
+
+
+def _thickness(words: list[str]) -> float | dict[str, float] | None:
+    """``["0.1"]`` as one number, ``["glass=0.01", ...]`` by name; None for no words."""
+    try:
+        if len(words) == 1 and "=" not in words[0]:
+            return float(words[0])
+        named = [word.rpartition("=") for word in words]
+        return {name: float(value) for name, _, value in named} or None
+    except ValueError as error:
+        raise ValueError(
+            f"--thickness: got {' '.join(words)}, expected a number, or NAME=NUMBER of each [m]"
+        ) from error

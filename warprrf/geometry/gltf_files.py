@@ -88,6 +88,7 @@ class _File:
                     f"buffer {k} is not there, or shorter than the {buffer['byteLength']} bytes stated"
                 )
             self.buffers.append(data)
+        self.picture = lru_cache(None)(self._picture)  # materials share them
         self.material = lru_cache(None)(self._material)
         self.parts = lru_cache(None)(self._parts)
 
@@ -173,6 +174,11 @@ class _File:
         self.triangles = _counted(self.triangles, corners, positions)
         return material.name, positions.astype(np.float64), corners, colours
 
+    def _picture(self, source: str | int) -> np.ndarray:
+        """The picture of a URI or a buffer view."""
+        data = self.file(source) if isinstance(source, str) else self.view(source)
+        return read_picture(data, f"texture {source!r:.60}")
+
     def _material(self, index: int) -> _Material:
         material, path = self.row("materials", index), self.folder.path
         factor = np.array(
@@ -186,8 +192,7 @@ class _File:
             webp = texture.get("extensions", {}).get("EXT_texture_webp", {}).get("source")
             image = self.row("images", texture.get("source", webp))
             try:
-                data = self.file(image["uri"]) if "uri" in image else self.view(image.get("bufferView"))
-                picture = read_picture(data, f"texture of material {name or index}")
+                picture = self.picture(image["uri"] if "uri" in image else image.get("bufferView"))
             except FileNotFoundError as error:
                 warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=8)
                 factor = np.full(4, np.nan)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -22,7 +23,15 @@ from scipy.spatial import cKDTree
 
 from warprrf import device as _device
 from warprrf.cache import Cache, cached_property
-from warprrf.checks import LARGEST_M, check_array, check_count, check_number, checked, one_line
+from warprrf.checks import (
+    LARGEST_M,
+    check_array,
+    check_count,
+    check_number,
+    check_similarity,
+    checked,
+    one_line,
+)
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh_files import MeshOptions, load_mesh
 from warprrf.geometry.rays import Hit, RaySearch, check_rows
@@ -32,6 +41,8 @@ ENDPOINT_CLEARANCE = 1e-4
 """Length at both ends of a segment in which :meth:`Mesh.visible` ignores surfaces [m]."""
 
 
+LARGEST_HOLE = 0.4, 1.0
+"""Holes no larger than this share of a surface, and than this [m], leave it an inside: a scan's do, a doorway doesn't."""
 _KEPT = ("vertices", "faces", "face_colours", "face_label", "labels")
 
 
@@ -65,7 +76,7 @@ class Mesh:
 
     Raises:
         TypeError: if the arguments don't read as arrays, or faces are not whole numbers.
-        ValueError: on a wrong shape, no faces, an index out of range, or vertices that are not finite.
+        ValueError: on a wrong shape, no face that has an area, an index out of range, or vertices that are not finite.
     """
 
     def __init__(
@@ -91,6 +102,8 @@ class Mesh:
                 f"faces: got indices from {low} to {high}, expected 0 to {len(self.vertices) - 1} "
                 f"for {len(self.vertices)} vertices"
             )
+        if not np.cross(*np.diff(self.vertices[self.faces], axis=1).swapaxes(0, 1)).any():
+            raise ValueError("faces: got none that has an area, expected at least one")
         self.vertices.setflags(write=False)
         self.faces.setflags(write=False)
         self.face_colours = self._checked_colours(face_colours)
@@ -249,6 +262,53 @@ class Mesh:
         return np.unique(self.first_at_place)
 
     @cached_property
+    def closed_part_of(self) -> np.ndarray:
+        """Which closed part of the surface each face belongs to, -1 for none and for a repeat of a face, shape ``(F,)``.
+
+        A connected part is closed, and so has an inside, if all its edges belong to an even number of faces, or if its
+        holes are small, as a scan's (:data:`LARGEST_HOLE`). A sheet has none, nor has a room with a doorway.
+        """
+        corner = self.welded_faces[self.distinct_faces]
+        flat = (corner == np.roll(corner, 1, axis=1)).any(axis=1)
+        face, corner = self.distinct_faces[~flat], corner[~flat]
+        found, count = np.full(len(self.faces), -1), 0
+        part = components(len(corner), edge_pairs(corner))
+        for own in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
+            share, most = LARGEST_HOLE
+            size = float(np.linalg.norm(np.ptp(self.triangles[face[own]].reshape(-1, 3), axis=0)))
+            if len(own) > 3 and self._largest_hole(corner[own], face[own]) <= min(share * size, most):
+                found[face[own]] = count
+                count += 1
+        return found
+
+    @cached_property
+    def closed_parts(self) -> list[Mesh]:
+        """The parts of :attr:`closed_part_of`, each a mesh of its own."""
+        order = np.argsort(self.closed_part_of, kind="stable")
+        starts = np.searchsorted(self.closed_part_of[order], np.arange(self.closed_part_of.max() + 2))
+        return [Mesh(self.vertices, self.faces[order[a:b]]) for a, b in pairwise(starts)]
+
+    def _largest_hole(self, corner: np.ndarray, face: np.ndarray) -> float:
+        """Diagonal of the box around the largest border of faces with the welded vertices ``corner`` (K, 3) [m]."""
+        edge = np.sort(corner[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        edge, count = np.unique(edge, axis=0, return_counts=True)
+        edge = edge[count % 2 == 1]
+        if len(edge) == 0:
+            return 0.0
+        # Holes that touch in a vertex are two: borders go on where exactly two edges meet.
+        _, index, count = np.unique(edge, return_inverse=True, return_counts=True)
+        order = np.argsort(index.reshape(-1), kind="stable") // 2
+        first = np.cumsum(count)[count == 2] - 2
+        border = components(len(edge), np.column_stack([order[first], order[first + 1]]))
+        place = np.zeros((int(corner.max()) + 1, 3))
+        place[corner.reshape(-1)] = self.vertices[self.faces[face].reshape(-1)]
+        low, high = (np.full((border.max() + 1, 3), sign * np.inf) for sign in (1, -1))
+        for side in edge.T:
+            np.minimum.at(low, border, place[side])
+            np.maximum.at(high, border, place[side])
+        return float(np.linalg.norm(high - low, axis=1).max())
+
+    @cached_property
     def center(self) -> np.ndarray:
         """Middle of the bounds [m], shape ``(3,)``: the origin of the float32 copy that devices hold."""
         return self.bounds.mean(axis=0)
@@ -381,6 +441,16 @@ class Mesh:
             return wp.Bvh(low, high), wp.array(np.ascontiguousarray(corners), dtype=wp.vec3d, device=where)
 
         return self._boxed.get(str(where), build)
+
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Mesh:
+        """The mesh at ``scale rotation x + shift``, with what is known of its faces.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        return Mesh(**self.__getstate__() | {"vertices": scale * self.vertices @ turn.T + moved})
 
     def cross_section(self, height: float) -> np.ndarray:
         """Line segments in which the surface meets the plane z = ``height`` [m]: a floor plan, shape ``(S, 2, 2)`` [m]."""

@@ -9,6 +9,8 @@ import warnings
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -148,6 +150,11 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
     """The materials of an MTL file by name."""
     known: dict[str, _Material] = {}
     name: str | None = None
+
+    @lru_cache(None)  # materials share them
+    def picture(file: Path) -> np.ndarray:
+        return read_picture(file.read_bytes(), f"path: {folder.path}, texture {file}")
+
     for number, words in _statements(folder.find(library).read_bytes().decode("utf-8", "replace")):
         try:
             match words:
@@ -159,10 +166,7 @@ def _read_materials(folder: Folder, library: str) -> dict[str, _Material]:
                     known[name] = (colour, known[name][1])
                 case ["map_Kd", *parts] if name is not None and parts:
                     file = parts[-1] if parts[0].startswith("-") else " ".join(parts)
-                    picture = read_picture(
-                        folder.find(file).read_bytes(), f"path: {folder.path}, texture {file}"
-                    )
-                    known[name] = (known[name][0], picture)
+                    known[name] = (known[name][0], picture(folder.find(file)))
         except FileNotFoundError as error:
             warnings.warn(f"{error}; its colours stay unknown", UserWarning, stacklevel=5)
         except ValueError as error:

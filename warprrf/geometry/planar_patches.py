@@ -9,12 +9,13 @@ surface is not flat at any such error: its facets stay patches of their own. Len
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import cached_property
+from warprrf.checks import check_similarity
 from warprrf.geometry.mesh import Mesh, components, edge_pairs, vectors_across
 
 FLAT_M = 1e-5
@@ -25,6 +26,9 @@ FLAT_RAD = 1.4e-3
 
 BENT_RAD = 0.8
 """Neighbours that are bent this much may still be coplanar: errors of 2 cm bend faces of 10 cm by 0.3."""
+FACETS = 6
+FACET_BEND_RAD = (0.03, 0.62)
+"""Facets of a smooth surface: more than a bay window's, bent by less than an octagon's 45 degrees."""
 MOST_NOISE_M = 0.05
 """Standard deviation of vertices' errors up to which unevenness is taken for a scanner's [m]."""
 
@@ -90,10 +94,40 @@ class PlanarPatches:
         group = np.full(len(planes[1]), -1, np.int32)
         return cls(mesh, label, *planes, area, group, np.arange(len(label)), tolerance_m, two_sided)
 
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> PlanarPatches:
+        """The patches of the mesh at ``scale rotation x + shift``.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        normal = self.normal @ turn.T
+        return replace(
+            self,
+            mesh=self.mesh.transformed(scale=scale, rotation=turn, shift=moved),
+            normal=normal,
+            offset=scale * self.offset + normal @ moved,
+            area=scale**2 * self.area,
+            tolerance_m=scale * self.tolerance_m,
+        )
+
     @property
     def once(self) -> np.ndarray:
         """Faces that repeat no other, shape ``(F,)``, bool."""
         return np.asarray(self.first == np.arange(len(self.first)))
+
+    @cached_property
+    def curved_m2(self) -> float:
+        """Area of the patches that are facets of smooth surfaces, as a round pillar's [m^2]: :data:`FACETS` or more that
+        meet one after the other at angles between :data:`FACET_BEND_RAD`."""
+        own = np.flatnonzero((self.face_patch >= 0) & self.once)
+        pair = self.face_patch[edge_pairs(self.mesh.welded_faces, own)]
+        bend = np.arccos(
+            np.abs((self.normal[pair[:, 0]] * self.normal[pair[:, 1]]).sum(axis=1)).clip(0.0, 1.0)
+        )
+        piece = components(len(self), pair[(bend > FACET_BEND_RAD[0]) & (bend < FACET_BEND_RAD[1])])
+        return float(self.area[np.bincount(piece)[piece] >= FACETS].sum())
 
     @cached_property
     def _faces_and_ends(self) -> tuple[np.ndarray, np.ndarray]:

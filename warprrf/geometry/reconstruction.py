@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
 from warprrf.checks import (
@@ -16,6 +17,7 @@ from warprrf.checks import (
     Expected,
     check_arrays,
     check_number,
+    check_similarity,
     check_type,
     checked,
     index_to,
@@ -28,6 +30,7 @@ from warprrf.geometry.photos.fusion import fuse_gaussians
 from warprrf.geometry.photos.planes import Plane
 from warprrf.geometry.photos.report import write_report
 from warprrf.geometry.photos.sfm import read_colmap
+from warprrf.geometry.photos.sparse import known_similarity
 from warprrf.geometry.photos.undistort import Lens, lenses_in_use
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
 from warprrf.geometry.splats.camera import Camera
@@ -154,6 +157,58 @@ class Reconstruction:
                 "Reconstruction.from_files a mesh=, or colmap= with the camera poses to fuse one from depth maps"
             )
         return self._mesh
+
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Reconstruction:
+        """Everything at ``scale rotation x + shift``: Gaussians, mesh, cameras and patches.
+
+        Args:
+            scale: metres of the new frame for each of this one.
+            rotation: shape ``(3, 3)``; none by default. z must stay up for spectra and radio maps to mean what they say.
+            shift: shape ``(3,)`` [m].
+
+        Raises:
+            ValueError: for a scale that is not positive or a matrix that is no rotation.
+
+        Example:
+            >>> turned = rec.transformed(rotation=[[0, -1, 0], [1, 0, 0], [0, 0, 1]])  # doctest: +SKIP
+        """
+        number, turn, moved = check_similarity(scale, rotation, shift)
+        how: dict[str, Any] = {"scale": number, "rotation": turn, "shift": moved}
+        patches = None if self.patches is None else self.patches.transformed(**how)
+        mesh = None if self._mesh is None else self._mesh.transformed(**how)
+        return Reconstruction(
+            None if self._gaussians is None else self._gaussians.transformed(**how),
+            mesh if patches is None else patches.mesh,
+            {name: camera.transformed(**how) for name, camera in self.cameras.items()},
+            patches=patches, scale_rms_m=number * self.scale_rms_m, metric=self.metric, unposed=self.unposed,
+            held_out=self.held_out, guessed=self.guessed, lenses=self.lenses, causes=self.causes, photos=self.photos,
+        )  # fmt: skip
+
+    def aligned(self, known_positions: Mapping[str, ArrayLike]) -> Reconstruction:
+        """In the frame and the metres of surveyed camera positions, by the similarity that meets them best.
+
+        It brings photos into the frame in which transmitter and receivers were measured: survey three cameras or more
+        with the same instrument. :attr:`scale_rms_m` says how well they are met.
+
+        Args:
+            known_positions: photo name (or its file name, where that is unique) to camera position (3,) [m], three or more
+                that are not on a line.
+
+        Raises:
+            ValueError: for fewer, a name that is no photo, or photos without a pose.
+
+        Example:
+            >>> rec = rec.aligned({"a.jpg": (0, 0, 1.5), "b.jpg": (4, 0, 1.5), "c.jpg": (4, 3, 1.2)})  # doctest: +SKIP
+        """
+        found = known_similarity(self.cameras, self.unposed, known_positions)
+        moved = self.transformed(scale=found.scale, rotation=found.rotation, shift=found.shift)
+        moved.scale_rms_m, moved.metric = found.rms_m, True
+        moved.guessed = tuple(
+            line for line in self.guessed if not line.startswith(("scale:", "up:"))
+        )  # known now
+        return moved
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write everything to ``folder`` (one safetensors file, replaced at once)."""

@@ -1,21 +1,22 @@
 """Where transmitters and receivers may be: in the air of the scene, off its surfaces, and not at each other's place.
 
-Whether a place is inside a solid is asked against a place that is in the air (a transmitter that was measured with,
-say), because a mesh may be a room of closed solids, one hollow shell, a torn scan or open sheets. A place that sees the
-other is in the same air. Else rays in many directions are counted: of a closed mesh they give the winding number. Of an
-open one a place is taken for solid only if nearly all rays from it cross one surface more or fewer than those from the
-air, and most of them meet a surface from behind where those from the air meet one from the front (or the other way
-round): places behind a partition or under a table top do not, nor do those in rooms whose mesh has holes.
+Only a closed surface has an inside (:attr:`warprrf.Mesh.closed_parts`: a scan's with small holes too); a sheet, or walls
+with an open side or a doorway, have none, however they are wound. A place is in the same air as another that sees it, or
+that the same closed surfaces hold. Else what is entered on the way from one to the other parts them, unless as many
+are left (another room), or only walls with two surfaces are left (the open air); a solid's hollow, wound the other way,
+is air. Where no place is known to be in the air, a closed surface that holds most of the rest is a room's, and so is one
+that is all there is.
 
-A city's mesh is no closed room: rays leave it, buildings often have no floors, and the ground is one sheet. So under the
-sky places are judged by rays upward besides. In a building low, slanting and steep ones all cross an odd number of
-surfaces, or out of the same number of solids; in a court, under a bridge or below a canopy some of them do not.
+A city's mesh is no closed room: buildings often have no floors, and the ground is one sheet. So under the sky places are
+judged by rays upward besides. In a building low, slanting, steep and vertical ones all cross an odd number of surfaces, or out of
+the same number of solids; in a court, under a bridge or below a canopy some of them do not.
 """
 
 from __future__ import annotations
 
 import warnings
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,11 +44,17 @@ LEAST_HZ = 100e9
 """Below it walls let much through, and waves bend round edges, indoors too."""
 
 _DIRECTIONS = 24
-_AGREED = 0.75  # share of rays that must say the same
-_BANDS = 3  # of rays upward: low, slanting, steep
+_AGREED = 0.75  # share of the rays of a band that must say the same
+_BANDS = 3  # of rays upward: low, slanting, steep; a fourth of as many is overhead
+_OVERHEAD = 0.98  # least sine of the elevation there
 _SKY = 1.0 / 3.0  # share of rays upward that meet nothing where there is sky
 _PLACES = 5  # along each side of a scene, at which the sky is looked for
-_BEHIND = -0.3  # mean of the sides (1 front, -1 back) from which rays meet surfaces: 65 % from behind
+_ROOM = 0.1  # least share of the box around a scene that its room takes
+_WALL = 0.5  # least share of what a room's walls hold that their inner surface does
+_CRUMBS = 0.1  # of a surface's area: what is left beside it is nothing to speak of
+_SAMPLES = 1000  # faces whose places tell what a surface holds
+_LEAK = 0.02  # share of rays that may leave a closed room: its walls need not meet exactly
+_FLOOR = 0.1  # least share of a plan with something below, for a scene with a floor
 _AT_ONCE = 20_000  # places whose rays are cast in one launch
 
 
@@ -61,6 +68,43 @@ def check_receivers(name: str, value: ArrayLike) -> np.ndarray:
     if array.ndim not in (1, 2) or array.shape[-1] != 3 or array.size == 0:
         raise ValueError(f"{name}: got shape {array.shape}, expected (3,) or (R, 3) with R at least 1")
     return array
+
+
+class Ends(NamedTuple):
+    """Both ends of links, row by row.
+
+    Attributes:
+        receivers, transmitters: positions [m], shape ``(R, 3)`` each.
+        single: whether one link was asked for: then results have no receiver axis.
+    """
+
+    receivers: np.ndarray
+    transmitters: np.ndarray
+    single: bool
+
+    @classmethod
+    def of(cls, receivers: ArrayLike, transmitter: ArrayLike, name: str = "receivers") -> Ends:
+        """``receivers`` and ``transmitter`` [m], each ``(3,)`` or ``(R, 3)``: one of either goes with all of the other.
+
+        Raises:
+            ValueError: naming the argument, on other shapes, numbers of rows that differ, or numbers not finite.
+        """
+        to, source = check_receivers(name, receivers), check_receivers("transmitter", transmitter)
+        if to.ndim == source.ndim == 2 and len(to) != len(source):
+            raise ValueError(
+                f"transmitter: got shape {source.shape}, expected (3,) or one for each receiver, {to.shape}"
+            )
+        rows = np.atleast_2d(*map(np.ascontiguousarray, np.broadcast_arrays(to, source)))
+        return cls(rows[0], rows[1], to.ndim == source.ndim == 1)
+
+    def groups(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Each transmitter (3,) and the rows under it."""
+        sources, under = np.unique(self.transmitters, axis=0, return_inverse=True)
+        return [(source, np.flatnonzero(under.ravel() == k)) for k, source in enumerate(sources)]
+
+    def shaped(self, results: Any) -> Any:
+        """``results`` of all rows as they are handed out: a single one by itself."""
+        return results[0] if self.single else results
 
 
 def check_positions(
@@ -100,20 +144,22 @@ def check_positions(
     if mesh is None:
         return
     reference = transmitter if known is None else known
-    low, high = mesh.bounds
-    outside = ((points < low) | (points > high)).any(axis=1)
+    apart = parted(mesh, points, reference, device=device)
+    if (
+        known is None
+        and (len(points) == 1 or apart[1:].mean() > 0.5)
+        and parted(mesh, transmitter[None], None, device=device)[0]
+    ):
+        apart = np.arange(len(points)) == 0
+    outside = ((points < mesh.bounds[0]) | (points > mesh.bounds[1])).any(axis=1)
     if outside.any():
-        within = np.concatenate([reference[None], points])
-        within = within[((within >= low) & (within <= high)).all(axis=1)]
-        outside &= _is_room(mesh, within[:_DIRECTIONS], device)
-    _refuse(outside, "outside the scene", points, labels, mesh)
+        air = points[~outside & ~apart]
+        sealed = _is_sealed(mesh, air[0], device) if len(air) else apart[0]
+        _refuse(outside & sealed, "outside the scene", points, labels, mesh)
     if not on_surfaces:
         near = mesh.distance(points, device=device) < WALL_CLEARANCE_M
         _refuse(near, "on a surface", points, labels, mesh)
-    inside = in_another_solid(mesh, points, reference, device=device)
-    if known is None and inside[1:].sum() > 0.5 * (len(points) - 1) and _is_within(mesh, transmitter, device):
-        inside = np.arange(len(points)) == 0
-    _refuse(inside, "inside a solid", points, labels, mesh)
+    _refuse(apart, "inside a solid", points, labels, mesh)
 
 
 def check_dataset(
@@ -139,36 +185,74 @@ def check_dataset(
     return receivers, transmitter
 
 
-def in_another_solid(
-    mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: DeviceLike = None
+def parted(
+    mesh: Mesh, points: np.ndarray, known: np.ndarray | None, *, device: DeviceLike = None
 ) -> np.ndarray:
-    """Whether surfaces part each of ``points`` (N, 3) [m] from the air around ``known`` (3,), shape ``(N,)``, bool.
+    """Whether closed surfaces part each of ``points`` (N, 3) [m] from the air around ``known`` (3,), or from the scene's
+    air if that is None, shape ``(N,)``, bool.
 
     In doubt they don't: see the module's text for what counts.
     """
     found = np.zeros(len(points), dtype=bool)
-    blocked = np.flatnonzero(~mesh.visible(points, known, device=device))
-    if len(blocked) == 0:
+    asked = np.arange(len(points))
+    if known is not None:
+        asked = np.flatnonzero(~mesh.visible(points, known, device=device))
+    if len(asked) == 0:
         return found
-    of_known, side_of_known = mesh.look_around(known[None], lattice(_DIRECTIONS), device=device)
-    front_of_known = _mean_side(side_of_known)[0]
-    for first in range(0, len(blocked), _AT_ONCE):
-        some = blocked[first : first + _AT_ONCE]
-        winding, side = mesh.look_around(points[some], lattice(_DIRECTIONS), device=device)
-        differs = winding - of_known
-        parted = (differs % 2).mean(axis=1) >= _AGREED
-        if mesh.is_closed:  # solids may overlap: their winding numbers add up
-            middle = np.median(differs, axis=1, keepdims=True)
-            parted |= (middle[:, 0] != 0) & ((differs == middle).mean(axis=1) >= _AGREED)
-        else:
-            parted &= (np.sign(front_of_known) * _mean_side(side) < _BEHIND) & (
-                abs(front_of_known) > -_BEHIND
-            )
-        found[some] = parted
-    if not mesh.is_closed and sees_sky(mesh, known, points, device=device):
-        own = np.concatenate([known[None], points[blocked]])
-        indoors = under_a_roof(mesh, own, device=device)
-        found[blocked] |= indoors[1:] != indoors[0]
+    own, rooms = points[asked], _rooms(mesh) if known is None else ()
+    entered, left = np.zeros(len(own), int), np.zeros(len(own), int)
+    solids: list[Mesh] = []
+    for k, part in sorted(
+        enumerate(mesh.closed_parts), key=lambda item: -np.ptp(item[1].bounds, axis=0).prod()
+    ):
+        inside = holds(part, own, device=device)
+        if k in rooms or (known is not None and holds(part, known[None], device=device)[0]):
+            left += ~inside
+        elif inside.any():
+            entered += np.where(_is_cavity(part, solids), -1, 1) * inside
+            solids.append(part)
+    found[asked] = (entered != left) & ((entered > 0) | (left % 2 == 1))
+    if is_open_air(mesh, device=device):
+        roofed = under_a_roof(mesh, own, device=device)
+        found[asked] |= roofed != (known is not None and under_a_roof(mesh, known[None], device=device)[0])
+    return found
+
+
+def in_the_air(
+    mesh: Mesh,
+    points: np.ndarray,
+    known: np.ndarray | None = None,
+    *,
+    clearance_m: float = WALL_CLEARANCE_M,
+    device: DeviceLike = None,
+) -> np.ndarray:
+    """Whether ``points`` (N, 3) [m] lie within the scene, in its air (that of ``known`` (3,) if given), and over its
+    floor or ground, where it has one, and ``clearance_m`` [m] off its surfaces, shape ``(N,)``, bool.
+
+    This is the mesh's word: a solid whose back no photo shows is air to it.
+    """
+    free = ((points >= mesh.bounds[0]) & (points <= mesh.bounds[1])).all(axis=1)
+    if clearance_m > 0:
+        free[free] = mesh.distance(points[free], device=device) >= clearance_m
+    free[free] = ~parted(mesh, points[free], known, device=device)
+    if known is not None:
+        floor = bool(_is_over(mesh, known[None], device)[0])
+    else:
+        floor = bool(_is_over(mesh, _spread(mesh), device).mean() > _FLOOR)
+    if floor:
+        free[free] = _is_over(mesh, points[free], device)
+    return free
+
+
+def holds(part: Mesh, points: np.ndarray, *, device: DeviceLike = None) -> np.ndarray:
+    """Whether each of ``points`` (N, 3) [m] is inside a closed surface, shape ``(N,)``, bool: most rays from it cross the
+    surface an odd number of times."""
+    found = ((points > part.bounds[0]) & (points < part.bounds[1])).all(axis=1)
+    within = np.flatnonzero(found)
+    for first in range(0, len(within), _AT_ONCE):
+        some = within[first : first + _AT_ONCE]
+        winding, _ = part.look_around(points[some], lattice(_DIRECTIONS), device=device)
+        found[some] = (winding % 2).mean(axis=1) > 0.5
     return found
 
 
@@ -200,19 +284,12 @@ def under_a_roof(mesh: Mesh, points: np.ndarray, *, device: DeviceLike = None) -
     found = np.zeros(len(points), dtype=bool)
     for first in range(0, len(points), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        winding, _ = mesh.look_around(points[some], _upward(), device=device)
+        winding, _ = mesh.look_around(points[some], np.concatenate([_upward(), _overhead()]), device=device)
         middle = np.median(winding, axis=1, keepdims=True)
         for votes in (winding % 2 == 1, (winding == middle) & (middle != 0)):
-            share = votes.reshape(len(votes), _BANDS, -1).mean(axis=2)
+            share = votes.reshape(len(votes), _BANDS + 1, -1).mean(axis=2)
             found[some] |= (share >= _AGREED).all(axis=1)
     return found
-
-
-def over_ground(mesh: Mesh, points: np.ndarray, *, device: DeviceLike = None) -> np.ndarray:
-    """Whether each of ``points`` (N, 3) [m] of a scene under the sky is in its air: over something, and neither in a
-    building nor in the ground, shape ``(N,)``, bool."""
-    below = mesh.cast(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), device=device)
-    return (below.face >= 0) & ~under_a_roof(mesh, points, device=device)
 
 
 def ground_height(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, device: DeviceLike = None) -> np.ndarray:
@@ -234,11 +311,9 @@ def is_open_air(mesh: Mesh, *, device: DeviceLike = None) -> bool:
     may be."""
     if mesh.is_closed:
         return False
-    low, high = mesh.bounds
-    share = (np.arange(_PLACES) + 0.5) / _PLACES
-    x, y = (a.ravel() for a in np.meshgrid(*(low[:2, None] + share * (high - low)[:2, None])))
-    places = np.column_stack([x, y, np.full(len(x), 0.5 * (low[2] + high[2]))])
-    ground = np.isfinite(ground_height(mesh, x, y, device=device))
+    places = _spread(mesh)
+    places = places[np.abs(places[:, 2] - mesh.center[2]) < 0.1 * np.ptp(mesh.bounds[:, 2])]  # halfway up
+    ground = np.isfinite(ground_height(mesh, *places[:, :2].T, device=device))
     return bool((ground & _sky_over(mesh, places, device)).mean() > 0.5)
 
 
@@ -307,37 +382,72 @@ def _refuse(bad: np.ndarray, what: str, points: np.ndarray, labels: list[str], m
         )
 
 
-def _is_room(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> bool:
-    """Whether nearly all ways from each of ``points`` (N, 3) within its bounds end on a surface: no sky, no open side."""
-    if len(points) == 0:
-        return mesh.is_closed
-    if sees_sky(mesh, points, device=device) or is_open_air(mesh, device=device):
-        return False
-    if mesh.is_closed:
+def _rooms(mesh: Mesh) -> list[int]:
+    """Which closed parts of a scene have its air inside: those that hold most of what is left, from the outermost inward,
+    or are all that is left: the scene's only surface, or the inner one of its walls."""
+    rooms = list[int]()
+    volume = [abs(_volume(part)) for part in mesh.closed_parts]
+    least = _ROOM * float(np.ptp(mesh.bounds, axis=0).prod())
+    for k in sorted(range(len(volume)), key=lambda k: -volume[k]):
+        if volume[k] < least:
+            break
+        rest = np.flatnonzero(~np.isin(mesh.closed_part_of[mesh.distinct_faces], [*rooms, k]))
+        rest = mesh.distinct_faces[
+            rest[np.argsort(-mesh.areas[mesh.distinct_faces[rest]], kind="stable")][:_SAMPLES]
+        ]
+        held = holds(mesh.closed_parts[k], mesh.triangles[rest].mean(axis=1))
+        left = mesh.areas[rest].sum()
+        if mesh.areas[rest[held]].sum() > 0.5 * left or left <= _CRUMBS * mesh.closed_parts[k].areas.sum():
+            rooms.append(k)
+            least = _WALL * volume[k]
+    return rooms
+
+
+def _is_cavity(part: Mesh, solids: list[Mesh]) -> bool:
+    """Whether a closed surface bounds a hollow in one of ``solids``: it lies within that, and is wound the other way."""
+    for solid in solids:
+        if (part.bounds[0] >= solid.bounds[0]).all() and (part.bounds[1] <= solid.bounds[1]).all():
+            if (
+                _volume(part) * _volume(solid) < 0
+                and holds(solid, part.triangles.mean(axis=1)[:_DIRECTIONS]).mean() > 0.5
+            ):
+                return True
+    return False
+
+
+def _volume(part: Mesh) -> float:
+    """What a closed surface encloses [m^3], negative where it is wound inward."""
+    a, b, c = np.moveaxis(part.triangles - part.center, 1, 0)
+    return float(np.einsum("fi,fi->", a, np.cross(b, c))) / 6.0
+
+
+def _is_sealed(mesh: Mesh, known: np.ndarray, device: DeviceLike) -> bool:
+    """Whether a closed surface holds ``known`` (3,), or ways end on surfaces from there and from all places within the
+    bounds that it sees: no sky, no open side."""
+    if any(holds(part, known[None], device=device)[0] for part in mesh.closed_parts):
         return True
-    side = mesh.look_around(points, lattice(_DIRECTIONS), device=device)[1]
-    return bool(((side != 0).mean(axis=1) >= 0.95).all())
+    places = _spread(mesh)
+    places = np.concatenate([known[None], places[mesh.visible(places, known, device=device)]])
+    side = mesh.look_around(places, lattice(4 * _DIRECTIONS), device=device)[1]
+    return bool(((side == 0).mean(axis=1) < _LEAK).all())
 
 
-def _is_within(mesh: Mesh, point: np.ndarray, device: DeviceLike) -> bool:
-    """Whether it looks as if a place (3,) were in a solid, itself: in a building, or amid surfaces seen from behind."""
-    if sees_sky(mesh, point, device=device):
-        return False
-    if is_open_air(mesh, device=device):
-        return bool(under_a_roof(mesh, point[None], device=device)[0])
-    return bool(_mean_side(mesh.look_around(point[None], lattice(_DIRECTIONS), device=device)[1])[0] < 0)
+def _is_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
+    """Whether there is something below each of ``points`` (N, 3) [m], shape ``(N,)``, bool."""
+    return mesh.cast(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), device=device).face >= 0
+
+
+def _spread(mesh: Mesh) -> np.ndarray:
+    """Places spread over the box around a scene, shape ``(N, 3)`` [m]."""
+    share = (np.arange(_PLACES) + 0.5) / _PLACES
+    grid = np.stack(np.meshgrid(share, share, share, indexing="ij"), axis=-1).reshape(-1, 3)
+    return mesh.bounds[0] + grid * np.ptp(mesh.bounds, axis=0)
 
 
 def _sky_over(mesh: Mesh, points: np.ndarray, device: DeviceLike) -> np.ndarray:
     """Whether a third of the rays upward from ``points`` (N, 3) meets nothing, shape ``(N,)``, bool."""
     side = mesh.look_around(points, _upward(), device=device)[1]
     return np.asarray((side == 0).mean(axis=1) >= _SKY)
-
-
-def _mean_side(side: np.ndarray) -> np.ndarray:
-    """Mean of the sides of those rays that meet something, shape ``(N,)``."""
-    mean: np.ndarray = side.sum(axis=1) / np.maximum((side != 0).sum(axis=1), 1)
-    return mean
 
 
 @lru_cache(maxsize=4)
@@ -352,6 +462,13 @@ def _upward() -> np.ndarray:
     """Directions likewise spread over the upper half of the sphere, from low to steep."""
     k = np.arange(_DIRECTIONS) + 0.5
     return _turned(k / _DIRECTIONS, k)
+
+
+@lru_cache(maxsize=1)
+def _overhead() -> np.ndarray:
+    """As many directions straight up, nearly, as a band of those has."""
+    k = np.arange(_DIRECTIONS // _BANDS) + 0.5
+    return _turned(_OVERHEAD + (1.0 - _OVERHEAD) * k / len(k), k)
 
 
 def _turned(height: np.ndarray, k: np.ndarray) -> np.ndarray:

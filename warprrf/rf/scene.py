@@ -18,8 +18,8 @@ from warprrf.checks import check_array, check_number, check_type, checked
 from warprrf.device import DeviceLike
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.mesh_files import MeshOptions, is_mesh_file
-from warprrf.rf.em.materials import Material, load_materials
-from warprrf.rf.positions import is_open_air, over_ground
+from warprrf.rf.em.materials import Material
+from warprrf.rf.positions import in_the_air
 from warprrf.rf.scene_parts import MaterialChoice, Materials, ScenePart, read_mesh_scene
 from warprrf.rf.scene_sionna import SIONNA_FREQUENCY_HZ, parts_of, to_sionna_scene
 from warprrf.rf.scene_xml import read_scene_xml
@@ -100,9 +100,9 @@ class Scene:
         (``concrete``, ``itu_glass``, ``Wood_01``); the others are names alone until ``materials`` says more: they tell a
         radio field which surfaces are alike, but nothing can be simulated with them.
 
-        Materials named after those of ITU-R P.2040 are known; a table ``materials.json`` beside the file goes before
-        what the file says, and ``materials`` goes before both. What scatters nothing in the file has a scattering
-        coefficient of 0, as in Sionna.
+        Materials named after those of ITU-R P.2040 are known. ``materials`` goes first, then a table ``materials.json`` beside
+        the file, which is read where ``materials`` has not every name, then what the file says. What scatters nothing in
+        the file has a scattering coefficient of 0, as in Sionna.
 
         Args:
             path: the scene file (Mitsuba's XML), or a mesh file.
@@ -126,9 +126,7 @@ class Scene:
         path = Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"path: there is no scene file {path}")
-        beside = path.parent / "materials.json"
-        table = load_materials(beside) if beside.is_file() else None
-        choice = MaterialChoice(materials, table, extrapolate)
+        choice = MaterialChoice(materials, path.parent / "materials.json", extrapolate)
         if is_mesh_file(path):
             found = read_mesh_scene(path, choice, MeshOptions(unit, up, simplify, allow_outside))
             choice.check_used()
@@ -247,29 +245,14 @@ class Scene:
     def is_free(
         self, points: ArrayLike, *, clearance_m: float = 0.0, device: DeviceLike = None
     ) -> np.ndarray:
-        """Whether points lie in the air of a room of closed solids or of a city, shape ``(N,)``, bool.
+        """Whether points lie in the air of a room or a city, shape ``(N,)``, bool.
 
-        A point is in the air if rays from it in three directions all first meet a surface from its outer side, and no
-        solid of a closed mesh holds it (one solid may end within another). In a scene under the sky it is if there is
-        ground below it and it is not in a building, with floor or without. ``clearance_m`` asks for that distance [m]
-        from every surface besides.
+        See :mod:`warprrf.rf.positions` for what counts. ``clearance_m`` asks for that distance [m] from every surface
+        besides.
         """
         points = check_array("points", points, (None, 3))
         check_number("clearance_m", clearance_m, 0.0)
-        free = np.ones(len(points), dtype=bool)
-        if clearance_m > 0:
-            free = self.mesh.distance(points, device=device) >= clearance_m
-        if is_open_air(self.mesh, device=device):
-            free[free] = over_ground(self.mesh, points[free], device=device)
-            return free
-        directions = np.array([(0.021, 0.013, 1.0), (0.017, -0.011, -1.0), (1.0, 0.37, 0.113)])
-        for unit in directions / np.linalg.norm(directions, axis=1, keepdims=True):
-            hit = self.mesh.cast(points[free], np.tile(unit, (int(free.sum()), 1)), device=device)
-            free[free] = np.where(hit.face >= 0, self.mesh.face_normals[hit.face] @ unit < 0, False)
-        if self.mesh.is_closed and free.any():
-            winding, _ = self.mesh.look_around(points[free], directions, device=device)
-            free[free] = np.median(winding, axis=1) < 1
-        return free
+        return in_the_air(self.mesh, points, clearance_m=clearance_m, device=device)
 
 
 def _positions(name: str, values: Mapping[str, ArrayLike] | None) -> dict[str, np.ndarray]:

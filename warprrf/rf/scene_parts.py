@@ -10,7 +10,8 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from pathlib import Path
 
 import numpy as np
 
@@ -45,7 +46,7 @@ class MaterialChoice:
 
     Args:
         given: a mapping, every name of which must be asked for, or a table's file, which may hold more.
-        table: the scene's own table.
+        beside: the file of the scene's own table, which may be missing; read when a name is not among ``given``.
         extrapolate: see :meth:`Material.extrapolated`.
 
     Raises:
@@ -53,33 +54,39 @@ class MaterialChoice:
     """
 
     def __init__(
-        self, given: Materials | None, table: Mapping[str, Material] | None = None, extrapolate: bool = False
+        self, given: Materials | None, beside: Path | None = None, extrapolate: bool = False
     ) -> None:
-        self._table = dict(table or {})
+        self._beside = beside
+        self._given: dict[str, Material] = {}
         self._wanted: set[str] = set()
         if isinstance(given, Mapping):
             for name, material in given.items():
                 check_type(f"materials[{name!r}]", material, Material)
             self._wanted = set(given)
-            self._table |= given
+            self._given = dict(given)
         elif given is not None:
             if not isinstance(given, str | os.PathLike):
                 raise TypeError(
                     f"materials: got {type(given).__name__}, expected a mapping of names to materials, or a table's file"
                 )
-            self._table |= load_materials(given)
+            self._given = load_materials(given)
         self._extrapolate = extrapolate
         self._chosen: dict[str, Material] = {}
+
+    @cached_property
+    def _table(self) -> dict[str, Material]:
+        return {} if self._beside is None or not self._beside.is_file() else load_materials(self._beside)
 
     @property
     def names(self) -> list[str]:
         """Names that are known whatever the scene says."""
-        return sorted(self._table)
+        return sorted(self._table | self._given)
 
     def choose(self, name: str, declared: Callable[[], Material]) -> Material:
         """The material of ``name``; ``declared`` is asked where neither the caller nor a table has it."""
         if name not in self._chosen:
-            material = self._table[name] if name in self._table else declared()
+            known = self._given if name in self._given else self._table
+            material = known[name] if name in known else declared()
             self._chosen[name] = material.extrapolated() if self._extrapolate else material
         return self._chosen[name]
 

@@ -31,7 +31,7 @@ from warprrf.rf.positions import (
 )
 from warprrf.rf.scene import Scene
 from warprrf.rf.spectra.dataset import SpectrumDataset
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_shape
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, DEFAULT_SHAPE, check_beam, check_shape
 from warprrf.steps import Steps, digest
 
 ENGINES = ("exact", "sionna")
@@ -67,8 +67,8 @@ def simulate(
 
     Args:
         scene: The :class:`Scene`.
-        transmitter: Position [m], shape ``(3,)``.
-        receivers: Positions [m], shape ``(R, 3)``.
+        transmitter: Position [m], shape ``(3,)``: a data set is of one; fits take a list of data sets.
+        receivers: Positions [m], shape ``(R, 3)``, or ``(3,)`` for a set of one.
         frequency_hz: Carrier frequency [Hz].
         shape: Rows and columns of a spectrum.
         engine: "exact": line of sight, one mirror reflection and single-bounce scattering, without noise; ``depth``,
@@ -102,7 +102,7 @@ def simulate(
     if engine not in ENGINES:
         raise ValueError(f"engine: got {engine!r}, expected one of {', '.join(ENGINES)}")
     sampling = Sampling(depth=depth, samples=samples, refraction=refraction, seed=seed)
-    points = check_receivers("receivers", check_array("receivers", receivers, (None, 3)))
+    points = np.atleast_2d(check_receivers("receivers", receivers))
     source = check_array("transmitter", transmitter, (3,))
     frequency = check_frequency(frequency_hz)
     table = surface_table(scene.materials, frequency)
@@ -114,7 +114,7 @@ def simulate(
     warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, transmission=through, device=device)
 
     common: dict[str, Any] = {"transmitter": source, "frequency_hz": frequency}
-    common |= {"shape": check_shape(shape), "beam_sigma_rad": beam_sigma_rad}
+    common |= {"shape": check_shape(shape), "beam_sigma_rad": check_beam(beam_sigma_rad)}
     versions = _versions(engine)
     surfaces = (scene.mesh.vertices, scene.mesh.faces, scene.face_material, *vars(table).values())
     solver = (sampling, _versions(engine, solver_only=True)) if engine == "sionna" else None

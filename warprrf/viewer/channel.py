@@ -10,7 +10,7 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.viewer import answers, pictures
 from warprrf.viewer.answers import Answer, Asked
-from warprrf.viewer.page import Page
+from warprrf.viewer.page import Page, Setting
 from warprrf.viewer.subject import Subject
 
 CARRIERS_GHZ = (100.0, 1000.0)
@@ -47,18 +47,17 @@ class Channel:
         carrier, step = subject.carrier_hz / 1e9, answers.CARRIER_STEP_HZ / 1e9
         low, high = min(carrier, 1.0 if field is None else CARRIERS_GHZ[0]), max(carrier, CARRIERS_GHZ[1])
         with gui.add_folder("What is asked", expand_by_default=False):
-            self.range_db = gui.add_slider("dynamic range [dB]", min=10, max=100, step=1, initial_value=60)
-            self._mirrors = gui.add_slider(
+            range_db = gui.add_slider("dynamic range [dB]", min=10, max=100, step=1, initial_value=60)
+            mirrors = gui.add_slider(
                 "mirrors on a path", min=0, max=max(most, 1), step=1, initial_value=most if field else MIRRORS
             )
-            self.carrier = gui.add_slider(
-                "carrier [GHz]", min=low, max=high, step=step, initial_value=carrier
-            )
-            self.carrier.disabled = isinstance(field, RadioField) and not isinstance(field, BistaticField)
-            self._told = gui.add_checkbox("expected error", False, visible=hasattr(field, "gain_std_db"))
-            self._told.disabled = getattr(field, "errors", None) is None
-        for handle in (self.range_db, self._mirrors, self.carrier, self._told):
-            handle.on_update(lambda _: changed())
+            slid = gui.add_slider("carrier [GHz]", min=low, max=high, step=step, initial_value=carrier)
+            slid.disabled = isinstance(field, RadioField) and not isinstance(field, BistaticField)
+            told = gui.add_checkbox("expected error", False, visible=hasattr(field, "gain_std_db"))
+            told.disabled = getattr(field, "errors", None) is None
+        self.range_db, self._mirrors, self.carrier, self._told = (
+            Setting(handle, changed) for handle in (range_db, mirrors, slid, told)
+        )
 
     @property
     def asked(self) -> Asked:

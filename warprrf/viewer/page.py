@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import socket
+import sys
 import threading
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +19,29 @@ from warprrf.device import Progress, TimeLeft
 
 class _GivenUp(Exception):  # noqa: N818
     """Raised in background work that nobody waits for any more."""
+
+
+class Setting:
+    """An input of the page: its value is one that it offers, whatever a message says. ``changed`` is called with each."""
+
+    def __init__(self, handle: Any, changed: Callable[[], None] = lambda: None) -> None:
+        self._handle = handle
+        handle.on_update(lambda _: changed())
+
+    @property
+    def value(self) -> Any:
+        """The number within its bounds, or the option; may be set."""
+        said, options = self._handle.value, getattr(self._handle, "options", None)
+        if options is not None:
+            return said if said in options else options[0]
+        if isinstance(said, bool | str):
+            return said
+        low, high = (getattr(self._handle, end, None) for end in ("min", "max"))
+        return min(max(said, said if low is None else low), said if high is None else high)
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        self._handle.value = value
 
 
 class Page:
@@ -43,11 +68,11 @@ class Page:
                 pass
         except OSError as error:
             raise ValueError(f"host: got {host!r}, expected an address of this machine ({error})") from error
-        viser = _device.require("viser", extra="view")
-        with redirect_stdout(io.StringIO()):  # viser prints where it is
-            self.server = viser.ViserServer(host=host, port=port, verbose=False)
+        _device.require("viser", extra="view")
+        from warprrf.viewer.connections import open_server
+
+        self.server, self.url = open_server(host, port, self._refused)
         self.gui, self.scene = self.server.gui, self.server.scene
-        self.url = f"http://{host}:{self.server.get_port()}"
         self.message = ""
         self.hidden = {"cameras"}
         self._closed = False
@@ -65,6 +90,20 @@ class Page:
     def say(self, message: str) -> None:
         """Write ``message`` (Markdown) at the top of the page."""
         self.message = self._status.content = message
+
+    def _refused(self, wrong: str) -> None:
+        self.say(f"**A message of a page was dropped: {wrong}**")
+
+    @contextmanager
+    def telling(self) -> Iterator[None]:
+        """Say on the page what goes wrong within; what is no ValueError is reported as any thread's end, too."""
+        try:
+            yield
+        except ValueError as error:
+            self.say(f"**{error}**")
+        except Exception as error:  # noqa: BLE001 - reported here and there, and whoever asks next is answered
+            self.say(f"**{type(error).__name__}: {error}**")
+            threading.excepthook(threading.ExceptHookArgs([*sys.exc_info(), threading.current_thread()]))
 
     def show(self, name: str, visible: bool) -> bool:
         """Show or hide what is drawn under ``name``; False if nothing is drawn there yet."""
@@ -90,16 +129,11 @@ class Page:
             note.content = stage if seconds is None else f"{stage}: {seconds:.0f} s left"
 
         def run() -> None:
-            try:
+            with self.telling(), suppress(_GivenUp):
                 work(progress)
-            except _GivenUp:
-                return
-            except ValueError as error:
-                self.say(f"**{error}**")
-            finally:
-                if not self._closed:
-                    bar.remove()
-                    note.remove()
+            if not self._closed:
+                bar.remove()
+                note.remove()
 
         self._background = threading.Thread(target=run, name="warprrf-view-slow", daemon=True)
         self._background.start()

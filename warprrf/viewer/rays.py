@@ -8,7 +8,7 @@ import numpy as np
 
 from warprrf.viewer import answers, pictures
 from warprrf.viewer.answers import Answer
-from warprrf.viewer.page import Page
+from warprrf.viewer.page import Page, Setting
 
 DRAWN = 60
 COLOURS = "YlOrRd"  # the strongest are the darkest: they stand out on a light room
@@ -30,12 +30,9 @@ class Rays:
         self._rows: list[tuple[str, ...]] = []
         self._legs: list[np.ndarray] = []
         self.legend = page.gui.add_html("")
-        self._array = page.gui.add_dropdown("receiving array", tuple(ARRAYS))
-        self._facing = page.gui.add_slider(
-            "array faces [degrees]", min=-180, max=180, step=1, initial_value=0
-        )
-        for handle in (self._array, self._facing):
-            handle.on_update(lambda _: changed())
+        array = page.gui.add_dropdown("receiving array", tuple(ARRAYS))
+        facing = page.gui.add_slider("array faces [degrees]", min=-180, max=180, step=1, initial_value=0)
+        self._array, self._facing = Setting(array, changed), Setting(facing, changed)
 
     def show(self, found: Answer, range_db: float) -> None:
         """Draw an answer, gains over ``range_db``; its strongest path is the chosen one."""

@@ -12,7 +12,7 @@ from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.materials import mirror_share
 from warprrf.viewer import pictures
-from warprrf.viewer.page import Page
+from warprrf.viewer.page import Page, Setting
 from warprrf.viewer.subject import Subject
 
 THUMBNAIL = 96  # width of a photo at its camera, pixels
@@ -99,14 +99,13 @@ class Room:
         low, high = subject.bounds[:, 2]
         if subject.mesh is not None:
             page.hidden.add("splats")
-        self._cut = page.gui.add_slider(
+        cut = page.gui.add_slider(
             "show up to [m]", min=round(float(low), 2), max=round(float(high), 2) + 0.01, step=0.01,
             initial_value=round(float(high - 0.02 * (high - low)), 2),
         )  # fmt: skip
-        self.colouring = page.gui.add_dropdown("colour the mesh by", tuple(colourings(subject)))
+        chosen = page.gui.add_dropdown("colour the mesh by", tuple(colourings(subject)))
         self.legend = page.gui.add_html("")
-        self._cut.on_update(lambda _: self._draw())
-        self.colouring.on_update(lambda _: self.recolour())
+        self._cut, self.colouring = Setting(cut, self._draw), Setting(chosen, self.recolour)
         held = {
             "mesh": subject.mesh, "splats": subject.gaussians, "cameras": subject.cameras or None,
             "measured": subject.places if len(subject.places) else None, "paths": page, "map": subject.field,

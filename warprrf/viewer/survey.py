@@ -10,12 +10,13 @@ import numpy as np
 from warprrf.device import Progress
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.base import RadioField
-from warprrf.rf.maps.radio_map import QUANTITIES, in_the_air
+from warprrf.rf.maps.radio_map import QUANTITIES
+from warprrf.rf.positions import in_the_air
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.readings import Readings
 from warprrf.viewer import answers, pictures
-from warprrf.viewer.page import Page
+from warprrf.viewer.page import Page, Setting
 from warprrf.viewer.subject import Subject
 
 MEASURED, SUGGESTED = (240, 160, 30), (190, 30, 200)
@@ -64,12 +65,12 @@ class Survey:
             gui.add_markdown("A map needs a field.")
             return
         height = np.median(subject.places[:, 2]) if len(subject.places) else subject.bounds[0, 2] + HEIGHT_M
-        self.height = gui.add_number("height [m]", round(float(height), 2), step=0.1)
-        self._cell = gui.add_number("cell [m]", 0.5, min=0.05, step=0.05)
-        self._quantity = gui.add_dropdown("quantity", tuple(QUANTITIES.values()))
+        self.height = Setting(gui.add_number("height [m]", round(float(height), 2), step=0.1))
+        self._cell = Setting(gui.add_number("cell [m]", 0.5, min=0.05, step=0.05))
+        self._quantity = Setting(gui.add_dropdown("quantity", tuple(QUANTITIES.values())))
         self.map = self._add("compute the map", self._map)
         if subject.field.model == "bistatic":
-            self._count = gui.add_slider("places", min=1, max=10, step=1, initial_value=3)
+            self._count = Setting(gui.add_slider("places", min=1, max=10, step=1, initial_value=3))
             self.suggest = self._add("suggest where to measure next", self._suggest)
         if subject.spectra is not None:
             self.errors = self._add("errors at measured places", self._spectrum_errors)
@@ -169,7 +170,8 @@ class Survey:
         if truth is None:
             return
         _check_carrier(field, truth)
-        found = evaluate(truth, lambda at: field.spectrum(at), progress=progress)  # fitted ones are marked
+        shape = truth.path_gain.shape[1:]  # fitted ones are marked, so that nobody need be warned
+        found = evaluate(truth, lambda at: field.spectrum(at, shape=shape), progress=progress)
         psnr, fitted = found["per_receiver"]["psnr_db"], field.was_fitted_on(truth)
         worst = np.argsort(psnr)[:WORST]
         labels = [f"{psnr[k]:.1f} dB{' (fitted)' if fitted[k] else ''}" for k in worst]

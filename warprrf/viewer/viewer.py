@@ -204,28 +204,29 @@ class Viewer:
                 if self._closed:
                     return
                 since, self._wished_at, self._answering = self._wished_at, None, True
-            try:
-                self._answer()
-            finally:
-                with self._changed:
-                    self._answering = False
-                    self.times.append(time.perf_counter() - float(since or 0.0))
-                    self._changed.notify_all()
+            found = None
+            with self._page.telling():
+                found = self._answer()
+            with self._changed:
+                self.last, self._answering = found, False
+                self.times.append(time.perf_counter() - float(since or 0.0))
+                self._changed.notify_all()
 
-    def _answer(self) -> None:
-        """Ask, and send what came to the page."""
+    def _answer(self) -> Answer | None:
+        """Ask, and send what came to the page.
+
+        Raises:
+            ValueError: where there is no answer.
+        """
         page = self._page
+        source = self._asked()
+        if source is None:
+            page.say("Nothing to ask: give a field, a scene or a mesh.")
+            return None
         try:
-            source = self._asked()
-            if source is None:
-                page.say("Nothing to ask: give a field, a scene or a mesh.")
-                return
             found = answers.answer(source, self.receiver, self.transmitters, self._channel.asked)
-        except ValueError as error:  # a place in a wall, outside the room, too near: the page says so
-            self.last = None
-            page.say(f"No answer here: {error}")
-            return
-        self.last = found
+        except ValueError as error:  # a place in a wall, outside the room, too near
+            raise ValueError(f"No answer here: {error}") from error
         with page.server.atomic():
             self._channel.show(found)
             self._rays.show(found, float(self._channel.range_db.value))
@@ -236,6 +237,7 @@ class Viewer:
             + (f", carried over to {found.frequency_hz / 1e9:g} GHz" if carried else "")
             + f" ({1e3 * found.seconds:.0f} ms)"
         )
+        return found
 
     # ------------------------------------------------------------------------------------------ sharing
 

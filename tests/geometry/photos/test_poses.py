@@ -50,9 +50,6 @@ def truth() -> wr.Mesh:
     return wr.Scene.load(LOBBY / "scene.xml").mesh
 
 
-# ------------------------------------------------------------------------------------------- reading
-
-
 def test_transforms_hold_the_cameras_that_were_written(tmp_path):
     found = read_poses(written(tmp_path))
     for name, camera in lobby_cameras(NAMES).items():
@@ -91,43 +88,17 @@ def test_an_angle_of_view_tells_the_focal_length(tmp_path):
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"frames": 3}, '"frames"'),
-        ({"frames": [3]}, r"frames\[0\]"),
-        ({"frames": [{"file_path": 7}]}, r"file_path of frames\[0\]"),
         ({"frames": frames()[:1] * 2}, "comes twice"),
-        ({"fl_x": -1.0}, "fl_x"),
-        ({"fl_x": "wide"}, "fl_x"),
-        ({"w": 1e9}, "w: got"),
-        ({"w": 640.5}, "w: got"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model"),
         ({"k4": 0.1}, "k4"),
-        (
-            {"frames": [frames()[0] | {"transform_matrix": [[1, 2], [3, 4]]}]},
-            r"frames\[0\] \(images/view_000.jpg\)",
-        ),
-        ({"frames": [frames()[0] | {"transform_matrix": (2 * np.eye(4)).tolist()}]}, "last is 0 0 0 1"),
         ({"frames": [frames()[0] | {"transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}]}, "rigid"),
         ({"frames": [frames()[0] | {"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}]}, "mirrors"),
-        ({"frames": [frames()[0] | {"depth_file_path": "../x.png"}]}, "outside"),
         ({"frames": [frames()[0] | {"depth_file_path": "/etc/passwd"}]}, "outside"),
-        ({"frames": [frames()[0] | {"depth_file_path": "none.png"}]}, "none.png does not exist"),
     ],
 )
 def test_bad_transforms_are_named(tmp_path, change, message):
-    with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
+    with pytest.raises(ValueError, match=rf"transforms\.json.*{message}"):
         read_poses(written(tmp_path, **change))
-    assert "transforms.json" in str(caught.value) or "none.png" in str(caught.value)
-
-
-def test_numbers_that_are_none_and_files_that_are_none_are_named(tmp_path):
-    path = written(tmp_path)
-    path.write_text(path.read_text().replace("395.0", "NaN", 1))
-    with pytest.raises(ValueError, match="finite"):
-        read_poses(path)
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        read_poses(tmp_path / "other.json")
-    with pytest.raises(ValueError, match=r"neither a COLMAP model .* nor NAME\.pose\.txt"):
-        read_poses(tmp_path)
 
 
 def test_frames_are_matched_with_photos_by_as_much_of_their_names_as_it_takes(tmp_path):
@@ -148,9 +119,6 @@ def test_photos_of_another_shape_than_their_lens_are_refused(tmp_path):
     camera = next(iter(read_poses(written(tmp_path)).values()))
     with pytest.raises(ValueError, match="stored with 480 x 640 pixels, its lens is given for 640 x 480"):
         camera.of_size("a.jpg", 480, 640)
-
-
-# ------------------------------------------------------------------------------------------- triangulating
 
 
 @pytest.fixture(scope="module")
@@ -189,9 +157,6 @@ def test_points_of_a_colmap_model_are_taken_as_they_are(triangulated, tmp_path):
     np.testing.assert_allclose(
         again.cameras[NAMES[1]].world_to_camera, sparse.cameras[NAMES[1]].world_to_camera, atol=1e-9
     )
-
-
-# ------------------------------------------------------------------------------------------- depth
 
 
 @pytest.fixture(scope="module")
@@ -233,8 +198,6 @@ def test_depth_of_frames_that_tell_it_is_found(rgbd, tmp_path):
     ) == [rgbd / f"frame-00000{k}.depth.png" for k in (1, 2, 3)]
     with pytest.raises(ValueError, match="holds depth of 0 photos"):
         find_depth(rgbd, ["a.jpg", "b.jpg", "c.jpg"])
-    with pytest.raises(ValueError, match="not a folder"):
-        find_depth(rgbd / "none", ["a.jpg"])
     (tmp_path / "d.png").write_bytes((rgbd / "frame-000001.depth.png").read_bytes())
     one = [frames()[0] | {"depth_file_path": "d.png", "depth_unit_scale_factor": 0.002}]
     depth = next(iter(read_poses(written(tmp_path, frames=one)).values())).depth
@@ -242,31 +205,20 @@ def test_depth_of_frames_that_tell_it_is_found(rgbd, tmp_path):
     np.testing.assert_allclose(read_depth(depth), 2 * read_depth(once), rtol=1e-6)
 
 
-def test_bad_frames_are_named(rgbd, tmp_path):
+def test_frames_where_tracking_was_lost_are_left_out_and_bad_ones_named(rgbd, tmp_path):
     for file in [*rgbd.glob("*.pose.txt")][:3]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
     with pytest.raises(FileNotFoundError, match="camera-intrinsics.txt does not exist"):
         read_poses(tmp_path)
-    lens = tmp_path / "camera-intrinsics.txt"
-    for text, message in (
-        ("1 2 3", "3 rows of 3"),
-        ("a b c\n" * 3, "3 rows of 3"),
-        ("0 0 1\n" * 3, "fx 0 cx"),
-    ):
-        lens.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            read_poses(tmp_path)
-    lens.write_bytes((rgbd / lens.name).read_bytes())
+    (tmp_path / "camera-intrinsics.txt").write_bytes((rgbd / "camera-intrinsics.txt").read_bytes())
     (tmp_path / "lost.pose.txt").write_text("-inf -inf -inf -inf\n" * 4)
-    assert len(read_poses(tmp_path)) == 3  # tracking was lost
+    assert len(read_poses(tmp_path)) == 3
     (tmp_path / "bent.pose.txt").write_text("1 2 3 4\n" * 4)
     with pytest.raises(ValueError, match="bent.pose.txt"):
         read_poses(tmp_path)
     colour = [frame | {"depth_file_path": "colour.png"} for frame in frames()[:1]]
     image.new("RGB", (4, 3)).save(tmp_path / "colour.png")
-    with pytest.raises(
-        ValueError, match="colour.png does not read as a depth image: got an image of mode RGB"
-    ):
+    with pytest.raises(ValueError, match="colour.png does not read as a depth image: .* of mode RGB"):
         read_depth(next(iter(read_poses(written(tmp_path, frames=colour)).values())).depth)
 
 
@@ -274,13 +226,10 @@ def test_bad_frames_are_named(rgbd, tmp_path):
     "options, message",
     [
         ({"depth": "."}, "depth: got .* without poses"),
-        ({"up": "z"}, "up: got 'z' without poses"),
         ({"scale": 1.0}, "goes with poses"),
-        ({"poses": "none.json"}, "does not exist"),
-        ({"poses": ".", "up": "up"}, "up: got 'up'"),
         ({"up": "z", "poses": ".", "known_positions": {}}, "got both"),
     ],
 )
 def test_arguments_that_need_one_another_are_named(options, message, tmp_path):
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
+    with pytest.raises(ValueError, match=message):
         wr.reconstruct(PHOTOS, workspace=tmp_path, **options)

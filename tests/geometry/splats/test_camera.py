@@ -38,63 +38,17 @@ def test_opencv_axes_and_position():
     assert np.isnan(uv[2]).all()  # behind
 
 
-def test_resizing_keeps_the_field_of_view():
-    camera = looking_along_x()
-    half = camera.resized(32, 24)
-    points = camera.position + camera.directions().reshape(-1, 3)
-    assert np.allclose(half.project(points)[0] * 2, camera.project(points)[0])
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"width": 0}, "^width"),
-        ({"fx": -1}, "^fx"),
-        ({"cy": np.nan}, "^cy"),
-        ({"world_to_camera": np.diag([2.0, 2, 2, 1])}, "not a rotation"),
-        ({"world_to_camera": np.diag([-1.0, 1, 1, 1])}, "not a rotation"),
-        ({"world_to_camera": np.eye(3)}, "^world_to_camera"),
-    ],
-)
-def test_bad_cameras_are_refused(change, complaint):
-    arguments = {"width": 4, "height": 3, "fx": 5, "fy": 5, "cx": 2, "cy": 1, "world_to_camera": np.eye(4)}
-    with pytest.raises(ValueError, match=complaint):
-        Camera.pinhole(**{**arguments, **change})
-
-
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ({"kind": "fisheye"}, "^kind"),
-        ({"kind": None}, "^kind"),
-        ({"width": 0}, "^width"),
-        ({"height": 2.5}, "^height"),
-        ({"fx": 0.0}, "^fx"),
-        ({"fy": np.nan}, "^fy"),
-        ({"cx": np.inf}, "^cx"),
-        ({"cy": "1"}, "^cy"),
-        ({"world_to_camera": np.full((4, 4), np.nan)}, "^world_to_camera"),
-        ({"world_to_camera": np.ones((4, 4))}, "^world_to_camera.*not a rotation"),
+        ({"world_to_camera": np.diag([-1.0, 1, 1, 1])}, "^world_to_camera.*not a rotation"),
         ({"world_to_camera": np.diag([1.0, 1, 1, 2])}, "^world_to_camera.*last row"),
-        ({"world_to_camera": None}, "^world_to_camera"),
-        ({"kind": "spherical"}, "^fx of a spherical camera"),
         ({"kind": "spherical", "fx": 0, "fy": 0, "cx": 0, "cy": 0}, "^world_to_camera.*turned"),
     ],
 )
 def test_no_way_of_building_a_camera_takes_nonsense(change, complaint):
     turned = np.diag([-1.0, -1, 1, 1])
-    good = {
-        "kind": "pinhole",
-        "width": 4,
-        "height": 3,
-        "fx": 5,
-        "fy": 5,
-        "cx": 2,
-        "cy": 1,
-        "world_to_camera": turned,
-    }
-    Camera(**good)
-    with pytest.raises((ValueError, TypeError), match=complaint):
-        Camera(**{**good, **change})
-    with pytest.raises(ValueError, match="^width"):
-        Camera(**good).resized(0, 2)
+    lens = {"kind": "pinhole", "width": 4, "height": 3, "fx": 5, "fy": 5, "cx": 2, "cy": 1}
+    Camera(**lens, world_to_camera=turned)
+    with pytest.raises(ValueError, match=complaint):
+        Camera(**{**lens, "world_to_camera": turned, **change})

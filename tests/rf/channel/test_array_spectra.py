@@ -57,11 +57,8 @@ def test_nerf2_folders_are_read_by_their_own_conventions(folder: Path) -> None:
     [
         (lambda p: (p / "tx_pos.csv").unlink(), "tx_pos.csv is missing"),
         (lambda p: (p / "tx_pos.csv").write_text("x,y,z\n1,2,3\n"), "got 1 positions"),
-        (lambda p: (p / "tx_pos.csv").write_text("x,y,z\n1,2\n"), "rows x,y,z"),
-        (lambda p: (p / "gateway_info.yml").write_text("gateway1: 3\n"), "gateway_info.yml.*position"),
         (lambda p: (p / "gateway_info.yml").write_text("position: [1, nan, 3]\n"), "gateway_info.yml.*position"),
         (lambda p: (p / "spectrum" / "1.png").rename(p / "spectrum" / "0.png"), "named '0'"),
-        (lambda p: (p / "spectrum" / "2.png").write_bytes(b"\x89PNG\r\n\x1a\n rest"), "2.png"),
         (lambda p: (p / "spectrum" / "2.png").write_bytes((p / "spectrum" / "1.png").read_bytes()[:50]), "2.png"),
     ],
 )  # fmt: skip
@@ -92,12 +89,8 @@ GOOD = {
     [
         ("power", -np.ones((2, 5, 7)), "linear powers"),
         ("power", np.zeros((2, 5, 7)), "no value above the floor"),
-        ("power", np.ones((2, 7, 5)), "power"),
         ("array", PlanarArray(4, 4, polarisation="V"), "polarisation"),
         ("directions", 2.0 * hemisphere((5, 7)), "unit vectors"),
-        ("receivers", np.zeros((3, 3)), "receivers"),
-        ("length_std_m", -1.0, "length_std_m"),
-        ("floor", 0.0, "floor"),
     ],
 )
 def test_wrong_arguments_are_named(name: str, value: object, said: str) -> None:

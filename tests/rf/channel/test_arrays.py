@@ -36,8 +36,6 @@ def test_orientation_towards_points_the_boresight():
     rng = np.random.default_rng(1)
     for d in random_directions(20, rng):
         assert np.allclose(rotation_matrix(orientation_towards(d)) @ [1, 0, 0], d)
-    with pytest.raises(ValueError, match="direction"):
-        orientation_towards([0, 0, 0])
 
 
 @pytest.mark.parametrize("pattern", [*PATTERNS, "callable"])
@@ -106,28 +104,3 @@ def test_plane_wave_error_falls_as_fresnel_says():
     near, far = (plane_wave_error(a, d, WAVELENGTH) for d in (0.05 * fraunhofer, 100 * fraunhofer))
     assert near.beam_loss_db > 1.0 and far.beam_loss_db < 1e-4
     assert far.entry_error < 5e-3 < near.entry_error
-
-
-def test_spherical_response_is_the_field_of_a_point_source():
-    a = PlanarArray(8, 5, orientation=(0.2, 0.3, 0.4))
-    source = np.array([0.05, -0.02, 0.03])
-    each = np.linalg.norm(source - a.positions(WAVELENGTH), axis=1)
-    far = np.linalg.norm(source)
-    field = np.exp(-2j * np.pi * each / WAVELENGTH) / each / (np.exp(-2j * np.pi * far / WAVELENGTH) / far)
-    np.testing.assert_allclose(a.spherical_response(source, WAVELENGTH), field, rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        ({"rows": 0, "cols": 1}, "rows"),
-        ({"rows": 1, "cols": 2.0}, "cols"),
-        ({"rows": 1, "cols": 1, "spacing": -1}, "spacing"),
-        ({"rows": 1, "cols": 1, "orientation": [0, 0]}, "orientation"),
-        ({"rows": 1, "cols": 1, "pattern": "horn"}, "pattern"),
-        ({"rows": 1, "cols": 1, "polarisation": "X"}, "polarisation"),
-    ],
-)
-def test_bad_arrays_are_named(arguments, name):
-    with pytest.raises((ValueError, TypeError), match=name):
-        PlanarArray(**arguments)

@@ -6,15 +6,12 @@ import pytest
 from warprrf.rf.channel.band_plan import HIGH_HZ, LOW_HZ, THZ_CHANNELS, UNIT_HZ, thz_channel
 
 
-def test_69_channels_of_eight_bandwidths():
+def test_69_channels_of_eight_bandwidths_lie_in_the_band_side_by_side():
     assert list(THZ_CHANNELS) == list(range(1, 70))
     widths = [c.bandwidth_hz / 1e9 for c in THZ_CHANNELS.values()]
     counts = {2.16: 32, 4.32: 16, 8.64: 8, 12.96: 5, 17.28: 4, 25.92: 2, 51.84: 1, 69.12: 1}
     for width, count in counts.items():
         assert np.isclose(widths, width).sum() == count
-
-
-def test_channels_lie_in_the_band_side_by_side():
     for number, c in THZ_CHANNELS.items():
         assert c.number == number and c.low_hz >= LOW_HZ and c.high_hz <= HIGH_HZ
         assert ((c.low_hz - LOW_HZ) / UNIT_HZ) == pytest.approx(
@@ -49,7 +46,3 @@ def test_frequencies_fill_the_channel():
     c = thz_channel(33)
     f = c.frequencies_hz(8)
     assert np.allclose(np.diff(f), c.bandwidth_hz / 8) and f.mean() == pytest.approx(c.center_hz)
-    with pytest.raises(ValueError, match="count"):
-        c.frequencies_hz(0)
-    with pytest.raises(ValueError, match="number"):
-        thz_channel(70)

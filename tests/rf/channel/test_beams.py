@@ -5,50 +5,25 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
+import path_makers
 import pytest
+from path_makers import CARRIER, paths_along
 
 import warprrf as wr
 from warprrf.rf.channel.beams import signal_over_interference
-from warprrf.rf.spectra.spectrum import angles_from_directions, pixel_directions
+from warprrf.rf.spectra.spectrum import pixel_directions
 
-F_HZ = 300e9
-WAVELENGTH_M = 299792458.0 / F_HZ
+WAVELENGTH_M = 299792458.0 / CARRIER
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
-    d = np.random.default_rng(seed).normal(size=(count, 3))
-    return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
-def paths_along(arrival: np.ndarray, departure: np.ndarray, gain: np.ndarray) -> wr.Paths:
-    """Mirror paths of one receiver with given unit directions."""
-    theta_r, phi_r = angles_from_directions(arrival)
-    theta_t, phi_t = angles_from_directions(departure)
-    count = len(gain)
-    return wr.Paths(
-        gain=np.asarray(gain, complex),
-        tau=np.full(count, 1e-8),
-        theta_r=theta_r,
-        phi_r=phi_r,
-        theta_t=theta_t,
-        phi_t=phi_t,
-        vertices=np.zeros((count, 1, 3)),
-        kind=np.full(count, "mirror", dtype="<U7"),
-        valid=np.ones(count, dtype=bool),
-        frequency_hz=F_HZ,
-    )
+    return path_makers.random_directions(count, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(1, 1), (4, 4), (3, 8)])
 def test_dft_beams_are_orthonormal(rows: int, cols: int) -> None:
     weights = wr.dft_codebook(wr.PlanarArray(rows, cols, orientation=(0.3, -0.2, 0.1))).weights
     np.testing.assert_allclose(weights @ weights.conj().T, np.eye(rows * cols), atol=1e-12)
-
-
-def test_orthonormal_beams_together_receive_all_power_of_any_direction() -> None:
-    array = wr.PlanarArray(4, 6, orientation=(0.5, 0.1, 0.0))
-    power = np.abs(wr.dft_codebook(array).amplitude(random_directions(50))) ** 2
-    np.testing.assert_allclose(power.sum(axis=0), array.elements, rtol=1e-12)
 
 
 def test_dft_beam_looks_along_the_cosines_that_are_stated() -> None:
@@ -106,24 +81,10 @@ def test_one_path_is_met_by_the_beams_along_it() -> None:
     for a, d in zip(arrival, departure, strict=True):
         paths = paths_along(a[None], d[None], np.array([0.01j]))
         chosen = wr.select_beams(paths, tx, rx)
-        h = paths.cfr([F_HZ], tx_array=tx, rx_array=rx)[..., 0]
+        h = paths.cfr([CARRIER], tx_array=tx, rx_array=rx)[..., 0]
         power = np.abs(wr.dft_codebook(rx).weights @ h @ wr.dft_codebook(tx).weights.T) ** 2
         assert (chosen.rx[0], chosen.tx[0]) == np.unravel_index(power.argmax(), power.shape)
         np.testing.assert_allclose(chosen.gain[0], power.max(), rtol=1e-9)
-
-
-def test_predicted_gain_is_the_mean_over_random_phases() -> None:
-    tx, rx = wr.PlanarArray(2, 2), wr.PlanarArray(2, 3)
-    rng = np.random.default_rng(5)
-    arrival, departure = random_directions(6, seed=6), random_directions(6, seed=7)
-    size = rng.uniform(0.5, 1.0, 6)
-    predicted = wr.beam_gains(paths_along(arrival, departure, size), tx, rx)
-    received, sent = wr.dft_codebook(rx), wr.dft_codebook(tx)
-    phases = np.exp(2j * np.pi * rng.random((20_000, 6)))
-    pairs = np.einsum("al,bl->abl", received.amplitude(arrival), sent.amplitude(departure)) * size
-    seen = np.mean(np.abs(phases @ pairs.reshape(-1, 6).T) ** 2, axis=0).reshape(predicted.shape)
-    # The share of fluctuation left of 20,000 draws is 1 / sqrt(20,000) = 0.7 %; 5 of them.
-    np.testing.assert_allclose(seen, predicted, rtol=0.035)
 
 
 def test_batched_paths_choose_as_each_receiver_does_and_best_come_first() -> None:
@@ -164,27 +125,6 @@ def test_receiver_without_paths_gets_gain_zero() -> None:
     assert wr.select_beams(nothing, rx_array=wr.PlanarArray(2, 2)).gain[0] == 0.0
 
 
-def test_users_in_one_direction_are_parted_over_other_paths() -> None:
-    """Two users behind one strong direction: alone both take it; together one has to go round by its weaker path."""
-    tx = wr.PlanarArray(8, 8)
-    shared, aside = (np.array([np.sqrt(1.0 - y**2 - 0.125**2), y, 0.125]) for y in (0.125, -0.625))
-    arrival = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    first = paths_along(arrival[:1], shared[None], np.array([1.0]))
-    second = paths_along(arrival, np.stack([shared, aside]), np.array([0.9, 0.5]))
-    alone = [wr.select_beams(p, tx) for p in (first, second)]
-    assert alone[0].tx[0] == alone[1].tx[0]
-    noise = 0.1
-    together = wr.select_beams_multiuser([first, second], tx, noise=noise)
-    gains = [wr.beam_gains(p, tx) for p in (first, second)]
-    sinr = signal_over_interference(gains, [alone[0].tx[0]] * 2, [0, 0], noise)
-    assert together.tx[0] == alone[0].tx[0]
-    assert together.tx[1] == wr.select_beams(paths_along(arrival[1:], aside[None], np.ones(1)), tx).tx[0]
-    assert together.spectral_efficiency > np.log2(1.0 + sinr).sum() + 3.0
-    np.testing.assert_allclose(
-        together.sinr, signal_over_interference(gains, together.tx, together.rx, noise), rtol=1e-12
-    )
-
-
 def test_multi_user_choice_is_as_good_as_trying_everything() -> None:
     tx, rx = wr.PlanarArray(2, 3), wr.PlanarArray(1, 2)
     users = [
@@ -210,33 +150,14 @@ def test_a_single_user_gets_its_best_pair() -> None:
     np.testing.assert_allclose(user.sinr, one.gain / 2.0)
 
 
-def test_bad_input_is_named() -> None:
+def test_what_no_codebook_can_be_made_of_is_named() -> None:
     array = wr.PlanarArray(2, 2)
-    paths = paths_along(np.eye(3)[:1], np.eye(3)[:1], np.ones(1))
     with pytest.raises(ValueError, match="array: got polarisation 'V'"):
         wr.dft_codebook(wr.PlanarArray(2, 2, polarisation="V"))
-    with pytest.raises(ValueError, match="rx_array: got polarisation 'V'"):
-        wr.select_beams(paths, array, wr.PlanarArray(2, 2, polarisation="V"))
     for factors in ((np.ones((2, 5)),), (np.ones((2, array.cols)),) * 3, ()):
         with pytest.raises(ValueError, match="factors: got"):
             wr.channel.Codebook(array, factors)
-    with pytest.raises(ValueError, match="oversampling: got 0"):
-        wr.dft_codebook(array, 0)
-    with pytest.raises(ValueError, match="directions: got a vector of length zero"):
-        wr.steering_codebook(array, np.zeros((1, 3)))
     with pytest.raises(ValueError, match="either directions or points"):
         wr.steering_codebook(array)
     with pytest.raises(ValueError, match="wavelength_m: got None"):
         wr.steering_codebook(array, points=np.ones((1, 3)))
-    with pytest.raises(ValueError, match="count: got 0"):
-        wr.select_beams(paths, array, count=0)
-    with pytest.raises(TypeError, match="source: got list"):
-        wr.select_beams([paths], array)
-    with pytest.raises(TypeError, match="tx_array: got int"):
-        wr.select_beams(paths, 4)
-    with pytest.raises(ValueError, match=r"channel: got shape \(3,\)"):
-        wr.dft_codebook(array).received(np.ones(3))
-    with pytest.raises(ValueError, match="noise: got 0"):
-        wr.select_beams_multiuser([paths], array, noise=0.0)
-    with pytest.raises(ValueError, match="sources: got none"):
-        wr.select_beams_multiuser([], array, noise=1.0)

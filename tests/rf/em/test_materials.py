@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,46 +29,6 @@ def test_concrete_at_300_ghz_has_the_recommended_permittivity(table: dict[str, M
     assert eta.imag == pytest.approx(-17.975 * 0.0145 * 300**1.09 / 300, rel=1e-3)
 
 
-def test_every_lobby_material_is_known_at_140_and_300_ghz(table: dict[str, Material]) -> None:
-    for material in table.values():
-        for frequency in (140e9, 300e9):
-            assert material.permittivity(frequency).real >= 1
-            assert material.permittivity(frequency).imag <= 0
-            assert 0 <= material.scattering_coefficient(frequency) <= 1
-
-
-def test_our_rows_are_those_of_sionna(table: dict[str, Material]) -> None:
-    itu = pytest.importorskip("sionna.rt.radio_materials.itu", reason="sionna-rt is not installed")
-    for material in table.values():
-        if material.itu is None:
-            continue
-        for ghz in (140.0, 300.0):
-            rows = itu.ITU_MATERIALS_PROPERTIES[material.itu]
-            a, b, c, d = next(v for (low, high), v in rows.items() if low <= ghz <= high)
-            assert material.relative_permittivity(ghz * 1e9) == pytest.approx(a * ghz**b)
-            assert material.conductivity(ghz * 1e9) == pytest.approx(c * ghz**d)
-
-
-def test_lobby_holds_mirrors_and_diffusers(table: dict[str, Material]) -> None:
-    s = {name: m.scattering_coefficient(300e9) for name, m in table.items()}
-    assert all(s[name] < 0.3 for name in ("glass", "metal", "marble"))
-    assert all(s[name] > 0.5 for name in ("concrete", "brick", "plasterboard", "carpet_tile"))
-
-
-@pytest.mark.parametrize("frequency", [60e9, 500e9])
-def test_frequency_outside_the_band_names_material_frequency_and_band(
-    table: dict[str, Material], frequency: float
-) -> None:
-    for question in ("permittivity", "scattering_coefficient"):
-        with pytest.raises(ValueError, match=rf"{frequency / 1e9:g} GHz.*brick.*110 to 330 GHz"):
-            getattr(table["brick"], question)(frequency)
-
-
-@pytest.mark.parametrize(("sigma_mm", "expected"), [(0.02, 0.25), (0.05, 0.57), (0.1, 0.89), (0.15, 0.99)])
-def test_scattering_at_300_ghz_from_roughness(sigma_mm: float, expected: float) -> None:
-    assert roughness_scattering(sigma_mm * 1e-3, 300e9) == pytest.approx(expected, abs=0.005)
-
-
 def test_roughness_keeps_the_energy_of_the_mirror_direction() -> None:
     # S^2 + rho^2 = 1 with rho the Rayleigh factor
     wavelength = 299792458.0 / 140e9
@@ -84,52 +45,21 @@ def test_the_first_row_that_holds_counts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "value"),
     [
-        ({"pattern": "backscattering"}, "pattern"),
-        ({"scattering": 1.2}, "scattering"),
-        ({"thickness_m": 0.0}, "thickness_m"),
-        ({"roughness_m": float("nan")}, "roughness_m"),
-        ({"alpha_r": 0}, "alpha_r"),
-        ({"alpha_r": 1001}, "alpha_r.*1 to 1000"),
-        ({"alpha_r": 2.5}, "alpha_r"),
-        ({"thickness_m": -0.1}, "thickness_m"),
-        ({"thickness_m": math.nan}, "thickness_m"),
-        ({"thickness_m": "0.1"}, "thickness_m"),
-        ({"thickness_m": None}, "thickness_m"),
-        ({"scattering": math.nan}, "scattering"),
-        ({"scattering": -0.1}, "scattering"),
-        ({"scattering": "0.1"}, "scattering"),
-        ({"roughness_m": -1e-3}, "roughness_m"),
-        ({"roughness_m": 150.0}, "roughness_m"),
-        ({"pattern": None}, "pattern"),
+        ("relative_permittivity", 0.5),
+        ("relative_permittivity", 3 - 1j),
+        ("conductivity", -0.1),
+        ("thickness_m", -1.0),
+        ("scattering", 1.2),
+        ("pattern", "backscattering"),
+        ("alpha_r", 1001),
+        ("alpha_r", 2.5),
     ],
 )
-def test_bad_values_are_refused_by_name(change: dict, message: str) -> None:
-    good = {"name": "m", "bands": (Band(1e9, 2e9, 1, 0, 0, 0),)}
-    with pytest.raises((ValueError, TypeError), match=message):
-        Material(**(good | change))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"relative_permittivity": -2.0}, "relative_permittivity"),
-        ({"relative_permittivity": 0.5}, "relative_permittivity"),
-        ({"relative_permittivity": math.nan}, "relative_permittivity"),
-        ({"relative_permittivity": math.inf}, "relative_permittivity"),
-        ({"relative_permittivity": 3 - 1j}, "relative_permittivity"),
-        ({"relative_permittivity": "3"}, "relative_permittivity"),
-        ({"conductivity": -0.1}, "conductivity"),
-        ({"conductivity": math.nan}, "conductivity"),
-        ({"conductivity": None}, "conductivity"),
-        ({"thickness_m": -1.0}, "thickness_m.*'m'"),
-        ({"scattering": 2.0}, "scattering.*'m'"),
-    ],
-)
-def test_a_custom_material_gives_no_power(change: dict, message: str) -> None:
-    with pytest.raises((ValueError, TypeError), match=message):
-        Material.custom("m", **({"relative_permittivity": 3.0} | change))
+def test_a_custom_material_gives_no_power(name: str, value: object) -> None:
+    with pytest.raises((ValueError, TypeError), match=name):
+        Material.custom("m", **({"relative_permittivity": 3.0} | {name: value}))
 
 
 def test_no_material_gives_back_more_than_comes() -> None:
@@ -170,11 +100,7 @@ def test_beyond_total_reflection_a_thick_slab_without_loss_gives_back_all() -> N
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ((0.0, 1e9, 3, 0, 0, 0), "low_hz"),
         ((2e9, 1e9, 3, 0, 0, 0), "low_hz, high_hz"),
-        ((1e9, math.inf, 3, 0, 0, 0), "high_hz"),
-        ((1e9, 2e9, math.nan, 0, 0, 0), "^a:"),
-        ((1e9, 2e9, 3, "0", 0, 0), "^b:"),
         ((1e9, 2e9, -3, 0, 0, 0), "relative_permittivity.* at 1 GHz"),
         ((1e9, 100e9, 1.5, -0.4, 0, 0), "relative_permittivity.* at 100 GHz"),  # 1.5 / 100^0.4 = 0.24
         ((1e9, 100e9, 3, 0, -0.01, 1), "conductivity.* at 1 GHz"),
@@ -186,103 +112,40 @@ def test_a_row_that_gives_power_somewhere_in_its_band_is_refused(row: tuple, mes
         Band(*row)
 
 
-@pytest.mark.parametrize("frequency", [0.0, -1e9, math.nan, None, "1e9"])
-def test_a_material_is_asked_at_a_frequency(frequency: float) -> None:
-    for question in ("permittivity", "scattering_coefficient", "band"):
-        with pytest.raises((ValueError, TypeError), match="^frequency_hz"):
-            getattr(Material.conductor(), question)(frequency)
-    with pytest.raises((ValueError, TypeError), match="^frequency_hz"):
-        roughness_scattering(1e-4, frequency)
-
-
-HOSTILE = {
-    "a list": [5],
-    "no list": {"materials": 5},
-    "a number for a material": {"materials": [5]},
-    "a nameless one": {"materials": [{"name": 5}]},
-    "permittivity no list": {"permittivity": {}},
-    "a row that is no row": {"permittivity": [5]},
-    "a row of text": {"permittivity": [{"low_ghz": "1"}]},
-    "no row": {"permittivity": []},
-    "thickness without a value": {"thickness_m": 0.1},
-    "thickness null": {"thickness_m": {"value": None}},
-    "a lobe of text": {"pattern": {"value": "directive", "alpha_r": "4"}},
-    "a lobe too narrow": {"pattern": {"value": "directive", "alpha_r": 10**9}},
-    "a pattern of a list": {"pattern": {"value": [1]}},
-    "negative roughness": {"roughness_m": {"value": -1.0}},
-    "a number for a name of ITU's": {"itu": 1.5},
-}
-
-
-@pytest.mark.parametrize("case", sorted(HOSTILE))
-def test_a_hostile_table_is_a_value_error_that_names_the_file(case: str, tmp_path: Path) -> None:
-    content = HOSTILE[case]
-    if isinstance(content, dict) and "materials" not in content:
-        content = {"materials": [json.loads(TABLE.read_text())["materials"][0] | content]}
-    file = tmp_path / "hostile.json"
-    file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"hostile\.json"):
-        load_materials(file)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [b"\xff\xfe", b"[" * 100_000, b'{"materials": [{"name": "m", "permittivity": [{"low_ghz": 1e999}]}]}'],
-)
-def test_bytes_that_are_no_table_are_a_value_error_that_names_the_file(text: bytes, tmp_path: Path) -> None:
-    file = tmp_path / "hostile.json"
-    file.write_bytes(text)
-    with pytest.raises(ValueError, match=r"hostile\.json"):
-        load_materials(file)
-
-
-def test_a_table_names_a_material_once(tmp_path: Path) -> None:
-    content = json.loads(TABLE.read_text())
-    content["materials"].append(content["materials"][0])
-    file = tmp_path / "materials.json"
-    file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"materials\.json has two .*'marble'"):
-        load_materials(file)
-
-
-def test_a_broken_table_says_which_material_and_what(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no table"):
-        load_materials(tmp_path / "none.json")
-    broken = tmp_path / "broken.json"
-    broken.write_text("{")
-    with pytest.raises(ValueError, match=r"broken\.json: .*no JSON"):
-        load_materials(broken)
-    content = json.loads(TABLE.read_text())
-    del content["materials"][0]["thickness_m"]
-    broken.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"marble.*thickness_m"):
-        load_materials(broken)
-
-
-def test_a_table_may_give_the_scattering_coefficient_itself(tmp_path: Path) -> None:
-    content = json.loads(TABLE.read_text())
+def test_a_table_may_give_the_scattering_coefficient_itself_and_names_a_material_once(tmp_path: Path) -> None:
+    content, file = json.loads(TABLE.read_text()), tmp_path / "materials.json"
     brick = next(entry for entry in content["materials"] if entry["name"] == "brick")
     del brick["roughness_m"]
-    file = tmp_path / "materials.json"
-    file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"brick.*neither 'roughness_m' nor 'scattering'"):
-        load_materials(file)
     brick["scattering"] = {"value": 0.43, "source": "fitted"}
     file.write_text(json.dumps(content))
     read = load_materials(file)["brick"]
     assert read.scattering_coefficient(300e9) == read.scattering_coefficient(140e9) == 0.43
     assert read.sources is not None
     assert read.sources["scattering"] == "fitted"
-    brick["scattering"]["value"] = 1.43
-    file.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=r"brick.*scattering.*1\.43"):
-        load_materials(file)
+    for change, told in (
+        (lambda: content["materials"].append(content["materials"][0]), r"materials\.json has two .*'marble'"),
+        (
+            lambda: content["materials"].pop() and brick["scattering"].update(value=1.43),
+            r"brick.*scattering.*1\.43",
+        ),
+        (lambda: brick["pattern"].update(reciprocal="yes"), "reciprocal"),
+        (
+            lambda: brick["pattern"].pop("reciprocal") and brick.pop("scattering"),
+            "brick.*neither 'roughness_m' nor 'scattering'",
+        ),
+    ):
+        change()
+        file.write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=told):
+            load_materials(file)
 
 
 def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], tmp_path: Path) -> None:
     given = [
         *table.values(),
         Material.custom("own", relative_permittivity=2.5, scattering=0.3, pattern="directive", alpha_r=7),
+        replace(table["glass"], name="turning", xpd=0.25),
+        replace(table["glass"], name="both ways", reciprocal=True),
     ]
     file = tmp_path / "materials.json"
     file.write_text(json.dumps({"materials": [table_entry(material) for material in given]}))
@@ -290,7 +153,7 @@ def test_a_written_entry_reads_as_the_same_material(table: dict[str, Material], 
     for material in given:
         again = read[material.name]
         assert again.bands == material.bands
-        for name in ("thickness_m", "pattern", "roughness_m", "scattering", "itu"):
+        for name in ("thickness_m", "pattern", "roughness_m", "scattering", "itu", "xpd", "reciprocal"):
             assert getattr(again, name) == getattr(material, name)
         if material.pattern == "directive":
             assert again.alpha_r == material.alpha_r

@@ -1,5 +1,6 @@
 """Many receivers at once: the same answers whatever computes them, in memory or in a file that survives a kill."""
 
+import inspect
 import os
 import signal
 import subprocess
@@ -10,29 +11,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from furnished import RECEIVERS, TX, furnished, spectra
+from radio_scenes import SlabMaterial
 
 import warprrf as wr
 from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.fields import batches
+from warprrf.rf.spectra.spectrum import pixel_solid_angles
 
-TX = np.array([0.8, 0.9, 2.2])
-OTHER = TX + [0.4, 0.2, -0.3]
-PLACES = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1]]
-)
+PLACES, OTHER = RECEIVERS[:6], TX + [0.4, 0.2, -0.3]
 F = np.linspace(299e9, 301e9, 5)
-ARRAYS = {"tx_array": wr.PlanarArray(1, 2), "rx_array": wr.PlanarArray(3, 1), "diffuse": "random_phase"}
+ARRAYS = {
+    "tx_array": wr.PlanarArray(1, 2),
+    "rx_array": wr.PlanarArray(3, 1, pattern=wr.horn(0.9)),
+    "diffuse": "random_phase",
+}
 
 
-def fitted() -> wr.RadioField:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
+def fitted(model: str = "bistatic") -> wr.RadioField:
+    walls, box = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)
+    scene = furnished(walls, box)
+    ds = spectra(scene, PLACES[:3], shape=(12, 24), sigma=0.15)
+    return wr.RadioField.fit(
+        scene, ds, model, **{"quick": True} if model == "bistatic" else {"iterations": 5}
     )
-    stuff = [SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)]
-    scene = RadioScene(mesh, part, stuff)
-    ds = exact_spectra(scene, PLACES[:3], transmitter=TX, frequency_hz=300e9, shape=(12, 24), sigma=0.15)
-    return wr.RadioField.fit(scene, ds, quick=True)
 
 
 @pytest.fixture(scope="module")
@@ -58,42 +60,84 @@ def answers(field: wr.RadioField, folder: Path | None = None, **how: Any) -> lis
     ]  # fmt: skip
 
 
-def test_many_receivers_get_what_each_gets(field: wr.RadioField) -> None:
-    spectra, cfr, gain, _ = answers(field)
-    for k, place in enumerate(PLACES):
-        np.testing.assert_allclose(
-            spectra[k], field.spectrum(place).path_gain, rtol=1e-6, atol=1e-6 * spectra[k].max()
-        )
-        paths = field.paths(place)
-        np.testing.assert_allclose(
-            cfr[k], paths.cfr(F, **ARRAYS), rtol=1e-5, atol=1e-6 * np.abs(cfr[k]).max()
-        )
-        np.testing.assert_array_equal(gain[k], paths.gain[:7])
-    assert cfr.dtype == np.complex64
-    assert cfr.shape == (6, 3, 2, 5)
-
-
-def test_every_receiver_may_have_its_own_transmitter(field: wr.RadioField, tmp_path: Path) -> None:
-    own = np.array([TX, OTHER, TX, OTHER, OTHER, TX])
-    spectra, paths = (
-        field.spectra(PLACES, own).path_gain,
-        field.paths(PLACES, own, 5, store=tmp_path / "paths.nc"),
+def test_a_row_is_what_its_link_gets_alone_without_a_receiver_axis(
+    field: wr.RadioField, tmp_path: Path
+) -> None:
+    own, stored = np.array([TX, OTHER, TX, OTHER, OTHER, TX]), {}
+    verbs: dict[str, Any] = {
+        "spectrum": lambda *at: field.spectrum(*at).path_gain, "links": lambda *at: field.links(*at).total_path_gain,
+        "array": lambda *at: field.array_spectrum(at[0], wr.PlanarArray(2, 2), [[1.0, 0, 0]], at[1]),
+        "traced": lambda *at: wr.trace_paths(field.mesh, receivers=at[0], transmitter=at[1], frequency_hz=3e11).gain,
+        "spectra": lambda *at, **how: field.spectra(*at, **how).path_gain,
+        "paths": lambda *at, **how: field.paths(*at, 7, **how).gain,
+        "cfr": lambda at, source, **how: field.cfr(at, F, source, **ARRAYS, **how),
+    }  # fmt: skip
+    for name, ask in verbs.items():
+        rows, alone, shared = ask(PLACES, own), ask(PLACES[1], OTHER), ask(PLACES[1], own)
+        for row in (rows[1], shared[1], shared[3]):  # those of paths are padded
+            row = row[: len(alone)] if alone.ndim else row
+            np.testing.assert_allclose(row, alone, rtol=1e-5, atol=1e-6 * np.abs(alone).max(), err_msg=name)
+        for _ in range(2 if name in ("spectra", "paths", "cfr") else 0):
+            np.testing.assert_array_equal(ask(PLACES[1], OTHER, store=tmp_path / name), alone)
+        stored[name] = rows
+    assert wr.Paths.load(tmp_path / "paths").receiver.shape == (3,)
+    np.testing.assert_allclose(
+        stored["spectra"], stored["spectrum"], rtol=1e-6, atol=1e-6 * stored["spectrum"].max()
     )
-    cfr = field.cfr(PLACES, F, own, diffuse="power")
-    for k, (place, source) in enumerate(zip(PLACES, own, strict=True)):
+    np.testing.assert_array_equal(field.paths(PLACES, own, 5).transmitter, own)
+    for cfr, *link in zip(stored["cfr"], PLACES, own, strict=True):
         np.testing.assert_allclose(
-            spectra[k], field.spectrum(place, source).path_gain, rtol=1e-6, atol=1e-6 * spectra[k].max()
+            cfr, field.paths(*link).cfr(F, **ARRAYS), rtol=1e-5, atol=1e-6 * np.abs(cfr).max()
         )
-        alone = field.paths(place, source, 5)
-        np.testing.assert_array_equal(paths[k].gain, alone.gain)
-        np.testing.assert_array_equal(paths[k].transmitter, source)
-        np.testing.assert_allclose(cfr[k], field.paths(place, source).cfr(F, diffuse="power"), rtol=1e-5)
-    again = field.paths(PLACES, own, 5)
-    np.testing.assert_array_equal(again.transmitter, own)
-    with pytest.raises(ValueError, match=r"transmitters: got shape \(2, 3\)"):
+    assert cfr.dtype == np.complex64 and cfr.shape == (3, 2, 5)
+    with pytest.raises(ValueError, match=r"transmitter: got shape \(2, 3\)"):
         field.spectra(PLACES, own[:2])
     with pytest.raises(ValueError, match=r"receivers\[1\].*outside"):
         field.spectra([PLACES[0], PLACES[0] + 50.0])
+
+
+def test_every_model_takes_what_the_base_says() -> None:
+    """Names, order, kinds and defaults of parameters, which more may follow by name; places have one name each."""
+    for kind in wr.RadioField.models.values():
+        for verb in (n for n in dir(wr.RadioField) if n[0] != "_" and callable(getattr(wr.RadioField, n))):
+            ours, base = (inspect.signature(getattr(one, verb)).parameters for one in (kind, wr.RadioField))
+            shared = [p for p in base.values() if p.kind is not p.VAR_KEYWORD]
+            if verb == "fit":  # each class has a model of its own
+                shared = [
+                    p.replace(default=ours["model"].default) if p.name == "model" else p for p in shared
+                ]
+            assert [p.replace(annotation=0) for p in ours.values() if p.name in {p.name for p in shared}] == [
+                p.replace(annotation=0) for p in shared
+            ]
+            more = [p.kind for p in ours.values() if p.name not in base]
+            assert set(more) <= {inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.VAR_KEYWORD}, verb
+        for f in [wr.simulate, wr.trace_paths, *(getattr(kind, n) for n in dir(kind) if n[0] != "_")]:
+            names = inspect.signature(f).parameters if callable(f) else ()
+            assert not {"rx", "tx", "receiver", "transmitters"} & set(names), f
+
+
+@pytest.mark.parametrize("model", ["bistatic", "rf3dgs+", "rf3dgs"])
+def test_a_field_answers_on_any_grid(model: str) -> None:
+    """A pixel's centre has its power per solid angle on every grid that has it; totals of scattering are the room's; floor
+    and range are a pixel's."""
+    field, finer = fitted(model), (36, 72)
+    own, other = (field.spectrum(PLACES, shape=shape) for shape in (None, finer))
+    if model == "bistatic":
+        np.testing.assert_allclose(other.total_path_gain, own.total_path_gain, rtol=0.02)
+    else:
+        density = [s.path_gain / pixel_solid_angles(s.shape)[:, None] for s in (own, other)]
+        np.testing.assert_allclose(density[1][:, 1::3, 1::3], density[0], rtol=1e-3)
+    assert other.aod.shape == (6, *finer, 2)
+    assert 9 * other.floor == pytest.approx(own.floor)
+    assert field.spectra(PLACES[0], shape=finer).path_gain.shape == finer
+    truth = wr.SpectrumDataset.from_spectra(
+        receivers=PLACES[3:],
+        transmitter=TX,
+        frequency_hz=300e9,
+        path_gain=other.path_gain[3:],
+        beam_sigma_rad=0.15,
+    )
+    assert wr.evaluate(truth, field.spectrum)["psnr_db"] > 100
 
 
 def test_a_store_holds_the_same_bits_and_is_known_again(field: wr.RadioField, tmp_path: Path) -> None:
@@ -113,7 +157,7 @@ def test_a_store_of_something_else_is_refused(field: wr.RadioField, tmp_path: Pa
     before = file.read_bytes()
     for ask in (
         lambda: field.spectra(PLACES[:5], store=file), lambda: field.spectra(PLACES, OTHER, store=file),
-        lambda: field.cfr(PLACES, F, diffuse="power", store=file),
+        lambda: field.cfr(PLACES, F, diffuse="power", store=file), lambda: field.spectra(PLACES, shape=(6, 12), store=file),
         lambda: replace(field, floor=2 * field.floor).spectra(PLACES, store=file),
     ):  # fmt: skip
         with pytest.raises(ValueError, match="store: .*another field, other places or other options"):
@@ -129,38 +173,8 @@ def test_a_store_of_something_else_is_refused(field: wr.RadioField, tmp_path: Pa
         field.paths(PLACES, store=tmp_path / "paths.nc")
 
 
-def test_what_was_begun_is_continued_and_never_taken_for_whole(
-    field: wr.RadioField, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole, file = field.spectra(PLACES).path_gain, tmp_path / "spectra.nc"
-
-    def stop(_: str, done: int, __: int) -> None:
-        if done == 4:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        field.spectra(PLACES, store=file, progress=stop)
-    assert not file.exists()
-    unfinished = Path(f"{file}.unfinished")
-    with pytest.raises(ValueError, match="another field"):
-        field.spectra(PLACES, OTHER, store=file)
-    asked: list[int] = []
-    trace = type(field)._trace_spectra
-
-    def counted(self: Any, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-        asked.append(len(receivers))
-        return trace(self, receivers, transmitter)
-
-    monkeypatch.setattr(type(field), "_trace_spectra", counted)
-    np.testing.assert_array_equal(field.spectra(PLACES, store=file).path_gain, whole)
-    assert asked == [2]  # the other four were there
-    assert file.exists()
-    assert not unfinished.exists()
-
-
 KILLED = """
 import sys, numpy as np, warprrf as wr
-from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.fields import batches
 batches.AT_ONCE = 2
 field, places = wr.RadioField.load(sys.argv[1]), np.load(sys.argv[2])
@@ -184,10 +198,20 @@ def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_pa
         with pytest.raises(ValueError, match="another process is at work"):
             field.spectra(PLACES, store=names[2])
         os.kill(child.pid, signal.SIGKILL)
+    assert not Path(names[2]).exists() and Path(f"{names[2]}.unfinished").exists()
+    with pytest.raises(ValueError, match="another field"):
+        field.spectra(PLACES, OTHER, store=names[2])
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        field.spectra(PLACES, store=names[2], progress=stop)
     told: list[int] = []
     found = field.spectra(PLACES, store=names[2], progress=lambda _, done, __: told.append(done))
     np.testing.assert_array_equal(found.path_gain, field.spectra(PLACES).path_gain)
-    assert told == [4, 6]
+    assert told == [4, 6]  # the other four were there
+    assert not Path(f"{names[2]}.unfinished").exists()
 
 
 GAIN = np.arange(30.0).reshape(6, 5)

@@ -27,13 +27,3 @@ def test_nothing_is_lost(tmp_path, jones):
         p.save(tmp_path / f"{k}.nc")
         same(p, Paths.load(tmp_path / f"{k}.nc"))
     assert sorted(f.name for f in tmp_path.iterdir()) == ["0.nc", "1.nc", "2.nc"]  # no temporary files left
-
-
-def test_other_files_are_refused(tmp_path):
-    with pytest.raises(FileNotFoundError, match="none.nc"):
-        Paths.load(tmp_path / "none.nc")
-    import xarray
-
-    xarray.Dataset({"x": ("y", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-    with pytest.raises(ValueError, match="other.nc"):
-        Paths.load(tmp_path / "other.nc")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from path_makers import CARRIER, random_paths
 from places import LOBBY
+from sionna_room import sionna_or_skip
 
-from warprrf.rf import scene_sionna
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.interop.sionna_engine import load_sionna_scene
 from warprrf.rf.paths.path_set import Paths
@@ -19,11 +19,7 @@ RECEIVERS = np.array([[7.0, 4.0, 1.5], [3.1, 9.2, 1.2], [15.0, 3.0, 1.7]])
 
 @pytest.fixture(scope="module")
 def rt():
-    try:
-        scene_sionna.select_llvm()
-    except ImportError as error:
-        pytest.skip(str(error))
-    pytest.importorskip("sionna.rt", reason="Sionna RT is an extra", exc_type=ImportError)
+    sionna_or_skip()
     from warprrf.rf.scene_sionna import sionna_rt
 
     return sionna_rt()
@@ -170,20 +166,6 @@ def test_channels_are_theirs(rt, solved):
     np.testing.assert_allclose((np.abs(normal) ** 2).mean(axis=(1, 3, 4, 5)), 1.0)
 
 
-def test_link_level_functions_take_them():
-    """Sionna PHY's ``cir_to_ofdm_channel`` on our impulse response."""
-    channel = pytest.importorskip(
-        "sionna.phy.channel", reason="Sionna PHY is a package of its own", exc_type=ImportError
-    )
-    s = Paths.stack([random_paths(5), random_paths(8, seed=1)]).to_sionna(
-        PlanarArray(2, 2), PlanarArray(1, 2)
-    )
-    f = channel.subcarrier_frequencies(32, 1e7)
-    h = channel.cir_to_ofdm_channel(f, *(x[None] for x in s.cir(out_type="torch")))
-    ours = s.cfr(np.asarray(f))
-    np.testing.assert_allclose(h[0].numpy(), ours, atol=1e-4 * np.abs(ours).max())
-
-
 def test_shapes_of_paths_with_and_without_diffuse_power():
     p = Paths.stack(
         [random_paths(3), Paths.concatenate([random_paths(2), random_paths(2, seed=3, kind="diffuse")])]
@@ -193,5 +175,3 @@ def test_shapes_of_paths_with_and_without_diffuse_power():
     s = p.to_sionna(PlanarArray(2, 2), PlanarArray(1, 3), diffuse="power")
     assert s.a.shape == (2, 3, 1, 4, 4) and s.tau.shape == (2, 1, 4) and s.interactions.shape == (1, 2, 1, 4)
     assert s.valid[1, 0].tolist() == [True, True, False, False] and (s.tau[1, 0, 2:] == -1).all()
-    with pytest.raises(ValueError, match="out_type"):
-        s.cir(out_type="jax")

@@ -5,39 +5,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from furnished import RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, furnished, spectra
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined
 
-from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.materials import Material, roughness_scattering
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.relevance.model import full_field, material_parameters, with_lobes
 from warprrf.rf.relevance.search import Relevance, relevance, relevances
 from warprrf.rf.spectra.dataset import SpectrumDataset
 
-F = 300e9
-SHAPE = (24, 48)
-SIGMA = np.radians(5.0)
-TX = np.array([0.8, 0.9, 2.2])
-RECEIVERS = np.array([[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9]])
+RECEIVERS = RECEIVERS[:4]
 NOTHING = SlabMaterial("nothing", 1.0, 0.0, np.inf)  # reflects nothing: as good as empty space
 OPTIONS = {"transmitter": TX, "frequency_hz": F, "shape": SHAPE, "beam_sigma_rad": SIGMA}
 
 
-def room(walls: object, box: object) -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    return RadioScene(mesh, part, [walls, box])
-
-
 def plated(material: object) -> RadioScene:
     """An empty room but for a plate of one material on the floor."""
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([0.2, 0.2, 0.01], [4.8, 3.8, 0.05])
-    )
+    mesh, part = joined(ROOM, box_mesh([0.2, 0.2, 0.01], [4.8, 3.8, 0.05]))
     return RadioScene(mesh, part, [NOTHING, material])
 
 
@@ -47,25 +33,24 @@ def metal(roughness_m: float) -> Material:
     )
 
 
-def spectra(scene: RadioScene) -> SpectrumDataset:
-    return exact_spectra(
-        scene, RECEIVERS, transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA, sub_pixels=4
-    )
-
-
 @pytest.fixture(scope="module")
-def furnished() -> RadioScene:
+def slabs() -> RadioScene:
     walls = SlabMaterial("walls", 3.0, 0.5, 0.1, 0.5, "directive", 4)
-    return room(walls, SlabMaterial("box", 6.0, 0.5, 0.1, 0.8))
+    return furnished(walls, SlabMaterial("box", 6.0, 0.5, 0.1, 0.8))
 
 
 @pytest.fixture(scope="module")
-def several(furnished: RadioScene) -> list[Relevance]:
-    return relevances(furnished, (1e-6, 0.1, 0.5, 2.0, 1000.0), receivers=RECEIVERS, **OPTIONS)
+def data(slabs: RadioScene) -> SpectrumDataset:
+    return spectra(slabs, RECEIVERS, sub_pixels=4)
+
+
+@pytest.fixture(scope="module")
+def several(slabs: RadioScene) -> list[Relevance]:
+    return relevances(slabs, (1e-6, 0.1, 0.5, 2.0, 1000.0), receivers=RECEIVERS, **OPTIONS)
 
 
 def test_an_empty_room_has_line_of_sight_and_nothing_else() -> None:
-    found = relevance(room(NOTHING, NOTHING), receivers=RECEIVERS[:3], **OPTIONS)
+    found = relevance(furnished(NOTHING, NOTHING), receivers=RECEIVERS[:3], **OPTIONS)
     assert [name for name in found.kept if name not in ("diffraction", "transmission")] == ["line_of_sight"]
     assert found.terms.mirror_order == 0
     assert not found.terms.diffuse
@@ -95,12 +80,12 @@ def test_the_worth_of_a_mirror_is_its_power() -> None:
 
 
 def test_lambertian_materials_leave_one_lobe() -> None:
-    scene = room(SlabMaterial("a", 4.0, 0.5, 0.1, 0.7), SlabMaterial("b", 3.0, 0.5, 0.1, 0.9))
+    scene = furnished(SlabMaterial("a", 4.0, 0.5, 0.1, 0.7), SlabMaterial("b", 3.0, 0.5, 0.1, 0.9))
     assert relevance(scene, receivers=RECEIVERS, **OPTIONS).terms.lobes == (0,)
 
 
 def test_a_lobe_that_hardly_differs_is_replaced_and_power_is_kept() -> None:
-    scene = room(
+    scene = furnished(
         SlabMaterial("a", 4.0, 0.5, 0.1, 0.7, "directive", 5),
         SlabMaterial("b", 4.0, 0.5, 0.1, 0.7, "directive", 6),
     )
@@ -142,9 +127,9 @@ def test_a_larger_tolerance_never_keeps_more(several: list[Relevance]) -> None:
     assert several[-1].kept == ()
 
 
-def test_the_choice_stays_within_its_tolerance(furnished: RadioScene, several: list[Relevance]) -> None:
+def test_the_choice_stays_within_its_tolerance(slabs: RadioScene, several: list[Relevance]) -> None:
     """Checked on spectra made anew, not on what the choice was made with."""
-    full = full_field(furnished, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)[0]
+    full = full_field(slabs, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)[0]
     for found in several[1:4]:
         assert max(found.image_db, found.total_db) <= found.tolerance_db
         reduced, change = found.reduce(full), []
@@ -162,25 +147,6 @@ def test_blocked_receivers_have_no_line_of_sight_to_lose(several: list[Relevance
     assert found["diffraction"].image_db < found["diffraction"].image_blocked_db
 
 
-def test_elements_that_no_receiver_sees_matter_to_further_bounces_alone(furnished: RadioScene) -> None:
-    from warprrf.rf.relevance.model import without_elements
-
-    full, walls, source = full_field(
-        furnished, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA
-    )
-    single = replace(full, terms=Terms(lobes=full.terms.lobes, mirror_order=2))
-    view = single.view(RECEIVERS[0])
-    face = view.hits.face.numpy()
-    unseen = np.ones(len(full.surface.element_area), bool)
-    unseen[full.surface.element[face[face >= 0]]] = False
-    assert unseen.any()
-    dropped = without_elements(single, unseen)
-    seen = replace(view, transport=dropped.transport())
-    assert np.array_equal(dropped.render(seen).image, single.render(view).image)
-    assert source == "scene"
-    assert not walls.assumed
-
-
 def test_table_and_file_say_the_same(several: list[Relevance], tmp_path: Path) -> None:
     found = several[1]
     table = found.table()
@@ -189,40 +155,34 @@ def test_table_and_file_say_the_same(several: list[Relevance], tmp_path: Path) -
     found.save(tmp_path / "r.json")
     assert Relevance.load(tmp_path / "r.json") == found
     text = (tmp_path / "r.json").read_text()
-    for damage in ("{}", "[5]", text.replace('"tolerance_db": 0', '"tolerance_db": 1'), text[:500]):
-        assert damage != text
-        (tmp_path / "r.json").write_text(damage)
-        with pytest.raises(ValueError, match=r"r\.json"):
-            Relevance.load(tmp_path / "r.json")
-    (tmp_path / "r.json").write_text("{}")
-    with pytest.raises(ValueError, match=r"r\.json"):
+    (tmp_path / "r.json").write_text(text.replace('"tolerance_db": 0', '"tolerance_db": 1'))
+    with pytest.raises(ValueError, match=r"r\.json"):  # not what was saved
         Relevance.load(tmp_path / "r.json")
 
 
-def test_a_bare_mesh_assumes_materials_and_leaves_lobes_to_the_fit(furnished: RadioScene) -> None:
-    found = relevance(furnished.mesh, receivers=RECEIVERS[:2], **OPTIONS)
+def test_a_bare_mesh_assumes_materials_and_leaves_lobes_to_the_fit(slabs: RadioScene) -> None:
+    found = relevance(slabs.mesh, receivers=RECEIVERS[:2], **OPTIONS)
     assert found.materials == "assumed"
     assert found["lobes"].kept is None
     assert found.options(F)["lobes"] is None
     assert "assumed" in found.table()
 
 
-def test_a_fit_leaves_out_what_is_ruled_out(furnished: RadioScene) -> None:
-    data = spectra(furnished)
+def test_a_fit_leaves_out_what_is_ruled_out(slabs: RadioScene, data: SpectrumDataset) -> None:
     ruled = relevance(plated(metal(1e-7)), receivers=RECEIVERS[:3], **OPTIONS)
-    field = RadioField.fit(furnished, data, relevance=ruled)
+    field = RadioField.fit(slabs, data, relevance=ruled)
     assert isinstance(field, BistaticField)
     assert field.terms == replace(ruled.terms, residual=field.terms.residual, indirect=field.terms.indirect)
     tried = {choice["term"] for choice in field.report["choices"]}
     assert not tried & {"mirror_order", "mirror_scatter", "scatter_mirror", "diffuse_order"}
-    given = RadioField.fit(furnished, data, relevance=ruled, mirror_order=0)
+    given = RadioField.fit(slabs, data, relevance=ruled, mirror_order=0)
     assert given.terms.mirror_order == 0  # what the caller says counts for more
     with pytest.raises(ValueError, match="relevance"):
-        RadioField.fit(furnished, replace(data, frequency_hz=140e9), relevance=ruled)
+        RadioField.fit(slabs, replace(data, frequency_hz=140e9), relevance=ruled)
 
 
-def test_a_fitted_field_is_judged_by_its_parameters(furnished: RadioScene) -> None:
-    field = RadioField.fit(furnished, spectra(furnished), residual=True, diffuse_order=1)
+def test_a_fitted_field_is_judged_by_its_parameters(slabs: RadioScene, data: SpectrumDataset) -> None:
+    field = RadioField.fit(slabs, data, residual=True, diffuse_order=1)
     found = relevance(field, receivers=RECEIVERS, tolerance_db=0.5)
     assert found.materials == "fit"
     assert found.floor == field.floor
@@ -230,27 +190,3 @@ def test_a_fitted_field_is_judged_by_its_parameters(furnished: RadioScene) -> No
     assert set(found.terms.lobes) <= set(field.terms.lobes)
     with pytest.raises(ValueError, match="frequency_hz"):
         relevance(field, receivers=RECEIVERS, frequency_hz=140e9)
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "name"),
-    [
-        ({"tolerance_db": 0.0}, ValueError, "tolerance_db"),
-        ({"floor": -1.0}, ValueError, "floor"),
-        ({"transmitter": None}, ValueError, "transmitter"),
-        ({"frequency_hz": None}, ValueError, "frequency_hz"),
-        ({"receivers": [[9.0, 9.0, 9.0]]}, ValueError, "receivers"),
-        ({"receivers": [TX]}, ValueError, "transmitter"),
-        ({"shape": (1, 1)}, ValueError, "shape"),
-        ({"geometry": "room"}, TypeError, "geometry"),
-        (
-            {"geometry": Mesh(*box_mesh([0, 0, 0], [5, 4, 3])), "frequency_hz": 5e12},
-            ValueError,
-            "frequency_hz",
-        ),
-    ],
-)
-def test_bad_input_is_named(furnished: RadioScene, change: dict[str, object], error: type, name: str) -> None:
-    options = {"geometry": furnished, "receivers": RECEIVERS[:1], **OPTIONS, **change}
-    with pytest.raises(error, match=name):
-        relevance(options.pop("geometry"), **options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[3]
 FOLDER = ROOT / "benchmarks" / "results"
+sys.path.append(str(ROOT))  # for what the benchmarks compute of their results
 
 NAMES = {
     "bistatic": "**bistatic**",
@@ -49,14 +51,19 @@ def table(name: str) -> str:
 
 @cache
 def read(name: str) -> Row:
-    """A result file."""
-    found: Row = json.loads((FOLDER / f"{name}.json").read_text())
+    """A result file; one of a settled question has its date, the commit that made it, question and answer beside it."""
+    found: Row = json.loads(_file(name).read_text())
     return found
+
+
+def _file(name: str) -> Path:
+    settled = FOLDER / "settled" / f"{name}.json"
+    return settled if settled.is_file() else FOLDER / f"{name}.json"
 
 
 def measured(name: str) -> Row | None:
     """A result file that a checkout may lack; :func:`missing` is then what a page says."""
-    return read(name) if (FOLDER / f"{name}.json").is_file() else None
+    return read(name) if _file(name).is_file() else None
 
 
 def missing(command: str) -> str:
@@ -99,7 +106,7 @@ def _machine(name: str) -> str:
     versions = m["versions"]
     return (
         f"Measured on {m['processor']}, {m['cores']} cores{device}, Python {m['python']}, Warp {versions['warp-lang']}; "
-        f"every figure is in `benchmarks/results/{name}.json`."
+        f"every figure is in `{_file(name).relative_to(ROOT)}`."
     )
 
 

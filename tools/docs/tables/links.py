@@ -133,15 +133,12 @@ def _city_verbs() -> str:
 
 
 BEAMS = {
-    "exhaustive": "exhaustive search, its pilots counted",
     "powers": "true power of every path, no phases",
     "bistatic": "**bistatic field**",
     "zero": "our geometry, no spectra",
     "rf3dgs+": "RF-3DGS+",
     "nearest": "nearest receiver's beam",
     "transmitter": "point at the transmitter",
-    "hierarchical": "hierarchical search",
-    "random": "random",
 }
 
 
@@ -150,38 +147,15 @@ def _beams() -> str:
     found = measured("beams")
     if found is None:
         return missing("python -m benchmarks beams")
-    rows = found["truths"]["exact"]["links"]
-    ends = [e for e in ("rx 16", "rx 256", "rx 4096", "tx 256", "tx 64, rx 64") if find(rows, ends=e)]
-    last = "rx 4096" if "rx 4096" in ends else ends[-1]
+    rows = sorted(found["rows"], key=lambda r: (list(BEAMS).index(r["method"]), r["n_train"] or 0))
+    sizes = sorted({r["elements"] for r in rows})
     lines = []
     for method, count in dict.fromkeys((r["method"], r["n_train"]) for r in rows):
-        own = [find(rows, ends=e, method=method, n_train=count) for e in ends]
-        best = find(rows, ends=last, method=method, n_train=count)
-        lines.append([
-            BEAMS[method], str(count or ""),
-            *(show(r and 100 * r["within"], "{:.0f}") + show(r and 100 * r["within_blocked"], " / {:.0f} %") for r in own),
-            show(best and best["efficiency_los"], "{:.2f}") + show(best and best["efficiency_blocked"], " / {:.2f}"),
-        ])  # fmt: skip
-    lines.sort(key=lambda line: list(BEAMS.values()).index(line[0]))
-    return markdown(("within 1 dB, all / blocked", "spectra", *ends, f"bit/s/Hz, {last}"), lines)
-
-
-@entry("beams-users")
-def _beams_users() -> str:
-    found = measured("beams")
-    rows = found["truths"]["exact"].get("users", []) if found else []
-    if not rows:
-        return missing("python -m benchmarks beams")
-    choices = list(dict.fromkeys(r["choice"] for r in rows))
-    words = {
-        "alone": "own best beams", "together": "beams minding interference", "mr": "maximum ratio", "zf": "zero forcing",
-        "slnr": "SLNR",
-    }  # fmt: skip
-    lines = []
-    for users, method, count in dict.fromkeys((r["users"], r["method"], r["n_train"]) for r in rows):
-        cells = [find(rows, users=users, method=method, n_train=count, choice=c) for c in choices]
-        if any(cells):
-            name = BEAMS.get(method, "true channel of every element")
-            values = (show(c and c["efficiency"], "{:.2f}") for c in cells)
-            lines.append([f"{users} users: {name}", str(count or ""), *values])
-    return markdown(("sum, bit/s/Hz", "spectra", *(words.get(c, c) for c in choices)), lines)
+        own = [find(rows, elements=n, method=method, n_train=count) for n in sizes]
+        cells = [
+            show(r and 100 * r["within"], "{:.0f}") + show(r and 100 * r["within_blocked"], " / {:.0f} %")
+            for r in own
+        ]
+        lines.append([BEAMS[method], str(count or ""), *cells])
+    head = ("within 1 dB, all / blocked", "spectra", *(f"{n} elements" for n in sizes))
+    return markdown(head, lines)

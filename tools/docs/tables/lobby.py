@@ -43,13 +43,19 @@ SCORES = (
 def _scored(found: dict[str, Row]) -> str:
     rows = [
         [
-            NAMES[m],
+            _name(m),
             *(show(row[k], f) for k, _, f in SCORES),
             show(1e3 * row["seconds_per_spectrum"], "{:.2g}"),
         ]
         for m, row in found.items()
     ]
     return markdown(("model", *(h for _, h, _ in SCORES), "a spectrum [ms]"), rows)
+
+
+def _name(method: str) -> str:
+    """Name of a method, or of METHOD-COUNT: one on another number of spectra."""
+    name, _, count = method.rpartition("-")
+    return NAMES[method] if method in NAMES else f"{NAMES[name]}, {count} spectra"
 
 
 @entry("lobby-exact")
@@ -122,8 +128,8 @@ def _uncertainty() -> str:
 def _delays() -> str:
     lines = [
         [
-            f"{TRUTHS[r['truth']]}, {r['n_train']}", show(r["mirror"]["found"], "{:.0%}"),
-            show(r["mirror"]["median_ns"], "{:.4f}"), show(r["scattering"]["median_by_power_ns"], "{:.3f}"),
+            f"{TRUTHS[r['truth']]}, {r['n_train']}", show(r["found"], "{:.0%}"),
+            show(r["mirror_ns"], "{:.4f}"), show(r["scattering_ns"], "{:.3f}"),
         ]
         for r in read("bistatic")["delays"]
     ]  # fmt: skip
@@ -138,7 +144,7 @@ def _transmitter() -> str:
             NAMES[r["method"]], show(r["seen"]["psnr_db"]), show(r["psnr_db"]),
             show(r["direction_within_3deg"], "{:.0%}"), show(r["direction_within_3deg_blocked"], "{:.0%}"),
         ]
-        for r in read("bistatic")["second"]
+        for r in read("transmitter")["second"]
     ]  # fmt: skip
     head = ("model, ten spectra", "fitted transmitter [dB]", "another one [dB]", "within 3°", "blocked")
     return markdown(head, lines)

@@ -79,11 +79,12 @@ EFFECTS = {
 
 @entry("relevance")
 def _relevance() -> str:
-    cases = read("relevance")["cases"]
+    rows = read("relevance")["rows"]
+    cases = list(dict.fromkeys((r["ghz"], r["roughness"]) for r in rows))
     lines = []
     for effect, words in EFFECTS.items():
-        worth = [find(c["effects"], name=effect) for c in cases]
+        worth = [find(rows, name=effect, ghz=ghz, roughness=roughness) for ghz, roughness in cases]
         if any(worth):
             lines.append([words, *(show(w and w["worth_db"], "{:.2g}") for w in worth)])
-    head = [f"{c['frequency_hz'] / 1e9:.0f} GHz, {c['roughness']}" for c in cases]
+    head = [f"{ghz:.0f} GHz, {roughness}" for ghz, roughness in cases]
     return markdown(("effect left out [dB]", *head), lines)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from tables.common import NAMES, Row, entry, markdown, read, show
+from functools import cache
+
+from benchmarks.evaluation import margins, summarise, unpacked
+from tables.common import NAMES, Row, entry, find, markdown, read, show
 
 PLACES = {
     ("exact", "random"): "exact engine",
@@ -15,9 +18,24 @@ PAPER_TRUTHS = {truth: name for (truth, split), name in PLACES.items() if split 
 PAPER_TRUTHS["paper-law"] = "targets made by the paper's law"
 
 
+@cache
+def runs() -> list[Row]:
+    """Every run of the paper's evaluation."""
+    return unpacked(read("paper"))
+
+
+@cache
+def summary() -> list[Row]:
+    """Means of the runs of a kind, with LPIPS where it was measured."""
+    known = read("lpips")["rows"]
+    place = ("truth", "split", "count", "method")
+    found = [(row, find(known, **{k: row[k] for k in place})) for row in summarise(runs())]
+    return [{**row, "lpips": seen and seen["lpips"]} for row, seen in found]
+
+
 def paper(truth: str, split: str, count: int | None = None) -> list[Row]:
-    """Rows of the paper's evaluation of one place, those of ``count`` spectra and of none where it is given."""
-    rows = [r for r in read("paper")["rows"] if (r["truth"], r["split"]) == (truth, split)]
+    """Rows of one place, those of ``count`` spectra and of none where it is given."""
+    rows = [r for r in summary() if (r["truth"], r["split"]) == (truth, split)]
     rows = [r for r in rows if count is None or r["count"] in (count, 0)]
     return sorted(rows, key=lambda r: (list(NAMES).index(r["method"]), r["count"]))
 
@@ -67,9 +85,7 @@ def _paper_margins() -> str:
 
     parts = []
     for (truth, split), name in PLACES.items():
-        rows = [
-            r for r in read("paper")["margins"] if (r["truth"], r["split"], r["count"]) == (truth, split, 100)
-        ]
+        rows = [r for r in margins(runs()) if (r["truth"], r["split"], r["count"]) == (truth, split, 100)]
         lines = [
             [
                 NAMES[r["method"]],
@@ -95,7 +111,7 @@ def _paper_behind() -> str:
     }  # fmt: skip
     behind: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
     compared = 0
-    for r in read("paper")["margins"]:
+    for r in margins(runs()):
         for figure, word in words.items():
             for part, who in (("", ""), ("_blocked", ", blocked")):
                 margin = r[figure + part]
@@ -109,8 +125,8 @@ def _paper_behind() -> str:
         return text + "."
     lines = []
     for (place, method, figure), found in behind.items():
-        counts, margins = zip(*sorted(found), strict=True)
-        worst = f"{max(margins, key=abs):+.2g}"
+        counts, differences = zip(*sorted(found), strict=True)
+        worst = f"{max(differences, key=abs):+.2g}"
         lines.append([place, method, figure, ", ".join(map(str, counts)), worst])
     return text + ":\n\n" + markdown(("truth", "behind", "in", "spectra", "by at most"), lines)
 
@@ -124,9 +140,9 @@ def _paper_detail() -> str:
                 NAMES[r["method"]], show(r["ssim"], "{:.2f}"), show(r["lpips"], "{:.3f}"), show(r["rmse_db"]),
                 f"{r['direction_within_3deg']:.0%} / {show(r['direction_within_3deg_blocked'], '{:.0%}')}",
                 f"{r['beam_gain_loss_db']:.1f} / {show(r['beam_gain_loss_db_blocked'])}",
-                show(r["tof_error_median_ns"], "{:.2g}"), show(r.get("train_s"), "{:.3g}"),
-                show(1e3 * r["seconds_per_spectrum"], "{:.3g}"), show(r.get("peak_memory_gib"), "{:.1f}"),
-                show(r.get("model_mib"), "{:.2g}"),
+                show(r["tof_error_median_ns"], "{:.2g}"), show(r["train_s"], "{:.3g}"),
+                show(1e3 * r["seconds_per_spectrum"], "{:.3g}"), show(r["peak_memory_gib"], "{:.1f}"),
+                show(r["model_mib"], "{:.2g}"),
             ]
             for r in paper(*place, 100)
         ]  # fmt: skip
@@ -141,36 +157,29 @@ def _paper_detail() -> str:
 
 @entry("paper-statement")
 def _paper_statement() -> str:
-    lines = [r for r in read("paper")["finding"] if r["split"] == "random" and not r["opacity"]]
-    published = {r["method"]: r["psnr_db"] for r in read("paper")["published"]}
+    published = {r["method"]: r["psnr_db"] for r in read("published")["rows"]}
     parts = [f"The paper reports RF-3DGS+ {published['rf3dgs+'] - published['rf3dgs']:.1f} dB above RF-3DGS."]
     for truth, name in PAPER_TRUTHS.items():
-        own = [r["psnr_db"]["difference"] for r in lines if r["truth"] == truth]
-        if own:
-            parts.append(f"{name[0].upper()}{name[1:]}: {sum(own) / len(own):+.1f} dB over {len(own)} sizes.")
+        own = [r["psnr_db"]["difference"] for r in read("law")["sizes"] if r["truth"] == truth]
+        parts.append(f"{name[0].upper()}{name[1:]}: {sum(own) / len(own):+.1f} dB over {len(own)} sizes.")
     return " ".join(parts)
 
 
 @entry("paper-runs")
 def _paper_runs() -> str:
-    found = read("paper")
-    missing_runs = len(found["missing"])
-    data = "; ".join(
-        f"{name} {found['data'][f'{truth}/random']['content']}"
-        for truth, name in PAPER_TRUTHS.items()
-        if f"{truth}/random" in found["data"]
-    )
-    left = f" {missing_runs} of their runs are missing." if missing_runs else ""
-    absent = [name for (t, split), name in PLACES.items() if f"{t}/{split}" not in found["data"]]
-    none = f" Not run yet: {', '.join(absent)}." if absent else ""
-    rooms = {room for r in found["rows"] if r["truth"] in ("exact", "sionna") for room in r["rooms"]}
+    hashes = {r["truth"]: r["data"] for r in runs()} | {"paper-law": read("law")["data"]}
+    data = "; ".join(f"{name} {hashes[truth]}" for truth, name in PAPER_TRUTHS.items())
+    missing_runs = read("paper")["missing"]
+    left = f" Missing runs: {len(missing_runs)}." if missing_runs else ""
+    rooms = {r["room"] for r in runs() if r["truth"] in ("exact", "sionna")}
     made = f" Reconstructions of the lobby, from the same photos, behind the rows: {len(rooms)}."
-    return f"Data, by the hash of the file: {data}.{made}{left}{none}"
+    return f"Data, by the hash of the file: {data}.{made}{left}"
 
 
 @entry("paper-networks")
 def _paper_networks() -> str:
-    effort = read("paper")["effort"]
+    found = read("networks")
+    effort = found["effort"]
     lines = [
         [
             NAMES[r["method"]], name, str(r["count"]), show(r["fit_s"] / 60.0, "{:.0f}"), "; ".join(r["devices"]),
@@ -178,9 +187,9 @@ def _paper_networks() -> str:
             show(r["loss_curve"][-1] / r["loss_curve"][len(r["loss_curve"]) // 2], "{:.2f}"), show(r["psnr_db"]),
             show(r["lpips"], "{:.2f}"),
         ]
-        for place, name in PLACES.items()
-        for r in paper(*place)
-        if r["loss_curve"]
+        for (truth, split), name in PLACES.items()
+        for r in sorted(found["rows"], key=lambda r: (list(NAMES).index(r["method"]), r["count"]))
+        if (r["truth"], r["split"]) == (truth, split)
     ]  # fmt: skip
     head = (
         "network", "truth", "spectra", "training [min]", "on", "last loss over first", "last loss over that at half time",
@@ -210,7 +219,7 @@ def _paper_stage2() -> str:
                         show(r["train_s"], "{:.0f}"),
                     ]
                 )
-    for r in read("paper")["published"][:1]:
+    for r in read("published")["rows"][:1]:
         lines.append(
             [NAMES[r["method"]], "as published, NVIDIA RTX 4090", "", "", show(r["train_s"], "{:.0f}")]
         )
@@ -224,7 +233,7 @@ def _published() -> str:
             NAMES[r["method"]], show(r["psnr_db"], "{:.2f}"), show(r["ssim"], "{:.3f}"), show(r["lpips"], "{:.3f}"),
             show(r["train_s"], "{:.0f}"), show(1e3 * r["seconds_per_spectrum"], "{:.3g}"),
         ]
-        for r in read("paper")["published"]
+        for r in read("published")["rows"]
     ]  # fmt: skip
     return markdown(("as published", "PSNR [dB]", "SSIM", "LPIPS", "training [s]", "a spectrum [ms]"), lines)
 
@@ -232,24 +241,21 @@ def _published() -> str:
 @entry("law")
 def _law() -> str:
     words = {"exact": "power that scatters as it does", "paper-law": "given the paper's factor, path by path"}
-    found = [r for r in read("paper")["finding"] if r["split"] == "random" and not r["opacity"]]
     lines = [
         [
             words.get(r["truth"], PLACES.get((r["truth"], "random"), r["truth"])), str(r["count"]),
             show(r["psnr_db"]["rf3dgs+"]), show(r["psnr_db"]["rf3dgs"]), show(r["psnr_db"]["difference"], "{:+.1f}"),
         ]
-        for r in found
+        for r in read("law")["sizes"]
     ]  # fmt: skip
     return markdown(("truth", "spectra", "RF-3DGS+ [dB]", "RF-3DGS [dB]", "difference [dB]"), lines)
 
 
 @entry("gap")
 def _gap() -> str:
-    found = read("gap")
-    what = {r["choice"]: r["what"] for r in found["differences"]}
     lines = []
-    for r in found["differences"]:
-        cells = [what[r["choice"]], str(r["train"])]
+    for r in read("gap")["differences"]:
+        cells = [r["what"], str(r["train"])]
         for key in ("psnr_db", "own_psnr_db"):
             cells += [show(r[key][m], "{:.1f}") for m in ("rf3dgs+", "rf3dgs")]
             cells.append(show(r[key]["difference"], "{:+.1f}"))

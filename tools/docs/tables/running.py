@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-import sys
 
-from tables.common import ROOT, entry, markdown, read, show
+from tables.common import entry, markdown, read, show
 
 THREADS = 100 * 16  # of a hundred machines
 LINK = 1.25e9  # bytes a second: 10 Gbit/s
@@ -59,7 +58,6 @@ def _cluster_cost() -> str:
 
 @entry("benchmarks")
 def _benchmarks() -> str:
-    sys.path.append(str(ROOT))
     from benchmarks.__main__ import NAMES as commands
 
     return markdown(

@@ -83,6 +83,16 @@ class SparseModel:
         )
 
 
+@dataclass(frozen=True)
+class Similarity:
+    """The points x at ``scale rotation x + shift``, and the rms distance at those that it was fitted to [m]."""
+
+    scale: float
+    rotation: np.ndarray
+    shift: np.ndarray
+    rms_m: float
+
+
 def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]) -> SparseModel:
     """``sparse`` in metres and world axes, by the similarity that best meets surveyed camera positions.
 
@@ -96,27 +106,35 @@ def align_to_known(sparse: SparseModel, known_positions: Mapping[str, ArrayLike]
         ValueError: for fewer than three positions, positions on one line, a name that is no photo, or a surveyed
             photo that could not be posed.
     """
+    moved = known_similarity(sparse.cameras, sparse.unposed, known_positions)
+    found = transformed(sparse, moved.scale, moved.rotation, moved.shift)
+    return replace(found, metric=True, upright=True, scale_rms_m=moved.rms_m)
+
+
+def known_similarity(
+    cameras: Mapping[str, Camera], unposed: Sequence[str], known_positions: Mapping[str, ArrayLike]
+) -> Similarity:
+    """What brings ``cameras``, by photo name, to surveyed positions; see :func:`align_to_known` for both and errors."""
     if len(known_positions) < 3:
         raise ValueError(
             f"known_positions: got {len(known_positions)}, expected at least 3 camera positions that are not on a line"
         )
-    names = match_names("known_positions", known_positions, (*sparse.cameras, *sparse.unposed))
-    lost = [n for n in names if n not in sparse.cameras]
-    usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in sparse.cameras}
+    names = match_names("known_positions", known_positions, (*cameras, *unposed))
+    lost = [n for n in names if n not in cameras]
+    usable = {n: p for n, p in zip(names, known_positions.values(), strict=True) if n in cameras}
     if len(usable) < 3:
         raise ValueError(
             f"known_positions: only {len(usable)} of the surveyed photos were posed, expected at least 3; "
             f"without pose: {some(lost)}"
         )
-    source = np.array([sparse.cameras[n].position for n in usable])
+    source = np.array([cameras[n].position for n in usable])
     target = np.array([check_array(f"known_positions[{n!r}]", p, (3,)) for n, p in usable.items()])
     try:
         scale, rotation, shift = fit_similarity(source, target)
     except ValueError as error:
         raise ValueError(f"known_positions: {error}") from error
     rms = float(np.sqrt(((scale * source @ rotation.T + shift - target) ** 2).sum(axis=1).mean()))
-    moved = transformed(sparse, scale, rotation, shift)
-    return replace(moved, metric=True, upright=True, scale_rms_m=rms)
+    return Similarity(scale, rotation, shift, rms)
 
 
 Scale = float | tuple[str, str, float]
@@ -203,10 +221,8 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> tuple[float, np.ndar
 
 def transformed(sparse: SparseModel, scale: float, rotation: np.ndarray, shift: np.ndarray) -> SparseModel:
     """``sparse`` with every point ``x`` at ``scale rotation x + shift``; cameras move along."""
-    cameras = {}
-    for name, camera in sparse.cameras.items():
-        pose = np.eye(4)
-        pose[:3, :3] = camera.rotation @ rotation.T
-        pose[:3, 3] = -pose[:3, :3] @ (scale * rotation @ camera.position + shift)
-        cameras[name] = replace(camera, world_to_camera=pose)
+    cameras = {
+        name: camera.transformed(scale=scale, rotation=rotation, shift=shift)
+        for name, camera in sparse.cameras.items()
+    }
     return replace(sparse, cameras=cameras, points=scale * sparse.points @ rotation.T + shift)

@@ -7,12 +7,20 @@ centres lie at +0.5. A spherical image has zenith ``(i + 0.5) pi / H`` in row i 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_number, check_positive, check_type, checked
+from warprrf.checks import (
+    check_array,
+    check_count,
+    check_number,
+    check_positive,
+    check_similarity,
+    check_type,
+    checked,
+)
 
 KINDS = ("pinhole", "spherical")
 
@@ -125,6 +133,19 @@ class Camera:
             self.cx * sx,
             self.cy * sy,
         )
+
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Camera:
+        """The camera that sees points at ``scale rotation x + shift`` where this one sees ``x``.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`. ValueError too for a spherical one that would be turned.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        pose = np.eye(4)
+        pose[:3, :3] = self.rotation @ turn.T
+        pose[:3, 3] = -pose[:3, :3] @ (scale * turn @ self.position + moved)
+        return replace(self, world_to_camera=pose)
 
     def project(self, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Pixel coordinates ``(N, 2)`` of world points ``(N, 3)``, and their depth along the optical axis ``(N,)`` [m]

@@ -6,15 +6,18 @@ Scales in metres, opacities in [0, 1], quaternions wxyz (normalised on entry), c
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from warprrf.checks import LARGEST_M, check_array, check_count, checked, one_line
+from warprrf.checks import LARGEST_M, check_array, check_count, check_similarity, checked, one_line
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.ply_files import read_ply, write_ply
+from warprrf.kernels.raster import sh as _sh
 from warprrf.kernels.raster.sh import COEFFICIENTS
 
 # The file holds the logit; beyond this an opacity is as good as 0 or 1 and its logit stays finite in float32.
@@ -118,6 +121,22 @@ class Gaussians:
         """Axis of the smallest scale, up to sign, shape ``(N, 3)`` float64."""
         return self.rotations[np.arange(len(self)), :, np.argmin(self.scales, axis=1)]
 
+    def transformed(
+        self, *, scale: float = 1.0, rotation: ArrayLike | None = None, shift: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> Gaussians:
+        """The Gaussians at ``scale rotation x + shift``; their colours turn along.
+
+        Arguments and errors: see :func:`warprrf.checks.check_similarity`.
+        """
+        scale, turn, moved = check_similarity(scale, rotation, shift)
+        return replace(
+            self,
+            means=scale * self.means @ turn.T + moved,
+            quaternions=quaternions_of(turn @ self.rotations),
+            scales=scale * self.scales,
+            sh=np.einsum("jk,nkc->njc", _turned_harmonics(turn, self.sh.shape[1]), self.sh),
+        )
+
     def save_ply(self, path: str | os.PathLike[str]) -> None:
         """Write the INRIA splat layout (binary little endian): x y z, normals (zero), f_dc, f_rest channel by channel,
         opacity as logit, scales as logarithm, rotation wxyz.
@@ -181,6 +200,21 @@ class Gaussians:
             )
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+def _turned_harmonics(rotation: np.ndarray, count: int) -> np.ndarray:
+    """Coefficients of the first ``count`` harmonics after a turn from those before, shape ``(count, count)``.
+
+    A turned harmonic is a sum of those of its degree, so values at more directions than harmonics fix the sum.
+    """
+    kernels = _sh.build(wp.float64)
+    directions = np.random.default_rng(0).standard_normal((4 * count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before, after = (
+        np.array([[float(v) for v in kernels.basis(wp.vec3d(*d))][:count] for d in turned])
+        for turned in (directions, directions @ rotation.T)
+    )
+    return np.linalg.lstsq(after, before, rcond=None)[0]
 
 
 def rotations_of(quaternions: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -151,6 +152,10 @@ class Rasterizer:
         self.kernels = reference if self.per_pixel else blocks
         self.tile = PIXEL_TILE if self.per_pixel else blocks.BLOCK
         self.threads_per_tile = PIXEL_TILE**2 if self.per_pixel else 1
+
+    def __reduce__(self) -> tuple[Callable[..., Rasterizer], tuple[()]]:
+        device, blending, real = str(self.device), self.blending, self.real
+        return partial(Rasterizer, device=device, blending=blending, real=real, per_pixel=self.per_pixel), ()
 
     def _vector(self, size: int) -> Any:
         """Warp's vector type of this precision."""

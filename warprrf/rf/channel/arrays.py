@@ -99,6 +99,11 @@ class PlanarArray:
             raise ValueError(
                 f"orientation: got shape {value.shape}, expected yaw, pitch and roll (3,) or a rotation (3, 3)"
             )
+        if np.linalg.det(value) < 0:
+            raise ValueError(
+                "orientation: got a matrix of determinant -1, which mirrors the array; expected a rotation, of "
+                "determinant 1: turn one of its columns round"
+            )
         return value
 
     def positions(self, wavelength_m: float) -> np.ndarray:

@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from warprrf.checks import check_array, check_count, check_positive, checked
+from warprrf.checks import check_array, check_count, check_positive, checked, one_line
 from warprrf.rf.channel.arrays import ISOTROPIC, PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.em.waves import carrier_phase
@@ -207,6 +207,8 @@ class BeamChoice:
         gain: Predicted mean |w_r^T H w_t|^2 [linear]; 0 for a receiver that no path reaches: any choice.
     """
 
+    __repr__ = one_line
+
     tx: np.ndarray
     rx: np.ndarray
     gain: np.ndarray
@@ -268,6 +270,8 @@ class MultiUserChoice:
         rx: Index of the user's own beam, shape ``(U,)``.
         sinr: Predicted signal over interference and noise [linear], shape ``(U,)``.
     """
+
+    __repr__ = one_line
 
     tx: np.ndarray
     rx: np.ndarray

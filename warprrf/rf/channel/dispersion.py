@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from warprrf.checks import check_array, checked
+from warprrf.checks import check_array, checked, one_line
 from warprrf.rf.channel.path_arrays import PathArrays
 
 COHERENCE = 0.5
@@ -40,6 +40,8 @@ class Dispersion:
         zenith_spread_departure_rad: Of the zenith of departure.
         coherence_bandwidth_hz: Frequency shift at which correlation first falls to one half [Hz]; inf if it never does.
     """
+
+    __repr__ = one_line
 
     path_gain: np.ndarray
     mean_delay_s: np.ndarray

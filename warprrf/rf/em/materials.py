@@ -67,7 +67,7 @@ class Band:
     def __post_init__(self) -> None:
         for name in ("a", "b", "c", "d"):
             check_number(name, getattr(self, name))
-        if not check_positive("low_hz", self.low_hz) < check_positive("high_hz", self.high_hz):
+        if not check_frequency(self.low_hz, "low_hz") < check_frequency(self.high_hz, "high_hz"):
             raise ValueError(f"low_hz, high_hz: got {self.low_hz}, {self.high_hz}, expected 0 < low < high")
         for frequency_hz in (self.low_hz, self.high_hz):  # both laws are monotonic in between
             what = f" at {frequency_hz / 1e9:g} GHz"
@@ -370,11 +370,31 @@ def _material(entry: object, where: str) -> Material:
         raise ValueError(f"{where}: {error}") from error
 
 
+_SHORT = ("itu", "thickness", "scattering", "pattern", "alpha_r", "xpd")
+
+
+def _short(name: str, entry: Any, where: str) -> Material:
+    """A material of P.2040 by its name there and what is said besides."""
+    given = dict(_mapping(entry, where))
+    unknown = sorted(set(given) - set(_SHORT))
+    if unknown:
+        raise ValueError(f"{where}: got {', '.join(unknown)}, expected among {', '.join(_SHORT)}")
+    itu = given.pop("itu", name)
+    if "thickness" in given:
+        given["thickness_m"] = given.pop("thickness")
+    try:
+        return itu_material(itu, name=name, **given)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
 @checked
 def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     """Read a table of materials (see ``data/lobby/materials.json``), by name.
 
     An entry has a ``roughness_m`` or, where that is not known, a ``scattering`` coefficient; of both the latter counts.
+    Or the table names materials of ITU-R P.2040, with what the recommendation does not say, as of :func:`itu_material`:
+    ``{"pane": {"itu": "glass", "thickness": 0.01}}``; ``itu`` may be left out where the name says it.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -383,9 +403,14 @@ def load_materials(path: str | os.PathLike[str]) -> dict[str, Material]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no table of materials {path}")
-    table = read_json(path).get("materials")
+    whole = read_json(path)
+    table = whole.get("materials")
+    if table is None:
+        return {
+            name: _short(name, entry, f"path: {path}, material {name!r}") for name, entry in whole.items()
+        }
     if not isinstance(table, list):
-        raise ValueError(f"path: {path} holds no list 'materials'")
+        raise ValueError(f"path: {path}: 'materials' is no list")
     found: dict[str, Material] = {}
     for k, entry in enumerate(table):
         material = _material(entry, f"path: {path}, entry {k}")

@@ -9,14 +9,16 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, ClassVar, Self, TypeAlias, Unpack
+from typing import Any, ClassVar, Self, TypeAlias, Unpack, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import tensor_files
+from warprrf.cache import Cache
 from warprrf.checks import (
     LARGEST_M,
     check_array,
@@ -30,6 +32,7 @@ from warprrf.device import DeviceLike, Progress, resolve
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.netcdf_files import Variable
 from warprrf.rf.channel.array_spectra import ArraySpectra
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.response import LinkOptions as LinkEnds
 from warprrf.rf.channel.response import frequency_response
 from warprrf.rf.em.absorption import Air, Gas
@@ -38,16 +41,15 @@ from warprrf.rf.fields.batches import Batch, Delivery
 from warprrf.rf.maps.links import BeamSearch, LinkOptions, Links, links_of
 from warprrf.rf.maps.radio_map import MapOptions, RadioMap, radio_map
 from warprrf.rf.paths.path_set import PATH_VARIABLES, Paths, arrays_of, ends_and_attributes
-from warprrf.rf.positions import check_positions, check_receivers
-from warprrf.rf.spectra.antenna import Pattern
+from warprrf.rf.positions import Ends, check_positions
+from warprrf.rf.spectra.antenna import Pattern, sample_pattern
 from warprrf.rf.spectra.dataset import SpectrumDataset, measured_at
 from warprrf.rf.spectra.readings import Readings
-from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_shape
+from warprrf.rf.spectra.spectrum import BEAM_SIGMA_RAD, Spectra, Spectrum, check_beam, check_shape
 from warprrf.steps import digest
 
 _PLAIN = ("frequency_hz", "shape", "floor", "range_db", "beam_sigma_rad")
 """Attributes of every model that are numbers, under these names in the header of a file."""
-NARROWEST_BEAM_RAD = 1e-4
 Measured: TypeAlias = SpectrumDataset | Readings | ArraySpectra
 """What fields are fitted to: a set of spectra, a table of readings, spectra of coherent arrays."""
 Data: TypeAlias = Measured | Sequence[Measured]
@@ -84,6 +86,7 @@ class RadioField(ABC):
     air: Air | None
     device: DeviceLike
     report: dict[str, Any]
+    _grids: Cache
     models: ClassVar[dict[str, type[RadioField]]] = {}
 
     @property
@@ -99,8 +102,10 @@ class RadioField(ABC):
             geometry: a Reconstruction (anything with ``.gaussians`` and ``.mesh``), a Scene or a Mesh.
             ds: training set: spectra, and for a ``bistatic`` field also :class:`Readings`, or a list of both.
             model: ``"bistatic"``, ``"rf3dgs+"`` or ``"rf3dgs"``.
-            options: keyword arguments of :meth:`BistaticField.fit` or :meth:`HarmonicField.fit`, which name and check
-                them.
+            options: by name, ``device`` and ``progress`` among them. A ``bistatic`` field takes ``client``, and those of
+                :class:`warprrf.FitOptions`: ``quick=True``, ``relevance``, ``mirror_order``, ``diffuse_order``, ``lobes``,
+                ``reciprocal``, ``residual``, ``gain_offset``, ``iterations``, ``seed``, ... The others take those of
+                :class:`warprrf.FieldOptions`: ``iterations``, ``batch``, ``sh_degree``, ``checkpoint``, ``seed``, ...
 
         Raises:
             ValueError, TypeError: for an unknown model or bad arguments.
@@ -181,15 +186,63 @@ class RadioField(ABC):
             ValueError: for a carrier outside ITU-R P.676; for an ``rf3dgs`` field, which has no lengths.
         """
 
+    def spectrum(
+        self,
+        receivers: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        *,
+        shape: tuple[int, int] | None = None,
+    ) -> Spectrum:
+        """The spatial spectrum of every receiver.
+
+        Args:
+            receivers: positions [m], shape ``(3,)`` or ``(R, 3)``.
+            transmitter: position ``(3,)``, or one for each receiver ``(R, 3)`` [m]; the fitted one by default. Lengths,
+                visibility and mirror points are those of any other too, materials and gains are kept.
+            shape: rows and columns; the field's own by default. Floor and range go with the size of the pixels.
+
+        Returns:
+            Arrays ``(H, W)`` for one receiver and transmitter ``(3,)``, else ``(R, H, W)``.
+
+        Raises:
+            ValueError: as for :meth:`check_positions`.
+        """
+        field = self.on_grid(shape)
+        return field._looked(receivers, transmitter, field._trace_spectrum)
+
+    def _looked(
+        self,
+        receivers: ArrayLike,
+        transmitter: ArrayLike | None,
+        look: Callable[[np.ndarray, np.ndarray], Spectrum],
+    ) -> Spectrum:
+        """What ``look`` finds at every receiver (3,) under its transmitter (3,)."""
+        ends = self.check_positions(receivers, transmitter)
+        found = [look(*link) for link in zip(ends.receivers, ends.transmitters, strict=True)]
+        return found[0] if ends.single else Spectrum.stack(found)
+
     @abstractmethod
-    def spectrum(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> Spectrum:
-        """The spatial spectrum at ``rx`` (3,) [m]."""
+    def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
+        """:meth:`spectrum` at a position (3,) that was checked."""
+
+    def on_grid(self, shape: tuple[int, int] | None) -> Self:
+        """The same field, its spectra of ``shape`` rows and columns; None for its own.
+
+        Floor and range, which are those of a pixel, go with the pixels' size.
+        """
+        if shape is None or check_shape(shape) == tuple(self.shape):
+            return self
+        smaller = float(np.prod(self.shape) / np.prod(shape))
+        low, high = (level + 10.0 * float(np.log10(smaller)) for level in self.range_db)
+        new = {"shape": check_shape(shape), "floor": self.floor * smaller, "range_db": (low, high)}
+        return self._grids.get(new["shape"], lambda: replace(cast(Any, self), **new))
 
     def spectra(
         self,
         receivers: ArrayLike,
-        transmitters: ArrayLike | None = None,
+        transmitter: ArrayLike | None = None,
         *,
+        shape: tuple[int, int] | None = None,
         store: str | os.PathLike[str] | None = None,
         client: Any = None,
         progress: Progress | None = None,
@@ -197,15 +250,15 @@ class RadioField(ABC):
         """Path gain of the spectra at many receivers: what :meth:`spectrum` says of each, without delays and departures.
 
         Args:
-            receivers: positions [m], shape ``(R, 3)``.
-            transmitters: position ``(3,)``, or one for each receiver ``(R, 3)`` [m]; the fitted one by default.
+            receivers, transmitter, shape: as for :meth:`spectrum`.
             store: a NetCDF-4 file that is written as answers come, in the place of memory; a call that was killed goes on
                 where it stopped. Until the last answer its name ends in ``.unfinished``.
             client: a ``dask.distributed.Client`` whose workers compute, to the same bits; this process by default.
             progress: called as ``progress("spectra", done, total)``.
 
         Returns:
-            Path gain ``(R, H, W)`` and where it holds; path gain of a store stays on the disk.
+            Path gain ``(R, H, W)``, ``(H, W)`` for one receiver and transmitter, and where it holds; path gain of a store
+            stays on the disk.
 
         Raises:
             ValueError: as for :meth:`spectrum`, and for a ``store`` of something else.
@@ -215,15 +268,16 @@ class RadioField(ABC):
             many = field.spectra(receivers, store="spectra.nc", client=distributed.Client("lab:8786"))
             many.path_gain[17]
         """
-        batch = self._batch("spectra", receivers, transmitters)
+        field, batch = self.on_grid(shape), Batch("spectra", self.check_positions(receivers, transmitter))
         variables = {"path_gain": Variable(("receiver", "zenith", "azimuth"), "1")}
-        delivery = Delivery(store, client, progress)
-        found = batch.gather(partial(_spectra, self), variables, {}, self._known_by(batch), delivery)
-        return Spectra(batch.receivers, batch.transmitters, self.frequency_hz, found["path_gain"])
+        delivery, key = Delivery(store, client, progress), field._known_by(store, batch)
+        found = batch.gather(partial(_spectra, field), variables, {}, key, delivery)
+        to, source, gain = map(batch.ends.shaped, (*batch.ends[:2], found["path_gain"]))
+        return Spectra(to, source, self.frequency_hz, gain)
 
     def paths(
         self,
-        rx: ArrayLike,
+        receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
         max_paths: int | None = None,
         *,
@@ -237,31 +291,34 @@ class RadioField(ABC):
         paths in proportion.
 
         Args:
-            rx: one position ``(3,)``, or ``(R, 3)`` for arrays ``(R, L)``, padded [m].
-            transmitter: position ``(3,)``, or one for each receiver ``(R, 3)`` [m]; the fitted one by default.
+            receivers, transmitter: as for :meth:`spectrum`.
             max_paths: keep the strongest only (the sum is then what they carry).
             store: as for :meth:`spectra`, with room for ``max_paths``; :meth:`Paths.load` reads it.
             client, progress: as for :meth:`spectra`.
+
+        Returns:
+            Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``, padded.
 
         Raises:
             ValueError: as for :meth:`spectra`, for a ``max_paths`` below 1, and for a store without one.
         """
         if max_paths is not None:
             check_count("max_paths", max_paths)
-        batch = self._batch("paths", rx, transmitter, names=("rx", "transmitter"))
-        if np.ndim(rx) == 1 and store is None and client is None:  # in a hurry
-            return self._trace_paths(batch.receivers[0], batch.transmitters[0], max_paths)
+        batch = Batch("paths", self.check_positions(receivers, transmitter))
+        ends = batch.ends
+        if ends.single and store is None and client is None:  # in a hurry
+            return self._trace_paths(ends.receivers[0], ends.transmitters[0], max_paths)
         work, delivery = partial(_paths, self, max_paths), Delivery(store, client, progress)
         if store is None:
             found: dict[int, Paths] = {}
             for rows, several in batch.each(work, delivery):
                 found |= zip(rows.tolist(), several, strict=True)
-            return found[0] if np.ndim(rx) == 1 else Paths.stack([found[k] for k in sorted(found)])
+            return found[0] if ends.single else Paths.stack([found[k] for k in sorted(found)])
         if max_paths is None:
             raise ValueError("max_paths: got None with a store, expected how many paths it has room for")
-        source = batch.transmitters if len(batch.groups()) > 1 else batch.transmitters[0]
-        known, attributes = ends_and_attributes(batch.receivers, source, self.frequency_hz, self.air)
-        attributes |= self._known_by(batch, max_paths)
+        source = ends.transmitters if len(ends.groups()) > 1 else ends.transmitters[0]
+        known, attributes = ends_and_attributes(ends.receivers, source, self.frequency_hz, self.air)
+        attributes |= {"single_receiver": int(ends.single)} | self._known_by(store, batch, max_paths)
         batch.gather(partial(_path_arrays, work, max_paths), PATH_VARIABLES, known, attributes, delivery)
         return Paths.load(store)
 
@@ -269,7 +326,7 @@ class RadioField(ABC):
         self,
         receivers: ArrayLike,
         frequencies_hz: ArrayLike,
-        transmitters: ArrayLike | None = None,
+        transmitter: ArrayLike | None = None,
         *,
         max_paths: int | None = None,
         store: str | os.PathLike[str] | None = None,
@@ -280,15 +337,15 @@ class RadioField(ABC):
         """Channel frequency responses at many receivers, from their :meth:`paths`, which are not kept.
 
         Args:
-            receivers: positions [m], shape ``(R, 3)``.
+            receivers, transmitter: as for :meth:`spectrum`.
             frequencies_hz: absolute [Hz], shape ``(F,)``.
-            transmitters: as for :meth:`spectra`.
             max_paths: as for :meth:`paths`.
             store, client, progress: as for :meth:`spectra`.
             response: as for :meth:`Paths.cfr`: ``tx_array``, ``rx_array``, ``diffuse``, ...
 
         Returns:
-            Shape ``(R, M, N, F)``, complex64: M receiving and N transmitting ports; that of a store stays on the disk.
+            Shape ``(R, M, N, F)``, ``(M, N, F)`` for one receiver and transmitter, complex64: M receiving and N
+            transmitting ports; that of a store stays on the disk.
 
         Raises:
             ValueError: as for :meth:`spectra` and :meth:`Paths.cfr`.
@@ -297,45 +354,28 @@ class RadioField(ABC):
         if unknown := set(response) - set(ResponseOptions.__annotations__):
             raise TypeError(f"cfr: got {', '.join(sorted(unknown))}, expected options of Paths.cfr")
         ports = [a.ports for a in (response.get("tx_array"), response.get("rx_array")) if a is not None]
-        batch = self._batch("cfr", receivers, transmitters, 8 * len(f) * int(np.prod(ports)))
+        ends = self.check_positions(receivers, transmitter)
+        batch = Batch("cfr", ends, 8 * len(f) * int(np.prod(ports)))
         variables = {
             "cfr": Variable(("receiver", "receiving_port", "transmitting_port", "frequency"), "1"),
             "frequency": Variable(("frequency",), "Hz"),
         }
-        key = self._known_by(batch, f, max_paths, response)
+        key = self._known_by(store, batch, f, max_paths, {n: _sampled(o) for n, o in response.items()})
         work, delivery = partial(_cfr, self, f, max_paths, response), Delivery(store, client, progress)
-        return batch.gather(work, variables, {"frequency": f}, key, delivery)["cfr"]
+        return ends.shaped(batch.gather(work, variables, {"frequency": f}, key, delivery)["cfr"])
 
-    def _batch(
-        self,
-        stage: str,
-        receivers: ArrayLike,
-        transmitters: ArrayLike | None,
-        row_bytes: int = 0,
-        names: tuple[str, str] = ("receivers", "transmitters"),
-    ) -> Batch:
-        """What is asked of many receivers, once the field holds there."""
-        places = np.atleast_2d(check_receivers(names[0], receivers))
-        sources = check_array(names[1], self.transmitter if transmitters is None else transmitters)
-        if sources.shape not in ((3,), places.shape):
-            raise ValueError(
-                f"{names[1]}: got shape {sources.shape}, expected (3,) or one for each receiver, {places.shape}"
-            )
-        batch = Batch(stage, places, np.broadcast_to(sources, places.shape), row_bytes)
-        for source, own in batch.groups():
-            self.check_positions(places[own], source, name=names[0])
-        return batch
-
-    def _known_by(self, batch: Batch, *options: Any) -> dict[str, str]:
+    def _known_by(self, store: str | os.PathLike[str] | None, batch: Batch, *options: Any) -> dict[str, str]:
         """What tells a store of these answers from others."""
+        if store is None:
+            return {}
         tensors, header = self._whole()
         del header["report"]
-        asked = batch.stage, batch.receivers, batch.transmitters, str(resolve(self.device)), options
+        asked = batch.stage, *batch.ends, str(resolve(self.device)), options
         return {"answers": batch.stage, "key": digest(version("warprrf"), tensors, header, asked)}
 
     def _trace_spectra(self, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
         """:meth:`spectra` at positions (K, 3) that were checked."""
-        return np.stack([self.spectrum(receiver, transmitter).path_gain for receiver in receivers])
+        return np.stack([self._trace_spectrum(one, transmitter).path_gain for one in receivers])
 
     @abstractmethod
     def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
@@ -343,7 +383,7 @@ class RadioField(ABC):
 
     def links(
         self,
-        rx: ArrayLike,
+        receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
         beam_sigma_rad: float = BEAM_SIGMA_RAD,
@@ -352,14 +392,13 @@ class RadioField(ABC):
         client: Any = None,
         progress: Progress | None = None,
     ) -> Links:
-        """Total and best path gain, delay spread and best-beam gain at ``rx`` (R, 3) [m], without spectra.
+        """Total and best path gain, delay spread and best-beam gain at every receiver, without spectra.
 
         A ``bistatic`` field traces several receivers at once on a coarser grid of rays, for a small part of a
         spectrum's time; other models take their paths one receiver at a time.
 
         Args:
-            rx: receiver positions.
-            transmitter: as for :meth:`spectrum`.
+            receivers, transmitter: as for :meth:`spectrum`.
             beam_sigma_rad: width of the receiver's beam: kappa = 1 / sigma^2.
             shape: rows and columns of the grid that rays fill; 20 x 40 by default, the field's own for other models.
             mirror_order: most reflections on a mirror path of a ``bistatic`` field, if fewer than it was fitted with:
@@ -367,12 +406,20 @@ class RadioField(ABC):
             client: as for :meth:`spectra`.
             progress: called as ``progress("links", done, total)``.
 
+        Returns:
+            Arrays ``(R,)``; numbers for one receiver and transmitter.
+
         Raises:
             ValueError: as for :meth:`spectrum`, and for a beam width that is not positive.
         """
-        receivers, source = self.check_positions(check_array("rx", rx, (None, 3)), transmitter)
-        options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, progress)
-        return self.trace_links(receivers, source, options)
+        ends = self.check_positions(receivers, transmitter)
+        rows, found = np.zeros(0, int), []
+        for source, own in ends.groups():
+            tell = None if progress is None else partial(_told, progress, len(rows), len(ends.receivers))
+            options = LinkOptions(beam_sigma_rad, shape, mirror_order, client, tell)
+            found.append(self.trace_links(ends.receivers[own], source, options))
+            rows = np.concatenate([rows, own])
+        return Links.joined(found)[0 if ends.single else np.argsort(rows)]
 
     def suggest(
         self,
@@ -408,25 +455,27 @@ class RadioField(ABC):
             field = wr.RadioField.fit(room, wr.SpectrumDataset.empty(transmitter=source, frequency_hz=300e9))
             first = candidates[field.suggest(candidates, 3)]
         """
-        raise ValueError(f"suggest: got a field of model {self.model!r}, expected 'bistatic'")
+        raise ValueError(
+            f"field: got one of model {self.model!r}, expected 'bistatic', which can suggest places"
+        )
 
     def check_positions(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "rx"
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """``rx`` (3,) or (R, 3) and ``transmitter`` (3,), by default the fitted one, if the field holds there [m]; errors
-        call the first ``name``.
+        self, receivers: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "receivers"
+    ) -> Ends:
+        """``receivers`` and ``transmitter`` [m], each ``(3,)`` or ``(R, 3)``, by default the fitted one, row by row, if the
+        field holds there; errors call the first ``name``.
 
         Raises:
             ValueError: for a place that is not finite, outside the scene, on a surface, in another solid than the air
                 of the fitted transmitter, or a receiver within the transmitter's reactive near field.
         """
-        receivers = check_receivers(name, rx)
-        source = self.transmitter if transmitter is None else check_array("transmitter", transmitter, (3,))
-        check_positions(
-            self.mesh, source, receivers, SPEED_OF_LIGHT / self.frequency_hz, names=("transmitter", name),
-            known=self.transmitter, device=self.device,
-        )  # fmt: skip
-        return receivers, source
+        ends = Ends.of(receivers, self.transmitter if transmitter is None else transmitter, name)
+        for source, own in ends.groups():
+            check_positions(
+                self.mesh, source, ends.shaped(ends.receivers[own]), SPEED_OF_LIGHT / self.frequency_hz,
+                names=("transmitter", name), known=self.transmitter, device=self.device,
+            )  # fmt: skip
+        return ends
 
     def trace_links(self, receivers: np.ndarray, transmitter: np.ndarray, options: LinkOptions) -> Links:
         """:meth:`links` at positions that were checked: from paths, one receiver at a time."""
@@ -463,6 +512,7 @@ class RadioField(ABC):
 
     def __post_init__(self) -> None:
         """Check what every model has; ValueError or TypeError names the attribute."""
+        object.__setattr__(self, "_grids", Cache(2))
         object.__setattr__(self, "transmitter", check_array("transmitter", self.transmitter, (3,)))
         if self.device is not None:  # its name: a wp.Device cannot be pickled
             object.__setattr__(self, "device", str(self.device))
@@ -472,7 +522,7 @@ class RadioField(ABC):
         low, high = (check_number("range_db", value, -1e4, 1e4) for value in self.range_db)
         if not low <= high:
             raise ValueError(f"range_db: got {self.range_db}, expected the lower end first")
-        check_number("beam_sigma_rad", self.beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
+        check_beam(self.beam_sigma_rad)
         if self.fitted_on is not None:
             known = check_array("fitted_on", self.fitted_on, (None, 3))
             if self.fitted_under is not None:
@@ -521,6 +571,18 @@ def _cfr(
         for paths in _paths(field, max_paths, (receiver[None], part[1]))
     ]
     return {"cfr": np.stack(found)}
+
+
+def _told(progress: Progress, before: int, total: int, stage: str, done: int, _: int) -> None:
+    """Progress of a part, after ``before`` of ``total``."""
+    progress(stage, before + done, total)
+
+
+def _sampled(option: Any) -> Any:
+    """An option as a store is known by it: of an array's pattern that is a function, its gains."""
+    if isinstance(option, PlanarArray) and callable(option.pattern):
+        return replace(option, pattern=sample_pattern(option.pattern, np.linspace(0.0, np.pi, 3601)))
+    return option
 
 
 def _links(

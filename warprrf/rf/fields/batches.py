@@ -12,6 +12,7 @@ import numpy as np
 from warprrf.cluster import each
 from warprrf.device import Progress
 from warprrf.netcdf_files import Store, Variable
+from warprrf.rf.positions import Ends
 
 AT_ONCE = 24  # receivers of a part: some tenths of a second of work, to which sending it adds little
 PART_BYTES = 64_000_000  # of its answers at most
@@ -35,35 +36,28 @@ class Batch:
 
     Attributes:
         stage: name of the answers, for the progress.
-        receivers: positions [m], shape ``(R, 3)``.
-        transmitters: of each, shape ``(R, 3)``.
+        ends: places that were checked.
         row_bytes: of one receiver's answer.
     """
 
     stage: str
-    receivers: np.ndarray
-    transmitters: np.ndarray
+    ends: Ends
     row_bytes: int = 0
 
     def parts(self) -> list[np.ndarray]:
         """Receivers that are asked together, under one transmitter: always the same, so that so are the answers."""
         most = max(1, min(AT_ONCE, PART_BYTES // max(1, self.row_bytes)))
-        return [own[k : k + most] for _, own in self.groups() for k in range(0, len(own), most)]
-
-    def groups(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Each transmitter (3,) and its receivers' indices."""
-        sources, under = np.unique(self.transmitters, axis=0, return_inverse=True)
-        return [(source, np.flatnonzero(under.ravel() == k)) for k, source in enumerate(sources)]
+        return [own[k : k + most] for _, own in self.ends.groups() for k in range(0, len(own), most)]
 
     def each(
         self, work: Work, delivery: Delivery, missing: np.ndarray | None = None
     ) -> Iterator[tuple[np.ndarray, Any]]:
         """Rows and answers of the parts of which some are ``missing`` (R,), all by default, as they are ready."""
         parts = [own for own in self.parts() if missing is None or missing[own].any()]
-        count = len(self.receivers)
+        ends, count = self.ends, len(self.ends.receivers)
         done, tell = count - sum(map(len, parts)), delivery.progress or (lambda *_: None)
         tell(self.stage, done, count)
-        jobs = [(self.receivers[own], self.transmitters[own[0]]) for own in parts]
+        jobs = [(ends.receivers[own], ends.transmitters[own[0]]) for own in parts]
         for k, found in each(work, jobs, delivery.client):
             yield parts[k], found
             done += len(parts[k])
@@ -79,18 +73,16 @@ class Batch:
     ) -> dict[str, np.ndarray]:
         """Arrays ``(R, ...)`` of the answers, which are arrays ``(K, ...)`` by the names of ``variables``; ``known`` and
         ``attributes`` go into the file besides."""
-        path, held = delivery.store, dict[str, np.ndarray]()
+        path, held, count = delivery.store, dict[str, np.ndarray](), len(self.ends.receivers)
         if path is None:
             for rows, found in self.each(work, delivery):
                 for name, array in found.items():
                     if name not in held:
-                        held[name] = np.empty((len(self.receivers), *array.shape[1:]), array.dtype)
+                        held[name] = np.empty((count, *array.shape[1:]), array.dtype)
                     held[name][rows] = array
             return held
-        ends = {"receiver_position": self.receivers, "transmitter_positions": self.transmitters}
-        with Store(
-            path, ends | dict(known), _ENDS | dict(variables), attributes, len(self.receivers)
-        ) as store:
+        ends = {"receiver_position": self.ends.receivers, "transmitter_positions": self.ends.transmitters}
+        with Store(path, ends | dict(known), _ENDS | dict(variables), attributes, count) as store:
             for rows, found in self.each(work, delivery, store.missing):
                 store.put(rows, found)
         return store.arrays()

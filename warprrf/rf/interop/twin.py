@@ -4,9 +4,12 @@ A group of the field scatters as a mix of lobes times the Fresnel curve of a hal
 curve. A Sionna radio material has one curve |Gamma|^2, one scattering coefficient S and one lobe: it scatters
 S^2 |Gamma|^2 f_s and mirrors (1 - S^2) |Gamma|^2 (Degli-Esposti et al. 2007). Each group is projected on that:
 
-- permittivity and S are those of the half-space that comes nearest to both powers, in dB over the cosine of incidence,
-  weighted by it (what a surface takes in under even light). Where lobe weights W and mirror strength m sum to one that
-  is the fitted curve and S^2 = W; where they do not, the mirror gives way: it shows in few pixels, scattering in all;
+- permittivity and S are those of the slab that comes nearest to both powers, in dB over the cosine of incidence,
+  weighted by it (what a surface takes in under even light). It is as thick as the scene says or the caller, which
+  decides what it lets through; where nobody says, it stands for a half-space, and lets nothing through. Both faces of a
+  slab reflect; their fringes, which hang on fractions of a wavelength of its thickness, are averaged. Where lobe weights
+  W and mirror strength m sum to one and the slab is a half-space, that is the fitted curve and S^2 = W; else the mirror
+  gives way: it shows in few pixels, scattering in all;
 - the lobe is the one exponent nearest to the mix, in dB over both hemispheres, weighted by the solid angle that a
   receiver sees and with a floor where scattered power is lost in noise.
 
@@ -20,7 +23,7 @@ import dataclasses
 import os
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -28,7 +31,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from warprrf.checks import checked
+from warprrf.checks import check_positive, checked
 from warprrf.files import partial_path, read_json, write_json
 from warprrf.geometry.mesh_files import write_mesh
 from warprrf.rf.em.fresnel import LAMBERTIAN, fresnel_curves, lobe, slab_reflection
@@ -60,7 +63,7 @@ class Reflection:
     """What a material can say of a group's reflection; see :func:`project_reflection`.
 
     Attributes:
-        relative_permittivity: of a half-space with losses of :data:`LOSS_TANGENT`.
+        relative_permittivity: of a slab with losses of :data:`LOSS_TANGENT`.
         scattering: scattering coefficient S.
         scattering_error_db: error of S^2 |Gamma|^2, rms over incidence [dB].
         mirror_error_db: error of (1 - S^2) |Gamma|^2, rms over incidence [dB].
@@ -81,6 +84,7 @@ class TwinGroup:
         area_m2: area of its faces [m^2].
         material: what it became.
         permittivity: complex relative permittivity at the carrier.
+        thickness_m: of the slab [m]; inf where it stands for a half-space.
         scattering: scattering coefficient S.
         alpha_r: exponent of its lobe, 0 for Lambertian.
         scattering_error_db: error of the power that it scatters, rms over incidence [dB].
@@ -92,6 +96,7 @@ class TwinGroup:
     area_m2: float
     material: Material = dataclasses.field(repr=False)
     permittivity: complex
+    thickness_m: float
     scattering: float
     alpha_r: int
     scattering_error_db: float
@@ -137,7 +142,12 @@ class Twin:
 
 
 @checked
-def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
+def write_twin(
+    field: RadioField,
+    folder: str | os.PathLike[str],
+    *,
+    thickness_m: float | Mapping[str, float] | None = None,
+) -> Twin:
     """Write the reconstructed mesh with a field's materials as ``scene.xml``, ``materials.json`` and ``meshes/``.
 
     ``sionna.rt.load_scene`` opens the XML as it is, all lobes Lambertian; :func:`load_sionna_scene` sets the scattering
@@ -146,16 +156,24 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     field's carrier.
 
     No material can hold a common gain (an uncalibrated receiver), residuals of elements or an indirect radiance, and
-    softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former.
+    softened blocking belongs to the field's tracer: :attr:`Twin.left_out` says what this field has of the former, and
+    which materials let nothing through because nobody said how thick they are.
     Sionna may find one mirror in several small triangles and count it as often; :func:`simulate` counts it once.
 
     Args:
         field: a fitted bistatic field.
         folder: a new or empty folder, or an earlier twin's, which is replaced. It is written beside and renamed.
+        thickness_m: of all surfaces [m], or of some by the names of their groups; the others have that of the
+            :class:`Scene` that the field was fitted on. ``inf``: a half-space.
 
     Raises:
         TypeError: if the field is of another model.
-        ValueError: if the folder holds anything else, or the field models line of sight alone.
+        ValueError: if the folder holds anything else, the field models line of sight alone, a thickness is not positive,
+            or no group has its name.
+
+    Example::
+
+        twin = wr.interop.write_twin(field, "twin", thickness_m={"glass": 0.01})
     """
     if not isinstance(field, BistaticField):
         raise TypeError(f"field: got {type(field).__name__}, expected a field of model 'bistatic'")
@@ -164,14 +182,24 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     folder = Path(folder)
     _check_replaceable(folder)
     surface = field.surface
-    face_material = field.material[surface.group]
+    thickness = _thicknesses(field, thickness_m)
+    # A slab: a material of one thickness.
+    slab = np.unique(
+        np.column_stack([field.material, thickness]), axis=0, return_inverse=True, equal_nan=True
+    )[1].reshape(-1)
+    face_material = slab[surface.group]
     area = np.bincount(face_material, surface.mesh.areas)
     own = np.bincount(surface.group, surface.mesh.areas, minlength=surface.groups)
     used = [m for m in np.argsort(-area, kind="stable").tolist() if area[m] > 0]
-    largest = {m: int(np.where(field.material == m, own, -1.0).argmax()) for m in used}  # a material's name
+    largest = {m: int(np.where(slab == m, own, -1.0).argmax()) for m in used}  # a material's name
     names = _identifiers(surface.group_names)
-    groups = [_project(field, largest[m], names[largest[m]], float(area[m])) for m in used]
-    left_out = _left_out(field)
+    groups = [
+        _project(field, largest[m], names[largest[m]], float(area[m]), float(thickness[largest[m]]))
+        for m in used
+    ]
+    left_out = _left_out(
+        field, [surface.group_names[largest[m]] for m in used if np.isnan(thickness[largest[m]])]
+    )
     table = {
         "about": [ABOUT, f"Fitted to spectra at {field.frequency_hz / 1e9:g} GHz. Left out:", *left_out],
         "materials": [table_entry(group.material) for group in groups],
@@ -204,15 +232,18 @@ def write_twin(field: RadioField, folder: str | os.PathLike[str]) -> Twin:
     return Twin(folder / "scene.xml", field.frequency_hz, tuple(groups), left_out)
 
 
-def project_reflection(log_excess: float, scattered: float, mirrored: float) -> Reflection:
-    """The half-space and the S that come nearest to what a group scatters and mirrors.
+def project_reflection(
+    log_excess: float, scattered: float, mirrored: float, thickness_wavelengths: float = np.inf
+) -> Reflection:
+    """The slab and the S that come nearest to what a group scatters and mirrors.
 
     Args:
         log_excess: ln(epsilon_r - 1) of the group's curve, clipped to the family that fields know.
         scattered: W, what it scatters of that curve; 0 for nothing.
         mirrored: m, what it mirrors of that curve; 0 for nothing.
+        thickness_wavelengths: of the slab, over the wavelength; inf for a half-space.
     """
-    cosine, weight, family = _half_spaces()
+    cosine, weight, family = _slabs(thickness_wavelengths)
     gap = (
         family - NEPER * np.log(fresnel_curves().value(np.full(len(cosine), log_excess), cosine)[0])[:, None]
     )
@@ -279,12 +310,28 @@ def project_lobes(
     return best, float(error[best])
 
 
-def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
-    """What group ``g`` becomes."""
+def _thicknesses(field: BistaticField, given: float | Mapping[str, float] | None) -> np.ndarray:
+    """Thickness of each group of the field [m], shape ``(G,)``: what is given, else what its scene says, else NaN."""
+    names, found = field.surface.group_names, field.surface.thickness_m.copy()
+    if given is None:
+        return found
+    for name, value in given.items() if isinstance(given, Mapping) else [(name, given) for name in names]:
+        if name not in names:
+            raise ValueError(f"thickness_m: got the name {name!r}, expected one of {', '.join(names)}")
+        argument = f"thickness_m[{name!r}]" if isinstance(given, Mapping) else "thickness_m"
+        found[names.index(name)] = value if value == np.inf else check_positive(argument, value)
+    return found
+
+
+def _project(field: BistaticField, g: int, name: str, area: float, thickness_m: float) -> TwinGroup:
+    """What group ``g`` becomes as a slab; NaN stands for a half-space."""
     p, terms, frequency = field.parameters, field.terms, field.frequency_hz
     scattered = float(p.weight[g].sum()) if terms.diffuse else 0.0
     mirrored = float(np.exp(p.log_mirror[g])) if terms.mirror_order > 0 else 0.0
-    reflection = project_reflection(float(p.log_excess[g]), scattered, mirrored)
+    known = np.isfinite(thickness_m)
+    reflection = project_reflection(
+        float(p.log_excess[g]), scattered, mirrored, thickness_m / field.wavelength_m if known else np.inf
+    )
     permittivity = reflection.relative_permittivity
     alpha_r, lobe_error = LAMBERTIAN, 0.0
     if scattered > 0:
@@ -296,12 +343,12 @@ def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
     material = Material(
         _MATERIAL + name,
         (row,),
-        thickness_m=THICKNESS_WAVELENGTHS * field.wavelength_m,
+        thickness_m=thickness_m if known else THICKNESS_WAVELENGTHS * field.wavelength_m,
         scattering=reflection.scattering,
         pattern="lambertian" if alpha_r == LAMBERTIAN else "directive",
         alpha_r=max(alpha_r, 1),
         sources={
-            "thickness_m": "stands for a half-space",
+            "thickness_m": "of the scene, or given" if known else "stands for a half-space",
             "scattering": f"{fitted}; errors {reflection.scattering_error_db:.2f} dB rms scattered, "
             f"{reflection.mirror_error_db:.2f} dB rms mirrored",
             "pattern": f"{fitted}; one lobe for the mix: {lobe_error:.2f} dB rms",
@@ -312,6 +359,7 @@ def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
         area_m2=area,
         material=material,
         permittivity=material.permittivity(frequency),
+        thickness_m=thickness_m if known else np.inf,
         scattering=material.scattering_coefficient(frequency),
         alpha_r=alpha_r,
         scattering_error_db=reflection.scattering_error_db,
@@ -320,8 +368,12 @@ def _project(field: BistaticField, g: int, name: str, area: float) -> TwinGroup:
     )
 
 
-def _left_out(field: BistaticField) -> tuple[str, ...]:
+def _left_out(field: BistaticField, half_spaces: Sequence[str]) -> tuple[str, ...]:
     found, p, s = [], field.parameters, field.surface
+    if half_spaces:
+        found.append(
+            f"what passes through {', '.join(half_spaces)}: of unknown thickness, so they let nothing through; give thickness_m"
+        )
     if p.log_gain != 0.0:
         found.append(f"common gain of {NEPER * p.log_gain:.2f} dB: multiply the twin's path gain by it")
     if field.terms.residual:
@@ -334,13 +386,22 @@ def _left_out(field: BistaticField) -> tuple[str, ...]:
     return tuple(found)
 
 
-@lru_cache(maxsize=1)
-def _half_spaces() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cosines of incidence ``(C,)``, their weights 2 cos dcos, and the family's |Gamma|^2 there [dB], ``(C, E)``."""
+@lru_cache(maxsize=16)
+def _slabs(thickness_wavelengths: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cosines of incidence ``(C,)``, their weights 2 cos dcos, and the family's |Gamma|^2 there [dB], ``(C, E)``.
+
+    What both faces reflect is added in power: r + |1 - Gamma^2|^2 a^2 r / (1 - r^2 a^2), r of a face, a of one passage.
+    """
     node, step = np.polynomial.legendre.leggauss(48)
     cosine = 0.5 * (1.0 + node)
-    te, tm = slab_reflection(cosine[:, None], (1.0 + _EXCESS) * (1.0 - 1j * LOSS_TANGENT), np.inf, 1.0)
-    return cosine, step * cosine, NEPER * np.log(0.5 * (np.abs(te) ** 2 + np.abs(tm) ** 2))
+    eta = (1.0 + _EXCESS) * (1.0 - 1j * LOSS_TANGENT)
+    root = np.sqrt(eta - 1.0 + cosine[:, None] ** 2)
+    passed = np.exp(4.0 * np.pi * min(thickness_wavelengths, THICKNESS_WAVELENGTHS) * root.imag)
+    powers = []
+    for face in slab_reflection(cosine[:, None], eta, np.inf, 1.0):
+        power = np.abs(face) ** 2
+        powers.append(power + np.abs(1.0 - face**2) ** 2 * passed**2 * power / (1.0 - (power * passed) ** 2))
+    return cosine, step * cosine, NEPER * np.log(np.mean(powers, axis=0))
 
 
 @lru_cache(maxsize=4)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_positive, checked, one_line
+from warprrf.checks import checked, one_line
 from warprrf.cluster import each
 from warprrf.device import Progress
 from warprrf.rf.channel.dispersion import delay_spread
@@ -22,6 +22,7 @@ from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.spectra.beam import beam_operator
 from warprrf.rf.spectra.spectrum import (
     BEAM_SIGMA_RAD,
+    check_beam,
     check_shape,
     directions_from_angles,
     pixel_of,
@@ -31,7 +32,7 @@ from warprrf.rf.spectra.spectrum import (
 
 @dataclass(frozen=True)
 class Links:
-    """Links of several receivers to one transmitter, arrays ``(R,)``.
+    """Links of several receivers, arrays ``(R,)``; or one, numbers.
 
     Attributes:
         total_path_gain: sum over all paths [linear]; the sum of the spectrum.
@@ -47,6 +48,10 @@ class Links:
     best_path_gain: np.ndarray
     delay_spread_s: np.ndarray
     best_beam_gain: np.ndarray
+
+    def __getitem__(self, chosen: Any) -> Links:
+        """Those of some receivers, or of one."""
+        return Links(*(array[chosen] for array in vars(self).values()))
 
     @classmethod
     def joined(cls, parts: Sequence[Links]) -> Links:
@@ -77,8 +82,7 @@ class LinkOptions:
     def __post_init__(self) -> None:
         if self.shape is not None:
             object.__setattr__(self, "shape", check_shape(self.shape))
-        sigma = self.beam_sigma_rad
-        check_positive("beam_sigma_rad", sigma, "beam width in radians")
+        check_beam(self.beam_sigma_rad)
         if self.mirror_order not in (None, 0, 1, 2, 3):
             raise ValueError(
                 f"mirror_order: got {self.mirror_order!r}, expected 0 to 3, or None for the field's own"

@@ -1,11 +1,7 @@
 """Radio maps: what a link gets at every place of a floor plan.
 
 A cell holds what a receiver at its centre gets, not the mean over the cell. Cells inside solids, outside the room, on a
-surface or in the transmitter's reactive near field hold NaN. Which are inside or outside is decided by the mesh alone,
-open and torn as a reconstructed one may be: rays from the centre over the whole sphere meet surfaces from their outer
-side in the air and from behind anywhere else, and three in four decide. Which side is the outer one is decided at the
-transmitter, which stands in the air. Under the open sky (a street, a city) cells in buildings and in the ground hold
-NaN.
+surface or in the transmitter's reactive near field hold NaN: see :func:`warprrf.rf.positions.in_the_air`.
 """
 
 from __future__ import annotations
@@ -27,13 +23,9 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.maps.links import LinkOptions, Links
 from warprrf.rf.positions import (
     NEAR_FIELD,
-    WALL_CLEARANCE_M,
     check_positions,
     ground_height,
-    is_open_air,
-    lattice,
-    sees_sky,
-    under_a_roof,
+    in_the_air,
 )
 
 BOLTZMANN = 1.380649e-23  # SI [J/K]
@@ -41,10 +33,6 @@ ROOM_TEMPERATURE_K = 290.0  # at which noise figures are stated (ITU-R P.372)
 MOST_CELLS = 2_000_000
 
 _FORMAT = "warprrf radio map 1"
-_SIDE_RAYS = 64  # that decide whether a place is in the air
-_OUTER_SHARE = (
-    0.5  # least excess of rays that meet an outer side over those that meet one from behind: 3 in 4
-)
 _LAYERS = {
     "total_path_gain": ("1", "total path gain"),
     "best_path_gain": ("1", "gain of the strongest path"),
@@ -307,7 +295,7 @@ def radio_map(
 ) -> RadioMap:
     """Links at the centres of cells over a floor plan.
 
-    Cells are left out that the field's mesh takes for solid; see :func:`in_the_air` for what it cannot know.
+    Cells are left out that the field's mesh takes for solid; see :func:`warprrf.rf.positions.in_the_air`.
 
     Args:
         field: a fitted field with a mesh.
@@ -365,31 +353,6 @@ def radio_map(
         ground_m=ground,
         **layers,
     )
-
-
-def in_the_air(mesh: Mesh, points: np.ndarray, known: np.ndarray, *, device: Any = None) -> np.ndarray:
-    """Whether ``points`` (N, 3) [m] lie in the air like ``known`` (3,) does, shape ``(N,)``.
-
-    Three in four of 64 rays over the sphere must meet a surface from the side that most of those from ``known`` meet;
-    under the open sky places must not be in a building or in the ground. What lies
-    on a surface does not count. This is the mesh's word: a solid whose back no photo shows may be air to it,
-    and air that no photo looked into (above a gallery, behind a desk) solid.
-    """
-    free = (points >= mesh.bounds[0]).all(axis=1) & (points <= mesh.bounds[1]).all(axis=1)
-    own = points[free]
-    outdoors = sees_sky(mesh, known, device=device) or is_open_air(mesh, device=device)
-    if outdoors and not under_a_roof(mesh, known[None], device=device)[0]:
-        free[free] = ~under_a_roof(mesh, own, device=device)
-    else:
-        free[free] = _in_room(mesh, own, known, device)
-    free[free] = mesh.distance(points[free], device=device) > WALL_CLEARANCE_M
-    return free
-
-
-def _in_room(mesh: Mesh, points: np.ndarray, known: np.ndarray, device: Any) -> np.ndarray:
-    places = np.concatenate([np.reshape(known, (1, 3)), points])
-    outer = mesh.look_around(places, lattice(_SIDE_RAYS), device=device)[1].mean(axis=1)
-    return np.asarray(outer[1:] * np.sign(outer[0]) > _OUTER_SHARE)
 
 
 def _centres(mesh: Mesh, cell: float, bounds: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ try all pairs. Nothing that could be a path is left out, to rounding. Source: J.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
@@ -18,7 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_positive
+from warprrf.checks import check_positive, users_level
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.planar_patches import PlanarPatches
 from warprrf.kernels.radio import mirrors as kernels
@@ -28,6 +29,9 @@ MOST_KEPT = 4_000_000  # pairs of a chain and a patch to try up to which all cha
 BLOCK = 500_000  # chains that are unfolded at once
 MOST_CHAINS = 20_000_000
 """More chains of mirrors than this are not tried unless asked for: a minute on two cores in a room, twenty in a city."""
+
+CURVED_M2, CURVED_SHARE = 0.5, 0.01
+"""Area of smooth surfaces that facets stand for, and its share of all patches, above which a warning says so."""
 
 _SAMPLE = 1000  # chains from which the number of longer ones is estimated
 _FIRST, _LAUNCH_S = 4096, 0.1  # chains in the first launch; later ones take about so long
@@ -70,6 +74,9 @@ class MirrorImages:
 
     Raises:
         ValueError: if ``max_chains`` is not positive.
+
+    Warns:
+        UserWarning: of smooth surfaces that were cut into flat mirrors.
     """
 
     def __init__(
@@ -81,6 +88,13 @@ class MirrorImages:
         max_chains: float = MOST_CHAINS,
         device: DeviceLike = None,
     ) -> None:
+        if patches.two_sided and patches.curved_m2 > max(CURVED_M2, CURVED_SHARE * patches.area.sum()):
+            warnings.warn(
+                f"mesh: {patches.curved_m2:.3g} m^2 of it are flat facets of smooth surfaces (a round pillar, say); each "
+                "mirrors as a plane or not at all, so that mirror paths off them are right in the mean alone",
+                UserWarning,
+                stacklevel=users_level(),
+            )
         self.patches = patches
         self.max_chains = check_positive("max_chains", max_chains)
         self.transmitter = np.asarray(transmitter, float)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_count, checked
+from warprrf.checks import check_array, check_count, checked, one_line
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.channel.path_arrays import PathArrays
 from warprrf.rf.channel.response import channel_taps, frequency_response, impulse_response
@@ -45,6 +45,8 @@ class SionnaPaths:
         vertices: Interaction points [m], shape ``(depth, R, 1, L, 3)``; 0 where none.
         synthetic_array: True.
     """
+
+    __repr__ = one_line
 
     a: np.ndarray
     tau: np.ndarray

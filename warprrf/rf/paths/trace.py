@@ -20,7 +20,7 @@ from warprrf.rf.paths.images import MOST_CHAINS, MirrorImages
 from warprrf.rf.paths.mirror_paths import MirrorPaths, exact_paths, stops_of
 from warprrf.rf.paths.path_set import Paths
 from warprrf.rf.paths.polarisation import jones_matrices
-from warprrf.rf.positions import check_positions, check_receivers, question_unit, warn_of_unmodelled
+from warprrf.rf.positions import Ends, check_positions, question_unit, warn_of_unmodelled
 
 
 @checked
@@ -45,8 +45,7 @@ def trace_paths(
 
     Args:
         mesh_or_scene: A :class:`Mesh` or anything with a ``mesh``; a scene has ``face_material`` and ``materials`` too.
-        transmitter: Position [m], shape ``(3,)``.
-        receivers: Positions [m], shape ``(3,)`` or ``(R, 3)``.
+        transmitter, receivers: Positions [m], shapes ``(3,)`` or ``(R, 3)``, row by row.
         frequency_hz: Carrier frequency [Hz].
         mirror_order: Most reflections on one path: 0 and up.
         gas: Absorption of the air in every gain: see :meth:`Paths.with_gas`.
@@ -54,7 +53,7 @@ def trace_paths(
         device: Where chains are tried and rays cast.
 
     Returns:
-        Arrays ``(L,)`` for one receiver, ``(R, L)`` for several; line of sight first, then by order, then by delay.
+        Arrays ``(L,)`` for one receiver and transmitter, else ``(R, L)``; line of sight first, then by order, then by delay.
 
     Raises:
         ValueError: on a position that is NaN, outside a closed room, inside a solid, or within the reactive near
@@ -65,19 +64,23 @@ def trace_paths(
     Warns:
         UserWarning: below 100 GHz and outdoors, that diffraction and transmission are not modelled.
     """
-    points = check_receivers("receivers", receivers)
-    source, frequency = check_array("transmitter", transmitter, (3,)), check_frequency(frequency_hz)
+    ends, frequency = Ends.of(receivers, transmitter), check_frequency(frequency_hz)
     mesh, wavelength_m = as_mesh(mesh_or_scene), SPEED_OF_LIGHT / frequency
     question_unit(mesh, wavelength_m)
-    check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
-    warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device)
+    for source, own in ends.groups():
+        points = ends.shaped(ends.receivers[own])
+        check_positions(mesh, source, points, wavelength_m, on_surfaces=True, device=device)
+        warn_of_unmodelled(mesh, source, points, frequency_hz=frequency, device=device)
     order = check_count("mirror_order", mirror_order, 0)
     tell: Progress = progress or (lambda stage, done, total: None)
-    tell("patches", 0, 1)
-    tracer = MirrorTracer(mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device)
-    tell("patches", 1, 1)
-    found = tracer.trace_each(points.reshape(-1, 3), order, progress)
-    return (found[0] if points.ndim == 1 else Paths.stack(found)).with_gas(gas)
+    found: dict[int, Paths] = {}
+    for source, own in ends.groups():
+        tell("patches", 0, 1)
+        tracer = MirrorTracer(mesh_or_scene, transmitter=source, frequency_hz=frequency, device=device)
+        tell("patches", 1, 1)
+        found |= zip(own.tolist(), tracer.trace_each(ends.receivers[own], order, progress), strict=True)
+    several = [found[k] for k in sorted(found)]
+    return (several[0] if ends.single else Paths.stack(several)).with_gas(gas)
 
 
 class MirrorTracer:

@@ -186,6 +186,7 @@ def without_elements(field: BistaticField, dropped: np.ndarray) -> BistaticField
         element_group=np.where(dropped, none, s.element_group).astype(np.int32),
         material=np.append(s.material, s.material.max() + 1),
         look=np.vstack([s.look, np.full(s.look.shape[1], np.nan)]),
+        thickness_m=np.append(s.thickness_m, np.nan),
         group_names=(*s.group_names, "unseen"),
     )
     parameters = replace(

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from warprrf.checks import check_array, check_positive, checked
+from warprrf.checks import check_array, check_positive, checked, one_line
 from warprrf.device import Progress
 from warprrf.files import read_json, write_json
 from warprrf.geometry.mesh import as_mesh
@@ -109,6 +109,8 @@ class Relevance:
         terms: the smallest bistatic model.
         image_db, total_db: its changes against the full model [dB], rms over receivers, all effects left out at once.
     """
+
+    __repr__ = one_line
 
     materials: str
     frequency_hz: float

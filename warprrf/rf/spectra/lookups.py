@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,13 +38,19 @@ class Lookup:
     train: SpectrumDataset = field(repr=False)
     _predict: Callable[[np.ndarray], Spectrum] = field(repr=False)
 
-    def __call__(self, receiver: ArrayLike) -> Spectrum:
-        """The predicted spectrum at ``receiver`` (3,) [m].
+    def __call__(self, receivers: ArrayLike) -> Spectrum:
+        """The predicted spectrum at ``receivers`` (3,) or (R, 3) [m].
 
         Raises:
-            ValueError: if the position is not three finite numbers.
+            ValueError: if a position is not three finite numbers, or there is none.
         """
-        return self._predict(check_array("receiver", receiver, (3,)))
+        places = check_array("receivers", receivers, (..., 3))
+        if places.size == 0:
+            raise ValueError(
+                f"receivers: got shape {places.shape}, expected (3,) or (R, 3) with R at least 1"
+            )
+        found = [self._predict(place) for place in places.reshape(-1, 3)]
+        return found[0] if places.ndim == 1 else Spectrum.stack(found)
 
     spectrum = __call__
 
@@ -55,19 +62,7 @@ class Lookup:
 @checked
 def nearest(train: SpectrumDataset) -> Lookup:
     """The spectrum of the nearest training receiver, with its delays and angles of departure."""
-    receivers = _receivers(train)
-
-    def predict(receiver: np.ndarray) -> Spectrum:
-        i = int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))
-        return Spectrum(
-            path_gain=np.array(train.path_gain[i], dtype=np.float32),
-            delay_s=np.array(train.delay_s[i]),
-            aod=np.array(train.aod[i]),
-            floor=float(train.floor),
-            range_db=train.range_db,
-        )
-
-    return Lookup("nearest", "", train, predict)
+    return Lookup("nearest", "", train, partial(_nearest, _receivers(train), train))
 
 
 @checked
@@ -87,15 +82,7 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
     receivers = _receivers(train)
     floor, range_db = float(train.floor), train.range_db
     images = np.asarray(train.path_gain, dtype=np.float64)
-    tables = {"db": np.asarray(to_db(images, floor), np.float64), "linear": images}
-
-    def gain(receiver: np.ndarray, keep: np.ndarray, how: str) -> np.ndarray:
-        distance = np.linalg.norm(receivers[keep] - receiver, axis=-1)
-        same = distance < SAME_PLACE_M
-        weight = same.astype(np.float64) if same.any() else distance**-power
-        average = np.tensordot(weight / weight.sum(), tables[how][keep], axes=1)
-        return np.maximum(10 ** (average / 10) - floor, 0.0) if how == "db" else average
-
+    tables = {"db": to_db(images, floor), "linear": images}
     note = f"averaged in {domain}"
     if domain == "auto":
         everyone = np.arange(len(receivers))
@@ -103,7 +90,8 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
         for i in everyone if len(everyone) > 1 else []:
             truth = unit_image(images[i], floor, range_db)
             for how in score:
-                left_out = gain(receivers[i], everyone != i, how)
+                others, known = receivers[everyone != i], tables[how][everyone != i]
+                left_out = _average(others, known, how, floor, power, receivers[i])
                 score[how] += psnr(unit_image(left_out, floor, range_db), truth) / len(everyone)
         domain = max(score, key=lambda how: score[how])
         note = (
@@ -112,8 +100,7 @@ def idw(train: SpectrumDataset, *, power: float = 2.0, domain: str = "auto") -> 
         )
     elif domain not in tables:
         raise ValueError(f'domain: got {domain!r}, expected "db", "linear" or "auto"')
-    all_of_them = np.ones(len(receivers), dtype=bool)
-    return Lookup("idw", note, train, lambda receiver: _bare(gain(receiver, all_of_them, domain), train))
+    return Lookup("idw", note, train, partial(_idw, train, receivers, tables[domain], domain, power))
 
 
 @checked
@@ -122,7 +109,7 @@ def constant(train: SpectrumDataset) -> Lookup:
     _receivers(train)
     level = float(np.mean(to_db(np.asarray(train.path_gain, np.float64), float(train.floor))))
     gain = np.full(train.path_gain.shape[1:], max(10 ** (level / 10) - float(train.floor), 0.0))
-    return Lookup("constant", f"{level:.2f} dB", train, lambda receiver: _bare(gain, train))
+    return Lookup("constant", f"{level:.2f} dB", train, partial(_same, _bare(gain, train)))
 
 
 @checked
@@ -131,7 +118,44 @@ def mean(train: SpectrumDataset) -> Lookup:
     _receivers(train)
     images = to_db(np.asarray(train.path_gain, np.float64), float(train.floor))
     gain = np.maximum(10 ** (np.mean(images, axis=0) / 10) - float(train.floor), 0.0)
-    return Lookup("mean", "", train, lambda receiver: _bare(gain, train))
+    return Lookup("mean", "", train, partial(_same, _bare(gain, train)))
+
+
+def _nearest(receivers: np.ndarray, train: SpectrumDataset, receiver: np.ndarray) -> Spectrum:
+    i = int(np.argmin(np.linalg.norm(receivers - receiver, axis=-1)))
+    return Spectrum(
+        path_gain=np.array(train.path_gain[i], dtype=np.float32),
+        delay_s=np.array(train.delay_s[i]),
+        aod=np.array(train.aod[i]),
+        floor=float(train.floor),
+        range_db=train.range_db,
+    )
+
+
+def _idw(
+    train: SpectrumDataset,
+    receivers: np.ndarray,
+    table: np.ndarray,
+    domain: str,
+    power: float,
+    at: np.ndarray,
+) -> Spectrum:
+    return _bare(_average(receivers, table, domain, float(train.floor), power, at), train)
+
+
+def _average(
+    receivers: np.ndarray, table: np.ndarray, domain: str, floor: float, power: float, at: np.ndarray
+) -> np.ndarray:
+    """Path gain at ``at`` (3,), averaged over a table of spectra (R, H, W) in its domain."""
+    distance = np.linalg.norm(receivers - at, axis=-1)
+    same = distance < SAME_PLACE_M
+    weight = same.astype(np.float64) if same.any() else distance**-power
+    average = np.tensordot(weight / weight.sum(), table, axes=1)
+    return np.maximum(10 ** (average / 10) - floor, 0.0) if domain == "db" else average
+
+
+def _same(spectrum: Spectrum, _: np.ndarray) -> Spectrum:
+    return spectrum
 
 
 def _receivers(train: SpectrumDataset) -> np.ndarray:

@@ -26,6 +26,7 @@ from warprrf.device import Progress
 from warprrf.rf.spectra.antenna import respond, scanned_kernel
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import (
+    NARROWEST_BEAM_RAD,
     Spectrum,
     check_whole,
     directions_from_angles,
@@ -35,7 +36,6 @@ from warprrf.rf.spectra.spectrum import (
 )
 
 SSIM_WINDOW = 7  # pixels; scikit-image's default, so that figures compare with other work
-NARROWEST_BEAM_RAD = 1e-4
 PSNR_CEILING_DB = 150.0  # what two equal images score, instead of infinity
 
 
@@ -187,7 +187,8 @@ def evaluate(
     Args:
         test: truth: held-out receivers.
         predict: from a receiver position ``(3,)`` [m] to a :class:`Spectrum`, or to a path gain array
-            ``(height, width)`` alone (then there is no ToF or AoD error).
+            ``(height, width)`` alone (then there is no ToF or AoD error). A field's ``spectrum`` is asked on the grid of
+            ``test``, whatever the field's own.
         beam_width_rad: full width at half maximum of the beam in ``beam_gain_loss_db``.
         progress: called once a receiver with the stage ``"evaluate"``.
 
@@ -224,6 +225,7 @@ def evaluate(
             "no errors of prediction; score receivers that were held out (ds.split)",
             stacklevel=2,
         )
+    predict = _on_grid(predict, test.path_gain.shape[1:])
     check_number("beam_width_rad", beam_width_rad, NARROWEST_BEAM_RAD, 2 * np.pi)
     floor, range_db = float(test.floor), test.range_db
     names = (
@@ -309,6 +311,21 @@ def _fitted_on(predict: Callable[[np.ndarray], Any], test: SpectrumDataset) -> i
     """How many receivers of ``test`` whoever predicts was fitted on; None where that is not known."""
     owner = getattr(predict, "__self__", predict)
     return int(np.count_nonzero(owner.was_fitted_on(test))) if isinstance(owner, _Fitted) else None
+
+
+@runtime_checkable
+class _AnyGrid(Protocol):
+    """A field."""
+
+    def on_grid(self, shape: tuple[int, int]) -> Any: ...
+
+
+def _on_grid(predict: Callable[[np.ndarray], Any], shape: tuple[int, int]) -> Callable[[np.ndarray], Any]:
+    """``predict``, with spectra of ``shape`` if they are a field's."""
+    owner = getattr(predict, "__self__", None)
+    if isinstance(owner, _AnyGrid) and getattr(predict, "__name__", "") == "spectrum":
+        return owner.on_grid(shape).spectrum  # type: ignore[no-any-return]
+    return predict
 
 
 def _checked_gain(prediction: Spectrum | ArrayLike, shape: tuple[int, ...], index: int) -> np.ndarray:

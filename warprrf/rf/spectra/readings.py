@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -465,13 +466,14 @@ def horn(width_rad: float, floor_db: float = -60.0) -> Pattern:
             f"width_rad: got {width:g}, expected radians, at most {WIDEST_HORN_RAD:.3g}: "
             f"horn(np.radians({width:g})) is {width:g} degrees wide"
         )
-
-    def shape(angle: np.ndarray) -> np.ndarray:
-        return np.maximum(np.exp(-4.0 * np.log(2.0) * (angle / width) ** 2), 10.0 ** (low / 10.0))
-
     angle = np.linspace(0.0, np.pi, 20_001)
-    mean = 0.5 * np.trapezoid(shape(angle) * np.sin(angle), angle)
-    return lambda off: shape(np.asarray(off)) / mean
+    mean = 0.5 * np.trapezoid(_horn_gain(width, low, 1.0, angle) * np.sin(angle), angle)
+    return partial(_horn_gain, width, low, mean)
+
+
+def _horn_gain(width: float, floor_db: float, mean: float, angle: ArrayLike) -> np.ndarray:
+    lobe = np.exp(-4.0 * np.log(2.0) * (np.asarray(angle) / width) ** 2)
+    return np.maximum(lobe, 10.0 ** (floor_db / 10.0)) / mean
 
 
 def check_turned(name: str, value: ArrayLike, count: int) -> np.ndarray:

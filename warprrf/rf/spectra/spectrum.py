@@ -10,7 +10,7 @@ total path gain, and an isotropic field stays one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -19,12 +19,14 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_number, check_positive, checked, one_line
+from warprrf.checks import check_array, check_number, check_positive, check_type, checked, one_line
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
 BEAM_SIGMA_RAD = float(np.deg2rad(2.0))
 """Default beam width: kappa = 1 / sigma^2 [rad]."""
+
+NARROWEST_BEAM_RAD = 1e-4
 
 DEFAULT_SHAPE = (90, 180)
 """Default grid: 2 by 2 degrees."""
@@ -58,6 +60,15 @@ def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     if rows * columns > MOST_PIXELS:
         raise ValueError(f"shape: got {rows} x {columns} pixels, expected at most {MOST_PIXELS} in all")
     return rows, columns
+
+
+def check_beam(beam_sigma_rad: float) -> float:
+    """``beam_sigma_rad`` as a beam width from :data:`NARROWEST_BEAM_RAD` to pi.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    return check_number("beam_sigma_rad", beam_sigma_rad, NARROWEST_BEAM_RAD, np.pi)
 
 
 def check_range_db(range_db: Sequence[float]) -> tuple[float, float]:
@@ -252,7 +263,7 @@ def spread_paths(
     Raises:
         ValueError: on a wrong shape, NaN, a negative gain, a direction of length zero, or a sigma that is not positive.
     """
-    rows, columns = check_shape(shape)
+    shape = rows, columns = check_shape(shape)
     d = check_array("directions", directions, (None, 3))
     power = check_array("powers", powers, (len(d),))
     check_positive("sigma", sigma, "beam width in radians")
@@ -429,9 +440,10 @@ class Spectra:
     """Path gain by direction at many receivers; :meth:`RadioField.spectra` gives them.
 
     Attributes:
-        receivers, transmitters: positions [m], shape ``(R, 3)``.
+        receivers, transmitters: positions [m], shape ``(R, 3)``; ``(3,)`` for a single link.
         frequency_hz: carrier [Hz].
-        path_gain: [linear], shape ``(R, H, W)``, float32; an array that stays on the disk where they were stored.
+        path_gain: [linear], shape ``(R, H, W)`` or ``(H, W)``, float32; an array that stays on the disk where they were
+            stored.
     """
 
     receivers: np.ndarray
@@ -442,13 +454,13 @@ class Spectra:
     __repr__ = one_line
 
     def __len__(self) -> int:
-        return len(self.receivers)
+        return len(np.atleast_2d(self.receivers))
 
 
 @checked
 @dataclass(frozen=True)
 class Spectrum:
-    """The spatial spectrum of one receiver.
+    """The spatial spectrum of one receiver, arrays ``(H, W)``, or of several, arrays ``(R, H, W)``.
 
     Attributes:
         path_gain: Path gain per pixel [linear], shape ``(H, W)``.
@@ -471,10 +483,10 @@ class Spectrum:
 
     def __post_init__(self) -> None:
         """Check shapes and values; ValueError or TypeError names the field."""
-        shape = check_array("path_gain", self.path_gain, (None, None)).shape
-        for name, rest in (("path_gain", ()), ("delay_s", ()), ("aod", (2,)), ("std_db", ())):
-            if (value := getattr(self, name)) is not None:
-                check_array(name, value, (*shape, *rest), finite=False)
+        shape = check_array("path_gain", self.path_gain, (..., None, None)).shape
+        for name, value in self._arrays().items():
+            if value is not None:
+                check_array(name, value, (*shape, 2) if name == "aod" else shape, finite=False)
                 object.__setattr__(self, name, np.asarray(value))
         check_pixels(self.path_gain, self.delay_s, self.aod)
         check_number("floor", self.floor, least=0.0)
@@ -484,25 +496,57 @@ class Spectrum:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
-        return self.path_gain.shape[0], self.path_gain.shape[1]
+        return self.path_gain.shape[-2], self.path_gain.shape[-1]
+
+    @classmethod
+    def stack(cls, spectra: Sequence[Spectrum]) -> Spectrum:
+        """Spectra of several receivers as one; floor and range are those of the first.
+
+        Raises:
+            TypeError, ValueError: for none, or what are no spectra.
+        """
+        if not isinstance(spectra, Sequence) or not len(spectra):
+            raise ValueError(f"spectra: got {spectra!r:.60}, expected a list of at least one")
+        for k, one in enumerate(spectra):
+            check_type(f"spectra[{k}]", one, Spectrum)
+        several: dict[str, Any] = {}
+        for name, first in spectra[0]._arrays().items():
+            several[name] = None if first is None else np.stack([getattr(one, name) for one in spectra])
+        return replace(spectra[0], **several)
+
+    def __getitem__(self, receiver: int) -> Spectrum:
+        """The spectrum of one of several receivers."""
+        if self.path_gain.ndim == 2:
+            raise TypeError("spectrum: it is of one receiver, which has no index")
+        own: dict[str, Any] = {n: None if a is None else a[receiver] for n, a in self._arrays().items()}
+        return replace(self, **own)
+
+    def _arrays(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ("path_gain", "delay_s", "aod", "std_db")}
 
     @property
     def path_gain_db(self) -> np.ndarray:
-        """10 log10(P + N0) [dB], shape ``(H, W)``."""
+        """10 log10(P + N0) [dB], shape of ``path_gain``."""
         with np.errstate(divide="ignore"):
             return to_db(self.path_gain, self.floor)
 
     @property
-    def total_path_gain(self) -> float:
-        """Sum over the pixels [linear]."""
-        return float(np.sum(self.path_gain, dtype=np.float64))
+    def total_path_gain(self) -> Any:
+        """Sum over the pixels [linear]; shape ``(R,)`` for several receivers."""
+        total = np.sum(self.path_gain, axis=(-2, -1), dtype=np.float64)
+        return total if total.ndim else float(total)
 
     def plot(self, ax: Any = None, **options: Any) -> Any:
         """Draw the dB image over azimuth and zenith [degrees] into ``ax`` (a new one by default); returns the axes.
 
         Raises:
             ImportError: if matplotlib is missing.
+            ValueError: for spectra of several receivers.
         """
+        if self.path_gain.ndim > 2:
+            raise ValueError(
+                f"spectrum: got {len(self.path_gain)} receivers, expected one: spectrum[0].plot()"
+            )
         pyplot = _device.require("matplotlib.pyplot", extra="plots")
         if ax is None:
             _, ax = pyplot.subplots(figsize=(8.0, 4.0))

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
+from furnished import RECEIVERS, ROOM, TX, F, spectra
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -14,9 +15,7 @@ from warprrf.rf.fields.bistatic.surface import SKIN_M, Surface
 from warprrf.rf.paths.polarisation import chain_reflection, turns
 from warprrf.rf.paths.trace import MirrorTracer
 
-F = 300e9
-TX = np.array([0.8, 0.9, 2.2])
-RX = np.array([4.2, 3.1, 1.2])
+RX = RECEIVERS[0]
 
 
 def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -37,18 +36,14 @@ def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.
 
 @pytest.mark.usefixtures("device")
 def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
-    """The image method on the true scene multiplies Jones matrices; means of single mirrors miss them by decibels."""
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.0])
-    )
+    """The image method on the true scene multiplies Jones matrices."""
+    mesh, part = joined(ROOM, box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.0]))
     room = [
         SlabMaterial("walls", 3.0, 0.0, np.inf, 0.5),
         SlabMaterial("box", 7.0, 0.0, np.inf, 0.6),
     ]
     scene = RadioScene(mesh, part, room)
-    ds = exact_spectra(
-        scene, RX[None], transmitter=TX, frequency_hz=F, shape=(12, 24), sigma=np.radians(10.0)
-    )
+    ds = spectra(scene, RX[None], shape=(12, 24), sigma=np.radians(10.0))
     field = BistaticField.prior(scene, ds, terms=Terms(mirror_order=2))
     permittivity = np.array([m.relative_permittivity for m in room])
     mirrored = 1.0 - np.array([m.scattering for m in room]) ** 2
@@ -58,31 +53,15 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     found = view.paths
     true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
     power = field.render(view).powers.mirror
-    means = []
+    compared = 0
     for path in np.flatnonzero(found.order == 2):
         same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (
             true.arrival @ found.arrival[path] > 1 - 1e-9
         )
         assert same.sum() == 1
         assert power[path] == pytest.approx(true.power[same][0], rel=1e-6)
-        group = field.surface.patch_group[found.patch[path, :2]]
-        mean = mirrored[group] * fresnel_curves().value(p.log_excess[group], found.cosine[path, :2])[0]
-        free = (field.wavelength_m / (4 * np.pi * found.length_m[path])) ** 2 * found.share[path] ** 2
-        means.append(10 * np.log10(mean.prod() * free / power[path]))
-    assert len(means) >= 8
-    assert max(means) > 2.0
-    assert min(means) < -0.5
-
-
-def test_a_chain_reflects_as_much_backwards() -> None:
-    stops, normal, cosine = reflected_ways(40, 3, seed=0)
-    log_excess = np.random.default_rng(1).uniform(-1.0, 4.0, cosine.shape)
-    met = np.ones(cosine.shape, bool)
-    there = chain_reflection(log_excess, cosine, turns(stops, normal), met)[0]
-    back = chain_reflection(
-        log_excess[:, ::-1], cosine[:, ::-1], turns(stops[:, ::-1], normal[:, ::-1]), met
-    )[0]
-    np.testing.assert_allclose(there, back, rtol=1e-12)
+        compared += 1
+    assert compared >= 8
 
 
 def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_nothing() -> None:
@@ -97,18 +76,6 @@ def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_noth
     assert (slope[:, 1:] == 0).all()
     steps = np.abs(slope[:, 0] - rise / value)
     assert np.median(steps) < 0.02  # the table's derivative is that of a chord
-
-
-def test_derivatives_of_a_chain_are_those_of_differences() -> None:
-    stops, normal, cosine = reflected_ways(30, 3, seed=2)
-    turn, met = turns(stops, normal), np.ones(cosine.shape, bool)
-    met[::3, 2] = False
-    log_excess = np.random.default_rng(3).uniform(-1.0, 4.0, cosine.shape)
-    slope = chain_reflection(log_excess, cosine, turn, met)[1]
-    for k in range(3):
-        step = 1e-6 * np.eye(3)[k]
-        up, down = (chain_reflection(log_excess + s, cosine, turn, met)[0] for s in (step, -step))
-        np.testing.assert_allclose(slope[:, k], np.log(up / down) / 2e-6, atol=1e-7)
 
 
 def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:
@@ -130,7 +97,7 @@ def test_a_screen_beside_a_chain_covers_part_of_its_zone(edge_m: float, least: f
     The screen ends ``edge_m`` past the path, where the zone has a radius of 23 mm; rays start a skin above a mirror,
     which moves them by a centimetre.
     """
-    mesh, _ = joined(box_mesh([0, 0, 0], [5, 4, 3], inward=True))
+    mesh = Mesh(*ROOM)
     alone = mirror_paths(_surface(mesh), TX, RX[None], 1e-3, 2)
     order = np.flatnonzero(alone.order == 2)
     over = alone.point[order]

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
+from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
+from radio_scenes import RadioScene, box_mesh, joined, mirror_paths
 from told import check_told
 
 from warprrf.rf.em.fresnel import fresnel_curves
@@ -16,10 +16,9 @@ from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic import fit as fitting
 from warprrf.rf.fields.bistatic import training
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
-from warprrf.rf.fields.bistatic.measured import SpectrumPixels
+from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.rays import RayGrid
-from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
+from warprrf.rf.fields.bistatic.response import Response, predict
 from warprrf.rf.fields.bistatic.scattering import scatter
 from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.training import trace
@@ -29,36 +28,12 @@ from warprrf.rf.spectra.lookups import nearest
 from warprrf.rf.spectra.metrics import evaluate
 from warprrf.rf.spectra.spectrum import spread, sub_pixel_directions, to_db
 
-F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F
-SHAPE = (24, 48)
-SIGMA = np.radians(5.0)
-TX = np.array([0.8, 0.9, 2.2])
-MATERIALS = [
-    SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5, "directive", 4),
-    SlabMaterial("box", 6.0, 0.5, np.inf, 0.8),
-]
-RECEIVERS = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1],
-     [2.2, 0.7, 1.5], [4.5, 2.2, 1.0], [1.8, 1.1, 1.1], [2.6, 3.5, 1.4]]
-)  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def scene() -> RadioScene:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    return RadioScene(mesh, part, MATERIALS)
-
-
-def spectra(scene: RadioScene, receivers: np.ndarray, transmitter: np.ndarray = TX) -> SpectrumDataset:
-    return exact_spectra(scene, receivers, transmitter=transmitter, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
 
 
 @pytest.fixture(scope="module")
 def data(scene: RadioScene) -> SpectrumDataset:
-    return spectra(scene, RECEIVERS)
+    return spectra(scene)
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +75,7 @@ def test_a_transmitter_never_seen_is_as_good(
     scene: RadioScene, field: BistaticField, data: SpectrumDataset
 ) -> None:
     other = np.array([4.3, 3.2, 2.4])
-    moved = spectra(scene, RECEIVERS[[2, 4, 6, 8]], other)
+    moved = spectra(scene, RECEIVERS[[2, 4, 6, 8]], transmitter=other)
     assert psnr(field, moved, other) > psnr(field, data.subset(np.arange(6, 10))) - 4
     assert psnr(field, moved, other) > psnr(field, moved) + 8  # and it does depend on the transmitter
 
@@ -118,21 +93,6 @@ def test_paths_carry_the_spectrum_and_line_of_sight_is_exact(field: BistaticFiel
     assert several.gain.shape == (2, 5)
 
 
-def test_spectra_of_many_receivers_are_those_of_each(field: BistaticField) -> None:
-    told: list[tuple[str, int, int]] = []
-    found = field.spectra(RECEIVERS, progress=lambda *step: told.append(step)).path_gain
-    for image, receiver in zip(found, RECEIVERS, strict=True):
-        np.testing.assert_allclose(
-            image, field.spectrum(receiver).path_gain, rtol=1e-6, atol=1e-6 * image.max()
-        )
-    other = TX + [0.3, 0.2, -0.1]
-    elsewhere = field.spectrum(RECEIVERS[1], other).path_gain
-    np.testing.assert_allclose(
-        field.spectra(RECEIVERS[:3], other).path_gain[1], elsewhere, rtol=1e-6, atol=1e-6 * elsewhere.max()
-    )
-    assert told[-1] == ("spectra", len(RECEIVERS), len(RECEIVERS))
-
-
 def test_a_saved_field_answers_the_same(field: BistaticField, tmp_path: Path) -> None:
     file = tmp_path / "field.safetensors"
     field.save(file)
@@ -141,9 +101,6 @@ def test_a_saved_field_answers_the_same(field: BistaticField, tmp_path: Path) ->
     before, after = (f.spectrum(RECEIVERS[7], uncertainty=True) for f in (field, again))
     assert np.array_equal(before.path_gain, after.path_gain)
     assert np.array_equal(before.std_db, after.std_db)
-    file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(ValueError, match="corrupt"):
-        RadioField.load(file)
 
 
 def test_before_any_spectrum_the_field_is_that_of_the_prior(scene: RadioScene, data: SpectrumDataset) -> None:
@@ -163,37 +120,7 @@ def test_fitting_twice_gives_the_same_numbers(scene: RadioScene, data: SpectrumD
     assert np.array_equal(a.parameters.log_weight, b.parameters.log_weight)
 
 
-def test_jacobian_against_differences(scene: RadioScene, data: SpectrumDataset) -> None:
-    seen = trace(scene, data.subset([0]))
-    measured = SpectrumPixels(BeamOperator(SHAPE, SIGMA), np.arange(0, SHAPE[0] * SHAPE[1], 7))
-    lobes = Terms().lobes
-    response = respond(seen.views[0], measured, Terms(), data.floor)
-    layout = Layout(2, len(lobes), indirect=True, gain=True)
-    rng = np.random.default_rng(0)
-    p = layout.unpack(rng.normal(-1.0, 0.2, layout.size))
-    power, slopes, index = jacobian(response, p, layout)
-    dense = np.zeros((len(power), layout.size))
-    dense[:, index] = slopes.T
-    assert np.allclose(power, predict(response, p), rtol=1e-4)
-    for k in range(layout.size):
-        step = np.zeros(layout.size)
-        step[k] = 0.02
-        up, down = (predict(response, layout.unpack(layout.pack(p) + s * step)) for s in (1, -1))
-        numeric = (up - down) / 0.04
-        scale = np.abs(numeric).max() + 1e-3 * power.max()
-        # The permittivity's table is linear between its nodes, which a difference may straddle.
-        allowed = 0.1 if k % layout.stride == layout.lobes else 0.02
-        assert np.abs(dense[:, k] - numeric).max() < allowed * scale, k
-    planted = dense[:, 0] * 1.2
-    up, down = (
-        predict(response, layout.unpack(layout.pack(p) + s * np.eye(layout.size)[0] * 0.02)) for s in (1, -1)
-    )
-    assert np.abs(planted - (up - down) / 0.04).max() > 0.1 * np.abs(dense[:, 0]).max()
-
-
 def test_an_uncalibrated_gain_is_found(scene: RadioScene, data: SpectrumDataset) -> None:
-    from dataclasses import replace
-
     few = data.subset(np.arange(4))
     off = replace(few, path_gain=few.path_gain * np.float32(10**0.35), floor=few.floor * 10**0.35)
     found = RadioField.fit(scene, off, gain_offset=True)
@@ -216,20 +143,11 @@ def test_the_beam_keeps_power_and_its_adjoint_is_one() -> None:
     beam = BeamOperator(SHAPE, SIGMA)
     rng = np.random.default_rng(1)
     x, y = rng.random((*SHAPE, 2)), rng.random((*SHAPE, 2))
-    assert beam(x).sum() == pytest.approx(x.sum(), rel=1e-9)
-    assert (beam(x) * y).sum() == pytest.approx((x * beam.adjoint(y.astype(np.float32))).sum(), rel=1e-5)
-
-
-def test_fresnel_family_contains_the_half_space() -> None:
-    curves = fresnel_curves()
-    value, slope = curves.value(np.log([2.0]), [1.0])
-    n = np.sqrt(3.0)
-    assert value[0] == pytest.approx(((n - 1) / (n + 1)) ** 2, rel=2e-3)
-    up, down = (curves.value(np.log([2.0]) + s, [1.0])[0][0] for s in (0.05, -0.05))
-    assert slope[0] == pytest.approx((up - down) / 0.1, rel=0.05)
-
-
-# ---------------------------------------------------------------------------------------------- hard cases
+    whole, back = beam(x), beam.adjoint(y)
+    assert whole.sum() == pytest.approx(x.sum(), rel=1e-9)
+    assert (whole * y).sum() == pytest.approx((x * beam.adjoint(y.astype(np.float32))).sum(), rel=1e-5)
+    assert 0 < np.abs(beam(x, quick=True) - whole).max() < 3e-6 * whole.max()
+    assert np.abs(beam.adjoint(y, quick=True) - back).max() < 3e-6 * back.max()
 
 
 def test_grazing_scatter_stays_finite(scene: RadioScene, field: BistaticField) -> None:
@@ -268,7 +186,7 @@ def test_a_receiver_one_millimetre_from_a_wall(scene: RadioScene, field: Bistati
 def test_a_receiver_in_full_shadow_gets_nothing_but_what_bounces(scene: RadioScene) -> None:
     # A closed shell around the receiver: nothing arrives.
     mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True),
+        ROOM,
         box_mesh([2.9, 1.9, 0.9], [4.1, 3.1, 2.1]),
         box_mesh([3.0, 2.0, 1.0], [4.0, 3.0, 2.0], inward=True),
     )
@@ -284,8 +202,6 @@ def test_a_receiver_in_full_shadow_gets_nothing_but_what_bounces(scene: RadioSce
 def test_an_empty_spectrum_is_refused_and_one_among_others_is_not(
     scene: RadioScene, data: SpectrumDataset
 ) -> None:
-    from dataclasses import replace
-
     nothing = replace(data.subset([0, 1]), path_gain=np.zeros((2, *SHAPE), np.float32))
     with pytest.raises(ValueError, match="no pixel above the floor"):
         RadioField.fit(scene, nothing)
@@ -319,18 +235,9 @@ def test_duplicate_receivers_change_little(scene: RadioScene, data: SpectrumData
     assert np.sqrt(np.mean((a - b) ** 2)) < 0.5
 
 
-def test_bad_options_are_refused(scene: RadioScene, data: SpectrumDataset) -> None:
-    few = data.subset([0])
-    with pytest.raises(ValueError, match=r"bistatic, rf3dgs\+, rf3dgs"):
-        RadioField.fit(scene, few, model="magic")
-    for options, name in (({"mirror_order": 4}, "mirror_order"), ({"diffuse_order": 0}, "diffuse_order"),
-                          ({"lobes": ()}, "lobes"), ({"iterations": -1}, "iterations")):  # fmt: skip
-        with pytest.raises(ValueError, match=name):
-            RadioField.fit(scene, few, **options)
-    with pytest.raises(TypeError, match="geometry"):
-        RadioField.fit(SimpleNamespace(), few)
+def test_what_was_traced_at_other_places_is_refused(scene: RadioScene, data: SpectrumDataset) -> None:
     with pytest.raises(ValueError, match="transport"):
-        RadioField.fit(scene, data.subset([1]), transport=trace(scene, few))
+        RadioField.fit(scene, data.subset([1]), transport=trace(scene, data.subset([0])))
 
 
 def test_a_tracer_on_true_materials_matches_the_exact_engine(scene: RadioScene) -> None:
@@ -377,15 +284,8 @@ def test_a_quick_fit_tries_nothing_and_is_near(scene: RadioScene, data: Spectrum
         RadioField.fit(scene, few, sub_pixels=0)
 
 
-def test_terms_state_what_they_allow() -> None:
-    assert not Terms().further
-    assert Terms(diffuse_order=2).further
-
-
 def test_a_fit_goes_on_after_steps_that_were_cut_short() -> None:
     """One weight has 9 nepers to go, 1.5 a step, while pixels that nothing explains hide how much each step gains."""
-    from dataclasses import replace
-
     lit, hopeless = 20, 4000
     count = lit + hopeless
     none = np.zeros((0, count), np.float32)

@@ -1,15 +1,15 @@
 """What differs within a material group: planted gains come back, few spectra move elements, many cells."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra
+from furnished import RECEIVERS, ROOM, SHAPE, SIGMA, TX, spectra
+from radio_scenes import RadioScene, SlabMaterial
 from scipy import sparse
+from trimesh.remesh import subdivide_to_size
 
-from warprrf import tensor_files as files
-from warprrf.rf.fields.base import RadioField
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import NEPER, Target
 from warprrf.rf.fields.bistatic.links import LinkTracer
@@ -20,34 +20,18 @@ from warprrf.rf.fields.bistatic.surface import CELLS, ELEMENT_M, Surface
 from warprrf.rf.maps.links import LinkOptions
 from warprrf.rf.spectra.beam import BeamOperator
 
-F = 300e9
-SHAPE = (24, 48)
-TX = np.array([0.8, 0.9, 2.2])
-RECEIVERS = np.array([[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9]])
-
-
-MEASURED = SpectrumPixels(BeamOperator(SHAPE, np.radians(5.0)))
+RECEIVERS = RECEIVERS[:5]
+MEASURED = SpectrumPixels(BeamOperator(SHAPE, SIGMA))
 
 
 @pytest.fixture(scope="module")
 def field() -> BistaticField:
     """A room before any measurement, whose surfaces also send on the light of others."""
-    vertices, faces = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
-    scene = RadioScene(*_meshed(vertices, faces), [SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5)])
-    ds = exact_spectra(
-        scene, RECEIVERS[:1], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=np.radians(5.0)
-    )
-    return BistaticField.prior(scene, ds, terms=Terms(diffuse_order=2, mirror_scatter=True, residual=True))
-
-
-def _meshed(vertices: np.ndarray, faces: np.ndarray):
-    """Faces of about 0.15 m, of one material."""
-    import trimesh
-
-    from warprrf.geometry.mesh import Mesh
-
-    fine = trimesh.Trimesh(vertices, faces, process=False).subdivide_to_size(0.25)
-    return Mesh(fine.vertices, fine.faces), np.zeros(len(fine.faces), np.int32)
+    mesh = Mesh(*subdivide_to_size(*ROOM, 0.25))
+    walls = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5)
+    scene = RadioScene(mesh, np.zeros(len(mesh.faces), np.int32), [walls])
+    terms = Terms(diffuse_order=2, mirror_scatter=True, residual=True)
+    return BistaticField.prior(scene, spectra(scene, RECEIVERS[:1]), terms=terms)
 
 
 def shares_of(field: BistaticField, planted: np.ndarray) -> list[Shares]:
@@ -74,6 +58,9 @@ def test_cells_are_pieces_of_elements(field: BistaticField) -> None:
     centre = s.mesh.triangles.mean(axis=1)
     for k in range(0, s.cells, 7):
         assert np.ptp(centre[s.cell == k], axis=0).max() <= ELEMENT_M / CELLS
+    large = Surface.of(Mesh(*ROOM))  # of faces larger than cells, each of which is one
+    assert np.array_equal(large.cell_element[large.cell], large.element)
+    assert np.bincount(large.cell, minlength=large.cells).min() >= 1
 
 
 def test_planted_gains_come_back(field: BistaticField) -> None:
@@ -167,34 +154,3 @@ def test_links_have_the_same_gains(field: BistaticField) -> None:
     for scale in ([[1.0], [0.0]], [[0.0], [1.0]]):
         textured = totals(replace(field, residual=rng.normal(1.0, 0.3, field.residual.shape) * scale))
         np.testing.assert_allclose(textured[0] - bare[0], textured[1] - bare[1], rtol=0.1)
-
-
-def test_the_file_keeps_them_and_refuses_others(field: BistaticField, tmp_path: Path) -> None:
-    textured = replace(field, residual=np.random.default_rng(7).normal(size=field.residual.shape))
-    textured.save(tmp_path / "field.safetensors")
-    back = RadioField.load(tmp_path / "field.safetensors")
-    np.testing.assert_array_equal(back.residual, textured.residual)
-    np.testing.assert_array_equal(back.surface.cell_element, textured.surface.cell_element)
-    np.testing.assert_array_equal(
-        back.spectrum(RECEIVERS[1]).path_gain, textured.spectrum(RECEIVERS[1]).path_gain
-    )
-    tensors, header = files.read(tmp_path / "field.safetensors")
-    files.write(tmp_path / "wrong.safetensors", tensors | {"residual": textured.residual[:, :-1]}, header)
-    with pytest.raises(ValueError, match="wrong.safetensors: .*residual: got shape"):
-        RadioField.load(tmp_path / "wrong.safetensors")
-    with pytest.raises(ValueError, match="residual: got shape"):
-        replace(textured, residual=np.zeros(len(field.surface.element_area)))
-
-
-def test_a_surface_of_faces_larger_than_cells(field: BistaticField) -> None:
-    """Each of them is a cell of its own; nothing is lost."""
-    vertices, faces = box_mesh([0, 0, 0], [5, 4, 3], inward=True)
-    surface = Surface.of(RadioScene(*_plain(vertices, faces), [SlabMaterial("walls")]))
-    assert np.array_equal(surface.cell_element[surface.cell], surface.element)
-    assert np.bincount(surface.cell, minlength=surface.cells).min() >= 1
-
-
-def _plain(vertices: np.ndarray, faces: np.ndarray):
-    from warprrf.geometry.mesh import Mesh
-
-    return Mesh(vertices, faces), np.zeros(len(faces), np.int32)

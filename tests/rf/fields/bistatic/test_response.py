@@ -9,21 +9,24 @@ from functools import partial
 import numpy as np
 import pytest
 import warp as wp
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
+from radio_scenes import RadioScene
 
+from warprrf.rf.channel.array_spectra import UP, hemisphere
+from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.fit import Reading, Target
+from warprrf.rf.fields.bistatic.fit import OWN_GAIN, Reading, Target
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
-from warprrf.rf.fields.bistatic.measured import WeighedPaths, read
+from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
 from warprrf.rf.fields.bistatic.observations import observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.transport import ReceiverView
+from warprrf.rf.spectra.beam import BeamOperator
 from warprrf.rf.spectra.readings import Readings, horn, path_weights
 
-F, SHAPE, SIGMA = 300e9, (24, 48), np.radians(5.0)
-TX, RX = np.array([0.8, 0.9, 2.2]), np.array([4.2, 3.1, 1.2])
+RX = RECEIVERS[0]
 
 
 def delay_profile(view: ReceiverView) -> WeighedPaths:
@@ -37,13 +40,8 @@ def delay_profile(view: ReceiverView) -> WeighedPaths:
 
 
 @pytest.fixture(scope="module")
-def field() -> BistaticField:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    scene = RadioScene(mesh, part, [SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box")])
-    ds = exact_spectra(scene, RX[None], transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=SIGMA)
-    return BistaticField.prior(scene, ds, terms=Terms(mirror_order=1))
+def field(scene: RadioScene) -> BistaticField:
+    return BistaticField.prior(scene, spectra(scene, RX[None]), terms=Terms(mirror_order=1))
 
 
 def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
@@ -99,41 +97,76 @@ def test_places_where_a_horn_is_turned_alike_share_a_table(field: BistaticField)
             np.testing.assert_allclose(found, back[0], rtol=0.05, atol=1e-3 * back[0].max())
 
 
-def test_its_jacobian_is_that_of_differences(field: BistaticField) -> None:
-    view = field.view(RX)
-    profile = delay_profile(view)
-    response = respond(view, profile, field.terms, field.floor)
-    layout = Layout(*field.parameters.log_weight.shape, indirect=False, gain=True)
-    x = layout.pack(replace(field.parameters, log_gain=0.1))
+def differences(ask, x: np.ndarray, step: float) -> np.ndarray:
+    """Slopes of the readings ``ask(x)`` by each parameter, shape (parameters, readings)."""
+    steps = step * np.eye(len(x))
+    return np.stack([(ask(x + s) - ask(x - s)) / (2.0 * step) for s in steps])
+
+
+def dense(table: np.ndarray, index: np.ndarray, layout: Layout) -> np.ndarray:
+    """A Jacobian with the rows of what is not seen: zeros."""
+    whole = np.zeros((layout.size, table.shape[1]))
+    whole[index] = table
+    return whole
+
+
+def array_image(view: ReceiverView) -> ArrayImage:
+    """Half a hemisphere as an array of 4 x 4 elements sees it, whose paths' lengths are known to 0.4 mm."""
+    array, directions = PlanarArray(4, 4, orientation=UP), hemisphere((18, 36)).reshape(-1, 3)
+    return ArrayImage.of(view, array, directions, 0.0004).part(np.arange(0, len(directions), 13))
+
+
+def pixels(view: ReceiverView) -> SpectrumPixels:
+    return SpectrumPixels(BeamOperator(SHAPE, SIGMA), np.arange(0, SHAPE[0] * SHAPE[1], 7))
+
+
+@pytest.mark.parametrize(
+    ("measured", "lit"), [(delay_profile, False), (array_image, False), (pixels, False), (pixels, True)]
+)
+def test_its_jacobian_is_that_of_differences(field: BistaticField, measured, lit: bool) -> None:
+    """Also of light that surfaces send on, ``lit``: without beams of single paths, which would drown it."""
+    view, rng = field.view(RX), np.random.default_rng(0)
+    response = respond(view, measured(view), field.terms, field.floor)
+    if lit:
+        sent = rng.uniform(0.0, 1e6, (2, len(response.offset))).astype(np.float32)
+        response = replace(response, sender=np.array([0, 1]), sent=sent)
+        response = response.limited(Terms(line_of_sight=False, mirror_order=0))
+    groups, lobes = field.parameters.log_weight.shape
+    layout = Layout(groups, lobes, indirect=True, gain=True)
+    x = layout.pack(replace(field.parameters, log_gain=0.1, log_indirect=np.full(groups, -1.0)))
+    x += rng.normal(0.0, 0.2, layout.size)
     values, table, index = jacobian(response, layout.unpack(x), layout)
-    np.testing.assert_allclose(values, predict(response, layout.unpack(x)), rtol=1e-5)
-    for row, place in zip(table, index, strict=True):
-        step = 0.02 * (np.arange(layout.size) == place)
-        slope = (
-            predict(response, layout.unpack(x + step)) - predict(response, layout.unpack(x - step))
-        ) / 0.04
+    np.testing.assert_allclose(values, predict(response, layout.unpack(x)), rtol=1e-4)
+    slopes = differences(lambda x: predict(response, layout.unpack(x)), x, 0.02)
+    caught = []
+    for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.02  # that of permittivity is a table's
-        assert np.abs(row - slope).max() <= allowed * np.abs(slope).max() + 1e-5 * values.max()
+        bound = allowed * np.abs(slope).max() + 1e-5 * values.max()
+        assert np.abs(row - slope).max() <= bound
+        caught.append(np.abs(1.2 * row - slope).max() > bound)
+    assert np.mean(np.array(caught)[index]) > 0.7  # planted errors, but those of what is hardly seen
 
 
-def test_the_jacobian_at_another_carrier_is_that_of_differences(field: BistaticField) -> None:
+@pytest.mark.parametrize(
+    ("measured", "how"), [(delay_profile, {"ratio": 0.6}), (array_image, {"chain": OWN_GAIN})]
+)
+def test_errors_at_another_carrier_or_of_unknown_gain_have_the_slopes_of_differences(
+    field: BistaticField, measured, how: dict
+) -> None:
     view = field.view(RX)
-    profile = delay_profile(view)
-    response = respond(view, profile, field.terms, field.floor)
-    reading = Reading(response, Target(np.zeros(len(response.offset))), ratio=0.6)
+    response = respond(view, measured(view), field.terms, field.floor)
+    target = 10 * np.log10(1 + np.roll(predict(response, field.parameters), 3))
+    reading = Reading(response, Target(target), **how)
     groups, lobes = field.parameters.log_weight.shape
     layout = Layout(groups, lobes, indirect=True, gain=True)
     rng = np.random.default_rng(5)
     x = layout.pack(replace(field.parameters, log_indirect=np.full(groups, -3.0)))
     x += rng.normal(0.0, 0.4, layout.size)
     error, table, index = reading.linearised(layout.unpack(x), layout)
-    whole = np.zeros((layout.size, len(error)))
-    whole[index] = table
-    for place in range(layout.size):
-        step = 0.02 * (np.arange(layout.size) == place)
-        slope = (reading.error_db(layout.unpack(x + step)) - reading.error_db(layout.unpack(x - step))) / 0.04
+    slopes = differences(lambda x: reading.error_db(layout.unpack(x)), x, 0.02)
+    for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.01  # that of permittivity is a table's
-        assert np.abs(whole[place] - slope).max() <= allowed * np.abs(slope).max() + 1e-4
+        assert np.abs(row - slope).max() <= allowed * np.abs(slope).max() + 1e-4
 
 
 def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() -> None:
@@ -150,13 +183,8 @@ def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() 
     layout = Layout(3, 2, indirect=False, gain=False)
     x = layout.pack(Parameters.prior(3, 2)) + rng.normal(0.0, 0.3, layout.size)
     values, table, index = jacobian(response, layout.unpack(x), layout)
-    whole = np.zeros((layout.size, count))
-    whole[index] = table
-    for place in range(layout.size):
-        step = 1e-2 * (np.arange(layout.size) == place)
-        high, low = (predict(response, layout.unpack(x + s * step)) for s in (1.0, -1.0))
-        slope = (high - low) / 2e-2
-        assert (np.abs(whole[place] - slope) <= 1e-3 * np.abs(slope) + 1e-4 * values).all()
+    slopes = differences(lambda x: predict(response, layout.unpack(x)), x, 1e-2)
+    assert (np.abs(dense(table, index, layout) - slopes) <= 1e-3 * np.abs(slopes) + 1e-4 * values).all()
 
 
 def test_a_used_field_is_copied_and_pickled(field: BistaticField) -> None:

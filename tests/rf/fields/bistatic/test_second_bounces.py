@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined, mirror_paths
+from furnished import RECEIVERS, ROOM, SHAPE, TX, F, spectra
+from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
 
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import Reading, Target, fit_groups
 from warprrf.rf.fields.bistatic.grouping import regroup
-from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
+from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.response import (
-    Response,
-    jacobian,
     predict,
     respond,
     with_further_bounces,
@@ -25,32 +25,10 @@ from warprrf.rf.fields.bistatic.surface import Surface
 from warprrf.rf.fields.bistatic.training import trace
 from warprrf.rf.fields.bistatic.transport import Transport
 from warprrf.rf.spectra.beam import BeamOperator
-from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import to_db
 
-F = 300e9
 WAVELENGTH = SPEED_OF_LIGHT / F
-SHAPE = (24, 48)
-TX = np.array([0.8, 0.9, 2.2])
-ROOM = np.array([5.0, 4.0, 3.0])
-
-
-def test_a_room_shows_as_many_images_as_its_lattice_has() -> None:
-    mesh, part = joined(box_mesh([0, 0, 0], ROOM, inward=True))
-    surface = Surface.of(RadioScene(mesh, part, [SlabMaterial()]))
-    receivers = np.array([[4.1, 3.2, 1.3], [2.2, 0.7, 0.6]])
-    found = mirror_paths(surface, TX, receivers, WAVELENGTH, 3)
-    for r, receiver in enumerate(receivers):
-        for order, count in ((0, 1), (1, 6), (2, 18), (3, 38)):  # |i| + |j| + |k| = n has 4 n^2 + 2 solutions
-            own = found.subset(np.flatnonzero((found.receiver == r) & (found.order == order)))
-            lattice = [
-                np.linalg.norm(image - receiver)
-                for i in range(-order, order + 1) for j in range(-order, order + 1) for k in range(-order, order + 1)
-                if abs(i) + abs(j) + abs(k) == order
-                for image in [np.where(np.array([i, j, k]) % 2 == 0, TX, ROOM - TX) + np.array([i, j, k]) * ROOM]
-            ]  # fmt: skip
-            assert len(own) == count
-            assert np.allclose(np.sort(own.length_m), np.sort(lattice), rtol=1e-12)
+RECEIVERS = RECEIVERS[:6]
 
 
 def test_a_surface_too_small_for_a_mirror_has_line_of_sight_alone() -> None:
@@ -131,23 +109,16 @@ MATERIALS = [
     SlabMaterial("one", 6.0, 0.5, np.inf, 0.8),
     SlabMaterial("two", 6.0, 0.5, np.inf, 0.8),
 ]
-RECEIVERS = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1]]
-)
 
 
 @pytest.fixture(scope="module")
 def scene() -> RadioScene:
     mesh, part = joined(
-        box_mesh([0, 0, 0], ROOM, inward=True),
+        ROOM,
         box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.4]),
         box_mesh([3.4, 0.8, 0.0], [4.0, 1.4, 1.0]),
     )
     return RadioScene(mesh, part, MATERIALS)
-
-
-def spectra(scene: RadioScene, receivers: np.ndarray) -> SpectrumDataset:
-    return exact_spectra(scene, receivers, transmitter=TX, frequency_hz=F, shape=SHAPE, sigma=np.radians(5.0))
 
 
 @pytest.fixture(scope="module")
@@ -197,69 +168,18 @@ def test_tied_responses_predict_the_same(readings: list[Reading]) -> None:
         rng.normal(-2, 0.5, (2, 5)), rng.normal(1, 0.3, 2), rng.normal(-1, 0.3, 2), rng.normal(-3, 0.2, 2)
     )
     for reading in readings:
-        response = with_light(reading.response, rng)
+        light = rng.uniform(0, 5, (2, len(reading.response.offset))).astype(np.float32)
+        response = replace(reading.response, sender=np.array([0, 2]), sent=light)
         assert np.allclose(predict(response, p.take(owner)), predict(response.tied(owner), p), rtol=1e-5)
-
-
-def with_light(response: Response, rng: np.random.Generator) -> Response:
-    light = rng.uniform(0, 5, (2, len(response.offset))).astype(np.float32)
-    return replace(response, sender=np.array([0, 2]), sent=light)
-
-
-def test_derivatives_follow_light_that_is_sent_on(readings: list[Reading]) -> None:
-    rng = np.random.default_rng(1)
-    response = with_light(readings[0].response, rng)
-    # beams of single paths would drown the rest in single precision
-    response = response.limited(Terms(line_of_sight=False, mirror_order=0))
-    layout = Layout(3, 5, indirect=True, gain=True)
-    p = Parameters(
-        rng.normal(-1.5, 0.3, (3, 5)),
-        rng.normal(1, 0.1, 3),
-        rng.normal(-1, 0.3, 3),
-        rng.normal(-2, 0.2, 3),
-        0.2,
-    )
-    x = layout.pack(p)
-    power, table, index = jacobian(response, layout.unpack(x), layout)
-    assert np.allclose(power, predict(response, layout.unpack(x)), rtol=1e-5)
-    dense = np.zeros((len(power), layout.size))
-    dense[:, index] = table.T
-    for k in range(layout.size):
-        step = np.zeros(layout.size)
-        step[k] = 1e-3
-        slope = (
-            predict(response, layout.unpack(x + step)) - predict(response, layout.unpack(x - step))
-        ) / 2e-3
-        # single precision, and curves that are linear piece by piece
-        gap = np.abs(dense[:, k] - slope)
-        assert np.quantile(gap, 0.99) <= 0.02 * np.abs(slope).max() + 3e-5 * power.max()
-
-
-def test_the_beam_at_some_pixels_is_that_of_the_whole_image() -> None:
-    beam = BeamOperator(SHAPE, np.radians(5.0))
-    images = np.random.default_rng(2).random((SHAPE[0] * SHAPE[1], 3))
-    pixels = np.array([0, 7, 500, 1151])
-    whole = beam(images.reshape(*SHAPE, 3)).reshape(-1, 3)
-    assert np.allclose(beam.at(pixels, images), whole[pixels], rtol=1e-5)
-    assert np.allclose(whole.sum(axis=0), images.sum(axis=0), rtol=1e-12)
-    quick = beam(images.reshape(*SHAPE, 3), quick=True).reshape(-1, 3)
-    assert 0 < np.abs(quick - whole).max() < 3e-6 * whole.max()
-    back = beam.adjoint(images.reshape(*SHAPE, 3), quick=True).reshape(-1, 3)
-    assert np.abs(back - beam.adjoint(images.reshape(*SHAPE, 3)).reshape(-1, 3)).max() < 3e-6 * back.max()
 
 
 def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
     """In a closed room whose surfaces send L evenly, the sum over pixels is (lambda / 4 pi)^2 4 pi L."""
-    import trimesh
-
-    from warprrf.geometry.mesh import Mesh
-
-    box, shape = trimesh.creation.box((6.0, 4.0, 3.0)), (12, 24)
-    surface = Surface.of(Mesh(box.vertices, box.faces[:, ::-1]))
+    surface, shape = Surface.of(Mesh(*ROOM)), (12, 24)
     radiance = 0.7
     for sub_pixels in (1, 3):
-        transport = Transport.of(surface, np.array([1.0, 0.5, 0.0]), F, shape, sub_pixels)
-        view = transport.view(np.array([0.5, -0.3, 0.2]), Terms(mirror_order=0))
+        transport = Transport.of(surface, TX, F, shape, sub_pixels)
+        view = transport.view(RECEIVERS[0], Terms(mirror_order=0))
         power = send(transport, view.hits, np.full(surface.element_sides, radiance))
         assert power.sum() == pytest.approx(
             (WAVELENGTH / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6

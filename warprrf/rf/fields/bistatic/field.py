@@ -23,7 +23,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warprrf.cache import Cache
-from warprrf.checks import Expected, check_array, check_arrays, check_count, check_number, checked, index_to
+from warprrf.checks import (
+    Expected,
+    check_array,
+    check_arrays,
+    check_count,
+    check_number,
+    check_type,
+    checked,
+    index_to,
+    one_line,
+)
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
 from warprrf.rf.channel.array_spectra import check_steering
@@ -77,6 +87,8 @@ class BistaticField(RadioField):
         report: how the fit went.
         device: where it computes.
     """
+
+    __repr__ = one_line
 
     surface: Surface = field(repr=False)
     transmitter: np.ndarray
@@ -165,7 +177,7 @@ class BistaticField(RadioField):
             client: a ``dask.distributed.Client`` whose workers cast the rays; this process by default.
             device: where rays are cast.
             progress: called with the stages ``"patches"``, ``"mirrors"``, ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`warprrf.rf.fields.bistatic.training.FitOptions`, in place of those of
+            settings: attributes of :class:`warprrf.FitOptions`, in place of those of
                 ``options``: ``quick=True``, ``mirror_order=2``, ``relevance=found``, ...
 
         Raises:
@@ -286,28 +298,39 @@ class BistaticField(RadioField):
 
     def spectrum(
         self,
-        rx: ArrayLike,
+        receivers: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
+        shape: tuple[int, int] | None = None,
         uncertainty: bool = False,
         view: ReceiverView | None = None,
     ) -> Spectrum:
-        """The spatial spectrum at ``rx`` (3,) [m].
+        """The spatial spectrum of every receiver; see :meth:`RadioField.spectrum`.
 
         Args:
-            rx: receiver position.
-            transmitter: position (3,) [m] if another than the fitted one: lengths, visibility and mirror points are
-                computed anew, materials are kept.
+            receivers, transmitter, shape: as there.
             uncertainty: also give the standard deviation of the dB image per pixel, as ``std_db``.
-            view: what this receiver sees, if it was traced before (:meth:`view`).
+            view: what one receiver sees, if it was traced before (:meth:`view`), on this grid.
 
         Raises:
             ValueError: as for :meth:`check_positions`; for ``uncertainty`` of a field that was fitted to too few
                 receivers to know it.
         """
-        seen = view or self.view(rx, transmitter)
-        found = self.render(seen)
-        delay, aod = strongest(seen, found, self.beam_sigma_rad)
+        field = self.on_grid(shape)
+        if view is not None:
+            return field._seen(view, uncertainty)
+        return field._looked(
+            receivers, transmitter, lambda *link: field._trace_spectrum(*link, uncertainty=uncertainty)
+        )
+
+    def _trace_spectrum(
+        self, receiver: np.ndarray, transmitter: np.ndarray, *, uncertainty: bool = False
+    ) -> Spectrum:
+        return self._seen(self.transport(transmitter).view(receiver, self.terms), uncertainty)
+
+    def _seen(self, view: ReceiverView, uncertainty: bool) -> Spectrum:
+        found = self.render(view)
+        delay, aod = strongest(view, found, self.beam_sigma_rad)
         spectrum = Spectrum(
             path_gain=found.image.astype(np.float32),
             delay_s=delay,
@@ -315,12 +338,12 @@ class BistaticField(RadioField):
             floor=self.floor,
             range_db=self.range_db,
         )
-        return replace(spectrum, std_db=self._std_db(seen, found)) if uncertainty else spectrum
+        return replace(spectrum, std_db=self._std_db(view, found)) if uncertainty else spectrum
 
     def paths(
         self,
         receivers: ArrayLike,
-        transmitters: ArrayLike | None = None,
+        transmitter: ArrayLike | None = None,
         max_paths: int | None = None,
         *,
         store: str | os.PathLike[str] | None = None,
@@ -335,7 +358,7 @@ class BistaticField(RadioField):
         """
         if view is None:
             return super().paths(
-                receivers, transmitters, max_paths, store=store, client=client, progress=progress
+                receivers, transmitter, max_paths, store=store, client=client, progress=progress
             )
         return paths_of(view, self.render(view), self.floor, self.air, max_paths)
 
@@ -359,47 +382,55 @@ class BistaticField(RadioField):
 
     def array_spectrum(
         self,
-        rx: ArrayLike,
+        receivers: ArrayLike,
         array: PlanarArray,
         directions: ArrayLike,
         transmitter: ArrayLike | None = None,
         *,
         length_std_m: float = 0.0,
     ) -> np.ndarray:
-        """Angular spectrum |a^H h|^2 / M^2 of a coherent array at ``rx`` (3,) [m], in expectation over the phases of what
+        """Angular spectrum |a^H h|^2 / M^2 of a coherent array at every receiver, in expectation over the phases of what
         is scattered; see :class:`ArraySpectra`.
 
         Args:
-            rx: the array's centre.
+            receivers, transmitter: as for :meth:`spectrum`; the array's centre.
             array: turned as it stands; without polarisation.
             directions: unit vectors in world axes, shape ``(..., 3)``.
-            transmitter: as for :meth:`spectrum`.
             length_std_m: how well the lengths of paths are known [m].
 
         Returns:
-            Path gain, shape ``(...)``.
+            Path gain, shape ``(...)`` for one receiver and transmitter, else ``(R, ...)``.
 
         Raises:
             TypeError, ValueError: as for :meth:`spectrum`, and naming the argument.
         """
         steered = check_steering(array, directions)
         std = check_number("length_std_m", length_std_m, 0.0)
-        view = self.view(rx, transmitter)
-        image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
-        powers = path_powers(view, self.materials, self.sent_radiance(view.transport))
-        return np.maximum(read(view, image, powers), 0.0).reshape(steered.shape[:-1])
+        ends, found = self.check_positions(receivers, transmitter), []
+        for receiver, source in zip(ends.receivers, ends.transmitters, strict=True):
+            view = self.transport(source).view(receiver, self.terms)
+            image = ArrayImage.of(view, array, steered.reshape(-1, 3), std)
+            powers = path_powers(view, self.materials, self.sent_radiance(view.transport))
+            found.append(np.maximum(read(view, image, powers), 0.0).reshape(steered.shape[:-1]))
+        return np.asarray(ends.shaped(np.stack(found)))
 
-    def view(self, rx: ArrayLike, transmitter: ArrayLike | None = None) -> ReceiverView:
-        """What the receiver at ``rx`` (3,) sees of the geometry, whatever the materials: the costly part of a spectrum.
+    def view(self, receivers: ArrayLike, transmitter: ArrayLike | None = None) -> ReceiverView:
+        """What one receiver (3,) sees of the geometry under one transmitter (3,), whatever the materials: the costly part
+        of a spectrum.
 
         Raises:
-            ValueError: as for :meth:`spectrum`.
+            ValueError: as for :meth:`spectrum`, and for several.
         """
-        receiver, source = self.check_positions(check_array("rx", rx, (3,)), transmitter)
-        return self.transport(source).view(receiver, self.terms)
+        ends = self.check_positions(receivers, transmitter)
+        if not ends.single:
+            raise ValueError(
+                f"receivers: got {len(ends.receivers)} links, expected one place (3,) and transmitter (3,)"
+            )
+        return self.transport(ends.transmitters[0]).view(ends.receivers[0], self.terms)
 
     def render(self, view: ReceiverView) -> Rendered:
         """The spectrum of what is seen, by its parts."""
+        check_type("view", view, ReceiverView)
         view = view.transport.complete(view, self.terms)
         return render(view, self.materials, self._beam, self.sent_radiance(view.transport))
 
@@ -429,7 +460,7 @@ class BistaticField(RadioField):
     ) -> np.ndarray:
         """Where to measure next; see :meth:`RadioField.suggest`, and :mod:`warprrf.rf.fields.bistatic.suggest` for how."""
         given = check_array("candidates", candidates, (None, 3))
-        places, source = self.check_positions(given, name="candidates")
+        places = self.check_positions(given, name="candidates").receivers
         check_count("n", n, 1, len(places))
         pointings = None
         if (arrival is None) != (receive_pattern is None):
@@ -440,7 +471,7 @@ class BistaticField(RadioField):
             check_gains("receive_pattern", receive_pattern)
             angles = check_turned("arrival", arrival, len(places))
             pointings = Pointings(directions_from_angles(*angles.T), receive_pattern)
-        sensitivity, unknowns = self._sensitivity(source)
+        sensitivity, unknowns = self._sensitivity(self.transmitter)
         measured = np.zeros((0, 3)) if self.fitted_on is None else self.fitted_on
         return suggest(
             sensitivity, unknowns, places, n, measured=measured, pointings=pointings, progress=progress

@@ -17,7 +17,7 @@ from warprrf.rf.fields.bistatic.uncertainty import ErrorModel
 _SURFACE = {
     name: name
     for name in ("normal", "patch", "plane_normal", "plane_offset", "group", "material", "patch_group", "element",
-                 "element_centre", "element_area", "element_group", "look")
+                 "element_centre", "element_area", "element_group", "look", "thickness_m")
 } | {"cell": "texel", "cell_element": "texel_element"}  # fmt: skip
 """Arrays of a surface, and what files call them."""
 _PARAMETERS = ("log_weight", "log_excess", "log_mirror", "log_indirect")
@@ -48,6 +48,9 @@ def put_together(tensors: dict[str, np.ndarray], header: dict[str, Any]) -> dict
     Raises:
         KeyError, TypeError, ValueError: for what is missing or does not fit.
     """
+    tensors.setdefault(
+        "surface/thickness_m", np.full(len(header["group_names"]), np.nan)
+    )  # older files have none
     names, two_sided = header["group_names"], header.get("two_sided", False)
     check_type("group_names", names, list)
     check_type("two_sided", two_sided, bool)

@@ -54,6 +54,7 @@ ARRAYS = {
     "element_centre": lengths("E 3"),
     "element_area": Expected("E", 0.0, LARGEST_M**2),
     "element_group": index_to("G", "E"),
+    "thickness_m": Expected("G", 0.0, np.inf, nan=True),
 }
 """What the arrays of a :class:`Surface` must be: F faces, P patches, G groups, E elements, X cells, K looks."""
 
@@ -77,6 +78,7 @@ class Surface:
         cell: cell of each face, shape ``(F,)`` int32.
         cell_element: element of each cell, shape ``(X,)`` int32.
         element_centre, element_area, element_group: of each element, shapes ``(E, 3)`` [m], ``(E,)`` [m^2], ``(E,)``.
+        thickness_m: thickness of what each group is a slab of [m], shape ``(G,)``; NaN where nobody knows.
         group_names: what the groups are called.
         skin_m: depth of the surface's skin.
         two_sided: whether faces have two sides; False: mirrors that of ``plane_normal``, elements the front one, of a surface
@@ -101,6 +103,7 @@ class Surface:
     element_centre: np.ndarray
     element_area: np.ndarray
     element_group: np.ndarray
+    thickness_m: np.ndarray
     group_names: tuple[str, ...]
     skin_m: float
     two_sided: bool = False
@@ -192,7 +195,8 @@ class Surface:
         return cls(
             mesh=mesh, normal=np.asarray(normal[parent]), patch=patch, plane_normal=planes[0], plane_offset=planes[1],
             group=group, material=sort, look=look, patch_group=_largest_groups(mesh, patch, group, len(planes[1])),
-            group_names=tuple(names), skin_m=skin, two_sided=sides, **_elements(mesh, patch, group, element_m),
+            thickness_m=_thickness(geometry, material, len(names)), group_names=tuple(names), skin_m=skin,
+            two_sided=sides, **_elements(mesh, patch, group, element_m),
         )  # fmt: skip
 
     def on_device(self, device: DeviceLike) -> Any:
@@ -274,6 +278,14 @@ def _named_faces(geometry: GeometryLike, mesh: Mesh) -> tuple[np.ndarray | None,
     if len(used) < 2:
         return None, ()
     return group.reshape(-1).astype(np.int32), tuple((*names, "unnamed")[k] for k in used)
+
+
+def _thickness(geometry: GeometryLike, named: np.ndarray | None, groups: int) -> np.ndarray:
+    """Thickness of each group [m], where the groups are a Scene's materials; else NaN."""
+    materials = getattr(geometry, "materials", ())
+    if named is None or len(materials) != groups:
+        return np.full(groups, np.nan)
+    return np.array([np.nan if is_name_alone(m) else float(m.thickness_m) for m in materials])
 
 
 def _elements(mesh: Mesh, patch: np.ndarray, group: np.ndarray, width_m: float) -> dict[str, np.ndarray]:

@@ -34,6 +34,7 @@ from warprrf.checks import (
     check_number,
     check_positive,
     checked,
+    one_line,
 )
 from warprrf.device import DeviceLike, Progress
 from warprrf.geometry.mesh import GeometryLike, Mesh
@@ -49,7 +50,7 @@ from warprrf.rf.fields.harmonic.paths import View, near_line_of_sight, paths_of
 from warprrf.rf.fields.harmonic.problem import Problem, harmonics
 from warprrf.rf.fields.harmonic.transport import Transport, transport
 from warprrf.rf.paths.trace import Paths
-from warprrf.rf.positions import check_dataset
+from warprrf.rf.positions import Ends, check_dataset
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import Spectrum, angles_from_directions
 from warprrf.steps import digest
@@ -83,6 +84,8 @@ class HarmonicField(RadioField):
         fitted_on: receivers whose spectra it was fitted to [m], shape ``(R, 3)``; None where it is not known.
         report: how the fit went: seconds, pairs, losses, Gaussians seen.
     """
+
+    __repr__ = one_line
 
     gaussians: Gaussians = field(repr=False)
     mesh: Mesh | None = field(repr=False)
@@ -148,7 +151,7 @@ class HarmonicField(RadioField):
             transport: blending weights of ``ds.receivers``, if they were computed before.
             device: where to compute.
             progress: called with the stages ``"transport"`` and ``"fit"``.
-            settings: attributes of :class:`~warprrf.rf.fields.harmonic.options.FieldOptions`, in place of those of
+            settings: attributes of :class:`warprrf.FieldOptions`, in place of those of
                 ``options``: ``gain="linear"``, ``iterations=600``, ``seed=1``, ...
 
         Raises:
@@ -156,6 +159,11 @@ class HarmonicField(RadioField):
             ValueError: for an option's value that is not allowed, receivers that are not inside the scene, spectra
                 without power, or a checkpoint of another fit.
         """
+        if not (hasattr(ds, "path_gain") and hasattr(ds, "transmitter")):
+            raise TypeError(
+                f"ds: got {type(ds).__name__}, expected a SpectrumDataset: model {model!r} is fitted to whole spectra; "
+                'a model="bistatic" takes readings and arrays too'
+            )
         chosen = FieldOptions.of(options, {**settings, "model": model})
         started = time.perf_counter()
         gaussians, mesh = _geometry(geometry)
@@ -204,33 +212,45 @@ class HarmonicField(RadioField):
         return replace(self, air=air)
 
     def check_positions(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "rx"
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, receivers: ArrayLike, transmitter: ArrayLike | None = None, *, name: str = "receivers"
+    ) -> Ends:
         """As :meth:`RadioField.check_positions`; ValueError also for another transmitter of an ``rf3dgs`` field."""
-        receivers, source = super().check_positions(rx, transmitter, name=name)
-        if self.options.model == "rf3dgs" and not np.array_equal(source, self.transmitter):
+        ends = super().check_positions(receivers, transmitter, name=name)
+        other = ends.transmitters[(ends.transmitters != self.transmitter).any(axis=1)]
+        if self.options.model == "rf3dgs" and len(other):
             raise ValueError(
-                f"transmitter: got {source.tolist()}, but an rf3dgs field holds only for the one it was fitted for, "
+                f"transmitter: got {other[0].tolist()}, but an rf3dgs field holds only for the one it was fitted for, "
                 f'{self.transmitter.tolist()}; fit model="rf3dgs+", which recomputes lengths, or fit again'
             )
-        return receivers, source
+        return ends
 
     def spectrum(
-        self, rx: ArrayLike, transmitter: ArrayLike | None = None, *, transport: Transport | None = None
+        self,
+        receivers: ArrayLike,
+        transmitter: ArrayLike | None = None,
+        *,
+        shape: tuple[int, int] | None = None,
+        transport: Transport | None = None,
     ) -> Spectrum:
-        """The spatial spectrum at ``rx`` (3,) [m].
+        """The spatial spectrum of every receiver; see :meth:`RadioField.spectrum`.
+
+        Gaussians that no ray of the fitted grid met learned nothing: on a finer one they are guesses.
 
         Args:
-            rx: receiver position.
-            transmitter: position (3,) [m] if another than the fitted one: lengths are recomputed, gains are kept.
-            transport: blending weights of exactly this receiver, if they were computed before.
+            receivers, transmitter, shape: as there.
+            transport: blending weights of exactly this receiver, on this grid, if they were computed before.
 
         Raises:
             ValueError: as for :meth:`check_positions`; or another transmitter with ``rf3dgs``, whose delays and gains
                 hold only for the one it was fitted for.
         """
-        receiver, source = self.check_positions(check_array("rx", rx, (3,)), transmitter)
-        return self._look(receiver, source, transport).spectrum
+        field = self.on_grid(shape)
+        return field._looked(
+            receivers, transmitter, lambda at, source: field._look(at, source, transport).spectrum
+        )
+
+    def _trace_spectrum(self, receiver: np.ndarray, transmitter: np.ndarray) -> Spectrum:
+        return self._look(receiver, transmitter, None).spectrum
 
     def _trace_paths(self, receiver: np.ndarray, transmitter: np.ndarray, max_paths: int | None) -> Paths:
         """At least one diffuse path is kept to carry what is below the floor. With ``line_of_sight="explicit"`` the ``los``

@@ -169,7 +169,7 @@ class SingleBounce:
         """Whether the mesh lets them see each other, and their Friis gain, less absorption."""
         distance = float(np.linalg.norm(receiver - transmitter))
         if distance == 0:
-            raise ValueError("rx: got the transmitter's own position; expected them apart")
+            raise ValueError("receivers: got the transmitter's own position; expected them apart")
         visible = self.mesh is not None and bool(
             self.mesh.visible(receiver, transmitter, device=self.device)[0]
         )

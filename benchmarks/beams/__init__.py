@@ -1,1 +1,0 @@
-"""Beams chosen from the field, beside pilots."""

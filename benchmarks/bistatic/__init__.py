@@ -1,1 +1,0 @@
-"""The bistatic field beside other systems, and what its parts are worth."""
