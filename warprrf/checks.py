@@ -415,9 +415,10 @@ def _as_array(letters: str, of_axes: bool, value: Any) -> object:
 def _as_object(kind: type, value: object) -> object:
     if isinstance(value, str):
         return value if kind is object or (kind is str and "\0" not in value) else _OTHER
-    # One's own class may stand for one of ours, as long as it is an object with attributes.
+    # One's own class may stand for one of ours, as long as it is an object with attributes; another of ours may not.
     own = kind.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
-    fits = isinstance(value, kind) or (own and not isinstance(value, wp.array))
+    known = type(value).__module__.startswith("warprrf.")
+    fits = isinstance(value, kind) or (own and not known and not isinstance(value, wp.array))
     return value if fits and not isinstance(value, bytes) else _OTHER
 
 

@@ -67,7 +67,7 @@ class Band:
     def __post_init__(self) -> None:
         for name in ("a", "b", "c", "d"):
             check_number(name, getattr(self, name))
-        if not check_positive("low_hz", self.low_hz) < check_positive("high_hz", self.high_hz):
+        if not check_frequency(self.low_hz, "low_hz") < check_frequency(self.high_hz, "high_hz"):
             raise ValueError(f"low_hz, high_hz: got {self.low_hz}, {self.high_hz}, expected 0 < low < high")
         for frequency_hz in (self.low_hz, self.high_hz):  # both laws are monotonic in between
             what = f" at {frequency_hz / 1e9:g} GHz"

@@ -12,16 +12,16 @@ CARRIERS_HZ = (1e5, 1e16)
 """What a carrier may be: a smaller number is one in megahertz or gigahertz."""
 
 
-def check_frequency(frequency_hz: ArrayLike | None) -> float:
-    """``frequency_hz`` as a float.
+def check_frequency(frequency_hz: ArrayLike | None, name: str = "frequency_hz") -> float:
+    """``frequency_hz`` as a float; errors call it ``name``.
 
     Raises:
         ValueError: if it is outside :data:`CARRIERS_HZ`.
     """
-    value, (low, high) = float(check_array("frequency_hz", frequency_hz, ())), CARRIERS_HZ
+    value, (low, high) = float(check_array(name, frequency_hz, ())), CARRIERS_HZ
     if not low <= value <= high:
         raise ValueError(
-            f"frequency_hz: got {value!r}, expected a carrier in hertz, {low:g} to {high:g} (28 GHz is 28e9)"
+            f"{name}: got {value!r}, expected a carrier in hertz, {low:g} to {high:g} (28 GHz is 28e9)"
         )
     return value
 

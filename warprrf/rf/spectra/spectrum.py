@@ -19,7 +19,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from warprrf import device as _device
-from warprrf.checks import check_array, check_number, check_positive, checked, one_line
+from warprrf.checks import check_array, check_number, check_positive, check_type, checked, one_line
 from warprrf.device import DeviceLike
 from warprrf.kernels.radio import beam as beam_kernels
 
@@ -503,8 +503,10 @@ class Spectrum:
         """Spectra of several receivers as one; floor and range are those of the first.
 
         Raises:
-            ValueError: for none.
+            ValueError, TypeError: for none, or anything else.
         """
+        for k, one in enumerate(spectra):
+            check_type(f"spectra[{k}]", one, cls)
         if not spectra:
             raise ValueError("spectra: got none, expected at least one")
         several: dict[str, Any] = {}
