@@ -157,17 +157,20 @@ def check_similarity(scale: object, rotation: object, shift: object) -> tuple[fl
     """What moves points ``x`` to ``scale rotation x + shift``.
 
     Args:
-        scale: positive number.
+        scale: from 1e-6 to 1e6.
         rotation: shape ``(3, 3)``; None for none.
-        shift: shape ``(3,)`` [m].
+        shift: shape ``(3,)``, each up to 20,000 km [m].
 
     Raises:
-        TypeError, ValueError: for a scale that is not positive, or a matrix that is no rotation.
+        TypeError, ValueError: for numbers out of range, or a matrix that is no rotation.
     """
     turn = np.eye(3) if rotation is None else check_array("rotation", rotation, (3, 3))
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0:
         raise ValueError(f"rotation: got {turn.tolist()}, expected a rotation: orthonormal, not mirrored")
-    return check_positive("scale", scale), turn, check_array("shift", shift, (3,))
+    moved = check_array("shift", shift, (3,))
+    if np.abs(moved).max() > 0.2 * LARGEST_M:
+        raise ValueError(f"shift: got {moved.tolist()}, expected at most {0.2 * LARGEST_M:g} m")
+    return check_number("scale", scale, 1e-6, 1e6), turn, moved
 
 
 def users_level() -> int:
@@ -417,8 +420,8 @@ def _as_object(kind: type, value: object) -> object:
         return value if kind is object or (kind is str and "\0" not in value) else _OTHER
     # One's own class may stand for one of ours, as long as it is an object with attributes; another of ours may not.
     own = kind.__module__.startswith("warprrf.") and hasattr(value, "__dict__") and not callable(value)
-    known = type(value).__module__.startswith("warprrf.")
-    fits = isinstance(value, kind) or (own and not known and not isinstance(value, wp.array))
+    own = own and not type(value).__module__.startswith("warprrf.")
+    fits = isinstance(value, kind) or (own and not isinstance(value, wp.array))
     return value if fits and not isinstance(value, bytes) else _OTHER
 
 

@@ -371,7 +371,7 @@ def _messages(place: Place, edits: tuple[Edit, ...]) -> str:
     with suppress(ConnectionClosed), connect(f"ws://{host}", **page, max_size=None, max_queue=None) as sender:
         for message in (wild, drag | {"position": right.tolist()}):
             sender.send(msgspec.msgpack.encode(message))
-        end = time.monotonic() + 10.0
+        end = time.monotonic() + 20.0
         while time.monotonic() < end:
             if viewer.last is not None and np.array_equal(viewer.last.receiver, right):
                 return ""

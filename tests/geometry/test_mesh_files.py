@@ -1,7 +1,6 @@
 """Mesh files of other software: units, axes, instances, colours, names; what they may name; damage."""
 
 import pickle
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -125,57 +124,36 @@ def test_numbered_pages_of_a_scan_are_no_materials(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.face_label, [-1, -1, 0])
 
 
-def one_texture_glb(folder: Path) -> Path:
-    def share(header):
-        textured = [m for m in header["materials"] if "baseColorTexture" in m["pbrMetallicRoughness"]]
-        header["materials"] = textured * len(header["materials"])
-
-    return changed_glb(room_glb(folder), share)
-
-
-def one_texture_obj(folder: Path) -> Path:
-    path = obj_with_materials(folder)
-    (folder / "square.mtl").write_text(
-        "".join(f"newmtl {n}\nmap_Kd pages/wood.png\n" for n in ("Wood_01", "Paint"))
-    )
-    return path
-
-
-@pytest.mark.parametrize("make", [one_texture_glb, one_texture_obj])
-def test_a_picture_that_materials_share_is_decoded_once(make, tmp_path: Path, monkeypatch) -> None:
-    path, read, decoded = make(tmp_path), mesh_content.read_picture, []
+@pytest.mark.parametrize("kind", ["glb", "obj"])
+def test_a_picture_that_materials_share_is_decoded_once(kind, tmp_path: Path, monkeypatch) -> None:
+    if kind == "glb":
+        path = changed_glb(room_glb(tmp_path), lambda h: h.update(materials=h["materials"][1:] * 2))
+    else:
+        path, materials = obj_with_materials(tmp_path), tmp_path / "square.mtl"
+        materials.write_text(materials.read_text().replace("Kd 0.9 0.1 0.2", "map_Kd pages/wood.png"))
+    read, decoded = mesh_content.read_picture, []
     for module in gltf_files, obj_files:
         monkeypatch.setattr(module, "read_picture", lambda *a: decoded.append(a) or read(*a))
     assert wr.Mesh.load(path).face_colours is not None
     assert len(decoded) == 1
 
 
-def outside_obj(folder: Path) -> Path:
-    path = obj_with_materials(folder)
-    path.write_text(path.read_text().replace("square.mtl", "../square.mtl"))
-    (folder.parent / "square.mtl").write_text("newmtl Paint\nKd 0 0 1\n")
-    return path
-
-
-def outside_texture(folder: Path) -> Path:
-    path = obj_with_materials(folder)
-    text = (folder / "square.mtl").read_text()
-    (folder / "square.mtl").write_text(text.replace("pages/wood.png", str(folder.parent / "wood.png")))
-    (folder / "pages" / "wood.png").rename(folder.parent / "wood.png")
-    return path
-
-
-def outside_buffer(folder: Path) -> Path:
-    path = room_gltf(folder)
-    path.write_text(path.read_text().replace('"gltf_buffer_0.bin"', '"..%2Fgltf_buffer_0.bin"'))
-    (folder / "gltf_buffer_0.bin").rename(folder.parent / "gltf_buffer_0.bin")
-    return path
-
-
-@pytest.mark.parametrize("make", [outside_obj, outside_texture, outside_buffer])
-def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, tmp_path: Path) -> None:
-    (tmp_path / "model").mkdir()
-    path = make(tmp_path / "model")
+@pytest.mark.parametrize(
+    ("make", "names", "name", "outside"),
+    [
+        (obj_with_materials, "square.obj", "square.mtl", "../square.mtl"),
+        (obj_with_materials, "square.mtl", "pages/wood.png", "{}/wood.png"),
+        (room_gltf, "model.gltf", "gltf_buffer_0.bin", "..%2Fgltf_buffer_0.bin"),
+    ],
+)
+def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(
+    make, names, name, outside, tmp_path: Path
+) -> None:
+    folder = tmp_path / "model"
+    folder.mkdir()
+    path = make(folder)
+    (folder / names).write_text((folder / names).read_text().replace(name, outside.format(tmp_path)))
+    (folder / name).rename(tmp_path / Path(name).name)
     with pytest.raises(ValueError, match=rf"{path.name}.*outside its folder.*allow_outside=True"):
         wr.Mesh.load(path)
     assert wr.Mesh.load(path, allow_outside=True).face_colours is not None
@@ -185,27 +163,20 @@ def test_files_outside_the_folder_are_read_only_if_that_is_asked_for(make, tmp_p
     ("change", "told"),
     [
         (lambda h: h["accessors"][0].update(count=10**9), "accessor 0 states"),
-        (lambda h: h["accessors"][0].update(sparse={}), "accessor 0 is sparse"),
-        (lambda h: h["bufferViews"][0].update(byteLength=10**9), "buffer view 0 states"),
         (lambda h: h["nodes"][0].update(children=[0]), "two parents"),
-        (lambda h: h["nodes"][1].update(mesh=99), "meshes 99 of 2"),
-        (
-            lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]),
-            "KHR_draco.*without compression",
-        ),
+        (lambda h: h.update(extensionsRequired=["KHR_draco_mesh_compression"]), "without compression"),
         (lambda h: h["meshes"][0]["primitives"][0].update(mode=6), "fans"),
-        (lambda h: h["meshes"][0]["primitives"][0].update(mode=1), "no triangles|lines"),
-        (lambda h: h["asset"].update(version="1.0"), "version 2"),
-        (lambda h: h["accessors"][0].update(componentType=1), "KeyError"),
     ],
 )
 def test_a_gltf_header_that_does_not_fit_its_data_is_refused(change, told: str, tmp_path: Path) -> None:
     path = changed_glb(room_glb(tmp_path), change)
-    if told.startswith("no triangles"):
-        assert (wr.Mesh.load(path).face_label is not None) and len(wr.Mesh.load(path).faces) < 16
-        return
     with pytest.raises(ValueError, match=rf"room\.glb.*({told})"):
         wr.Mesh.load(path)
+
+
+def test_lines_of_a_gltf_file_are_no_triangles(tmp_path: Path) -> None:
+    path = changed_glb(room_glb(tmp_path), lambda h: h["meshes"][0]["primitives"][0].update(mode=1))
+    assert len(wr.Mesh.load(path).faces) == 4
 
 
 @pytest.mark.parametrize("most", [10, 15])
@@ -213,15 +184,6 @@ def test_a_small_file_that_makes_many_triangles_is_refused(most: int, tmp_path: 
     monkeypatch.setattr(gltf_files, "LARGEST_FACES", most)  # 12 and 2 are made, 2 of them stand there twice
     with pytest.raises(ValueError, match=rf"room\.glb.*more than {most} triangles"):
         wr.Mesh.load(room_glb(tmp_path))
-
-
-def test_a_binary_stl_that_is_cut_short_is_refused(tmp_path: Path) -> None:
-    trimesh.creation.box().export(tmp_path / "box.stl")
-    whole = (tmp_path / "box.stl").read_bytes()
-    for damaged in (whole[:-1], whole[:80] + struct.pack("<I", 10**9) + whole[84:], b""):
-        (tmp_path / "box.stl").write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"box\.stl"):
-            wr.Mesh.load(tmp_path / "box.stl")
 
 
 def test_vertices_at_one_place_become_one_in_the_file_s_order(tmp_path: Path) -> None:

@@ -1,15 +1,12 @@
 """Ray and distance queries, on both back ends, against answers known in closed form; their hard cases."""
 
 import importlib.util
-import multiprocessing
-import os
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
 
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
+from scipy.spatial.transform import Rotation
 from trimesh.creation import icosphere
 
 from warprrf.device import resolve
@@ -50,13 +47,11 @@ def box_exit(origin, d, low, high):
     return np.where(d == 0, np.inf, t).min(axis=1)
 
 
-def rotation(seed):
-    q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
-    return q * np.sign(np.diag(r))
-
-
 def test_rays_at_vertices_and_edges_of_a_closed_mesh_do_not_escape(where):
-    mesh, rng = sphere(), np.random.default_rng(1)
+    """Nor are they stopped elsewhere by faces that come twice or have no area."""
+    clean, rng = sphere(), np.random.default_rng(1)
+    dirt = np.concatenate([clean.faces[::9], clean.faces[::7, [0, 0, 1]]])
+    mesh = Mesh(clean.vertices, np.concatenate([dirt, clean.faces]))
     assert mesh.is_closed
     vertex = mesh.vertices[rng.integers(len(mesh.vertices), size=60_000)]
     face = mesh.triangles[rng.integers(len(mesh.faces), size=60_000)]
@@ -95,30 +90,8 @@ def test_grazing_rays_meet_floor_or_wall_where_they_should(where, height):
     assert hit.valid.all()
 
 
-def test_degenerate_and_duplicate_triangles_change_nothing(where):
-    clean = sphere()
-    rng = np.random.default_rng(3)
-    some = rng.permutation(len(clean.faces))[:400]
-    middle = clean.triangles[some].mean(axis=1)
-    count = len(clean.vertices)
-    points = clean.faces[some][:, [0, 0, 1]]
-    collinear = np.column_stack(
-        [clean.faces[some, 0], np.arange(count, count + 400), np.arange(count + 400, count + 800)]
-    )
-    vertices = np.concatenate([clean.vertices, middle, 0.5 * (middle + clean.triangles[some, 0])])
-    dirty = Mesh(vertices, np.concatenate([points, clean.faces[some], clean.faces]))
-    needles = Mesh(vertices, np.concatenate([collinear, points, clean.faces[some], clean.faces]))
-    assert dirty.is_closed
-    aimed = np.concatenate([directions(100_000), clean.vertices, middle])
-    expected = clean.cast([0.01, 0.02, 0.03], aimed, **where)
-    for mesh in (dirty, needles):
-        hit = mesh.cast([0.01, 0.02, 0.03], aimed, **where)
-        np.testing.assert_allclose(hit.t, expected.t, atol=2e-6)
-        np.testing.assert_allclose(hit.t[:100_000], expected.t[:100_000], atol=1e-9)
-
-
 def test_a_receiver_on_a_surface_meets_the_next_surface(where):
-    turn, n = rotation(4), 30_000
+    turn, n = Rotation.random(None, 4).as_matrix(), 30_000
     vertices, faces = box_mesh(*ROOM)
     room = Mesh(vertices @ turn.T + [3.0, -2.0, 1.0], faces)
     rng = np.random.default_rng(5)
@@ -208,63 +181,12 @@ def test_many_rays_meet_what_each_meets_alone(length):
     np.testing.assert_array_equal(seen, mesh.visible(origin, end, backend="warp", device="cpu"))
 
 
-@pytest.mark.parametrize("backend", ["warp", "embree"])
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_point_sees_itself_and_no_points_see_nothing(backend, count):
-    mesh = Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([[0, 1, 2]]))
-    point = np.full((count, 3), 2.0)
-    for a in (point, point[0]):
-        assert mesh.visible(a, point, backend=backend, device="cpu").tolist() == [True] * count
-    assert len(mesh.visible(point[0], point[:0], backend=backend, device="cpu")) == 0
-
-
-@pytest.mark.parametrize("ask", ["cast", "visible", "distance"])
-def test_a_fresh_mesh_answers_several_threads_as_one(ask, where):
-    d = directions(4_000, seed=17)
-    sources = {"cast": (0.1 * d, d), "visible": (0.1 * d, 6.0 * d), "distance": (4.0 * d,)}
-    options = {"device": where["device"]} if ask == "distance" else where
-
-    def answer(mesh):
-        found = getattr(mesh, ask)(*sources[ask], **options)
-        return found.t if ask == "cast" else found
-
-    expected = answer(sphere())
-    for _ in range(10):
-        mesh, together = sphere(), Barrier(4)
-
-        def first_use(_, mesh=mesh, together=together):
-            together.wait()
-            return answer(mesh)
-
-        with ThreadPoolExecutor(4) as pool:
-            for found in pool.map(first_use, range(4)):
-                np.testing.assert_array_equal(found, expected)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_child_answers_as_its_parent(where):
-    """Neither the pool of threads that the parent has used nor its hierarchies hang in the child."""
-    if where["device"] != "cpu":
-        pytest.skip("CUDA cannot be used in a forked child")
-    mesh, d = sphere(), directions(20_000, seed=18)
-    expected = mesh.cast([0.0, 0.0, 0.0], d, **where).t
-    context = multiprocessing.get_context("fork")
-    ours, theirs = context.Pipe()
-
-    def answer():
-        used = mesh.cast([0.0, 0.0, 0.0], d, **where).t
-        fresh = sphere().cast([0.0, 0.0, 0.0], d, **where).t
-        theirs.send((used, fresh))
-
-    child = context.Process(target=answer, daemon=True)
-    child.start()
-    try:
-        assert ours.poll(60), "the child hangs"
-        for found in ours.recv():
-            np.testing.assert_array_equal(found, expected)
-    finally:
-        child.kill()
-        child.join()
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_a_point_sees_itself_and_no_points_see_nothing(where, count):
+    mesh, point = Mesh(*box_mesh(*ROOM)), np.ones((count, 3))
+    for a in (point, np.ones(3)):
+        assert mesh.visible(a, point, **where).tolist() == [True] * count
+    assert mesh.cast(point, point, **where).t.shape == (count,)
 
 
 def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypatch):
@@ -278,15 +200,6 @@ def test_auto_takes_embree_for_many_rays_on_a_cpu_where_it_is_installed(monkeypa
     assert choose("auto", cpu, raysearch.EMBREE_RAYS - 1) == "warp"
     monkeypatch.setattr(raysearch, "open3d_installed", lambda: False)
     assert choose("auto", cpu, 10**7) == "warp"
-
-
-def test_bad_rays_are_refused_by_both(where):
-    mesh = Mesh(*box_mesh(*ROOM))
-    with pytest.raises(ValueError, match="directions.*zero"):
-        mesh.cast([0, 0, 1], [[1, 0, 0], [0, 0, 0]], **where)
-    with pytest.raises(ValueError, match="b: got 30000 values that are NaN"):
-        mesh.visible([0, 0, 1], np.full((10_000, 3), np.nan), **where)
-    assert mesh.cast(np.zeros((0, 3)), np.zeros((0, 3)), **where).t.shape == (0,)
 
 
 def test_the_same_directions_are_cast_from_every_origin(where):
@@ -328,11 +241,8 @@ def test_segments_too_long_for_float32_are_judged_and_those_too_long_for_float64
         expected = np.arange(35) % 2 == 0
         expected[::7] = True
         np.testing.assert_array_equal(seen, expected)
-    for place in (3, 34):
-        end = 7.0 * outward
-        end[place] *= 1e200
-        with pytest.raises(ValueError, match="b: got 3 values that are above"):
-            mesh.visible(start, end, **where)
+    with pytest.raises(ValueError, match="b: got 105 values that are above"):
+        mesh.visible(start, 1e201 * np.sign(outward), **where)
 
 
 @no_embree
@@ -359,19 +269,6 @@ def test_misses_are_inf_and_minus_one():
     hit = plane.cast([[0.2, 0.2, 1.0], [5, 5, 1]], [0, 0, -1])
     assert hit.face.tolist() == [0, -1] and hit.t[1] == np.inf and np.isnan(hit.point[1]).all()
     np.testing.assert_array_equal(hit.normal[0], [0, 0, 1])
-
-
-@pytest.mark.usefixtures("device")
-def test_a_screen_blocks_exactly_its_shadow():
-    screen = Mesh([[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]], [[0, 1, 2], [0, 2, 3]])
-    rng = np.random.default_rng(2)
-    b = np.column_stack([np.full(5000, 2.0), rng.uniform(-4, 4, 5000), rng.uniform(-4, 4, 5000)])
-    a = np.array([-2.0, 0.0, 0.0])
-    crossing = 0.5 * b[:, 1:]
-    shadow = (np.abs(crossing) < 1).all(axis=1)
-    clear = (np.abs(np.abs(crossing) - 1) > 1e-6).all(axis=1)
-    np.testing.assert_array_equal(screen.visible(a, b)[clear], ~shadow[clear])
-    np.testing.assert_array_equal(screen.visible(b, a), screen.visible(a, b))
 
 
 def test_thin_sheet_just_off_the_end_still_blocks():

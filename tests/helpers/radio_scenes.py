@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+from golden.make import box_mesh as box_mesh
+from golden.make import joined as joined
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.rf.exact import ExactEngine
@@ -47,25 +49,6 @@ class RadioScene:
     @property
     def bounds(self):
         return self.mesh.bounds
-
-
-def box_mesh(low, high, inward=False):
-    """Vertices and faces of a closed box, 6 sides of 2 faces."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return low + corners * (high - low), faces[:, ::-1] if inward else faces
-
-
-def joined(*parts):
-    """One mesh of several (vertices, faces), and the part each face came from."""
-    shift = np.cumsum([0] + [len(v) for v, _ in parts])
-    mesh = Mesh(
-        np.concatenate([v for v, _ in parts]),
-        np.concatenate([f + s for (_, f), s in zip(parts, shift, strict=False)]),
-    )
-    return mesh, np.repeat(np.arange(len(parts)), [len(f) for _, f in parts])
 
 
 def square(half, z=0.0):

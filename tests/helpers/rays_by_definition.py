@@ -16,8 +16,14 @@ def cloud(rng, n, low=0.02, high=0.5, spread=2.0):
     )
 
 
-def one(mean=(2.0, 0.0, 0.0), scales=(0.1, 0.2, 0.3), opacity=0.5, quaternion=(1.0, 0, 0, 0)):
-    return wr.Gaussians([mean], [quaternion], [scales], [opacity], np.zeros((1, 1, 3)))
+def gaussians(means=(2.0, 0.0, 0.0), scales=(0.1, 0.2, 0.3), opacities=0.8, quaternions=(1.0, 0.0, 0.0, 0.0)):
+    """One or several; what is given once is that of all."""
+    means = np.atleast_2d(means)
+    n = len(means)
+    return wr.Gaussians(
+        means, np.broadcast_to(quaternions, (n, 4)), np.broadcast_to(scales, (n, 3)), np.broadcast_to(opacities, n),
+        np.zeros((n, 1, 3)),
+    )  # fmt: skip
 
 
 def met(gaussians, origin, directions, dtype=np.float64):
@@ -46,6 +52,34 @@ def met(gaussians, origin, directions, dtype=np.float64):
     alpha = opacities * np.exp(-0.5 * ((offset + t[..., None] * toward) ** 2).sum(-1))
     with np.errstate(invalid="ignore"):  # at a mean itself
         return t, alpha, along / np.sqrt((offset * offset).sum(-1) * (toward * toward).sum(-1))
+
+
+def blended(g, camera, features, blending, background=0.0):
+    """Textbook splatting, near to far: features, alpha, depth, and the smallest relative distance of any of a pixel's pairs
+    from a decision: cutoff, clamp, early exit, half-space."""
+    t, raw, cosine = met(g, camera.position, camera.directions())
+    means = g["means"] if isinstance(g, dict) else g.means
+    order = np.argsort(np.linalg.norm(means - camera.position, axis=1).astype(np.float32), kind="stable")
+    color, left = np.zeros((*t.shape[:2], features.shape[1])), np.ones(t.shape[:2])
+    total, reach, margin = np.zeros_like(left), np.zeros_like(left), np.full_like(left, np.inf)
+    for k in order:
+        near = np.minimum(
+            np.abs(raw[..., k] / blending.alpha_min - 1), np.abs(raw[..., k] / blending.alpha_max - 1)
+        )
+        # Cutoffs far from deciding do not matter where the Gaussian lies behind, nor the half-space where it is faint.
+        margin = np.where(cosine[..., k] > -0.01, np.minimum(margin, near), margin)
+        faint = raw[..., k] <= 0.5 * blending.alpha_min
+        margin = np.where(faint, margin, np.minimum(margin, np.abs(cosine[..., k])))
+        margin = np.minimum(margin, np.abs(left / blending.transmittance_min - 1))
+        counted = (raw[..., k] > blending.alpha_min) & (t[..., k] > 0) & (left > blending.transmittance_min)
+        alpha = np.where(counted, np.minimum(raw[..., k], blending.alpha_max), 0)
+        color += (alpha * left)[..., None] * features[k]
+        total += alpha * left
+        reach += alpha * left * t[..., k]
+        left = left * (1 - alpha if blending.rule == "product" else np.exp(-alpha))
+    with np.errstate(invalid="ignore"):
+        depth = np.where(total > 0, reach / total, np.inf)
+    return color + left[..., None] * background, total, depth, margin
 
 
 def brute_hits(g, origin, direction, k, blending, order="peak"):

@@ -71,8 +71,6 @@ class Room:
 
 Change = Callable[[Room], Room]
 
-# ---------------------------------------------------------------------------------------------------- rooms
-
 
 def plain() -> Room:
     """The room of the goldens: a cupboard and a screen in a box."""
@@ -121,8 +119,6 @@ def lobby() -> Room:
 
 
 ROOMS = {"plain": plain, "l-shaped": l_shaped, "lobby": lobby}
-
-# ----------------------------------------------------------------------------------------------------- laws
 
 
 def moved(
@@ -291,8 +287,6 @@ ROUNDED: dict[str, Change] = {
 }
 """What must not change it by more than rounding and noise are."""
 LAWS = EXACT | ROUNDED
-
-# -------------------------------------------------------------------------------------------------- figures
 
 
 def traced(room: Room) -> wr.Paths:

@@ -103,15 +103,6 @@ def test_rooms_are_not_open_air_even_with_holes():
     )  # most of its box has sky, and no ground
 
 
-def test_sampled_places_stand_in_streets():
-    places = wr.sample_receivers(scene(), 300, z=(1.0, 2.0), clearance=0.5, seed=1)
-    x, y = places[:, 0], places[:, 1]
-    for a, b, _ in HOUSES:
-        assert not ((x > a) & (x < a + 40.0) & (y > b) & (y < b + 30.0)).any()
-    assert np.ptp(x) > 130.0
-    assert np.ptp(y) > 110.0
-
-
 def test_places_above_the_ground_follow_a_slope():
     places = wr.sample_receivers(
         scene(small(0.2, 7.0)), 100, z=(0.1, 0.2), clearance=0.05, above_ground=True, seed=1

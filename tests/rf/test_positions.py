@@ -260,21 +260,15 @@ def test_sizes_that_are_no_metres_are_questioned(scale, unit):
     assert len(told) == (unit is not None)
 
 
-def test_relevance_questions_the_unit_too():
-    mesh = joined(box_mesh(3e3 * LOW, 3e3 * HIGH, inward=True))[0]
-    with (
-        pytest.warns(UserWarning, match="coordinates look like millimetres"),
-        pytest.raises(ValueError, match="geometry.*elements"),
-    ):
-        wr.relevance(mesh, transmitter=3e3 * TX, receivers=[3e3 * AIR], frequency_hz=F)
-
-
-def test_a_room_in_millimetres_is_refused_by_a_fit_before_it_is_cut_to_elements():
+def test_a_room_in_millimetres_is_refused_before_it_is_cut_to_elements():
     s = scene()
     ds = wr.simulate(s, transmitter=TX, receivers=[AIR], frequency_hz=F, shape=(16, 32))
     ds = replace(ds, receivers=1e3 * ds.receivers, transmitter=1e3 * ds.transmitter)
-    with (
-        pytest.warns(UserWarning, match="coordinates look like millimetres"),
-        pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
-    ):
-        wr.RadioField.fit(Mesh(1e3 * s.mesh.vertices, s.mesh.faces), ds)
+    mesh = Mesh(1e3 * s.mesh.vertices, s.mesh.faces)
+    ends = {"transmitter": ds.transmitter, "receivers": ds.receivers, "frequency_hz": F}
+    for ask in (lambda: wr.RadioField.fit(mesh, ds), lambda: wr.relevance(mesh, **ends)):
+        with (
+            pytest.warns(UserWarning, match="coordinates look like millimetres"),
+            pytest.raises(ValueError, match="geometry.*elements.*millimetres"),
+        ):
+            ask()

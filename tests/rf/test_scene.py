@@ -51,8 +51,6 @@ def test_air_is_free_and_solids_are_not(lobby: Scene) -> None:
 
 
 def test_missing_files_and_materials_are_named(copy: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="no scene file"):
-        Scene.load(copy / "other.xml")
     (copy / "meshes" / "desk.ply").rename(copy / "desk.ply")
     with pytest.raises(FileNotFoundError, match=r"'desk'.*desk\.ply"):
         Scene.load(copy / "scene.xml")
@@ -61,12 +59,6 @@ def test_missing_files_and_materials_are_named(copy: Path) -> None:
     (copy / "scene.xml").write_text(text.replace("mat-itu_brick", "mat-itu_cheese"))
     with pytest.raises(ValueError, match=r"'wall_north'.*'cheese'.*brick"):
         Scene.load(copy / "scene.xml")
-    (copy / "scene.xml").write_text(text[:500])
-    with pytest.raises(ValueError, match="not well-formed"):
-        Scene.load(copy / "scene.xml")
-    (copy / "scene.xml").write_text(text)
-    with pytest.raises(FileNotFoundError, match=r"other\.json"):
-        Scene.load(copy / "scene.xml", materials=copy / "other.json")
 
 
 @pytest.mark.parametrize(

@@ -16,19 +16,8 @@ LOW, HIGH = np.array([-7.0, -6, 0]), np.array([8.0, 6, 4])
 BOX = np.array([-1.0, -1, 0]), np.array([0.5, 1.5, 2.2])
 
 
-def scene(material=None, solid_walls=False):
-    if solid_walls:
-        walls = []
-        for axis in range(3):
-            for side in (0, 1):
-                low, high = LOW - 0.2, HIGH + 0.2
-                low[axis], high[axis] = (
-                    (HIGH[axis], HIGH[axis] + 0.2) if side else (LOW[axis] - 0.2, LOW[axis])
-                )
-                walls.append(box_mesh(low, high))
-        mesh, part = joined(box_mesh(BOX[0] - [0, 0, 0.05], BOX[1]), *walls)
-    else:
-        mesh, part = joined(box_mesh(LOW, HIGH, inward=True), box_mesh(*BOX))
+def scene(material=None):
+    mesh, part = joined(box_mesh(LOW, HIGH, inward=True), box_mesh(*BOX))
     stuff = material or Material.custom("stone", relative_permittivity=5.0, conductivity=0.5, scattering=0.5)
     return Scene(
         mesh,
@@ -81,7 +70,7 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
 
 
 def test_receivers_are_drawn_from_the_air():
-    s = scene(solid_walls=True)
+    s = scene()
     places = sample_receivers(s, 500, seed=4, clearance=0.3)
     assert (
         (places >= LOW + [0.3, 0.3, 0.8]).all() and (places <= HIGH - 0.3).all() and places[:, 2].max() <= 2.2
@@ -96,7 +85,7 @@ def test_receivers_are_drawn_from_the_air():
 
 
 def test_places_too_near_a_surface_are_ruled_out_before_solids(monkeypatch):
-    room = scene(solid_walls=True)
+    room = scene()
     places = sample_receivers(room, 3, seed=0)
     monkeypatch.delattr(Mesh, "look_around")  # the last of the tests
     assert not room.is_free(places, clearance_m=1e3).any()

@@ -50,9 +50,6 @@ def truth() -> wr.Mesh:
     return wr.Scene.load(LOBBY / "scene.xml").mesh
 
 
-# ------------------------------------------------------------------------------------------- reading
-
-
 def test_transforms_hold_the_cameras_that_were_written(tmp_path):
     found = read_poses(written(tmp_path))
     for name, camera in lobby_cameras(NAMES).items():
@@ -94,18 +91,14 @@ def test_an_angle_of_view_tells_the_focal_length(tmp_path):
         ({"frames": frames()[:1] * 2}, "comes twice"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model"),
         ({"k4": 0.1}, "k4"),
-        ({"frames": [frames()[0] | {"transform_matrix": (2 * np.eye(4)).tolist()}]}, "last is 0 0 0 1"),
         ({"frames": [frames()[0] | {"transform_matrix": np.diag([2.0, 2, 2, 1]).tolist()}]}, "rigid"),
         ({"frames": [frames()[0] | {"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}]}, "mirrors"),
-        ({"frames": [frames()[0] | {"depth_file_path": "../x.png"}]}, "outside"),
         ({"frames": [frames()[0] | {"depth_file_path": "/etc/passwd"}]}, "outside"),
-        ({"frames": [frames()[0] | {"depth_file_path": "none.png"}]}, "none.png does not exist"),
     ],
 )
 def test_bad_transforms_are_named(tmp_path, change, message):
-    with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
+    with pytest.raises(ValueError, match=rf"transforms\.json.*{message}"):
         read_poses(written(tmp_path, **change))
-    assert "transforms.json" in str(caught.value) or "none.png" in str(caught.value)
 
 
 def test_frames_are_matched_with_photos_by_as_much_of_their_names_as_it_takes(tmp_path):
@@ -126,9 +119,6 @@ def test_photos_of_another_shape_than_their_lens_are_refused(tmp_path):
     camera = next(iter(read_poses(written(tmp_path)).values()))
     with pytest.raises(ValueError, match="stored with 480 x 640 pixels, its lens is given for 640 x 480"):
         camera.of_size("a.jpg", 480, 640)
-
-
-# ------------------------------------------------------------------------------------------- triangulating
 
 
 @pytest.fixture(scope="module")
@@ -167,9 +157,6 @@ def test_points_of_a_colmap_model_are_taken_as_they_are(triangulated, tmp_path):
     np.testing.assert_allclose(
         again.cameras[NAMES[1]].world_to_camera, sparse.cameras[NAMES[1]].world_to_camera, atol=1e-9
     )
-
-
-# ------------------------------------------------------------------------------------------- depth
 
 
 @pytest.fixture(scope="module")
@@ -211,8 +198,6 @@ def test_depth_of_frames_that_tell_it_is_found(rgbd, tmp_path):
     ) == [rgbd / f"frame-00000{k}.depth.png" for k in (1, 2, 3)]
     with pytest.raises(ValueError, match="holds depth of 0 photos"):
         find_depth(rgbd, ["a.jpg", "b.jpg", "c.jpg"])
-    with pytest.raises(ValueError, match="not a folder"):
-        find_depth(rgbd / "none", ["a.jpg"])
     (tmp_path / "d.png").write_bytes((rgbd / "frame-000001.depth.png").read_bytes())
     one = [frames()[0] | {"depth_file_path": "d.png", "depth_unit_scale_factor": 0.002}]
     depth = next(iter(read_poses(written(tmp_path, frames=one)).values())).depth
@@ -241,13 +226,10 @@ def test_frames_where_tracking_was_lost_are_left_out_and_bad_ones_named(rgbd, tm
     "options, message",
     [
         ({"depth": "."}, "depth: got .* without poses"),
-        ({"up": "z"}, "up: got 'z' without poses"),
         ({"scale": 1.0}, "goes with poses"),
-        ({"poses": "none.json"}, "does not exist"),
-        ({"poses": ".", "up": "up"}, "up: got 'up'"),
         ({"up": "z", "poses": ".", "known_positions": {}}, "got both"),
     ],
 )
 def test_arguments_that_need_one_another_are_named(options, message, tmp_path):
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
+    with pytest.raises(ValueError, match=message):
         wr.reconstruct(PHOTOS, workspace=tmp_path, **options)

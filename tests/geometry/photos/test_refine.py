@@ -9,10 +9,10 @@ from skimage.metrics import structural_similarity
 from views import look
 
 from warprrf.geometry.photos.config import RefineConfig
-from warprrf.geometry.photos.densify import densified, filled
+from warprrf.geometry.photos.densify import filled
 from warprrf.geometry.photos.photo_loss import PhotoLoss
 from warprrf.geometry.photos.planes import Plane
-from warprrf.geometry.photos.refine import OVERHEAD, _initial, refine
+from warprrf.geometry.photos.refine import refine
 from warprrf.geometry.photos.targets import Exposures, PosedPhotos, Targets
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -59,38 +59,6 @@ def test_refinement_learns_the_photos_and_densifies(problem):
     end = refine(start, PosedPhotos(photos, cameras), config=CONFIG, device="cpu")
     assert psnr(end, photos, cameras) > psnr(start, photos, cameras) + 4
     assert len(end) > len(start)
-
-
-def test_few_gaussians_are_split_until_enough_are_there(problem):
-    arrays = {name: value.reshape(300, -1) for name, value in _initial(problem[0], CONFIG).items()}
-    for name in ("pull", "hits", "seen"):
-        arrays[name] += 1
-
-    def count(most, rounds_left):
-        config = replace(CONFIG, densify_to=most)
-        return len(densified(arrays, config, np.random.default_rng(0), rounds_left=rounds_left)["means"])
-
-    assert count(1, 3) == 300 + 24  # 8 %
-    assert count(600, 3) == 300 + 100 and count(600, 2) == 300 + 150
-    assert count(10_000, 3) == 300 + 150  # half of them at most
-
-
-def test_progress_counts_work_and_begins_where_a_run_was_stopped(problem, tmp_path):
-    start, photos, cameras = problem
-    told = []
-    config = replace(
-        CONFIG, iterations=40, downscale=2, coarse_pixels=200, full_from=0.5, checkpoint_every=20
-    )
-    file = tmp_path / "refine.safetensors"
-    for _ in range(2):
-        told.append([])
-        refine(start, PosedPhotos(photos, cameras), config=config, checkpoint=file, device="cpu",
-               progress=lambda stage, done, total: told[-1].append((done, total)))  # fmt: skip
-    pixels = photos[0].shape[0] * photos[0].shape[1]
-    # Squares of 4 pixels for a half (3072 pixels are 192 of them), then photos in full.
-    half = (pixels / 16 + OVERHEAD) / (pixels / 16 + pixels + 2 * OVERHEAD)
-    assert [done for done, total in told[0]] == [0, int(1000 * half), 1000]
-    assert told[1] == [(1000, 1000)]
 
 
 def test_a_run_continued_from_a_checkpoint_equals_one_never_stopped(problem, tmp_path):

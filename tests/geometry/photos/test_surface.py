@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import views
 
-from warprrf.geometry.mesh import Mesh
-from warprrf.geometry.photos.cells import occupancy, visible_from
-from warprrf.geometry.photos.config import SurfaceConfig
-from warprrf.geometry.photos.fusion import fuse_depth, range_to_depth
+from warprrf.geometry.photos.cells import occupancy
+from warprrf.geometry.photos.fusion import fuse_depth
 from warprrf.geometry.photos.planes import Plane, detect_planes, plane_axes
-from warprrf.geometry.photos.points import clean_points, estimate_normals
+from warprrf.geometry.photos.points import clean_points
 from warprrf.geometry.photos.snapping import find_patches, flattened, largest_first, simplified
 
 pytest.importorskip("open3d")
@@ -54,9 +52,6 @@ def grid_on(plane_normal, offset, size=1.0, step=0.05):
     return np.stack([u.ravel(), v.ravel()], axis=1) @ axes + offset * np.asarray(plane_normal, float)
 
 
-# ------------------------------------------------------------------------------------------------ points
-
-
 def test_planted_outliers_are_cleaned_and_little_else():
     rng = np.random.default_rng(0)
     good = np.concatenate([rng.uniform(-1, 1, (2000, 2)), 0.003 * rng.standard_normal((2000, 1))], axis=1)
@@ -68,20 +63,6 @@ def test_planted_outliers_are_cleaned_and_little_else():
     error[:10], length[10:20] = 3.0, 2
     keep = clean_points(good, reprojection_error=error, track_length=length)
     assert not keep[:20].any()
-
-
-def test_normals_of_a_sphere_are_radial_and_face_the_eye():
-    rng = np.random.default_rng(1)
-    radial = rng.standard_normal((4000, 3))
-    radial /= np.linalg.norm(radial, axis=1, keepdims=True)
-    for eye, sign in (([0.0, 0, 0], -1), (5 * radial, 1)):
-        normals = estimate_normals(2 * radial, eye)
-        cosine = sign * (normals * radial).sum(axis=1)
-        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 12
-        assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 2
-
-
-# ------------------------------------------------------------------------------------------------ planes
 
 
 def test_planes_are_found_in_noisy_points_with_outliers():
@@ -173,26 +154,6 @@ def test_a_plane_is_empty_where_one_sees_through_it():
     assert closed.area() > found.area() + 0.5
 
 
-def test_cells_of_a_plane_lie_on_it():
-    normal = np.array([0.6, 0.0, 0.8])
-    points = grid_on(normal, 1.3)
-    (plane,) = occupancy([Plane(normal, 1.3, np.arange(len(points)))], points, points[:0], points[:0])
-    cells = plane.cells()
-    assert plane.covers(cells).all() and len(cells) == plane.occupied.sum()
-    np.testing.assert_allclose(plane.distance(cells), 0, atol=1e-12)
-
-
-# ------------------------------------------------------------------------------------------------ fusion
-
-
-def test_range_becomes_depth_along_the_axis():
-    camera = look([0.0, 0, 1], [1.0, 0.3, 0.8])
-    points = camera.position + 2.7 * camera.directions().reshape(-1, 3)
-    _, depth = camera.project(points)
-    got = range_to_depth(np.full((camera.height, camera.width), 2.7), camera)
-    np.testing.assert_allclose(got.ravel(), depth, rtol=1e-12)
-
-
 def test_fused_room_has_no_bias_on_any_side(fused):
     # A pixel off by half would move floor and ceiling alike by 1 cm here.
     vertices = fused.vertices
@@ -212,25 +173,6 @@ def test_fused_surface_faces_the_cameras(fused):
     centres = fused.triangles.mean(axis=1)
     inward = ((np.array([0, 0, 1.2]) - centres) * fused.face_normals).sum(axis=1) > 0
     assert inward.mean() > 0.999
-
-
-def test_fused_sphere():
-    radius = 0.7
-    cameras = [look(3 * np.array([np.cos(a), np.sin(a), s]) / np.hypot(1, s), [0.0, 0, 0])
-               for a in np.arange(12) * np.pi / 6 for s in (-0.6, 0.1, 0.8)]  # fmt: skip
-    depths = []
-    for camera in cameras:
-        d = camera.directions()
-        b = d @ camera.position
-        inside = b**2 - camera.position @ camera.position + radius**2
-        depths.append(np.where(inside > 0, -b - np.sqrt(np.maximum(inside, 0)), np.inf))
-    mesh = fuse_depth(depths, cameras, config=SurfaceConfig(voxel_m=0.04))
-    error = np.linalg.norm(mesh.vertices, axis=1) - radius
-    assert abs(np.median(error)) < 4e-3
-    assert np.percentile(np.abs(error), 95) < 0.02
-
-
-# ------------------------------------------------------------------------------------------------ patches
 
 
 def walls():
@@ -280,15 +222,3 @@ def test_simplified_room_is_the_same_surface_with_few_faces(fused):
     assert np.percentile(np.abs(after.t[both] - before.t[both]), 99) < 1e-3
     for k in range(6):
         assert (coarse.mesh.face_normals[coarse.faces(k)] @ coarse.normal[k] > 0).all()
-
-
-def test_visibility_knows_frame_side_and_obstacles():
-    camera = look([0.0, 0, 1], [1.0, 0, 1])
-    points = np.array([[2.0, 0, 1], [-2.0, 0, 1], [2.0, 0, 1], [2.0, 0.5, 1]])
-    normals = np.array([[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0], [-1, 0, 0]])
-    shade = Mesh([[1, -0.1, 0], [1, 0.1, 0], [1, 0.1, 2], [1, -0.1, 2]], [[0, 1, 2], [0, 2, 3]])
-    assert visible_from(None, points, normals, [camera], clearance_m=0.01)[:, 0].tolist() == [
-        True, False, False, True,
-    ]  # fmt: skip
-    seen = visible_from(shade, points, normals, [camera], clearance_m=0.01)[:, 0]
-    assert seen.tolist() == [False, False, False, True]

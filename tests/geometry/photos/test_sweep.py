@@ -61,23 +61,6 @@ def floor_plane(half, z=0.0):
     return points, occupancy([plane], points, none, none, config=PlaneConfig(margin_m=0.0))[0]
 
 
-def test_photos_agree_on_a_surface_and_nowhere_else(views):
-    cameras, photos = views
-    rng = np.random.default_rng(0)
-    place = np.concatenate(
-        [rng.uniform(0.8, 1.3, (200, 2)) * rng.choice([-1, 1], (200, 2)), np.zeros((200, 1))], axis=1
-    )
-    up = np.tile([0.0, 0, 1], (200, 1))
-    axes = plane_axes(up[0])
-    chosen = sweep.choose_views(place, up[0], np.ones((200, 12), dtype=bool), cameras)
-    values = {}
-    for z in (-0.1, 0.0, 0.1):
-        values[z], contrast = photos.agreement(place + [0, 0, z], axes, chosen)
-        assert (contrast[values[z] > -1] > sweep.CONTRAST).all()
-    assert np.median(values[0.0]) > 0.9
-    assert max(np.median(values[-0.1]), np.median(values[0.1])) < 0.3
-
-
 @pytest.mark.usefixtures("device")
 def test_agreement_is_the_mean_correlation_over_pairs(views):
     cameras, photos = views
@@ -149,9 +132,6 @@ def test_a_small_known_piece_grows_to_what_the_photos_show(views):
     assert proven.covers(corner).mean() >= 0.75
 
 
-# ------------------------------------------------------------------------------------------------ edges
-
-
 def rectangle(normal, origin, first, second, cell=0.1):
     """A plane patch through ``origin`` spanned by ``first`` and ``second`` (whole cells)."""
     normal = np.asarray(normal, float)
@@ -195,11 +175,11 @@ def test_a_thin_screen_does_not_cut_the_floor_it_stands_on():
 
 def test_nearly_level_weak_planes_become_level_and_tilted_ones_stay():
     rng = np.random.default_rng(0)
-    strong = np.concatenate([rng.uniform(-2, 2, (900, 2)), 0.003 * rng.standard_normal((900, 1))], axis=1)[
-        :, [2, 0, 1]
-    ]
-    weak = np.concatenate([rng.uniform(-0.2, 0.2, (40, 2)), 0.004 * rng.standard_normal((40, 1))], axis=1)
-    tilted = np.concatenate([rng.uniform(-1, 1, (60, 2)), 0.001 * rng.standard_normal((60, 1))], axis=1)
+    sizes, noise = np.repeat([2.0, 0.2, 1.0], [900, 40, 60]), np.repeat([0.003, 0.004, 0.001], [900, 40, 60])
+    flat = np.column_stack(
+        [sizes[:, None] * rng.uniform(-1, 1, (1000, 2)), noise * rng.standard_normal(1000)]
+    )
+    strong, weak, tilted = flat[:900, [2, 0, 1]], flat[900:940], flat[940:]
     slope = np.array([np.sin(0.04), 0, np.cos(0.04)])
     tilted[:, 2] -= tilted[:, 0] * np.tan(0.04)
     points = np.concatenate([strong, weak, tilted])

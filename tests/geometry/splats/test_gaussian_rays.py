@@ -1,8 +1,5 @@
 """Rays through Gaussians against brute force in float64 and against the rasteriser; what goes wrong is named."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 import warp as wp
@@ -66,20 +63,3 @@ def test_a_panorama_s_rays_see_what_the_rasteriser_renders(rule):
     np.testing.assert_allclose(
         np.take_along_axis(t, first, 1)[seen, 0], image.peak.numpy().ravel()[seen], rtol=1e-9
     )
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_they_are_copied_and_pickled(dtype):
-    kinds = {
-        np.float32: (wp.vec3, wp.vec4, wp.vec3, wp.float32),
-        np.float64: (wp.vec3d, wp.vec4d, wp.vec3d, wp.float64),
-    }
-    values = [[[0.0, 0, 2], [0, 0, 3]], [[1.0, 0, 0, 0]] * 2, [[0.1, 0.2, 0.3]] * 2, [0.5, 0.25]]
-    arrays = tuple(
-        wp.array(np.array(v, dtype), dtype=k, device="cpu") for v, k in zip(values, kinds[dtype], strict=True)
-    )
-    rays = GaussianRays(arrays, blending=Blending(rule="exp"))
-    ends = np.zeros(3), np.array([0.1, 0.0, 4.0])
-    for again in (copy.deepcopy(rays), pickle.loads(pickle.dumps(rays))):
-        assert [a.dtype for a in again.inputs] == [a.dtype for a in arrays]
-        assert again.transmittance(*ends) == rays.transmittance(*ends) < 1

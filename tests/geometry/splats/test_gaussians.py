@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warprrf.geometry.splats.gaussians import Gaussians, quaternions_of, rotations_of
+from warprrf.geometry.splats.gaussians import Gaussians
 
 
 def some(n=5, coefficients=16, seed=0):
@@ -53,12 +53,3 @@ def test_ascii_and_shuffled_properties_are_read(tmp_path):
     g = Gaussians.load_ply(tmp_path / "a.ply")
     assert g.means.tolist() == [[1, 2, 3]] and g.opacities[0] == 0.5
     assert np.allclose(g.scales, 0.5) and np.allclose(g.quaternions, [[1, 0, 0, 0]])
-
-
-def test_quaternions_are_normalised_and_turn_back_from_rotations():
-    g = some(200)
-    assert np.allclose(np.linalg.norm(g.quaternions, axis=1), 1, atol=1e-6)
-    r = rotations_of(g.quaternions)
-    assert np.allclose(r @ r.transpose(0, 2, 1), np.eye(3), atol=1e-12)
-    back = quaternions_of(r)
-    assert np.allclose(np.abs(np.sum(back * g.quaternions, axis=1)), 1, atol=1e-6)

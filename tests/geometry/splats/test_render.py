@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from rays_by_definition import cloud, met
+from rays_by_definition import blended, cloud
 
 from warprrf.geometry.splats.camera import Camera
-from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.geometry.splats.rasterizer import RADIO, Blending
 from warprrf.geometry.splats.render import blend_weights, render
 
@@ -16,30 +15,6 @@ def pinhole(width=64, height=48, position=(0.0, 0.0, -4.0)):
     return Camera.pinhole(
         width, height, fx=0.6 * width, fy=0.6 * width, cx=width / 2, cy=height / 2, world_to_camera=pose
     )
-
-
-def brute_force(g: Gaussians, camera: Camera, features, blending: Blending, background=0.0):
-    """Textbook splatting in float64: every Gaussian on every ray. Features, alpha, depth, and how close the closest
-    cutoff decision of each pixel was."""
-    t, raw, _ = met(g, camera.position, camera.directions())
-    order = np.argsort(np.linalg.norm(g.means - camera.position, axis=1).astype(np.float32), kind="stable")
-    shape = (camera.height, camera.width)
-    color, left = np.zeros((*shape, features.shape[1])), np.ones(shape)
-    alpha_sum, depth_sum, margin = np.zeros(shape), np.zeros(shape), np.full(shape, np.inf)
-    for k in order:
-        ahead = t[..., k] > 0
-        counted = (raw[..., k] >= blending.alpha_min) & ahead & (left > blending.transmittance_min)
-        margin = np.minimum(margin, np.where(ahead, np.abs(raw[..., k] / blending.alpha_min - 1), np.inf))
-        margin = np.minimum(margin, np.abs(left / blending.transmittance_min - 1))
-        alpha = np.where(counted, np.minimum(raw[..., k], blending.alpha_max), 0)
-        weight = alpha * left
-        color += weight[..., None] * features[k]
-        alpha_sum += weight
-        depth_sum += weight * t[..., k]
-        left = left * (1 - alpha if blending.rule == "product" else np.exp(-alpha))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        depth = np.where(alpha_sum > 0, depth_sum / alpha_sum, np.inf)
-    return color + left[..., None] * background, alpha_sum, depth, margin
 
 
 CAMERAS = {
@@ -58,7 +33,7 @@ def test_agrees_with_brute_force_in_float64_away_from_the_cutoff(camera, rule):
     g = cloud(rng, 300)
     features, background = rng.random((300, 6)), rng.random(6)
     out = render(g, camera, features, background, device="cpu", blending=Blending(rule=rule))
-    color, alpha, depth, margin = brute_force(g, camera, features, Blending(rule=rule), background)
+    color, alpha, depth, margin = blended(g, camera, features, Blending(rule=rule), background)
     clear = margin > 1e-3
     assert clear.mean() > 0.5
     assert np.abs(out.features - color)[clear].max() < 1e-5 * max(1.0, np.abs(color).max())

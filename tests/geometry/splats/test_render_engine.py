@@ -6,9 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import warp as wp
-from rays_by_definition import met
 
-from benchmarks.engine.scenes import gaussians, panorama, photo, room
+from benchmarks.engine.scenes import panorama, photo
 from warprrf import device
 from warprrf.geometry.splats.camera import Camera
 from warprrf.geometry.splats.gaussians import Gaussians
@@ -30,34 +29,6 @@ def mixed(seed, n=150):
         rng.uniform(0, 1, (n, 3)) * (18, 12, 4), rng.normal(size=(n, 4)), np.exp(rng.uniform(-4, 0.7, (n, 3))),
         rng.uniform(0.05, 1, n), np.zeros((n, 1, 3)),
     )  # fmt: skip
-
-
-def lists_of_tiles(raster, g, cam):
-    """Gaussians of every tile (column, row), in the order of blending."""
-    prepared = raster.prepare(*raster.upload(g), cam)
-    ids, starts = prepared.ids.numpy(), prepared.starts.numpy()
-    return {
-        (tile % prepared.view.tiles_x, tile // prepared.view.tiles_x): ids[starts[tile] : starts[tile + 1]]
-        for tile in range(prepared.tiles)
-    }
-
-
-@pytest.mark.parametrize("blending", [Blending(), RADIO], ids=["photos", "radio"])
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
-@pytest.mark.parametrize("per_pixel", [False, True], ids=["blocks", "reference"])
-@pytest.mark.parametrize("seed", range(2))
-def test_a_tile_lists_every_gaussian_that_its_pixels_see(seed, per_pixel, camera, blending):
-    g = mixed(seed)
-    raster = Rasterizer(device="cpu", blending=blending, real=wp.float64, per_pixel=per_pixel)
-    t, alpha, _ = met(g, camera.position, camera.directions())
-    seen = (alpha >= blending.alpha_min) & (t > 0)
-    assert seen.any()
-    ranges = np.linalg.norm(g.means.astype(np.float64) - camera.position, axis=1)
-    for (column, row), listed in lists_of_tiles(raster, g, camera).items():
-        rows, columns = (slice(k * raster.tile, (k + 1) * raster.tile) for k in (row, column))
-        assert set(np.flatnonzero(seen[rows, columns].any(axis=(0, 1)))) <= set(listed.tolist())
-        assert len(set(listed.tolist())) == len(listed)
-        assert (np.diff(ranges[listed].astype(np.float32)) >= 0).all()  # near to far
 
 
 def image_and_gradients(g, cam, *, channels=3, device="cpu", **options):
@@ -127,9 +98,7 @@ def count_visits(offset: int, visits: wp.array(dtype=int)):
         ({}, 0, 1000),
         ({"grain": 1}, 0, 1000),
         ({"pieces": 7}, 0, 1000),
-        ({"cuts": [0, 10, 10, 999, 1000]}, 0, 1000),
-        ({"cuts": [200, 300]}, 200, 300),
-        ({"cuts": [200, 250, 300]}, 200, 300),
+        ({"cuts": [200, 250, 250, 300]}, 200, 300),
     ],
 )
 @pytest.mark.parametrize("count", [1, 3])
@@ -141,18 +110,6 @@ def test_a_launch_visits_every_index_once(how, first, last, count, monkeypatch):
         device.launch(count_visits, 1000, [visits], device="cpu", **how)
     index = np.arange(1000)
     assert np.array_equal(visits.numpy(), np.where((index >= first) & (index < last), index + 1, 0))
-
-
-def test_features_need_not_be_contiguous():
-    g, cam = gaussians(500), photo(40, 30)
-    raster = Rasterizer(device="cpu")
-    prepared = raster.prepare(*raster.upload(g), cam)
-    table = wp.array(np.tile(room(500)[4], (1, 2)), dtype=wp.float32, device="cpu")
-    part = table[:, :3]
-    assert not part.is_contiguous
-    straight = raster.blend(prepared, wp.array(room(500)[4], dtype=wp.float32, device="cpu"))
-    assert np.array_equal(raster.blend(prepared, part).features.numpy(), straight.features.numpy())
-    assert straight.features.numpy().max() > 0.3
 
 
 OTHERS = [{"per_pixel": True}, pytest.param({"device": "cuda:0"}, marks=pytest.mark.cuda)]

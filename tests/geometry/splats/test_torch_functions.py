@@ -1,4 +1,4 @@
-"""The rasteriser as a function of PyTorch: the image of `render`, and autograd's rules."""
+"""The rasteriser and rays through Gaussians as functions of PyTorch: the image of `render`, and autograd's rules."""
 
 import numpy as np
 import pytest
@@ -12,19 +12,32 @@ from warprrf.geometry.splats.rasterizer import Blending
 from warprrf.geometry.splats.render import render
 
 CAMERA = Camera.spherical(50, 25, position=(0.1, -0.2, 0.3))
+SMOOTH = Blending(alpha_min=1e-12, alpha_max=1.0, transmittance_min=1e-12)
+START, END = np.array([[-4.0, 0.1, 0.2], [0.3, -4.0, 0.1]]), np.array([[4.0, 0, 0], [0.1, 4.0, 0.3]])
 
 
-def tensors(seed, n=20, channels=5, dtype=torch.float64):
+def tensors(seed, n=20, channels=5, dtype=torch.float64, finest=-4.0):
     rng = np.random.default_rng(seed)
     values = (
-        rng.uniform(-2, 2, (n, 3)), rng.normal(size=(n, 4)), np.exp(rng.uniform(-4, -0.5, (n, 3))),
+        rng.uniform(-2, 2, (n, 3)), rng.normal(size=(n, 4)), np.exp(rng.uniform(finest, -0.5, (n, 3))),
         rng.uniform(0, 1, n), rng.random((n, channels)), rng.random(channels),
     )  # fmt: skip
     return [torch.tensor(v, dtype=dtype, requires_grad=True) for v in values]
 
 
-def images(values):
-    return interop.rasterize(*values[:5], CAMERA, values[5])
+def images(values, camera=CAMERA, **options):
+    return interop.rasterize(*values[:5], camera, values[5], **options)
+
+
+def passed(values, **options):
+    return interop.ray_transmittance(*values[:4], START, END, **options)
+
+
+def hits(values, **options):
+    index, *found = interop.ray_hits(*values[:4], START, END - START, 4, **options)
+    assert index.dtype == torch.int32 and not index.requires_grad
+    assert (found[0] < 10).all()  # all places are taken: no infinity meets autograd
+    return found
 
 
 def test_the_image_is_that_of_render():
@@ -34,32 +47,19 @@ def test_the_image_is_that_of_render():
     expected = render(g, CAMERA, features, background, blending=Blending(), device="cpu")
     found = images(values)
     for a, b in zip(found[:2], (expected.features, expected.alpha), strict=True):
+        assert a.dtype == torch.float32
         np.testing.assert_allclose(a.detach().numpy(), b, atol=1e-6)
 
 
-def test_torch_gradcheck_passes_and_a_planted_wrong_adjoint_fails(monkeypatch):
-    smooth = Blending(alpha_min=1e-12, alpha_max=1.0, transmittance_min=-0.5)
-    cam = Camera.spherical(8, 4, position=(0.1, 0.2, 0.05))
-    values = tensors(3, n=3, channels=1)
-    with torch.no_grad():
-        values[0] += 0.4 * values[0].sign()
-        values[2].clamp_(min=0.3)
+@pytest.mark.parametrize(("function", "inputs"), [(images, 6), (passed, 4), (hits, 4)])
+def test_gradcheck_passes(function, inputs):
+    values = tensors(3, n=4, channels=1, finest=-1.0)
+    options = {"camera": Camera.spherical(8, 4, position=(0.1, 0.2, 0.05))} if function is images else {}
 
-    def function(*v):
-        return interop.rasterize(*v[:5], cam, v[5], blending=smooth)
+    def of(*some):
+        return function([*some, *values[inputs:]], blending=SMOOTH, **options)
 
-    assert torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-6, rtol=1e-6)
-    Function = interop._Rasterize
-    right = Function.backward
-
-    def wrong(ctx, *incoming):
-        out = list(right(ctx, *incoming))
-        out[4] = out[4] * (1 + 1e-4)
-        return tuple(out)
-
-    monkeypatch.setattr(Function, "backward", staticmethod(wrong))
-    with pytest.raises(RuntimeError, match="Jacobian mismatch"):
-        torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-6, rtol=1e-6)
+    assert torch.autograd.gradcheck(of, values[:inputs], eps=1e-6, atol=1e-6, rtol=1e-6)
 
 
 def test_colours_of_harmonics_pass_gradcheck():
@@ -70,9 +70,10 @@ def test_colours_of_harmonics_pass_gradcheck():
     assert torch.autograd.gradcheck(lambda m, s: interop.colors(m, s, cam), (means, sh), atol=1e-7, rtol=1e-6)
 
 
-def test_second_backward_and_reused_gradients_behave():
-    values = tensors(4)
-    found = images(values)
+@pytest.mark.parametrize(("function", "inputs"), [(images, 6), (hits, 4)])
+def test_second_backward_and_reused_gradients_behave(function, inputs):
+    values = tensors(4, finest=-2.0)[:inputs]
+    found = function(values)
     incoming = [torch.randn(i.shape, dtype=i.dtype) for i in found]
     kept = [i.clone() for i in incoming]
     torch.autograd.backward(found, incoming, retain_graph=True)
@@ -112,21 +113,17 @@ def test_gradients_are_the_same_whether_all_or_some_are_wanted():
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "name"),
+    ("function", "place", "value", "name"),
     [
-        (0, torch.full((5, 3), float("nan")), "means"),
-        (1, torch.zeros(5, 4), "quaternions"),
-        (2, torch.zeros(5, 3), "scales"),
-        (2, torch.full((5, 3), 1e-40), "scales"),
-        (2, torch.full((5, 3), float("inf")), "scales"),
-        (3, torch.full((5,), 1.5), "opacities"),
-        (3, torch.ones(4), "opacities"),
-        (4, torch.ones(5, 2, dtype=torch.int64), "features"),
-        (5, torch.ones(7), "background"),
+        (images, 0, torch.full((5, 3), float("nan")), "means"),
+        (images, 3, torch.ones(4), "opacities"),
+        (images, 4, torch.ones(5, 2, dtype=torch.int64), "features"),
+        (passed, 0, torch.full((5, 3), float("nan")), "means"),
+        (passed, 2, torch.zeros(5, 3), "scales"),
     ],
 )
-def test_bad_tensors_are_named(place, value, name):
+def test_bad_tensors_are_named(function, place, value, name):
     values = [v.detach() for v in tensors(0, n=5, dtype=torch.float32)]
     values[place] = value
     with pytest.raises((ValueError, TypeError), match=f"^{name}:"):
-        images(values)
+        function(values)

@@ -104,12 +104,3 @@ def test_plane_wave_error_falls_as_fresnel_says():
     near, far = (plane_wave_error(a, d, WAVELENGTH) for d in (0.05 * fraunhofer, 100 * fraunhofer))
     assert near.beam_loss_db > 1.0 and far.beam_loss_db < 1e-4
     assert far.entry_error < 5e-3 < near.entry_error
-
-
-def test_spherical_response_is_the_field_of_a_point_source():
-    a = PlanarArray(8, 5, orientation=(0.2, 0.3, 0.4))
-    source = np.array([0.05, -0.02, 0.03])
-    each = np.linalg.norm(source - a.positions(WAVELENGTH), axis=1)
-    far = np.linalg.norm(source)
-    field = np.exp(-2j * np.pi * each / WAVELENGTH) / each / (np.exp(-2j * np.pi * far / WAVELENGTH) / far)
-    np.testing.assert_allclose(a.spherical_response(source, WAVELENGTH), field, rtol=1e-9)

@@ -57,37 +57,19 @@ def test_zero_forcing_nulls_interference_and_gives_what_the_inverse_gram_says() 
 
 def test_slnr_is_the_generalised_eigenvector_and_for_channels_the_mmse_precoder() -> None:
     h, noise = rayleigh(), 3e-10
+    scattered = wr.transmit_covariance([diffuse(seed) for seed in range(3)], wr.PlanarArray(3, 4))
+    for covariances, quiet in ((rank_one(h), noise), (scattered, 0.1)):
+        w = wr.precoders(covariances, "slnr", noise=quiet)
+        for own, found in zip(covariances, w, strict=True):
+            leaked = covariances.sum(axis=0) - own + len(covariances) * quiet * np.eye(ELEMENTS)
+            values, vectors = eigh(own, leaked)
+            best = vectors[:, -1:].T / np.linalg.norm(vectors[:, -1])
+            assert alike(found[None], best)[0] == pytest.approx(1.0, abs=1e-9)
+            ratio = (found.conj() @ own @ found) / (found.conj() @ leaked @ found)
+            assert ratio.real == pytest.approx(values[-1], rel=1e-9)
     w = wr.precoders(h, "slnr", noise=noise)
-    loaded = USERS * noise * np.eye(ELEMENTS)
-    for u in range(USERS):
-        others = np.delete(h, u, axis=0)
-        leaked = np.einsum("vi,vj->ij", others.conj(), others) + loaded
-        values, vectors = eigh(np.outer(h[u].conj(), h[u]), leaked)
-        best = vectors[:, -1:].T / np.linalg.norm(vectors[:, -1])
-        assert alike(w[u : u + 1], best)[0] == pytest.approx(1.0, abs=1e-10)
-        reached = np.abs(h[u] @ w[u]) ** 2 / (np.abs(others @ w[u]) ** 2).sum().clip(0)
-        signal, lost = np.abs(h[u] @ w[u]) ** 2, (w[u].conj() @ leaked @ w[u]).real
-        assert signal / lost == pytest.approx(values[-1], rel=1e-9)
-        assert reached > signal / lost
     mmse = h.conj().T @ np.linalg.inv(h @ h.conj().T + USERS * noise * np.eye(USERS))
     np.testing.assert_allclose(alike(w, mmse.T / np.linalg.norm(mmse.T, axis=1)[:, None]), 1.0, rtol=1e-12)
-    np.testing.assert_allclose(alike(w, wr.precoders(rank_one(h), "slnr", noise=noise)), 1.0, rtol=1e-9)
-
-
-def test_slnr_of_covariances_leaves_nothing_better() -> None:
-    array, noise = wr.PlanarArray(3, 4), 0.1
-    covariances = wr.transmit_covariance([diffuse(seed) for seed in range(3)], array)
-    w = wr.precoders(covariances, "slnr", noise=noise)
-    rng = np.random.default_rng(0)
-    for u in range(3):
-        leaked = covariances.sum(axis=0) - covariances[u] + 3 * noise * np.eye(12)
-
-        def ratio(x: np.ndarray, own: np.ndarray = covariances[u], leaked: np.ndarray = leaked) -> float:
-            return float(((x.conj() @ own @ x) / (x.conj() @ leaked @ x)).real)
-
-        for size in (1e-3, 0.1, 1.0):
-            for _ in range(50):
-                assert ratio(w[u] + size * (rng.normal(size=12) + 1j * rng.normal(size=12))) < ratio(w[u])
 
 
 def test_slnr_lies_between_maximum_ratio_and_zero_forcing() -> None:
@@ -144,15 +126,6 @@ def test_sinr_of_beams_is_that_of_the_multi_user_choice() -> None:
     for channels in (h, rank_one(h)):
         sinr = wr.precoded_sinr(channels, 3.0 * book.weights[sent], noise=1e-9)
         np.testing.assert_allclose(sinr, expected, rtol=1e-9)
-
-
-def test_two_users_on_orthogonal_beams_do_not_hear_each_other() -> None:
-    array = wr.PlanarArray(1, 8)
-    book = wr.dft_codebook(array)
-    h = 1e-5 * np.sqrt(8.0) * book.weights[[2, 5]].conj()
-    for method in ("mr", "zf", "slnr"):
-        sinr = wr.precoded_sinr(h, wr.precoders(h, method, noise=1e-10), noise=1e-10)
-        np.testing.assert_allclose(sinr, 8e-10 / 2e-10, rtol=1e-9)
 
 
 def test_bad_input_is_named() -> None:

@@ -193,26 +193,21 @@ def test_relative_delays_turn_all_by_one_phase():
 
 
 def test_several_receivers_are_each_alone():
-    parts = [random_paths(n, seed=n) for n in (7, 3, 12)]
+    parts = [random_paths(n, seed=n) for n in (7, 3, 12)] + [random_paths(3).select([])]
     both = Paths.stack(parts)
     f = BAND.frequencies_hz(40)
     a = PlanarArray(2, 2)
     h = both.cfr(f, tx_array=a)
-    assert h.shape == (3, 1, 4, 40)
+    assert h.shape == (4, 1, 4, 40)
+    for squint in (False, True):  # none without paths
+        assert not both.cfr(f, tx_array=a, squint=squint, method="grid")[3].any()
+    assert not both.taps(1e9, 0, 5)[3].any()
     for k, p in enumerate(parts):
         np.testing.assert_array_equal(h[k], p.cfr(f, tx_array=a))
         np.testing.assert_array_equal(both[k].gain, p.gain)
     coefficient, tau = both.cir(tx_array=a)
-    assert coefficient.shape == (3, 1, 4, 12) and tau.shape == (3, 12)
+    assert coefficient.shape == (4, 1, 4, 12) and tau.shape == (4, 12)
     assert np.isnan(tau[1, 3:]).all() and not coefficient[1, ..., 3:].any()
-
-
-def test_receiver_without_paths_has_a_channel_of_zeros():
-    both = Paths.stack([random_paths(3), random_paths(3).select([])])
-    for squint in (False, True):
-        h = both.cfr(BAND.frequencies_hz(16), tx_array=PlanarArray(2, 2), squint=squint, method="grid")
-        assert h[0].any() and not h[1].any()
-    assert not both.taps(1e9, 0, 5)[1].any()
 
 
 def test_polarised_ports():
@@ -310,6 +305,9 @@ def test_gas_is_put_in_and_taken_out():
     db_per_m = gas_attenuation_db_per_m(CARRIER)
     np.testing.assert_allclose(10 * np.log10(p.power / p.with_gas().power), db_per_m * p.length_m, rtol=1e-9)
     assert p.with_gas(False) is p
+    # relevance decides
+    assert p.with_gas(SimpleNamespace(kept=("line_of_sight",))) is p
+    np.testing.assert_array_equal(p.with_gas(SimpleNamespace(kept=("gas",))).gain, p.with_gas(True).gain)
 
 
 def test_channels_need_a_carrier_delays_and_for_spherical_waves_points():
@@ -321,12 +319,6 @@ def test_channels_need_a_carrier_delays_and_for_spherical_waves_points():
     ):
         with pytest.raises(ValueError, match=name):
             replace(p, **changed).cfr([3e11], **asked)
-
-
-def test_relevance_decides_on_gas():
-    p = random_paths(4)
-    assert p.with_gas(SimpleNamespace(kept=("line_of_sight",))) is p
-    np.testing.assert_array_equal(p.with_gas(SimpleNamespace(kept=("gas",))).gain, p.with_gas(True).gain)
 
 
 @pytest.mark.parametrize("wave", ["plane", "spherical"])

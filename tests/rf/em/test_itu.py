@@ -10,8 +10,6 @@ from warprrf.rf.em.materials import (
     Material,
     itu_material,
     itu_name,
-    load_materials,
-    table_entry,
 )
 
 
@@ -74,10 +72,3 @@ def test_between_bands_each_holds_up_to_the_geometric_mean():
     middle = np.sqrt(2.5e9 * 4e9)
     assert held.relative_permittivity(middle * 0.999) == 3
     assert held.relative_permittivity(middle * 1.001) == 2
-
-
-def test_xpd_survives_a_table(tmp_path):
-    from warprrf.files import write_json
-
-    write_json(tmp_path / "t.json", {"materials": [table_entry(itu_material("glass", xpd=0.25))]})
-    assert load_materials(tmp_path / "t.json")["glass"].xpd == 0.25

@@ -11,18 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from radio_scenes import RadioScene, SlabMaterial, box_mesh, exact_spectra, joined
+from furnished import RECEIVERS, TX, furnished, spectra
+from radio_scenes import SlabMaterial
 
 import warprrf as wr
 from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.fields import batches
 from warprrf.rf.spectra.spectrum import pixel_solid_angles
 
-TX = np.array([0.8, 0.9, 2.2])
-OTHER = TX + [0.4, 0.2, -0.3]
-PLACES = np.array(
-    [[4.2, 3.1, 1.2], [1.4, 3.4, 1.7], [3.2, 0.6, 0.8], [4.4, 1.3, 1.9], [0.9, 2.6, 0.9], [3.6, 3.3, 2.1]]
-)
+PLACES, OTHER = RECEIVERS[:6], TX + [0.4, 0.2, -0.3]
 F = np.linspace(299e9, 301e9, 5)
 ARRAYS = {
     "tx_array": wr.PlanarArray(1, 2),
@@ -32,12 +29,9 @@ ARRAYS = {
 
 
 def fitted(model: str = "bistatic") -> wr.RadioField:
-    mesh, part = joined(
-        box_mesh([0, 0, 0], [5, 4, 3], inward=True), box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 2.4])
-    )
-    stuff = [SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)]
-    scene = RadioScene(mesh, part, stuff)
-    ds = exact_spectra(scene, PLACES[:3], transmitter=TX, frequency_hz=300e9, shape=(12, 24), sigma=0.15)
+    walls, box = SlabMaterial("walls", 3.0, 0.5, np.inf, 0.5), SlabMaterial("box", 6.0, 0.5, np.inf, 0.8)
+    scene = furnished(walls, box)
+    ds = spectra(scene, PLACES[:3], shape=(12, 24), sigma=0.15)
     return wr.RadioField.fit(
         scene, ds, model, **{"quick": True} if model == "bistatic" else {"iterations": 5}
     )
@@ -179,38 +173,8 @@ def test_a_store_of_something_else_is_refused(field: wr.RadioField, tmp_path: Pa
         field.paths(PLACES, store=tmp_path / "paths.nc")
 
 
-def test_what_was_begun_is_continued_and_never_taken_for_whole(
-    field: wr.RadioField, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole, file = field.spectra(PLACES).path_gain, tmp_path / "spectra.nc"
-
-    def stop(_: str, done: int, __: int) -> None:
-        if done == 4:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        field.spectra(PLACES, store=file, progress=stop)
-    assert not file.exists()
-    unfinished = Path(f"{file}.unfinished")
-    with pytest.raises(ValueError, match="another field"):
-        field.spectra(PLACES, OTHER, store=file)
-    asked: list[int] = []
-    trace = type(field)._trace_spectra
-
-    def counted(self: Any, receivers: np.ndarray, transmitter: np.ndarray) -> np.ndarray:
-        asked.append(len(receivers))
-        return trace(self, receivers, transmitter)
-
-    monkeypatch.setattr(type(field), "_trace_spectra", counted)
-    np.testing.assert_array_equal(field.spectra(PLACES, store=file).path_gain, whole)
-    assert asked == [2]  # the other four were there
-    assert file.exists()
-    assert not unfinished.exists()
-
-
 KILLED = """
 import sys, numpy as np, warprrf as wr
-from warprrf.netcdf_files import Store, Variable
 from warprrf.rf.fields import batches
 batches.AT_ONCE = 2
 field, places = wr.RadioField.load(sys.argv[1]), np.load(sys.argv[2])
@@ -234,10 +198,20 @@ def test_a_killed_process_loses_only_what_it_was_at(field: wr.RadioField, tmp_pa
         with pytest.raises(ValueError, match="another process is at work"):
             field.spectra(PLACES, store=names[2])
         os.kill(child.pid, signal.SIGKILL)
+    assert not Path(names[2]).exists() and Path(f"{names[2]}.unfinished").exists()
+    with pytest.raises(ValueError, match="another field"):
+        field.spectra(PLACES, OTHER, store=names[2])
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        field.spectra(PLACES, store=names[2], progress=stop)
     told: list[int] = []
     found = field.spectra(PLACES, store=names[2], progress=lambda _, done, __: told.append(done))
     np.testing.assert_array_equal(found.path_gain, field.spectra(PLACES).path_gain)
-    assert told == [4, 6]
+    assert told == [4, 6]  # the other four were there
+    assert not Path(f"{names[2]}.unfinished").exists()
 
 
 GAIN = np.arange(30.0).reshape(6, 5)

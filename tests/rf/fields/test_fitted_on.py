@@ -77,11 +77,3 @@ def test_a_lookup_knows_what_it_was_built_from(room: Path) -> None:
     for build in (lookups.nearest, lookups.idw, lookups.constant, lookups.mean):
         with pytest.warns(UserWarning, match="fitted on"):
             assert wr.evaluate(ds.subset([0, 12]), build(ds.subset([0, 1])))["receivers_fitted_on"] == 1
-
-
-def test_a_field_of_no_measurement_was_fitted_on_nothing(room: Path) -> None:
-    ds = wr.SpectrumDataset.load(room / "spectra.nc")
-    from warprrf.rf.fields.bistatic.field import BistaticField
-
-    prior = BistaticField.prior(wr.Reconstruction.load(room / "reconstruction"), ds)
-    assert prior.fitted_on.shape == (0, 3) and not prior.was_fitted_on(ds).any()

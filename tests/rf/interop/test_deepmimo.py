@@ -103,14 +103,6 @@ def test_package_makes_our_channels(loaded, deepmimo):
             "mp,np,p,pf->mnf", phases((2, 1), p.arrival), phases((2, 3), p.departure), p.gain, waves
         )
         np.testing.assert_allclose(theirs[r], ours, atol=1e-4 * np.abs(ours).max())
-    single = deepmimo.ChannelParameters(
-        bs_antenna={"shape": [1, 1]},
-        num_paths=100,
-        ofdm={"subcarriers": count, "selected_subcarriers": chosen, "bandwidth": wide, "rx_filter": 0},
-    )
-    theirs = data.compute_channels(single) * np.sqrt(count)
-    ours = paths.cfr(F + chosen * wide / count)
-    np.testing.assert_allclose(theirs, ours, atol=1e-4 * np.abs(ours).max())
 
 
 def test_folder_without_the_package(tmp_path):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from places import ROOT
 from sionna_room import sionna_or_skip
 from twin_fields import BLOCKED, LOBES, MATERIALS, SEES, SHAPE, SIGMA, TX, F, known_field, room
 
@@ -71,49 +70,25 @@ def test_materials_are_the_fields_own(twin):
         twin.groups[0].material.permittivity(140e9)
 
 
-def test_sionna_opens_the_scene_as_it_is(twin):
+def test_sionna_opens_the_scene_as_it_is_and_our_loader_sets_the_scattering_patterns_too(twin):
     sionna_or_skip()
     import sionna.rt as rt
 
-    loaded = rt.load_scene(str(twin.xml), merge_shapes=False)
-    assert set(loaded.objects) == {"surface_walls", "surface_block_top__1_"}
-    for group in twin.groups:
-        radio = loaded.radio_materials[group.material.name]
+    bare = rt.load_scene(str(twin.xml), merge_shapes=False)
+    loaded = wr.load_sionna_scene(twin.xml, frequency_hz=F)
+    assert loaded.frequency.numpy()[0] == pytest.approx(F)
+    assert set(bare.objects) == set(loaded.objects) == {"surface_walls", "surface_block_top__1_"}
+    for group, alpha_r in zip(twin.groups, (4, None), strict=True):
+        radio = bare.radio_materials[group.material.name]
         assert radio.relative_permittivity.numpy()[0] == pytest.approx(group.permittivity.real, rel=1e-6)
         assert radio.conductivity.numpy()[0] == pytest.approx(group.material.conductivity(F), rel=1e-6)
         assert radio.scattering_coefficient.numpy()[0] == pytest.approx(group.scattering, rel=1e-6)
         assert isinstance(radio.scattering_pattern, rt.LambertianPattern)
-    assert len(rt.load_scene(str(twin.xml)).objects) == 2
-
-
-def test_our_loader_sets_the_scattering_patterns_too(twin):
-    sionna_or_skip()
-    import sionna.rt as rt
-
-    loaded = wr.load_sionna_scene(twin.xml, frequency_hz=F)
-    assert isinstance(loaded, rt.Scene)
-    assert loaded.frequency.numpy()[0] == pytest.approx(F)
-    walls, block = (loaded.objects[f"surface_{name}"].radio_material for name in ("walls", "block_top__1_"))
-    assert isinstance(walls.scattering_pattern, rt.DirectivePattern)
-    assert walls.scattering_pattern.alpha_r == 4
-    assert isinstance(block.scattering_pattern, rt.LambertianPattern)
-    assert walls.scattering_coefficient.numpy()[0] == pytest.approx(0.5, rel=2e-3)
+        pattern = loaded.radio_materials[group.material.name].scattering_pattern
+        assert isinstance(pattern, rt.DirectivePattern if alpha_r else rt.LambertianPattern)
+        assert getattr(pattern, "alpha_r", None) == alpha_r
     with pytest.raises(ValueError, match="140 GHz"):
         wr.load_sionna_scene(twin.xml, frequency_hz=140e9)
-
-
-def test_our_loader_opens_a_scene_of_itu_materials_with_our_table():
-    sionna_or_skip()
-    import sionna.rt as rt
-
-    lobby = ROOT / "data" / "lobby" / "scene.xml"
-    loaded, ours = wr.load_sionna_scene(str(lobby), frequency_hz=F), wr.Scene.load(lobby)
-    assert len(loaded.objects) == len(ours.object_names)
-    metal = loaded.objects["elevator"].radio_material
-    assert metal.conductivity.numpy()[0] == pytest.approx(1e7)
-    assert isinstance(metal.scattering_pattern, rt.DirectivePattern)
-    assert metal.scattering_pattern.alpha_r == 10
-    assert len(loaded.radio_materials) == len(ours.materials)
 
 
 def test_sionna_scatters_and_mirrors_as_the_field(twin, field):
@@ -123,16 +98,6 @@ def test_sionna_scatters_and_mirrors_as_the_field(twin, field):
     assert found.sum() == pytest.approx(ours.sum(), rel=0.01)
     gap = to_db(found, 1e-12) - to_db(ours, 1e-12)  # what sampling leaves dark lies below
     assert np.sqrt(np.mean(gap**2)) < 1.0
-
-
-# ------------------------------------------------------------------------------------------------ projection
-
-
-@pytest.mark.parametrize("exponent", [0, 1, 5, 12, 30, 75])
-def test_one_lobe_stays_as_it_is(exponent):
-    found, error = twins.project_lobes((0, exponent), np.array([0.0, 0.3]))
-    assert found == exponent
-    assert error < 1e-9
 
 
 def test_the_error_of_a_mix_is_that_of_random_directions():
@@ -174,19 +139,15 @@ def test_where_shares_do_not_sum_to_one_the_mirror_gives_way():
     assert lost.scattering_error_db == pytest.approx(np.sqrt(np.average(gap**2, weights=c)), abs=0.02)
 
 
-def test_more_than_metal_reflects_is_stated_as_error():
+def test_shares_at_the_ends_of_the_family():
     found = twins.project_reflection(np.log(1e9), 1.0, 2.0)  # the family ends at 201: 0.75 of the power
-    assert found.relative_permittivity > 1e5
+    assert found.relative_permittivity > 1e5 and 0 <= found.scattering <= 1
     assert found.scattering_error_db + found.mirror_error_db > 1.0
-    assert 0 <= found.scattering <= 1
-
-
-def test_all_scattered_and_all_mirrored():
     assert twins.project_reflection(np.log(2.0), 0.7, 0.0).scattering == 1.0
     assert twins.project_reflection(np.log(2.0), 0.0, 0.7).scattering < 1e-6
 
 
-@pytest.mark.parametrize("permittivity", [1.05, 1.5, 4.0, 30.0, 1e5])
+@pytest.mark.parametrize("permittivity", [1.05, 4.0, 1e5])
 def test_the_slab_reflects_like_a_half_space_in_single_precision_too(permittivity):
     eta, cosine = permittivity * (1 - 1j * twins.LOSS_TANGENT), np.linspace(0.02, 1.0, 500)
     front = slab_reflection(cosine, eta, np.inf, 1.0)
@@ -266,9 +227,6 @@ def test_a_reciprocal_lobe_becomes_the_nearest_of_the_other_kind():
     assert 0.3 < error < 2.0
 
 
-# ------------------------------------------------------------------------------------------------ files
-
-
 def test_an_earlier_twin_is_replaced_and_nothing_else(field, tmp_path):
     folder = tmp_path / "twin"
     folder.mkdir()
@@ -289,29 +247,19 @@ def test_an_earlier_twin_is_replaced_and_nothing_else(field, tmp_path):
         wr.write_twin(field, folder / "materials.json")
 
 
-def test_a_failed_write_leaves_the_earlier_twin(field, tmp_path, monkeypatch):
-    folder = tmp_path / "twin"
+@pytest.mark.parametrize("what", ["disk full", "stale handle"])
+def test_a_failed_write_leaves_the_earlier_twin(what, field, tmp_path, monkeypatch):
+    folder, rename = tmp_path / "twin", Path.rename
     wr.write_twin(field, folder)
     before = (folder / "scene.xml").read_bytes()
 
-    def full(*_args, **_options):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(twins, "write_mesh", full)
-    with pytest.raises(OSError, match="disk full"):
-        wr.write_twin(field, folder)
-    assert (folder / "scene.xml").read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == ["twin"]
-    monkeypatch.undo()
-    rename = Path.rename
-
-    def stuck(self, target):
-        if Path(target) == folder and "earlier" not in self.name:
-            raise OSError("stale handle")
+    def failing(self, target, *_):
+        if what == "disk full" or (Path(target) == folder and "earlier" not in self.name):
+            raise OSError(what)
         return rename(self, target)
 
-    monkeypatch.setattr(Path, "rename", stuck)
-    with pytest.raises(OSError, match="stale handle"):
+    monkeypatch.setattr(*((twins, "write_mesh") if what == "disk full" else (Path, "rename")), failing)
+    with pytest.raises(OSError, match=what):
         wr.write_twin(field, folder)
     assert (folder / "scene.xml").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["twin"]
@@ -323,16 +271,3 @@ def test_fields_without_materials_are_refused(field, tmp_path):
     with pytest.raises(ValueError, match="line of sight alone"):
         wr.write_twin(replace(field, terms=Terms(lobes=LOBES, diffuse=False, mirror_order=0)), tmp_path / "x")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_one_command_writes_a_saved_fields_twin(field, tmp_path, capsys):
-    field.save(tmp_path / "field.safetensors")
-    assert cli.main(["twin", str(tmp_path / "field.safetensors"), "-o", str(tmp_path / "twin")]) == 0
-    said = capsys.readouterr().out
-    assert "walls" in said
-    assert "2 materials" in said
-    assert len(wr.Scene.load(tmp_path / "twin" / "scene.xml").materials) == 2
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "notes.txt").write_text("mine")
-    assert cli.main(["twin", str(tmp_path / "field.safetensors"), "-o", str(tmp_path / "other")]) == 2
-    assert "notes.txt" in capsys.readouterr().err

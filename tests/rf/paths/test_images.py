@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from radio_scenes import box_mesh, joined
+from radio_scenes import box_mesh, joined, tube
 
 from warprrf.geometry.mesh import Mesh
 from warprrf.geometry.planar_patches import PlanarPatches, planar_patches
@@ -109,36 +109,6 @@ def test_progress_goes_from_patches_to_the_end_of_the_mirrors(kept, monkeypatch)
     assert len(done) == len(told) - 2 and done == sorted(done) and (kept or len(set(done)) > 10)
 
 
-def test_a_point_alone_and_among_many_has_the_same_paths():
-    patches = planar_patches(shards(3, 40))
-    points = np.random.default_rng(5).normal(0, 3.0, (100, 3))
-    images = MirrorImages(patches, TX)
-    together = exact_paths(images, points, 2)
-    for r in range(0, 100, 9):
-        alone = exact_paths(images, points[r][None], 2)
-        np.testing.assert_array_equal(alone.patch, together.patch[together.receiver == r])
-        np.testing.assert_array_equal(alone.length_m, together.length_m[together.receiver == r])
-
-
-def test_every_path_obeys_the_law_of_reflection_and_its_length_is_that_of_its_legs():
-    mesh, _ = joined(box_mesh([-3, -2, -1], [4, 3, 2], inward=True), box_mesh([1, 0, -1], [2, 1, 0.2]))
-    patches = planar_patches(mesh)
-    points = np.random.default_rng(6).uniform([-2.8, -1.8, 0.5], [3.8, 2.8, 1.8], (4, 3))
-    paths = exact_paths(MirrorImages(patches, TX), points, 4)
-    assert np.bincount(paths.order).min() >= 4
-    for k in range(len(paths)):
-        order = paths.order[k]
-        stops = np.concatenate([[TX], paths.point[k, :order], [points[paths.receiver[k]]]])
-        legs = np.diff(stops, axis=0)
-        lengths = np.linalg.norm(legs, axis=1)
-        assert paths.length_m[k] == pytest.approx(lengths.sum(), rel=1e-14)
-        for j, p in enumerate(paths.patch[k, :order]):
-            n = patches.normal[p]
-            before, after = legs[j] / lengths[j], legs[j + 1] / lengths[j + 1]
-            np.testing.assert_allclose(after, before - 2 * (before @ n) * n, atol=1e-10)
-            assert paths.cosine[k, j] == pytest.approx(abs(before @ n), abs=1e-12)
-
-
 def test_soft_blocking_finds_what_hard_blocking_does_where_zones_are_free():
     mesh = Mesh(*box_mesh([-3, -2, -1], [4, 3, 2], inward=True))
     patches = planar_patches(mesh)
@@ -165,29 +135,11 @@ def test_patches_with_a_back_mirror_on_their_front_alone():
         assert np.bincount(exact_paths(MirrorImages(given, TX), point, 1).order, minlength=2)[1] == expected
 
 
-def test_no_points_and_no_patches():
-    patches = planar_patches(shards(1, 3))
-    assert len(exact_paths(MirrorImages(patches, TX), np.zeros((0, 3)), 2)) == 0
-    none = PlanarPatches.from_planes(
-        patches.mesh, np.full(len(patches.mesh.faces), -1), np.zeros((0, 3)), np.zeros(0), tolerance_m=1e-5
-    )
-    assert exact_paths(MirrorImages(none, TX), np.array([[9.0, 9, 9]]), 3).order.tolist() == [0]
-
-
-def pillar(facets):
-    """A round pillar of 0.3 m in facets, without ends."""
-    azimuth, k = 2 * np.pi * np.arange(facets) / facets, np.arange(facets)
-    ring = 0.3 * np.column_stack([np.cos(azimuth), np.sin(azimuth)])
-    vertices = np.concatenate([np.column_stack([ring, np.full(facets, z)]) for z in (0.0, 3.0)])
-    after = (k + 1) % facets
-    return vertices + [2.0, 2.0, 0.0], np.concatenate(
-        [np.column_stack([k, after, after + facets]), np.column_stack([k, after + facets, k + facets])]
-    )
-
-
 @pytest.mark.parametrize(("facets", "curved"), [(4, False), (8, False), (16, True), (64, True)])
 def test_a_smooth_surface_that_was_cut_into_mirrors_is_told_of(facets, curved):
-    mesh = joined(box_mesh([0, 0, 0], [6, 5, 3], inward=True), pillar(facets))[0]
+    vertices, faces = tube(facets, 0.3, 3.0)
+    pillar = vertices + [2.0, 2.0, 0.0], faces
+    mesh = joined(box_mesh([0, 0, 0], [6, 5, 3], inward=True), pillar)[0]
     assert planar_patches(mesh).curved_m2 == pytest.approx(
         curved * 2 * facets * 0.3 * np.sin(np.pi / facets) * 3.0
     )

@@ -12,7 +12,6 @@ from warprrf.rf.em.absorption import gas_attenuation_db_per_m
 from warprrf.rf.em.materials import Material, roughness_scattering
 from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
-from warprrf.rf.fields.bistatic.materials import Terms
 from warprrf.rf.relevance.model import full_field, material_parameters, with_lobes
 from warprrf.rf.relevance.search import Relevance, relevance, relevances
 from warprrf.rf.spectra.dataset import SpectrumDataset
@@ -146,23 +145,6 @@ def test_blocked_receivers_have_no_line_of_sight_to_lose(several: list[Relevance
     assert found["line_of_sight"].image_blocked_db == 0.0
     assert found["line_of_sight"].total_db > 1
     assert found["diffraction"].image_db < found["diffraction"].image_blocked_db
-
-
-def test_elements_that_no_receiver_sees_matter_to_further_bounces_alone(slabs: RadioScene) -> None:
-    from warprrf.rf.relevance.model import without_elements
-
-    full, walls, source = full_field(slabs, transmitter=TX, frequency_hz=F, shape=SHAPE, beam_sigma_rad=SIGMA)
-    single = replace(full, terms=Terms(lobes=full.terms.lobes, mirror_order=2))
-    view = single.view(RECEIVERS[0])
-    face = view.hits.face.numpy()
-    unseen = np.ones(len(full.surface.element_area), bool)
-    unseen[full.surface.element[face[face >= 0]]] = False
-    assert unseen.any()
-    dropped = without_elements(single, unseen)
-    seen = replace(view, transport=dropped.transport())
-    assert np.array_equal(dropped.render(seen).image, single.render(view).image)
-    assert source == "scene"
-    assert not walls.assumed
 
 
 def test_table_and_file_say_the_same(several: list[Relevance], tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -45,24 +45,22 @@ def dataset(count=40, shape=(12, 24), seed=0):
     )
 
 
-def test_round_trip_is_exact(tmp_path):
-    before = dataset()
-    before.save(tmp_path / "a.nc")
-    after = SpectrumDataset.load(tmp_path / "a.nc")
-    for name in ("receivers", "transmitter", "path_gain", "delay_s", "aod", "role", "line_of_sight"):
-        np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
-        assert getattr(before, name).dtype == getattr(after, name).dtype
-    for name in (
-        "frequency_hz",
-        "floor",
-        "range_db",
-        "beam_sigma_rad",
-        "engine",
-        "polarisation",
-        "seed",
-        "attributes",
-    ):
-        assert getattr(before, name) == getattr(after, name)
+def same(a, b):
+    for name in (f.name for f in fields(SpectrumDataset) if f.name != "attributes"):
+        x, y = getattr(a, name), getattr(b, name)
+        np.testing.assert_array_equal(x, y, err_msg=name)
+        assert getattr(x, "dtype", None) == getattr(y, "dtype", None), name
+
+
+def test_round_trip_is_exact_with_or_without_receivers(tmp_path):
+    held = {
+        "text": "größer", "none": "", "number": 1.5, "whole": 3, "yes": True, "list": [1.0, 2.0], "words": ["a", "b"],
+    }  # fmt: skip
+    for before in (dataset(), dataset().subset([])):
+        replace(before, attributes=held).save(tmp_path / "a.nc")
+        after = SpectrumDataset.load(tmp_path / "a.nc")
+        same(before, after)
+        assert {**after.attributes, "list": list(after.attributes["list"])} == held
     assert os.listdir(tmp_path) == ["a.nc"]
 
 
@@ -90,10 +88,7 @@ def test_splits_nest_and_keep_their_test_receivers(seed):
         np.testing.assert_array_equal(test.receivers, again.receivers)
     assert (splits[0][1].role == "test").all() and len(splits[0][1]) == 10
     assert splits[0][0].floor == ds.floor and splits[0][0].range_db == ds.range_db
-
-
-def test_seed_0_takes_the_order_of_the_file():
-    ds = dataset()
+    # seed 0 takes the order of the file
     np.testing.assert_array_equal(ds.split(12)[0].receivers, ds.receivers[ds.role == "train"][:12])
 
 
@@ -116,77 +111,34 @@ def test_exr_keeps_the_spectrum_and_its_numbers(tmp_path):
     assert s.attributes["frequency_hz"] == 300e9
     assert (s.attributes["engine"], s.attributes["polarisation"]) == (ds.engine, ds.polarisation)
     np.testing.assert_array_equal(s.attributes["receiver"], ds.receivers[5])
-
-
-def test_a_spectrum_without_delays_is_no_exr(tmp_path):
-    pytest.importorskip("OpenEXR")
     with pytest.raises(ValueError, match="spectrum: got one without delay"):
         export_exr(tmp_path / "one.exr", Spectrum(np.ones((2, 4))))
 
 
-def test_missing_and_damaged_files_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nothing\.nc"):
-        SpectrumDataset.load(tmp_path / "nothing.nc")
-    path = tmp_path / "cut.nc"
-    dataset().save(path)
-    whole = path.read_bytes()
-    for part in (b"", b"not netcdf", whole[: len(whole) // 2], whole[:5000]):
-        path.write_bytes(part)
-        with pytest.raises(ValueError, match=r"cut\.nc"):
-            SpectrumDataset.load(path)
-    import xarray
-
-    xarray.Dataset({"temperature": ("x", np.zeros(3))}).to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(ValueError, match="lacks.*delay"):
-        SpectrumDataset.load(path)
+def turned(data):
+    """Every axis in another order, and columns told from 0 to 2 pi."""
+    data = data.assign_coords(azimuth=data.azimuth.values % (2 * np.pi)).sortby("azimuth")
+    data = data.isel(zenith=slice(None, None, -1), xyz=[2, 1, 0], angle=[1, 0], receiver=[5, 0, 7, 2])
+    return data.roll(azimuth=7, roll_coords=True).transpose("angle", "azimuth", "xyz", "zenith", "receiver")
 
 
-def same(a, b):
-    for name in ("receivers", "transmitter", "path_gain", "delay_s", "aod", "role", "line_of_sight"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+def as_others_write(data):
+    """Labels left out, and empty delays told by a number."""
+    delay = data.delay.fillna(-1.0).assign_attrs(data.delay.attrs, missing_value=-1.0)
+    return data.drop_vars(["xyz", "angle"]).assign(delay=delay)
 
 
-def by_columns(data):
-    """Columns told from 0 to 2 pi."""
-    return data.assign_coords(azimuth=data.azimuth.values % (2 * np.pi)).sortby("azimuth")
-
-
-REORDERED = {
-    "reversed rows": lambda data: data.isel(zenith=slice(None, None, -1)),
-    "reversed columns": lambda data: data.isel(azimuth=slice(None, None, -1)),
-    "rolled columns": lambda data: data.roll(azimuth=7, roll_coords=True),
-    "columns from 0 to 2 pi": by_columns,
-    "transposed": lambda data: data.transpose("angle", "azimuth", "xyz", "zenith", "receiver"),
-    "axes reversed": lambda data: data.isel(xyz=[2, 1, 0], angle=[1, 0]),
-    "labels dropped": lambda data: data.drop_vars(["xyz", "angle"]),
-    "empty as a number": lambda data: data.fillna({"delay": -1.0}).assign(
-        delay=data.delay.fillna(-1.0).assign_attrs(data.delay.attrs, missing_value=-1.0)
-    ),
-}
-
-
-@pytest.mark.parametrize("change", REORDERED.values(), ids=REORDERED)
-def test_what_other_tools_reorder_is_read_by_its_coordinates(tmp_path, change):
+@pytest.mark.parametrize(("change", "receivers"), [(turned, [5, 0, 7, 2]), (as_others_write, range(8))])
+def test_what_other_tools_reorder_is_read_by_its_coordinates(tmp_path, change, receivers):
     xarray = pytest.importorskip("xarray")
     before = dataset(8)
     before.save(tmp_path / "a.nc")
     with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
         change(opened.load()).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
-    same(SpectrumDataset.load(tmp_path / "b.nc"), before)
-
-
-def test_receivers_reordered_by_other_tools_keep_their_spectra(tmp_path):
-    xarray = pytest.importorskip("xarray")
-    before = dataset(8)
-    before.save(tmp_path / "a.nc")
-    order = [5, 0, 7, 2]
-    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_timedelta=False) as opened:
-        opened.isel(receiver=order).to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
-    same(SpectrumDataset.load(tmp_path / "b.nc"), before.subset(order))
+    same(SpectrumDataset.load(tmp_path / "b.nc"), before.subset(receivers))
 
 
 REFUSED = {
-    "zenith: got no such coordinate": lambda data: data.drop_vars("zenith"),
     "zenith: got the places": lambda data: data.isel(zenith=slice(0, 6)),
     "azimuth: got the places": lambda data: data.assign_coords(azimuth=data.azimuth + 0.1),
     "azimuth: got the unit 'degrees'": lambda data: data.assign_coords(
@@ -197,13 +149,7 @@ REFUSED = {
     "delay: got values packed by scale_factor": lambda data: data.assign(
         delay=data.delay.assign_attrs(scale_factor=2.0)
     ),
-    "path_gain: got dimensions": lambda data: data.assign(path_gain=data.path_gain[:, 0]),
     "lacks aod, role": lambda data: data.drop_vars(["aod", "role"]),
-    "lacks beam_sigma_rad, engine, floor": lambda data: data.drop_attrs().assign_attrs(frequency_hz=1.0),
-    r"role: got \[0, 1, 7\]": lambda data: data.assign(
-        role=("receiver", np.array([0, 1, 7, 0, 0, 0, 1, 0], np.int8))
-    ),
-    "floor: got -1": lambda data: data.assign_attrs(floor=-1.0),
 }
 
 
@@ -281,33 +227,16 @@ def test_the_process_outlives_a_full_disk(tmp_path):
     same(SpectrumDataset.load(paths[0]), dataset(8))
 
 
-@pytest.mark.parametrize(
-    "name", ["floor", "frequency_hz", "range_low_db", "receivers", "title", "compact", "a/b", "", "_x", 5]
-)
+@pytest.mark.parametrize("name", ["floor", "range_low_db", "title", "compact", "a/b", "", "_x", 5])
 def test_names_that_the_file_needs_are_no_attributes(name):
     with pytest.raises(ValueError, match=f"attributes: got .*{name}"):
         replace(dataset(), attributes={name: 1.0})
 
 
-@pytest.mark.parametrize("value", [None, {}, [[1.0]], [None], 1j, b"x", np.zeros(10_000), object()])
+@pytest.mark.parametrize("value", [None, [[1.0]], 1j, np.zeros(10_000)])
 def test_attributes_are_text_and_numbers(value):
     with pytest.raises(TypeError, match="attributes: 'mine' is a "):
         replace(dataset(), attributes={"mine": value})
-
-
-def test_attributes_come_back(tmp_path):
-    held = {
-        "text": "größer",
-        "none": "",
-        "number": 1.5,
-        "whole": 3,
-        "yes": True,
-        "list": [1.0, 2.0],
-        "words": ["a", "b"],
-    }
-    replace(dataset(), attributes=held).save(tmp_path / "a.nc")
-    found = SpectrumDataset.load(tmp_path / "a.nc").attributes
-    assert {**found, "list": list(found["list"])} == held
 
 
 def test_a_data_set_says_what_it_is_in_a_line():
@@ -325,70 +254,35 @@ def test_compact_files_of_the_faintest_floors_hold_numbers(tmp_path):
     )  # float32 ends there
 
 
-BAD_FIELDS = [
-    ("receivers", np.full((40, 3), np.nan), ValueError),
-    ("receivers", np.zeros((40, 2)), ValueError),
-    ("receivers", "here", TypeError),
-    ("transmitter", [1.0, np.nan, 0.0], ValueError),
-    ("transmitter", [1.0, 2.0], ValueError),
-    ("frequency_hz", 0.0, ValueError),
-    ("frequency_hz", np.inf, ValueError),
-    ("frequency_hz", None, (TypeError, ValueError)),
-    ("path_gain", -np.ones((40, 12, 24)), ValueError),
-    ("path_gain", np.full((40, 12, 24), 1e300), ValueError),
-    ("path_gain", np.ones((40, 12)), ValueError),
-    ("path_gain", np.ones((39, 12, 24)), ValueError),
-    ("delay_s", np.ones((3, 12, 24)), ValueError),
-    ("delay_s", np.full((40, 12, 24), -1e-9), ValueError),
-    ("delay_s", np.full((40, 12, 24), np.inf), ValueError),
-    ("aod", np.ones((40, 12, 24)), ValueError),
-    ("aod", np.full((40, 12, 24, 2), 3.5), ValueError),
-    ("floor", -1.0, ValueError),
-    ("floor", 0.0, ValueError),
-    ("floor", np.nan, ValueError),
-    ("range_db", (1.0, np.nan), ValueError),
-    ("range_db", (-80.0, -170.0), ValueError),
-    ("range_db", -80.0, TypeError),
-    ("beam_sigma_rad", 0.0, ValueError),
-    ("beam_sigma_rad", -0.03, ValueError),
-    ("beam_sigma_rad", np.nan, ValueError),
-    ("engine", 5, TypeError),
-    ("polarisation", None, TypeError),
-    ("seed", 1.5, TypeError),
-    ("seed", -1, ValueError),
-    ("role", ["training"] * 40, ValueError),
-    ("role", ["train"] * 39, ValueError),
-    ("line_of_sight", np.full(40, np.nan), ValueError),
-    ("line_of_sight", np.full(40, 2), ValueError),
-    ("line_of_sight", ["no"] * 40, TypeError),
-    ("attributes", [1], TypeError),
-]
+SPECTRUM, SPECTRA = Spectrum(np.ones((2, 4))), dataset()
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "kind"), BAD_FIELDS, ids=[f"{n}{k}" for k, (n, *_) in enumerate(BAD_FIELDS)]
-)
-def test_fields_that_no_data_set_has_are_refused(name, value, kind):
-    with pytest.raises(kind, match=f"^{name}: "):
-        replace(dataset(), **{name: value})
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "kind"),
+    ("held", "name", "value"),
     [
-        ("path_gain", np.ones(4), ValueError),
-        ("path_gain", -np.ones((2, 4)), ValueError),
-        ("path_gain", np.full((2, 4), np.nan), ValueError),
-        ("delay_s", np.ones((2, 3)), ValueError),
-        ("aod", np.ones((2, 4)), ValueError),
-        ("floor", -1.0, ValueError),
-        ("range_db", (0.0, np.nan), ValueError),
-        ("std_db", np.ones(3), ValueError),
+        (SPECTRA, "receivers", np.zeros((40, 2))),
+        (SPECTRA, "transmitter", [1.0, np.nan, 0.0]),
+        (SPECTRA, "frequency_hz", 0.0),
+        (SPECTRA, "path_gain", -np.ones((40, 12, 24))),
+        (SPECTRA, "path_gain", np.full((40, 12, 24), 1e300)),  # no float32
+        (SPECTRA, "path_gain", np.ones((39, 12, 24))),
+        (SPECTRA, "delay_s", np.full((40, 12, 24), -1e-9)),
+        (SPECTRA, "aod", np.full((40, 12, 24, 2), 3.5)),
+        (SPECTRA, "floor", -1.0),
+        (SPECTRA, "range_db", (-80.0, -170.0)),
+        (SPECTRA, "beam_sigma_rad", -0.03),
+        (SPECTRA, "role", ["training"] * 40),
+        (SPECTRA, "role", ["train"] * 39),
+        (SPECTRA, "line_of_sight", np.full(40, 2)),
+        (SPECTRUM, "path_gain", -np.ones((2, 4))),
+        (SPECTRUM, "delay_s", np.ones((2, 3))),
+        (SPECTRUM, "floor", -1.0),
+        (SPECTRUM, "range_db", (0.0, np.nan)),
     ],
 )
-def test_fields_that_no_spectrum_has_are_refused(name, value, kind):
-    with pytest.raises(kind, match=f"^{name}: "):
-        replace(Spectrum(np.ones((2, 4))), **{name: value})
+def test_fields_that_nothing_has_are_refused(held, name, value):
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        replace(held, **{name: value})
 
 
 def test_bad_choices_are_refused():
@@ -427,9 +321,3 @@ def test_spectra_of_paths_are_those_of_the_engine_that_finds_the_same_paths():
         SpectrumDataset.from_paths(replace(paths, receiver=None))
     with pytest.raises(ValueError, match="several transmitters"):
         SpectrumDataset.from_paths(replace(paths, transmitter=receivers + 0.1))
-
-
-def test_a_data_set_of_no_receivers_comes_back(tmp_path):
-    none = dataset().subset([])
-    none.save(tmp_path / "a.nc")
-    same(SpectrumDataset.load(tmp_path / "a.nc"), none)

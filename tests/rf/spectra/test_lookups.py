@@ -73,15 +73,3 @@ def test_constant_and_mean_are_averages_of_decibels() -> None:
     assert 10 * np.log10(constant[0, 0] + FLOOR) == pytest.approx(level.mean(), abs=1e-4)
     mean = lookups.mean(ds)([9.0, 9.0, 9.0]).path_gain
     assert 10 * np.log10(mean + FLOOR) == pytest.approx(level.mean(axis=0), abs=1e-4)
-
-
-def test_errors_name_the_argument() -> None:
-    ds = training_set([[0, 0, 0]], [1e-8])
-    with pytest.raises(ValueError, match="domain"):
-        lookups.idw(ds, domain="cubic")
-    with pytest.raises(ValueError, match="power"):
-        lookups.idw(ds, power=0.0)
-    with pytest.raises(ValueError, match="receiver"):
-        lookups.nearest(ds)([np.nan, 0.0, 0.0])
-    with pytest.raises(ValueError, match="no receivers"):
-        lookups.mean(training_set([], []))

@@ -51,6 +51,7 @@ NOT_MEASURED = ("", "na", "n/a", "#n/a", "<na>", "nan", "null", "none")
 """What stands in a file, in small letters, for a power that was not measured."""
 WIDEST_HORN_RAD = 2.0 * np.pi / 3.0
 """Full width at half maximum of the widest horns; a larger number is one in degrees."""
+WEIGHTS_AT_ONCE = 1_000_000  # of readings and paths: some MB of temporary arrays
 ALIKE = 0.7  # of two names' letters: one is misspelt for the other
 WINDOWS = ("rectangular", "hann")
 
@@ -409,16 +410,33 @@ def _number(name: str, cell: str, line: int) -> float:
 
 
 def path_weights(
-    readings: Readings, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
+    readings: Readings,
+    rows: np.ndarray,
+    arrival: np.ndarray,
+    departure: np.ndarray,
+    delay_s: np.ndarray,
+    *,
+    dtype: type[np.floating] = np.float64,
 ) -> np.ndarray:
-    """What ``rows`` (M,) of ``readings`` take of unit power on paths, shape ``(M, K)``.
+    """What ``rows`` (M,) of ``readings`` take of unit power on paths, shape ``(M, K)``, in ``dtype``.
 
     Args:
         arrival: unit vectors from the receiver, shape ``(K, 3)``.
         departure: unit vectors from the transmitter, shape ``(K, 3)``.
         delay_s: delays [s], shape ``(K,)``.
     """
-    r, weight = readings, np.ones((len(rows), len(delay_s)))
+    weight = np.empty((len(rows), len(delay_s)), dtype)
+    at_once = max(1, WEIGHTS_AT_ONCE // max(1, len(delay_s)))
+    for first in range(0, len(rows), at_once):
+        some = rows[first : first + at_once]
+        weight[first : first + at_once] = _path_weights(readings, some, arrival, departure, delay_s)
+    return weight
+
+
+def _path_weights(
+    r: Readings, rows: np.ndarray, arrival: np.ndarray, departure: np.ndarray, delay_s: np.ndarray
+) -> np.ndarray:
+    weight = np.ones((len(rows), len(delay_s)))
     for turned, pattern, path in (
         (r.arrival, r.receive_pattern, arrival),
         (r.departure, r.transmit_pattern, departure),

@@ -263,7 +263,7 @@ def spread_paths(
     Raises:
         ValueError: on a wrong shape, NaN, a negative gain, a direction of length zero, or a sigma that is not positive.
     """
-    rows, columns = check_shape(shape)
+    shape = rows, columns = check_shape(shape)
     d = check_array("directions", directions, (None, 3))
     power = check_array("powers", powers, (len(d),))
     check_positive("sigma", sigma, "beam width in radians")
@@ -503,12 +503,12 @@ class Spectrum:
         """Spectra of several receivers as one; floor and range are those of the first.
 
         Raises:
-            ValueError, TypeError: for none, or anything else.
+            TypeError, ValueError: for none, or what are no spectra.
         """
+        if not isinstance(spectra, Sequence) or not len(spectra):
+            raise ValueError(f"spectra: got {spectra!r:.60}, expected a list of at least one")
         for k, one in enumerate(spectra):
-            check_type(f"spectra[{k}]", one, cls)
-        if not spectra:
-            raise ValueError("spectra: got none, expected at least one")
+            check_type(f"spectra[{k}]", one, Spectrum)
         several: dict[str, Any] = {}
         for name, first in spectra[0]._arrays().items():
             several[name] = None if first is None else np.stack([getattr(one, name) for one in spectra])

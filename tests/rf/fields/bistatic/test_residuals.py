@@ -1,7 +1,6 @@
 """What differs within a material group: planted gains come back, few spectra move elements, many cells."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from scipy import sparse
 from trimesh.remesh import subdivide_to_size
 
 from warprrf.geometry.mesh import Mesh
-from warprrf.rf.fields.base import RadioField
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import NEPER, Target
 from warprrf.rf.fields.bistatic.links import LinkTracer
@@ -60,6 +58,9 @@ def test_cells_are_pieces_of_elements(field: BistaticField) -> None:
     centre = s.mesh.triangles.mean(axis=1)
     for k in range(0, s.cells, 7):
         assert np.ptp(centre[s.cell == k], axis=0).max() <= ELEMENT_M / CELLS
+    large = Surface.of(Mesh(*ROOM))  # of faces larger than cells, each of which is one
+    assert np.array_equal(large.cell_element[large.cell], large.element)
+    assert np.bincount(large.cell, minlength=large.cells).min() >= 1
 
 
 def test_planted_gains_come_back(field: BistaticField) -> None:
@@ -153,21 +154,3 @@ def test_links_have_the_same_gains(field: BistaticField) -> None:
     for scale in ([[1.0], [0.0]], [[0.0], [1.0]]):
         textured = totals(replace(field, residual=rng.normal(1.0, 0.3, field.residual.shape) * scale))
         np.testing.assert_allclose(textured[0] - bare[0], textured[1] - bare[1], rtol=0.1)
-
-
-def test_the_file_keeps_them(field: BistaticField, tmp_path: Path) -> None:
-    textured = replace(field, residual=np.random.default_rng(7).normal(size=field.residual.shape))
-    textured.save(tmp_path / "field.safetensors")
-    back = RadioField.load(tmp_path / "field.safetensors")
-    np.testing.assert_array_equal(back.residual, textured.residual)
-    np.testing.assert_array_equal(back.surface.cell_element, textured.surface.cell_element)
-    np.testing.assert_array_equal(
-        back.spectrum(RECEIVERS[1]).path_gain, textured.spectrum(RECEIVERS[1]).path_gain
-    )
-
-
-def test_a_surface_of_faces_larger_than_cells(field: BistaticField) -> None:
-    """Each of them is a cell of its own; nothing is lost."""
-    surface = Surface.of(RadioScene(Mesh(*ROOM), np.zeros(12, np.int32), [SlabMaterial("walls")]))
-    assert np.array_equal(surface.cell_element[surface.cell], surface.element)
-    assert np.bincount(surface.cell, minlength=surface.cells).min() >= 1

@@ -8,20 +8,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
-from furnished import RECEIVERS, SHAPE, SIGMA, TX, spectra
+from furnished import RECEIVERS, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene
 
 from warprrf.rf.channel.array_spectra import UP, hemisphere
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
+from warprrf.rf.fields.bistatic import observations
 from warprrf.rf.fields.bistatic.field import BistaticField
 from warprrf.rf.fields.bistatic.fit import OWN_GAIN, Reading, Target
 from warprrf.rf.fields.bistatic.materials import Layout, Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import ArrayImage, SpectrumPixels, WeighedPaths, read
+from warprrf.rf.fields.bistatic.observations import observe, places_of
 from warprrf.rf.fields.bistatic.render import path_powers
 from warprrf.rf.fields.bistatic.response import Response, jacobian, predict, respond
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.spectra.beam import BeamOperator
+from warprrf.rf.spectra.readings import Readings, horn
 
 RX = RECEIVERS[0]
 
@@ -59,6 +62,52 @@ def test_a_delay_profile_is_the_sum_of_its_paths(field: BistaticField) -> None:
     assert found.sum() == pytest.approx(expected.sum(), rel=0.01)
 
 
+def test_places_where_a_horn_is_turned_alike_share_a_table(
+    field: BistaticField, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says what a table of each place's own says, and memory does not grow with the places."""
+    places, azimuth = RX + [[0.0, 0, 0], [0.3, -0.4, 0.2]], np.linspace(-3.0, 3.0, 7)
+    arrival = np.tile(np.column_stack([np.full(7, 1.5), azimuth]), (2, 1))
+    horns = Readings(
+        TX,
+        np.repeat(places, 7, axis=0),
+        np.full(14, 1e-9),
+        F,
+        1e-15,
+        arrival=arrival,
+        receive_pattern=horn(0.3),
+    )
+    views, data = [field.view(place) for place in places], [horns]
+    where = places_of(data, field.mesh, None)
+    shared = [one.measured for one in observe(data, where, views, 1.0)[0]]
+    assert shared[0].of_bin is shared[1].of_bin and shared[0].alike == shared[1].alike
+    monkeypatch.setattr(observations, "MOST_POINTINGS_BYTES", 0)
+    own = [one.measured for one in observe(data, where, views, 1.0)[0]]
+    some = np.array([5, 2])
+    for a, b, view in zip(shared, own, views, strict=True):
+        powers = path_powers(view, field.materials, None)
+        expected = read(view, b, powers)
+        np.testing.assert_allclose(read(view, a, powers), expected, rtol=1e-3)
+        np.testing.assert_allclose(read(view, a.part(some), powers), expected[some], rtol=1e-3)
+        back = [m.to_bins(np.eye(7)[:, some])[m.bins(view)[0]] for m in (a, b)]
+        back += [m.part(some).to_bins(np.eye(2))[m.bins(view)[0]] for m in (a, b)]
+        for found in back[1:]:
+            np.testing.assert_allclose(found, back[0], rtol=0.05, atol=1e-3 * back[0].max())
+
+
+def differences(ask, x: np.ndarray, step: float) -> np.ndarray:
+    """Slopes of the readings ``ask(x)`` by each parameter, shape (parameters, readings)."""
+    steps = step * np.eye(len(x))
+    return np.stack([(ask(x + s) - ask(x - s)) / (2.0 * step) for s in steps])
+
+
+def dense(table: np.ndarray, index: np.ndarray, layout: Layout) -> np.ndarray:
+    """A Jacobian with the rows of what is not seen: zeros."""
+    whole = np.zeros((layout.size, table.shape[1]))
+    whole[index] = table
+    return whole
+
+
 def array_image(view: ReceiverView) -> ArrayImage:
     """Half a hemisphere as an array of 4 x 4 elements sees it, whose paths' lengths are known to 0.4 mm."""
     array, directions = PlanarArray(4, 4, orientation=UP), hemisphere((18, 36)).reshape(-1, 3)
@@ -86,14 +135,9 @@ def test_its_jacobian_is_that_of_differences(field: BistaticField, measured, lit
     x += rng.normal(0.0, 0.2, layout.size)
     values, table, index = jacobian(response, layout.unpack(x), layout)
     np.testing.assert_allclose(values, predict(response, layout.unpack(x)), rtol=1e-4)
-    whole = np.zeros((layout.size, len(values)))
-    whole[index] = table  # of what is not seen, none
+    slopes = differences(lambda x: predict(response, layout.unpack(x)), x, 0.02)
     caught = []
-    for place, row in enumerate(whole):
-        step = 0.02 * (np.arange(layout.size) == place)
-        slope = (
-            predict(response, layout.unpack(x + step)) - predict(response, layout.unpack(x - step))
-        ) / 0.04
+    for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.02  # that of permittivity is a table's
         bound = allowed * np.abs(slope).max() + 1e-5 * values.max()
         assert np.abs(row - slope).max() <= bound
@@ -117,13 +161,10 @@ def test_errors_at_another_carrier_or_of_unknown_gain_have_the_slopes_of_differe
     x = layout.pack(replace(field.parameters, log_indirect=np.full(groups, -3.0)))
     x += rng.normal(0.0, 0.4, layout.size)
     error, table, index = reading.linearised(layout.unpack(x), layout)
-    whole = np.zeros((layout.size, len(error)))
-    whole[index] = table
-    for place in range(layout.size):
-        step = 0.02 * (np.arange(layout.size) == place)
-        slope = (reading.error_db(layout.unpack(x + step)) - reading.error_db(layout.unpack(x - step))) / 0.04
+    slopes = differences(lambda x: reading.error_db(layout.unpack(x)), x, 0.02)
+    for place, (row, slope) in enumerate(zip(dense(table, index, layout), slopes, strict=True)):
         allowed = 0.1 if place % layout.stride == layout.lobes else 0.01  # that of permittivity is a table's
-        assert np.abs(whole[place] - slope).max() <= allowed * np.abs(slope).max() + 1e-4
+        assert np.abs(row - slope).max() <= allowed * np.abs(slope).max() + 1e-4
 
 
 def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() -> None:
@@ -140,13 +181,8 @@ def test_the_jacobian_of_chains_over_several_materials_is_that_of_differences() 
     layout = Layout(3, 2, indirect=False, gain=False)
     x = layout.pack(Parameters.prior(3, 2)) + rng.normal(0.0, 0.3, layout.size)
     values, table, index = jacobian(response, layout.unpack(x), layout)
-    whole = np.zeros((layout.size, count))
-    whole[index] = table
-    for place in range(layout.size):
-        step = 1e-2 * (np.arange(layout.size) == place)
-        high, low = (predict(response, layout.unpack(x + s * step)) for s in (1.0, -1.0))
-        slope = (high - low) / 2e-2
-        assert (np.abs(whole[place] - slope) <= 1e-3 * np.abs(slope) + 1e-4 * values).all()
+    slopes = differences(lambda x: predict(response, layout.unpack(x)), x, 1e-2)
+    assert (np.abs(dense(table, index, layout) - slopes) <= 1e-3 * np.abs(slopes) + 1e-4 * values).all()
 
 
 def test_a_used_field_is_copied_and_pickled(field: BistaticField) -> None:

@@ -7,6 +7,7 @@ import pytest
 from furnished import RECEIVERS, ROOM, SHAPE, TX, F, spectra
 from radio_scenes import RadioScene, SlabMaterial, box_mesh, joined, mirror_paths
 
+from warprrf.geometry.mesh import Mesh
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.field import BistaticField
@@ -15,7 +16,6 @@ from warprrf.rf.fields.bistatic.grouping import regroup
 from warprrf.rf.fields.bistatic.materials import Parameters, Terms
 from warprrf.rf.fields.bistatic.measured import SpectrumPixels
 from warprrf.rf.fields.bistatic.response import (
-    Response,
     predict,
     respond,
     with_further_bounces,
@@ -168,27 +168,18 @@ def test_tied_responses_predict_the_same(readings: list[Reading]) -> None:
         rng.normal(-2, 0.5, (2, 5)), rng.normal(1, 0.3, 2), rng.normal(-1, 0.3, 2), rng.normal(-3, 0.2, 2)
     )
     for reading in readings:
-        response = with_light(reading.response, rng)
+        light = rng.uniform(0, 5, (2, len(reading.response.offset))).astype(np.float32)
+        response = replace(reading.response, sender=np.array([0, 2]), sent=light)
         assert np.allclose(predict(response, p.take(owner)), predict(response.tied(owner), p), rtol=1e-5)
-
-
-def with_light(response: Response, rng: np.random.Generator) -> Response:
-    light = rng.uniform(0, 5, (2, len(response.offset))).astype(np.float32)
-    return replace(response, sender=np.array([0, 2]), sent=light)
 
 
 def test_an_even_radiance_all_around_arrives_from_the_whole_sphere() -> None:
     """In a closed room whose surfaces send L evenly, the sum over pixels is (lambda / 4 pi)^2 4 pi L."""
-    import trimesh
-
-    from warprrf.geometry.mesh import Mesh
-
-    box, shape = trimesh.creation.box((6.0, 4.0, 3.0)), (12, 24)
-    surface = Surface.of(Mesh(box.vertices, box.faces[:, ::-1]))
+    surface, shape = Surface.of(Mesh(*ROOM)), (12, 24)
     radiance = 0.7
     for sub_pixels in (1, 3):
-        transport = Transport.of(surface, np.array([1.0, 0.5, 0.0]), F, shape, sub_pixels)
-        view = transport.view(np.array([0.5, -0.3, 0.2]), Terms(mirror_order=0))
+        transport = Transport.of(surface, TX, F, shape, sub_pixels)
+        view = transport.view(RECEIVERS[0], Terms(mirror_order=0))
         power = send(transport, view.hits, np.full(surface.element_sides, radiance))
         assert power.sum() == pytest.approx(
             (WAVELENGTH / (4.0 * np.pi)) ** 2 * 4.0 * np.pi * radiance, rel=1e-6

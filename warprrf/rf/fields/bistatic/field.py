@@ -29,6 +29,7 @@ from warprrf.checks import (
     check_arrays,
     check_count,
     check_number,
+    check_type,
     checked,
     index_to,
     one_line,
@@ -429,6 +430,7 @@ class BistaticField(RadioField):
 
     def render(self, view: ReceiverView) -> Rendered:
         """The spectrum of what is seen, by its parts."""
+        check_type("view", view, ReceiverView)
         view = view.transport.complete(view, self.terms)
         return render(view, self.materials, self._beam, self.sent_radiance(view.transport))
 

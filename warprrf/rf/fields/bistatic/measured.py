@@ -15,6 +15,7 @@ import numpy as np
 from warprrf.rf.channel.arrays import PlanarArray
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.bistatic.materials import Parameters
+from warprrf.rf.fields.bistatic.rays import RayGrid
 from warprrf.rf.fields.bistatic.render import PathPowers
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.paths.mirror_paths import stops_of
@@ -27,6 +28,10 @@ DEPARTURES = (60, 120)
 
 class Measurement(Protocol):
     """What is read of a receiver's path powers: rays are summed in B bins, and N readings are linear in those."""
+
+    @property
+    def alike(self) -> object:
+        """Equal for measurements whose readings of powers in bins are the same."""
 
     @property
     def together(self) -> Superposition | None:
@@ -78,6 +83,11 @@ class SpectrumPixels:
     pixels: np.ndarray | None = None
     together: None = None
 
+    @property
+    def alike(self) -> object:
+        """Itself: receivers of one data set have one."""
+        return id(self)
+
     def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
         """A bin for each pixel."""
         grid = view.transport.grid
@@ -128,14 +138,30 @@ class WeighedPaths:
 
     Attributes:
         ray_bin: bin of each ray of the view that it was made for, shape ``(K,)``.
-        of_bin: readings of unit power in each bin, shape ``(N, B)`` float32.
+        of_bin: readings of unit power in each bin, shape ``(D, B)`` float32; receivers at which an antenna is turned alike
+            share it.
+        row: which of these each reading is, shape ``(N,)``.
         path: readings of unit power on each line-of-sight and mirror path, shape ``(L, N)`` float32.
     """
 
     ray_bin: np.ndarray
     of_bin: np.ndarray
+    row: np.ndarray
     path: np.ndarray
     together: None = None
+
+    @property
+    def alike(self) -> object:
+        """The same rows of one table."""
+        return id(self.of_bin), self.row.tobytes()
+
+    @classmethod
+    def turned(cls, view: ReceiverView, weigh: Weigh, of_bin: np.ndarray, row: np.ndarray) -> WeighedPaths:
+        """Those of one receiver that depend on arrival alone: bins are pixels, ``of_bin`` (D, B) that of their
+        directions (:func:`pixel_means`), of which each reading is a ``row`` (N,)."""
+        hit = view.hits.face.numpy() >= 0
+        pixel = np.arange(len(hit)) // view.transport.grid.sub_pixels**2
+        return cls(np.where(hit, pixel, -1), of_bin, row, _of_direct(view, weigh))
 
     @classmethod
     def of(
@@ -178,23 +204,28 @@ class WeighedPaths:
         ray_bin[ray] = own
         unit = [v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9) for v in mean[:2]]
         count = np.bincount(own, minlength=number)
-        return cls(
-            ray_bin,
-            weigh(unit[0], unit[1], mean[2][:, 0] / np.maximum(count, 1)).astype(np.float32),
-            np.ascontiguousarray(weigh(*direct_paths(view)).T, np.float32),
-        )
+        of_bin = weigh(unit[0], unit[1], mean[2][:, 0] / np.maximum(count, 1)).astype(np.float32, copy=False)
+        return cls(ray_bin, of_bin, np.arange(len(of_bin)), _of_direct(view, weigh))
 
     def bins(self, view: ReceiverView) -> tuple[np.ndarray, int]:
         """Bins of direction and delay."""
         return self.ray_bin, self.of_bin.shape[1]
 
     def of_bins(self, power: np.ndarray, *, quick: bool = False) -> np.ndarray:
-        """Weighed."""
-        return np.asarray(self.of_bin @ power.astype(np.float32 if quick else power.dtype, copy=False))
+        """Weighed, in single precision always: powers and weights are positive, and a table in double takes seconds."""
+        power = power.astype(np.float32)
+        if self._is_few:
+            return np.asarray(self.of_bin[self.row] @ power)
+        return np.asarray(self.of_bin @ power)[self.row]
 
     def to_bins(self, readings: np.ndarray) -> np.ndarray:
         """Weighed the other way."""
-        return np.asarray(self.of_bin.T @ readings.astype(np.float32))
+        readings = readings.astype(np.float32)
+        if self._is_few:
+            return np.asarray(self.of_bin[self.row].T @ readings)
+        table = np.zeros((len(self.of_bin), readings.shape[1]), np.float32)
+        np.add.at(table, self.row, readings)
+        return np.asarray(self.of_bin.T @ table)
 
     def of_paths(self, view: ReceiverView) -> np.ndarray:
         """Each path's weights."""
@@ -202,7 +233,23 @@ class WeighedPaths:
 
     def part(self, index: np.ndarray) -> WeighedPaths:
         """Some of the readings."""
-        return WeighedPaths(self.ray_bin, self.of_bin[index], self.path[:, index])
+        return WeighedPaths(self.ray_bin, self.of_bin, self.row[index], self.path[:, index])
+
+    @property
+    def _is_few(self) -> bool:
+        """Whether taking rows out of the table costs less than reading all of it."""
+        return 2 * len(self.row) < len(self.of_bin)
+
+
+def _of_direct(view: ReceiverView, weigh: Weigh) -> np.ndarray:
+    """Readings of unit power on each line-of-sight and mirror path, shape ``(L, N)`` float32."""
+    return np.ascontiguousarray(weigh(*direct_paths(view)).T, np.float32)
+
+
+def pixel_means(grid: RayGrid) -> np.ndarray:
+    """Unit vectors amid the rays of each pixel, shape ``(P, 3)``."""
+    mean = grid.directions.reshape(-1, grid.sub_pixels**2, 3).mean(axis=1)
+    return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,6 +311,11 @@ class ArrayImage:
     arriving: np.ndarray
     together: Superposition
 
+    @property
+    def alike(self) -> object:
+        """Itself."""
+        return id(self)
+
     @classmethod
     def of(
         cls, view: ReceiverView, array: PlanarArray, directions: np.ndarray, length_std_m: float
@@ -275,8 +327,7 @@ class ArrayImage:
         lag = np.round((place[:, None] - place[None]).reshape(-1, 3), 9)
         first = np.take_along_axis(lag, (lag != 0).argmax(axis=1)[:, None], axis=1)
         lag, count = np.unique(lag * np.where(first < 0, -1.0, 1.0) + 0.0, axis=0, return_counts=True)
-        pixels = grid.directions.reshape(-1, grid.sub_pixels**2, 3).mean(axis=1)
-        pixels /= np.linalg.norm(pixels, axis=1, keepdims=True)
+        pixels = pixel_means(grid)
         wave, met = 2.0 * np.pi * directions @ lag.T, 2.0 * np.pi * pixels @ lag.T
         share = count / array.elements**2
         steered = np.concatenate([share * np.cos(wave), share * np.sin(wave)], axis=1)

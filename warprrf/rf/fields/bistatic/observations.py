@@ -16,7 +16,13 @@ from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.fields.base import Data, Measured
 from warprrf.rf.fields.bistatic.fit import NEPER, OWN_GAIN, Target, gain_of
 from warprrf.rf.fields.bistatic.materials import Parameters, Terms
-from warprrf.rf.fields.bistatic.measured import ArrayImage, Measurement, SpectrumPixels, WeighedPaths
+from warprrf.rf.fields.bistatic.measured import (
+    ArrayImage,
+    Measurement,
+    SpectrumPixels,
+    WeighedPaths,
+    pixel_means,
+)
 from warprrf.rf.fields.bistatic.response import predict, respond
 from warprrf.rf.fields.bistatic.transport import ReceiverView
 from warprrf.rf.positions import check_dataset, check_positions, question_unit, warn_of_unmodelled
@@ -33,6 +39,8 @@ READING_ERROR_DB = 1.0
 """Standard deviation of what a field cannot explain of a reading without noise [dB]."""
 TOTAL_ERROR_DB = 0.5
 """The same of all power of a place: errors of single directions average out."""
+MOST_POINTINGS_BYTES = 256_000_000
+"""A table that the places of a data set share is no larger: 9,000 pointings of a horn."""
 TAP_STEPS = 4.0  # that delays are told apart in, per tap
 
 
@@ -131,9 +139,12 @@ def places_of(data: Sequence[Measured], mesh: Mesh | None, device: DeviceLike) -
             continue
         names, chain = np.unique(np.asarray(one.chain), return_inverse=True)
         key = np.column_stack([one.transmitters, one.receivers, chain])
-        first, own = np.unique(key, axis=0, return_index=True, return_inverse=True)[1:]
+        first, own, count = np.unique(
+            key, axis=0, return_index=True, return_inverse=True, return_counts=True
+        )[1:]
+        every = np.split(np.argsort(own.reshape(-1), kind="stable"), np.cumsum(count)[:-1])
         for number in np.argsort(first):
-            rows = np.flatnonzero((own.reshape(-1) == number) & np.isfinite(one.power))
+            rows = every[number][np.isfinite(one.power[every[number]])]
             if len(rows):
                 at = int(first[number])
                 found.append(
@@ -194,6 +205,7 @@ def observe(
     index = {name: k for k, name in enumerate(chains)}
     found: list[Observed] = []
     whole: dict[tuple[tuple[int, int], float], SpectrumPixels] = {}
+    pointings: dict[int, tuple[np.ndarray, np.ndarray] | None] = {}
     for place, view in zip(places, views, strict=True):
         one = data[place.data]
         if isinstance(one, SpectrumDataset):
@@ -214,15 +226,36 @@ def observe(
         expected = one.expected_db[rows] - 10.0 * np.log10(floor)
         above = NEPER * np.log1p(10.0 ** (expected / 10.0))
         step = None if one.bandwidth_hz is None else 1.0 / (TAP_STEPS * one.bandwidth_hz)
-        measured = WeighedPaths.of(
-            view, partial(path_weights, one, rows), arrival=one.arrival is not None,
-            departure=one.departure is not None, delay_step_s=step,
-        )  # fmt: skip
+        weigh = partial(path_weights, one, rows, dtype=np.float32)
+        if place.data not in pointings:
+            pointings[place.data] = _pointings(one, view)
+        if (known := pointings[place.data]) is not None:
+            measured = WeighedPaths.turned(view, weigh, known[0], known[1][rows])
+        else:
+            measured = WeighedPaths.of(
+                view,
+                weigh,
+                arrival=one.arrival is not None,
+                departure=one.departure is not None,
+                delay_step_s=step,
+            )
         unexplained = TOTAL_ERROR_DB if one.total else READING_ERROR_DB
         trust = noise_db / np.hypot(unexplained, one.noise_db[rows])
         target = Target(above, trust, one.power[rows] <= floors)
         found.append(Observed(place, measured, target, floor, index.get(place.chain, -1)))
     return found, chains
+
+
+def _pointings(one: Readings, view: ReceiverView) -> tuple[np.ndarray, np.ndarray] | None:
+    """What each pointing of a receiving antenna reads of unit power in each pixel, shape ``(D, P)`` float32, and which one
+    each reading is, shape ``(N,)``; None where arrival is not all that counts, or too many pointings differ."""
+    if one.arrival is None or one.departure is not None or one.delay_s is not None:
+        return None
+    first, row = np.unique(one.arrival, axis=0, return_index=True, return_inverse=True)[1:]
+    toward = pixel_means(view.transport.grid)
+    if len(first) * len(toward) * np.dtype(np.float32).itemsize > MOST_POINTINGS_BYTES:
+        return None
+    return path_weights(one, first, toward, toward, np.zeros(len(toward)), dtype=np.float32), row.reshape(-1)
 
 
 def _observe_array(one: ArraySpectra, place: Place, view: ReceiverView, noise_db: float) -> Observed:

@@ -127,7 +127,7 @@ def fit_residual(
     rest = np.concatenate([s.rest for s in shares])
     target = Target.joined([s.target for s in shares])
     # Receivers that are measured alike go through the measurement together.
-    batches = [list(own) for _, own in groupby(shares, key=lambda s: id(s.measured))]
+    batches = [list(own) for _, own in groupby(shares, key=lambda s: s.measured.alike)]
     bins = np.cumsum([0, *(len(b) * b[0].single.shape[0] for b in batches)])
     rows = np.cumsum([0, *(len(b) * len(b[0].rest) for b in batches)])
 
