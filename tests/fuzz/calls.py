@@ -21,8 +21,10 @@ from fuzz.place import ANGLES, POINTS, READINGS, TOWARDS, Place
 
 IGNORED = ("progress", "ax", "client")
 """Arguments that are not mutated unless an example names them: a caller's own functions, matplotlib's axes."""
-UNCHECKED = ("trace_links", "render", "sent_radiance")
-"""Methods that are given what others checked or made: ``links`` and ``radio_map``, ``view`` and ``transport`` are fuzzed."""
+UNCHECKED = ("trace_links", "render", "sent_radiance", "check_positions")
+"""Methods that are given what others checked or made, or that every verb asks."""
+PARTS = {"transformed": ("means", "vertices", "world_to_camera")}
+"""What else a refusal may name: parts of what a method makes."""
 OPTIONS_OF = ("FitOptions", "FieldOptions")
 """Classes whose options are what is public of them."""
 SERVERS = ("view", "Viewer")
@@ -267,7 +269,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     "RadioField.links": lambda p: {"shape": (8, 16), "client": None},
     "RadioField.load": lambda p: {"path": p.folder / "bistatic.safetensors", "device": "cpu"},
     "RadioField.on_grid": lambda p: {"shape": (8, 16)},
-    "RadioField.paths": lambda p: {"max_paths": 20, "client": None},
+    "RadioField.paths": lambda p: {"client": None},
     "RadioField.radio_map": lambda p: {"cell": 1.0},
     "RadioField.spectrum": lambda p: {"transmitter": p.transmitter + 0.1, "shape": (8, 16)},
     "RadioField.suggest": lambda p: {

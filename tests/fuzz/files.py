@@ -370,7 +370,7 @@ FORMATS: dict[str, Format] = {
     "step record": Format(_made(".steps/step.json", lambda place, path: _recorded(path)), _recorded, "json"),
     **{
         f"arrays, {how}": Format(
-            _made("a.npz", lambda p, path, c=c: write_arrays(path, ARRAYS_HELD, compress=c)), read_arrays, "zip", "sealed"
+            _made("a.npz", lambda p, path, c=c: write_arrays(path, ARRAYS_HELD, compress=c)), read_arrays, "", "sealed"
         )
         for how, c in (("compressed", True), ("plain", False))
     },

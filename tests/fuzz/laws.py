@@ -11,6 +11,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -278,7 +279,8 @@ def _table(place: Place, edits: tuple[Edit, ...]) -> str:
             head[k], told = head[k][:-1] if b % 2 else head[k].replace("_", ""), True
             told = head[k] not in COLUMNS
         elif name == "renamed":
-            head[k], told = head[k].partition("_")[0], True
+            head[k] = head[k].partition("_")[0]
+            told = head[k] not in COLUMNS
         elif name == "extra column":
             head.append(f"note_{a}")
             rows = [[*row, "x"] for row in rows]
@@ -338,17 +340,8 @@ def _pickles(place: Place, edits: tuple[Edit, ...]) -> str:
 
 
 @cache
-def _viewer(place: Place) -> tuple[Any, Any]:
-    """A viewer, and a page of it."""
-    import viser
-    from websockets.sync.client import connect
-
-    viewer = wr.view(place.mesh, port=20000 + os.getpid() % 20000)
-    host = viewer.url.split("/")[2]
-    page = connect(
-        f"ws://{host}", origin=f"http://{host}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None
-    )
-    return viewer, page
+def _viewer(place: Place) -> Any:
+    return wr.view(place.mesh, port=20000 + os.getpid() % 20000)
 
 
 MESSAGES = ("position", "name", "type", "wxyz", "none such")
@@ -357,32 +350,32 @@ MESSAGES = ("position", "name", "type", "wxyz", "none such")
 def _messages(place: Place, edits: tuple[Edit, ...]) -> str:
     """Whatever a page sends, the next drag is answered."""
     import msgspec
+    import viser
     from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
 
-    viewer, page = _viewer(place)
-    drag = {
+    drag: dict[str, Any] = {
         "type": "TransformControlsUpdateMessage",
         "name": "/receiver",
         "wxyz": [1, 0, 0, 0],
-        "position": [1.0, 1.0, 1.0],
     }
     values = [v for v in PLAIN.values() if v != 10**40]
-    wild = dict(drag)
+    wild = drag | {"position": [1.0, 1.0, 1.0]}
     for name, a, b in edits:
         value = values[a % len(values)]
         wild[name] = (value, [value] * 3, {"a": value}, [1.0, 2.0, value])[b % 4]
     right = np.array([1.0, 1.0, 1.0 + edits[0][1] % 1000 / 1e3])
-    try:
+    viewer = _viewer(place)
+    host = viewer.url.split("/")[2]
+    page = {"origin": f"http://{host}", "subprotocols": [f"viser-v{viser.__version__}"]}
+    with suppress(ConnectionClosed), connect(f"ws://{host}", **page, max_size=None, max_queue=None) as sender:
         for message in (wild, drag | {"position": right.tolist()}):
-            page.send(msgspec.msgpack.encode(message))
-            time.sleep(0.05)
-        end = time.monotonic() + 30.0
+            sender.send(msgspec.msgpack.encode(message))
+        end = time.monotonic() + 20.0
         while time.monotonic() < end:
             if viewer.last is not None and np.array_equal(viewer.last.receiver, right):
                 return ""
             time.sleep(0.01)
-    except ConnectionClosed:
-        pass
     _viewer.cache_clear()  # it answers no more
     viewer.close()
     return f"after {wild} no drag is answered"

@@ -90,7 +90,17 @@ class Trial:
         answer = asked(lambda: calls.call(case.target, changed))
         if isinstance(answer, Exception):
             paths = [changed[name] for name, _ in case.edits if isinstance(changed[name], str)]
-            return refused(answer, [*given, *paths, *(["field"] if "self" in changed else [])])
+            method = case.target.rpartition(".")[2]
+            return refused(
+                answer,
+                [
+                    *given,
+                    *paths,
+                    method,
+                    *calls.PARTS.get(method, ()),
+                    *(["field"] if "self" in changed else []),
+                ],
+            )
         values = {value for _, value in case.edits}
         unknown = case.target in calls.SPREADS and not np.asarray(changed["power"]).any()
         bad = "" if unknown or values & NOT_FINITE else wrong(answer, usual or {})

@@ -19,11 +19,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from warprrf.checks import check_array, check_type, checked, one_line
+from warprrf.checks import check_array, check_count, check_type, checked, one_line
 from warprrf.rf.em.absorption import Air, Gas, air_of
 from warprrf.rf.em.waves import SPEED_OF_LIGHT, carrier_phase
 from warprrf.rf.spectra.spectrum import angles_from_directions, directions_from_angles
 
+MOST_PATHS = 10_000_000
+"""Longest list that is asked for: 2 GB of a receiver."""
 _PADDING: dict[str, Any] = {
     "gain": 0.0, "tau": np.nan, "theta_r": np.nan, "phi_r": np.nan, "theta_t": np.nan, "phi_t": np.nan,
     "vertices": np.nan, "kind": "", "valid": False, "jones": 0.0,
@@ -277,9 +279,13 @@ class PathArrays:
 
     @classmethod
     def stack(cls, parts: Sequence[Self], length: int = 0) -> Self:
-        """Paths of several receivers, padded to the longest list or to ``length``: arrays ``(R, L)``."""
+        """Paths of several receivers, padded to the longest list or to ``length``: arrays ``(R, L)``.
+
+        Raises:
+            ValueError, TypeError: for no paths, or a length above :data:`MOST_PATHS`.
+        """
         _check_parts(parts)
-        length = max(length, *(len(p.gain) for p in parts))
+        length = max(check_count("length", length, 0, MOST_PATHS), *(len(p.gain) for p in parts))
         stacked: dict[str, Any] = {
             name: np.stack([_padded(a, 0, length, _PADDING[name]) for a in arrays])
             for name, arrays in _columns(parts).items()

@@ -96,7 +96,8 @@ def slab_transmission(
 def _shared(wave: np.ndarray, face: np.ndarray, echo: np.ndarray, none: np.ndarray | float) -> np.ndarray:
     """``wave`` over 1 - face^2 echo; ``none`` where that is 0, as at grazing of a slab without thickness."""
     below = 1.0 - face**2 * echo
-    return np.where(below == 0.0, none, wave / np.where(below == 0.0, 1.0, below))
+    nothing = np.abs(below) < np.finfo(float).tiny
+    return np.where(nothing, none, wave / np.where(nothing, 1.0, below))
 
 
 def _slab(

@@ -247,7 +247,8 @@ class SpectrumDataset:
                 "paths: got ones of several transmitters, expected those of one; a set holds one"
             )
         several = list(paths.each())
-        spread = [spread_paths(p.arrival, p.power, shape, beam_sigma_rad, device=device) for p in several]
+        grid = check_shape(shape)
+        spread = [spread_paths(p.arrival, p.power, grid, beam_sigma_rad, device=device) for p in several]
         aod = [np.column_stack([p.theta_t, p.phi_t]) for p in several]
         return cls.from_spectra(
             receivers=np.atleast_2d(paths.receiver),
