@@ -43,18 +43,6 @@ def test_infinite_lambertian_conductor(h1, h2, apart):
     assert power == pytest.approx((WAVELENGTH / (4 * np.pi * d)) ** 2 * 0.49 * 2 * (h1 + h2) / d, rel=1e-3)
 
 
-def test_scattered_power_per_solid_angle_does_not_depend_on_receiver_distance():
-    scene = room(SlabMaterial(scattering=0.8, pattern="directive", alpha_r=4))
-    e = engine(scene)
-    far = e.diffuse(RX)
-    for n in range(1000, len(far.power), 90_000):
-        step = 0.7 * far.range_m[n] * far.direction[n]
-        near = e.diffuse(RX + step)
-        same = near.index == far.index[n]
-        assert near.range_m[same][0] == pytest.approx(0.3 * far.range_m[n], rel=1e-9)
-        assert near.power[same][0] == pytest.approx(far.power[n], rel=1e-9)
-
-
 @pytest.mark.parametrize(
     "material",
     [

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from radio_scenes import box_mesh, joined
+from trimesh.remesh import subdivide_to_size
 
 import warprrf as wr
 from warprrf.geometry.mesh import Mesh
@@ -38,16 +39,7 @@ def sheet(a, b, c, d):
 
 def subdivided(mesh, noise_m, holes, seed=0):
     """Faces cut into many with noise on their corners, shared ones alike, and some faces missing."""
-    vertices, faces = mesh.vertices, mesh.faces
-    for _ in range(4):
-        middle = 0.5 * (vertices[faces] + vertices[np.roll(faces, -1, axis=1)])
-        n = len(vertices) + np.arange(3 * len(faces)).reshape(-1, 3)
-        vertices = np.concatenate([vertices, middle.reshape(-1, 3)])
-        a, b, c = faces.T
-        ab, bc, ca = n.T
-        faces = np.concatenate(
-            [np.column_stack(k) for k in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        )
+    vertices, faces = subdivide_to_size(mesh.vertices, mesh.faces, 0.4)
     place, index = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)
     rng = np.random.default_rng(seed)
     place = place + noise_m * rng.standard_normal(place.shape)

@@ -9,8 +9,8 @@ from furnished import RECEIVERS, TX, F, furnished, spectra
 from radio_scenes import RadioScene, SlabMaterial
 from twin_fields import known_field
 
-from warprrf.rf import exact
 from warprrf.rf.em.fresnel import fresnel_curves, lobe, slab_reflection
+from warprrf.rf.em.materials import NARROWEST_LOBE
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.fields.base import RadioField
@@ -44,7 +44,7 @@ def directions(count: int, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("alpha", [0, 1, 4, 12, 30, 200])
-def test_a_reciprocal_lobe_is_symmetric_and_scatters_all_that_comes(alpha):
+def test_a_reciprocal_lobe_is_symmetric_and_either_kind_scatters_all_that_comes(alpha):
     a, b = directions(2000, 0), directions(2000, 1)
     cos_mirror = 2.0 * a[:, 2] * b[:, 2] - (a * b).sum(axis=1)
     # f_s cos(theta_i): what the path gain of an element is proportional to
@@ -58,9 +58,13 @@ def test_a_reciprocal_lobe_is_symmetric_and_scatters_all_that_comes(alpha):
     cos_s, weight = 0.5 * (1.0 + node)[:, None], 0.5 * weight
     for cos_i in (1.0, 0.8, 0.4, 0.1, 0.01, 1e-4):
         cos_mirror = cos_i * cos_s + np.sqrt((1.0 - cos_i**2) * (1.0 - cos_s**2)) * np.cos(turn)
-        f = lobe(alpha, cos_i, cos_s, cos_mirror, reciprocal=True)
-        assert (f >= 0).all()
-        assert weight @ f.mean(axis=1) * 2.0 * np.pi == pytest.approx(1.0, rel=1e-9)
+        # narrow lobes of the other kind cost no time
+        for order, reciprocal in ((alpha, True), (alpha, False), (NARROWEST_LOBE, False)):
+            f = lobe(order, cos_i, cos_s, cos_mirror, reciprocal=reciprocal)
+            assert (f >= 0).all()
+            assert weight @ f.mean(axis=1) * 2.0 * np.pi == pytest.approx(
+                1.0, rel=1e-9 if reciprocal else 1e-6
+            )
 
 
 @pytest.mark.parametrize("alpha", [0, 4, 30])
@@ -82,36 +86,11 @@ def test_a_surface_never_sends_out_more_than_it_gets(alpha):
         assert 0.0 < 0.6 * scattered + 0.4 * gamma(cos_i) <= 1.0
 
 
-def element_gains(monkeypatch, transmitter, receiver, points, *, reciprocal) -> np.ndarray:
-    """Path gain of a unit of area at each of ``points`` (N, 3) on the room's surfaces, by the exact engine; 0 if dark."""
-    way = points - receiver
-    d2 = np.linalg.norm(way, axis=1)
-    toward = way / d2[:, None]
-    grid = exact._SubPixels(toward, np.ones(len(points)), wp.array(toward, dtype=wp.vec3d))
-    monkeypatch.setattr(exact, "_sub_pixel_grid", lambda *_: grid)
-    e = engine(transmitter, reciprocal=reciprocal)
-    found, power = e.diffuse(receiver), np.zeros(len(points))
-    same = np.abs(found.range_m - d2[found.index]) < 1e-6
-    power[found.index[same]] = found.power[same]
-    face = e.tracer.mesh.cast(np.tile(receiver, (len(points), 1)), toward).face
-    cos_s = np.abs((e.tracer.mesh.face_normals[face] * toward).sum(axis=1))
-    return power * cos_s / d2**2
-
-
-def test_each_path_of_the_exact_engine_is_the_same_both_ways(monkeypatch):
-    seen = engine(TX, reciprocal=True).diffuse(RX)
-    few = np.arange(0, len(seen.index), 97)
-    points = RX + seen.range_m[few, None] * seen.direction[few]
-    gaps = {}
-    for reciprocal in (True, False):
-        there, back = (
-            element_gains(monkeypatch, a, b, points, reciprocal=reciprocal) for a, b in ((TX, RX), (RX, TX))
-        )
-        both = (there > 0) & (back > 0)
-        assert both.mean() > 0.99  # but where single precision puts a ray across an edge
-        gaps[reciprocal] = np.log(there[both] / back[both])
-    assert np.abs(gaps[True]).max() < 1e-9
-    assert 10.0 / np.log(10.0) * np.sqrt(np.mean(gaps[False] ** 2)) > 1.0  # dB
+def test_the_exact_engines_diffuse_power_is_the_same_both_ways():
+    there, back = (engine(a, reciprocal=True).diffuse(b).power.sum() for a, b in ((TX, RX), (RX, TX)))
+    assert there == pytest.approx(back, rel=2e-3)
+    there, back = (engine(a, reciprocal=False).diffuse(b).power.sum() for a, b in ((TX, RX), (RX, TX)))
+    assert abs(there / back - 1.0) > 0.03
 
 
 LOBES = Terms(lobes=(0, 4, 30), reciprocal=True)

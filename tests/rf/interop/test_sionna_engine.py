@@ -11,7 +11,6 @@ from warprrf.rf import scene_sionna
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
 from warprrf.rf.exact import ExactEngine
 from warprrf.rf.interop.sionna_engine import Sampling
-from warprrf.rf.paths.sionna import repeated
 from warprrf.rf.scene import Scene
 from warprrf.rf.simulate import simulate
 from warprrf.rf.spectra.spectrum import pixel_of
@@ -95,17 +94,6 @@ def test_more_bounces_bring_more_power_and_simulate_says_how(scene):
     assert 1.05 < three.path_gain.sum() / one.path_gain.sum() < 10
     assert (three.attributes["depth"], three.attributes["samples"]) == (3, 100_000)
     assert three.attributes["version_sionna_rt"] and not three.line_of_sight[0]
-
-
-def test_a_mirror_found_twice_counts_once():
-    tau = np.array([30e-9, 40e-9, 40.001e-9, 40e-9, 40e-9, 40.1e-9])  # 0.3 mm and 30 mm apart
-    arrival = np.array([[1, 0, 0], [0, 1, 0], [1e-5, 1, 0], [0, 0, 1], [0, 1, 0], [0, 1, 0]], float)
-    aod = np.tile([1.0, 0.5], (6, 1))
-    bounces = np.array([1, 1, 1, 1, 2, 1])
-    assert repeated(tau, arrival, aod, bounces).tolist() == [False, False, True, False, False, False]
-    aod[2, 1] += 0.01  # leaves in another direction
-    assert not repeated(tau, arrival, aod, bounces).any()
-    assert repeated(tau[:0], arrival[:0], aod[:0], bounces[:0]).shape == (0,)
 
 
 def test_a_scene_needs_no_file_and_its_own_devices_play_no_part(engines, scene):
