@@ -1,4 +1,4 @@
-"""The engine's benchmark in tiny sizes: its sphere is closed, its errors move as they must, its rows are whole."""
+"""The engine's benchmark in tiny sizes: its sphere is closed, and its errors move as they must."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from places import LOBBY
 pytest.importorskip("open3d")
 
 from benchmarks.engine import table
-from benchmarks.engine.rays import KINDS, bumpy_sphere
+from benchmarks.engine.rays import bumpy_sphere
 from benchmarks.runner import Job, execute
 
 
@@ -27,7 +27,7 @@ def test_the_images_error_is_what_is_put_in():
     assert found["error_rms_db"] == pytest.approx(np.sqrt(np.mean(np.square(expected))), rel=1e-3)
 
 
-def test_more_discs_err_less_and_every_mesh_and_kind_of_ray_has_a_row(tmp_path):
+def test_more_discs_err_less(tmp_path):
     options = table.Options(
         scene=str(LOBBY / "scene.xml"), gaussians=(500, 10_000), shape=(24, 48), rays=2_000, triangles=1_000,
         repeats=1,
@@ -36,7 +36,3 @@ def test_more_discs_err_less_and_every_mesh_and_kind_of_ray_has_a_row(tmp_path):
     few, many = found["growth"]
     assert many["error_rms_db"] < 0.5 * few["error_rms_db"]
     assert many["range_error_median_m"] < few["range_error_median_m"] < 1e-3
-    assert [(r["mesh"], r["kind"]) for r in found["rays"]] == [
-        (m, k) for m in ("scene", "bumpy sphere") for k in KINDS
-    ]
-    assert all(row[name]["over_bare"] > 0 for row in found["rays"] for name in ("warp", "chosen"))

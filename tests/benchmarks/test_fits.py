@@ -39,17 +39,12 @@ def finished(room: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     return out, whole(out, room)
 
 
-def test_every_part_has_its_row_and_parts_are_worth_something(finished: tuple[Path, dict[str, Any]]) -> None:
-    out, found = finished
+def test_every_part_is_worth_something_and_delays_are_right(finished: tuple[Path, dict[str, Any]]) -> None:
+    _, found = finished
     psnr = {row["model"]: row["psnr_db"] for row in found["ablation"]}
     assert set(psnr) == {"everything", *LEFT_OUT, "true mesh, its materials as groups", "zero spectra"}
     assert psnr["no scattering"] < psnr["everything"] - 3 and psnr["zero spectra"] < psnr["everything"] - 3
-    assert [len(found[part]) for part in ("calibration", "delays")] == [1, 1]
-    assert "| exact | 8 | no mirrors |" in (out / "bistatic.md").read_text()
-
-
-def test_on_the_true_mesh_delays_are_right(finished: tuple[Path, dict[str, Any]]) -> None:
-    (row,) = finished[1]["delays"]
+    (row,) = found["delays"]  # on the true mesh
     assert row["found"] > 0.9 and row["mirror_ns"] < 1e-6 and row["scattering_ns"] < 1.0  # 15 degrees a pixel
 
 
@@ -74,15 +69,3 @@ def test_finished_rows_are_not_made_again_and_a_killed_run_loses_one(
     assert [row["psnr_db"] for row in again["ablation"]] == [
         row["psnr_db"] for row in finished[1]["ablation"]
     ]
-
-
-def test_bad_options_are_named(room: Path, tmp_path: Path) -> None:
-    for options, name in (
-        ({"counts": (400,)}, "counts"),
-        ({"every": 0}, "every"),
-        ({"truths": ("measured",)}, "truths"),
-    ):
-        with pytest.raises(ValueError, match=f"^{name}: got"):
-            whole(tmp_path, room, **options)
-    with pytest.raises(ValueError, match=r"geometry: .*none.*benchmarks lobby"):
-        whole(tmp_path, room, geometry=str(tmp_path / "none"))

@@ -69,10 +69,3 @@ def test_unbound_values_go_there_and_back_and_slopes_are_theirs(tmp_path: Path) 
         step[0, k] = 1e-6
         slope = (_physical(values + step) - _physical(values - step))[0, k] / 2e-6
         assert _slopes(values)[0, k] == pytest.approx(slope, rel=1e-5)
-
-
-def test_bad_times_are_named() -> None:
-    with pytest.raises(ValueError, match="seconds: got 0"):
-        Calibration(seconds=0)
-    with pytest.raises(ValueError, match="most_steps: got 0"):
-        Calibration(seconds=1.0, most_steps=0)
