@@ -9,7 +9,7 @@ import pytest
 from warprrf.geometry.splats.gaussians import Gaussians
 from warprrf.kernels.ssim import RADIUS, WINDOW
 from warprrf.rf.fields.harmonic.field import HarmonicField
-from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer, weighted_means
+from warprrf.rf.fields.harmonic.fitting import Layer, Target, fit_layer
 from warprrf.rf.fields.harmonic.opacity import Listed, OpacityTraining, list_responses
 from warprrf.rf.fields.harmonic.options import Rates
 from warprrf.rf.fields.harmonic.problem import Problem
@@ -194,17 +194,6 @@ def test_the_ridge_holds_a_gaussian_at_its_start() -> None:
     )
     assert np.abs(free).max() > 0.5
     assert np.abs(held).max() < 0.1 * np.abs(free).max()
-
-
-def test_weighted_means_are_those_of_the_pixels_that_see_a_gaussian() -> None:
-    t = synthetic_transport(receivers=2)
-    rng = np.random.default_rng(4)
-    values, where = rng.random((2, *SHAPE)), rng.random((2, *SHAPE)) < 0.5
-    seen, mean = weighted_means(t, values, where)
-    pixel = np.repeat(np.arange(len(t.start) - 1), np.diff(t.start))
-    for g, m in zip(seen, mean, strict=True):
-        mine = (t.gaussian == g) & where.ravel()[pixel]
-        assert m == pytest.approx(np.average(values.ravel()[pixel[mine]], weights=t.weight[mine]))
 
 
 def test_a_pixels_weight_is_the_sum_of_its_pairs_and_zero_without_any() -> None:
