@@ -245,6 +245,7 @@ EXAMPLES: dict[str, Callable[[Place], dict[str, Any]]] = {
     },
     "SpectrumDataset.empty": lambda p: {"shape": (12, 24), "beam_sigma_rad": 0.1, "floor": 1e-15},
     "SpectrumDataset.export_exr": lambda p: {"path": "one.exr"},
+    "SpectrumDataset.from_paths": lambda p: {"paths": p.paths, "shape": (12, 24), "beam_sigma_rad": 0.1},
     "SpectrumDataset.from_spectra": lambda p: {
         name: getattr(p.train, name)
         for name in ("receivers", "path_gain", "delay_s", "aod", "beam_sigma_rad", "line_of_sight", "engine", "floor")
