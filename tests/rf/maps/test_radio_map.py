@@ -217,13 +217,6 @@ def test_pictures_show_every_quantity(found: RadioMap, tmp_path: Path) -> None:
         np.testing.assert_allclose(shown, found.shown(quantity), equal_nan=True)
 
 
-def test_progress_counts_cells(whole: BistaticField) -> None:
-    said: list[tuple[str, int, int]] = []
-    m = whole.radio_map(1.2, 1.0, progress=lambda *step: said.append(step))
-    assert said[0] == ("links", 0, m.free.sum())
-    assert said[-1] == ("links", m.free.sum(), m.free.sum())
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from furnished import MATERIALS, RECEIVERS, ROOM, SHAPE, SIGMA, TX, F, spectra
 from radio_scenes import RadioScene, box_mesh, joined, mirror_paths
-from told import check_told
 
 from warprrf.rf.em.fresnel import fresnel_curves
 from warprrf.rf.em.waves import SPEED_OF_LIGHT
@@ -43,13 +42,6 @@ def field(scene: RadioScene, data: SpectrumDataset) -> BistaticField:
 
 def psnr(field: RadioField, ds: SpectrumDataset, transmitter: np.ndarray | None = None) -> float:
     return evaluate(ds, lambda rx: field.spectrum(rx, transmitter))["psnr_db"]
-
-
-def test_every_long_stage_of_a_fit_tells_how_far_it_is(scene: RadioScene, data: SpectrumDataset) -> None:
-    told: list[tuple[str, int, int]] = []
-    RadioField.fit(scene, data.subset(np.arange(4)), sub_pixels=1, progress=lambda *words: told.append(words))
-    check_told(told, ["patches", "mirrors", "transport", "fit"])
-    assert len([d for stage, d, _ in told if stage == "fit"]) > 4 + 6  # receivers, and fits that choose terms
 
 
 def test_spectra_that_would_not_fit_into_memory_are_refused(
