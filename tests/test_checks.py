@@ -40,14 +40,6 @@ def test_indices_are_neither_rounded_nor_wrapped(value: list[float]) -> None:
         Mesh(np.eye(3), [[0, *value]])
 
 
-@pytest.mark.parametrize(
-    "value", ["1.0", ["1.0"], [b"1"], [1j], [[1], [1, 2]], {}, object(), [object()], [10**400]]
-)
-def test_what_is_no_array_of_real_numbers_is_a_type_error(value: object) -> None:
-    with pytest.raises(TypeError, match=r"^points: got "):
-        check_array("points", value)
-
-
 def test_arrays_keep_their_values() -> None:
     np.testing.assert_array_equal(check_array("i", [1.0, 2.0], (None,), dtype=np.int32), [1, 2])
     np.testing.assert_array_equal(check_array("z", [1, 1j], (2,), dtype=complex), [1, 1j])

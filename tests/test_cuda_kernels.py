@@ -42,27 +42,18 @@ def kernels_of(name):
     return [k for k in found if isinstance(k, wp.Kernel) and k.func.__module__ == name]
 
 
+def test_kernels_are_looked_for_where_they_are():
+    assert "cast_rays" in {k.func.__name__ for k in kernels_of("warprrf.kernels.rays.mesh")}
+    assert {"warprrf.kernels.rays.mesh", "warprrf.kernels.raster.reference"} <= set(MODULES)
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_kernels_compile_for_cuda(name, tmp_path):
-    kernels = kernels_of(name)
+    kernels, tree = kernels_of(name), ast.parse(inspect.getsource(importlib.import_module(name)))
+    functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
+    in_source = {f.name for f in functions if any("wp.kernel" in ast.unparse(d) for d in f.decorator_list)}
+    assert {k.func.__name__ for k in kernels} == in_source  # none is missed
     for module in {k.module for k in kernels}:
         paths = wp.compile_aot_module(module, arch=ARCHITECTURE, use_ptx=True, module_dir=tmp_path)
         text = "".join(path.read_text() for path in paths)
         assert all(f".entry {k.key}" in text.replace(".visible", "") for k in kernels if k.module is module)
-
-
-def kernels_in_source(name):
-    """Names of the functions that a module's source decorates as kernels."""
-    tree = ast.parse(inspect.getsource(importlib.import_module(name)))
-    functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
-    return {f.name for f in functions if any("wp.kernel" in ast.unparse(d) for d in f.decorator_list)}
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_no_kernel_is_missed(name):
-    assert {k.func.__name__ for k in kernels_of(name)} == kernels_in_source(name)
-
-
-def test_kernels_are_looked_for_where_they_are():
-    assert {"warprrf.kernels.rays.mesh", "warprrf.kernels.raster.reference"} <= set(MODULES)
-    assert "cast_rays" in kernels_in_source("warprrf.kernels.rays.mesh")

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 
 from benchmarks.baselines import nerf2
 from benchmarks.baselines.cgan import CGANOptions, fit_cgan
-from benchmarks.baselines.training import Training, learn, path_gain_of, pictures
+from benchmarks.baselines.training import Training, learn
 from warprrf.rf.spectra import lookups, metrics
 from warprrf.rf.spectra.dataset import SpectrumDataset
 from warprrf.rf.spectra.spectrum import pixel_directions
@@ -99,12 +99,3 @@ def test_a_ray_is_the_sum_of_what_its_points_send_through_those_before_them() ->
             step = t[i + 1] - t[i]
             through *= np.exp((1j * angle(attenuation[i, 1]) - positive(attenuation[i, 0])) * step)
     assert shown == pytest.approx(abs(total), rel=1e-4)
-
-
-def test_pictures_are_the_db_image_in_the_stated_range_and_back() -> None:
-    ds = spectra()
-    low, high = ds.range_db
-    expected = (10 * np.log10(ds.path_gain[2, 3, 4] + ds.floor) - low) / (high - low)
-    assert pictures(ds)[2, 3, 4] == pytest.approx(expected, abs=1e-6)
-    assert np.allclose(path_gain_of(pictures(ds), ds.floor, ds.range_db), ds.path_gain, rtol=1e-4)
-    assert path_gain_of(np.array([-3.0]), ds.floor, ds.range_db)[0] == 0.0

@@ -13,7 +13,7 @@ from small_room import small_room
 
 import warprrf as wr
 from benchmarks import evaluation, newrf
-from benchmarks.data import VERSIONS, Geometry
+from benchmarks.data import VERSIONS
 from benchmarks.evaluation import COLUMNS, COMPARED, margins, region_held_out, summarise, unpacked
 from benchmarks.methods import METHODS, Effort
 from benchmarks.runner import Job, execute
@@ -98,8 +98,6 @@ def test_data_sets_of_any_room_stand_beside_each_other_and_no_run_is_done_twice(
     monkeypatch.setitem(VERSIONS, "lookups", 99)
     evaluate(tmp_path, data, methods=methods, steps=4)
     assert done == ["cgan", "nearest", "idw"]
-    with pytest.raises(ValueError, match="name: .* holds runs of spectra on other data"):
-        evaluate(tmp_path, data, methods=methods, name="spectra", **other)
 
 
 def test_a_killed_command_loses_the_run_at_work_and_says_what_is_missing(data: Path, tmp_path: Path) -> None:
@@ -159,17 +157,6 @@ def test_margins_pair_runs_of_the_same_spectra() -> None:
     assert (nearest["psnr_db"], nearest["psnr_db_std"], nearest["seeds"]) == (10.0, 0.0, 2)
     assert (zero["psnr_db"], zero["seeds"]) == (9.0, 3)
     assert zero["psnr_db_std"] == pytest.approx(np.std([6.0, 10.0, 11.0], ddof=1))
-
-
-def test_weights_of_some_receivers_are_taken_from_those_of_all(data: Path) -> None:
-    ds = wr.SpectrumDataset.load(data / "spectra.nc")
-    place, alone = (Geometry(data / "reconstruction", data / "scene.xml", "cpu") for _ in range(2))
-    seconds = place.weights(ds)[1]
-    found, share = place.weights(ds.subset([5, 2]))
-    expected = alone.weights(ds.subset([5, 2]))[0]
-    assert share == pytest.approx(seconds * 2 / len(ds))
-    for name in ("receivers", "start", "gaussian", "weight", "dominant", "expected_range"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 def test_the_second_rooms_scene_and_spectra_are_read_back_as_they_were(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 from small_room import small_room
 
 import warprrf as wr
-from benchmarks.lobby import pipeline, seeds
+from benchmarks.lobby import pipeline
 from benchmarks.runner import Job, execute
 from warprrf.files import write_json
 from warprrf.geometry.splats.gaussians import discs_on_mesh
@@ -115,21 +115,3 @@ def test_second_run_computes_nothing_and_a_killed_one_ends_with_the_same_figures
     for name in ("geometry", "geometry_error", "method", "pictures"):
         monkeypatch.setattr(pipeline.Lobby, name, lambda *_: pytest.fail("computed again"))
     assert whole(out, data)["methods"] == first["methods"]
-
-
-def test_seeds_have_runs_of_their_own_and_a_spread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Path, int]] = []
-
-    def run(options: Any, job: Job) -> Any:
-        asked.append((job.out, job.seed))
-        methods = {"bistatic": {"psnr_db": 30.0 + job.seed, "ssim": None}}
-        figures = {"methods": methods, "methods_sionna": methods, "camera_rms_m": 0.01 * job.seed}
-        return pipeline.Report("report", figures, "")
-
-    monkeypatch.setattr(pipeline, "run", run)
-    found = execute(seeds.BENCHMARKS["lobby-seeds"], seeds.Options(seeds=(0, 2, 4)), Job(tmp_path))
-    assert asked == [(tmp_path / f"seed-{k}", k) for k in (0, 2, 4)]
-    rows = {row["key"]: row for row in found["rows"]}
-    assert set(rows) == {"camera_rms_m", "methods.bistatic.psnr_db", "methods_sionna.bistatic.psnr_db"}
-    row = rows["methods.bistatic.psnr_db"]
-    assert (row["mean"], row["spread"], row["least"], row["most"]) == (32.0, 2.0, 30.0, 34.0)

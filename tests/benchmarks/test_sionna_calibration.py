@@ -13,14 +13,7 @@ pytest.importorskip("sionna.rt")
 from small_room import small_room
 
 import warprrf as wr
-from benchmarks.baselines.sionna_calibration import (
-    Calibration,
-    _bound,
-    _physical,
-    _slopes,
-    _unbound,
-    calibrate_sionna,
-)
+from benchmarks.baselines.sionna_calibration import Calibration, calibrate_sionna
 from warprrf.rf.interop.sionna_engine import Sampling, SionnaEngine
 
 
@@ -55,17 +48,3 @@ def test_calibration_lowers_the_error_and_finds_what_scatters(tmp_path: Path) ->
         sampling=Sampling(depth=1, samples=20_000), device="cpu",
     ).solve(train.receivers[0])  # fmt: skip
     assert recorded == [False]
-
-
-def test_unbound_values_go_there_and_back_and_slopes_are_theirs(tmp_path: Path) -> None:
-    material = wr.Scene.load(small_room(tmp_path) / "scene.xml").materials[0]
-    given = replace(material, scattering=0.4)
-    values = _unbound([given], 300e9)
-    (back,) = _bound([given], values, 300e9)
-    assert back.permittivity(300e9) == pytest.approx(given.permittivity(300e9), rel=1e-9)
-    assert back.scattering_coefficient(300e9) == pytest.approx(0.4)
-    for k in range(3):
-        step = np.zeros((1, 3))
-        step[0, k] = 1e-6
-        slope = (_physical(values + step) - _physical(values - step))[0, k] / 2e-6
-        assert _slopes(values)[0, k] == pytest.approx(slope, rel=1e-5)
