@@ -17,6 +17,7 @@ import pytest
 from warprrf import tensor_files
 from warprrf.files import (
     check_seal,
+    partial_path,
     read_arrays,
     read_json,
     write_arrays,
@@ -111,6 +112,11 @@ def test_partial_files_of_killed_processes_are_removed_and_those_of_living_ones_
     (folder / "inside").mkdir(parents=True)
     write_text(tmp_path / "b.txt", "")
     assert sorted(os.listdir(tmp_path)) == sorted([other_machine, "b.txt"])
+
+
+def test_a_path_without_a_name_is_refused() -> None:
+    with pytest.raises(ValueError, match="path: got ''"):
+        partial_path("")
 
 
 def test_text_and_arrays_come_back(tmp_path: Path) -> None:
